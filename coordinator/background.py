@@ -2,8 +2,8 @@
 
 `python -m petrobot.coordinator.background` reads orders from standard input. It runs at a low
 priority and with a time limit that the kernel enforces, so it never takes time from an active
-mission. A thread would: it shares the interpreter with the mission. Limits are in processor time,
-so the result for a drawing does not depend on what else the machine does.
+mission. A thread would: it shares the interpreter with the mission. Its limits are in processor
+time, so what else the machine does does not matter.
 
 An order is a line of JSON, {work, given}. The answer is any number of lines of JSON, each a more
 complete result than the one before, or one refusal after `!`. An empty line ends the answer.
@@ -17,14 +17,11 @@ import json
 import os
 import resource
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from petrobot.services.host.json_text import json_text
 
-STATES, SECONDS, MEMORY = 50_000, 4.0, 256 << 20
-"""Limits of one state space: markings, seconds of processor time, bytes."""
 HARD_END = 8
 """Seconds of processor time after which the kernel kills an analysis; results that it has already
 written are used."""
@@ -36,21 +33,6 @@ LONGEST_LINE = 256 << 20
 """The longest line that is read from the process (bytes)."""
 LOWER = 10
 """By how much its priority is lowered (nice)."""
-WORDS = {
-    "bounded": "Tokens stay bounded",
-    "safe": "Never two tokens in a place",
-    "deadlock_free": "Never stuck before its end",
-    "quasi_live": "Every transition can fire",
-    "live": "Every transition can fire again, whatever happened",
-    "proper": "Ready for the next mission, whatever happened",
-    "reversible": "Can come back to its beginning",
-    "one_run_each": "One run at a time in each action place",
-    "returned": "Every resource is back at the end",
-    "sound": "Can end properly from everywhere",
-    "stable": "Comes back to its nominal flow after errors",
-    "controllable": "Every error can be recovered from",
-}
-"""Verdicts in the words that the operator's page shows."""
 
 
 class RefusedError(ValueError):
@@ -64,10 +46,13 @@ class RefusedError(ValueError):
 
 
 class Superseded(RefusedError):  # noqa: N818 - not a fault: the drawing has changed since
-    """The same desk sent a newer drawing, so this one gets no answer."""
+    """The same desk sent a newer drawing, so this one gets no answer.
+
+    Status 200: that is normal work, and browsers log every 4xx answer as an error.
+    """
 
     def __init__(self) -> None:
-        super().__init__(409, "a newer drawing took its place")
+        super().__init__(200, "a newer drawing took its place", {"superseded": True})
 
 
 class BackgroundProcess:
@@ -186,19 +171,19 @@ def analysed(text: str, filename: str, view: str = "ordinary") -> dict[str, Any]
     reason, assumption, witness, complete}, false ones first. With the view "gspn" the forecast is
     included: `heat` is the share of the time that each action place takes. Raises TaskFileError.
     """
-    from petrobot.coordinator.analysis.net.space import SearchLimits
+    from petrobot.coordinator.analysis.may_run import BUDGET, WORDS
     from petrobot.coordinator.analysis.report import analyse, heat
     from petrobot.coordinator.task.file import loads
 
-    limits = SearchLimits(states=STATES, seconds=SECONDS, memory=MEMORY, clock=time.process_time)
-    analysis = analyse(loads(text, filename), view=view, limits=limits)
+    task = loads(text, filename)
+    analysis = analyse(task, view=view, limits=BUDGET.limits(), steps=BUDGET.steps)
     space = analysis.qualitative.space
     verdicts = [
         {"name": name, "words": WORDS.get(name, name.replace("_", " ")), **verdict.to_json()}
         for name, verdict in analysis.verdicts().items()
         if name != "safe"  # a task need not be safe: a runs place holds one token per run
     ]
-    for recovery in analysis.robot.recoveries if analysis.robot else ():
+    for recovery in analysis.progress.recoveries if analysis.progress else ():
         verdict = recovery.possible
         words = f"Can recover after {recovery.error_exit}"
         verdicts.append(

@@ -14,6 +14,7 @@ from typing import Any
 
 from petrobot.coordinator.engine import Engine, Point
 from petrobot.coordinator.run.executor import Executor
+from petrobot.coordinator.run.folder import NODE_LOGS
 from petrobot.coordinator.run.interfaces import (
     FirstAlternative,
     Forgetful,
@@ -48,7 +49,6 @@ from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 
 NODE_PARTY = "petrobot.services.node.lockstep:LockstepNode"
 SCRIPTED = "petrobot.services.scripted:load"
-LOGS = Path("runs/logs")
 
 Substitutes = Mapping[str, Callable[..., Any]]
 
@@ -295,7 +295,8 @@ def local_programs(
     )
     options = ["--services", str(directory.source), *(["--lockstep"] if lockstep else [])]
     options += ["--await-coordinator", str(awaited)] if lockstep and awaited else []
-    own = ["--log-level", log_level, *(["--mock", str(mock)] if mock else [])]
+    options += ["--log-level", log_level]
+    own = ["--mock", str(mock)] if mock else []
     return [
         Program(node.name, [sys.executable, "-m", "petrobot.sim", *options], first=True)
         if node.sim
@@ -308,7 +309,7 @@ def local_programs(
 
 def local_nodes(
     directory: Directory,
-    logs: Path = LOGS,
+    logs: Path = NODE_LOGS,
     *,
     lockstep: bool = False,
     mock: Path | None = None,

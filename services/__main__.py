@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -22,20 +21,13 @@ from petrobot.services.comm.location_file.reading import nearest
 from petrobot.services.comm.lockstep.mesh import CellError
 from petrobot.services.comm.lockstep.process import run_member
 from petrobot.services.comm.protocol.security import KeyFileError, KeyNeededError
-from petrobot.services.host.command_line import number
+from petrobot.services.host.command_line import LOG_LEVELS, add_log_level, log_to_stderr, number
 from petrobot.services.host.parent_death import die_with, wanted_with_parent
 from petrobot.services.node.lockstep import LockstepNode
 from petrobot.services.node.realtime import serve
 from petrobot.services.scripted import ScriptError
 from petrobot.services.scripted import load as load_script
-from petrobot.services.worker.process import log_to_stderr
 
-LOG_LEVELS = {
-    "debug": logging.DEBUG,
-    "info": logging.INFO,
-    "warning": logging.WARNING,
-    "error": logging.ERROR,
-}
 EXAMPLE = "example:\n  python -m petrobot.services vision --services services.toml"
 
 
@@ -63,13 +55,7 @@ def parser() -> argparse.ArgumentParser:
     commands.add_argument(
         "--mock", metavar="FILE", default="", help="replace the actions that this file scripts"
     )
-    commands.add_argument(
-        "--log-level",
-        choices=LOG_LEVELS,
-        default="info",
-        help="log what is at least so grave, to standard error (default: %(default)s; debug: "
-        "every message, too)",
-    )
+    add_log_level(commands)
     return commands
 
 

@@ -1,16 +1,17 @@
 """How a device driver is written: what owns a camera, an arm or a rover on its node.
 
-A driver is a class named by import path in services.toml (`[devices.NAME] driver =
-"module:Class"`), constructed as `Class(config, ports)`. One without a `period` lives in the worker
-process of its device, and actions use it directly as `ctx.device`. One with a `period` is *cyclic*:
-in real time it lives in a process of its own, paced by absolute deadline, so no user code delays
-it; actions see a `Remote` of it: `send` a command, read `state`. In lock step both live inline.
-"""
+A driver is a class derived from `Driver` and named by import path in services.toml (`[devices.NAME]
+driver = "module:Class"`); it is made as `Class(config, ports)`. One without a `period` lives in the
+worker process of its device, and actions use it directly as `ctx.device`. One with a `period` is
+*cyclic*: in real time it lives in a process of its own, paced by absolute deadline, so no user code
+delays it; actions see a `Remote` of it: `send` a command, read `state`. In lock step both live
+inline."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Mapping
+from copy import copy
 from typing import Any, Protocol, runtime_checkable
 
 from petrobot.services.comm.canopen.bus import CanBus
@@ -74,49 +75,147 @@ PORT_KEYS = ("interface", "channel", "bitrate", "can", "source", "address", "lat
 def refuse_unknown_keys(config: Mapping[str, Any], own: Collection[str]) -> None:
     """Raise ValueError if a device's table has a key that is neither its driver's `own` nor its
     ports': a mistyped one would silently be no setting at all. For a driver's constructor."""
-    for key in config:
-        if key not in own and key not in PORT_KEYS:
-            raise ValueError(f"unknown key {key!r}{nearest(key, [*own, *PORT_KEYS])}")
+    for name in config:
+        if name not in own and name not in PORT_KEYS:
+            raise ValueError(f"unknown key {name!r}{nearest(name, [*own, *PORT_KEYS])}")
 
 
-class Driver(Protocol):
-    """One device. Nothing here blocks; `now` is the cell's clock (s).
+class _Required:
+    """Default of a key that the table must give."""
 
-    A method that raises has broken the driver, but for `command` (which refuses so) and `picture`:
-    the device is stopped, its run ends in ERROR with the exception's words, and the traceback goes
-    to the node's log. In real time the driver is then made again in a new process; in lock step,
-    where nothing could have made it break but its code, its device works no more.
+
+class Key:
+    """A key of a device's table, declared by `key`."""
+
+    def __init__(self, default: Any, text: str) -> None:
+        self.default = default
+        self.text = text
+        self.name = ""
+        self.kind: type = object
+        """bool, int, float, str, list or dict; object: any plain data."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+        said = owner.__annotations__.get(name)
+        known = {k.__name__: k for k in (bool, int, float, str, list, dict)}
+        if said is not None:
+            word = said if isinstance(said, str) else said.__name__
+            self.kind = known.get(word.partition("[")[0].strip(), object)
+        elif self.default is not _Required:
+            self.kind = type(self.default)
+
+    def read(self, config: Mapping[str, Any]) -> Any:
+        """The key's value in a table. Raises ValueError."""
+        if self.name not in config:
+            if self.default is _Required:
+                raise ValueError(f"{self.name}: is missing; expected {self._expected()}")
+            return copy(self.default)
+        value = config[self.name]
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        fits = number if self.kind is float else isinstance(value, self.kind)
+        if not fits or (self.kind is int and not number) or value != value:
+            raise ValueError(f"{self.name}: expected {self._expected()}, found {value!r:.60}")
+        return float(value) if self.kind is float else value
+
+    def _expected(self) -> str:
+        words = {
+            bool: "true or false",
+            int: "a whole number",
+            float: "a number",
+            str: "a text",
+            list: "a list",
+            dict: "a table",
+        }
+        return words.get(self.kind, "a value") + (f" ({self.text})" if self.text else "")
+
+
+def key(default: Any = _Required, text: str = "") -> Any:
+    """Declare a key of a device's table in services.toml as an attribute of its driver.
+
+    `port: str = key(text="serial port")` is required, `speed = key(0.1, "m/s")` has a default. The
+    type is that of the annotation, else of the default. The driver reads the value as
+    `self.port`; a missing, unknown or mistyped key is refused by name.
+    """
+    return Key(default, text)
+
+
+class Driver:
+    """One device: the base class of drivers. Override what the device can do.
+
+    Nothing here may block. `now` is the cell's clock (s). A method that raises has broken the
+    driver, except `command` (which refuses by raising) and `picture`: the device is stopped, its
+    run ends in ERROR with the exception's words, and the traceback goes to the node's log. In real
+    time the driver is then made again in a new process; in lock step its device stays out of use.
     """
 
-    period: float | None
-    """Seconds between calls of `step`; None for a driver without cyclic duty."""
+    period: float | None = None
+    """Seconds between calls of `step`; None for a driver without cyclic work."""
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        """Read the keys of the device's table. Raises ValueError with every wrong key."""
+        self.ports = ports
+        for name, value in read_keys(type(self), config).items():
+            setattr(self, name, value)
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Take a command from an action (cyclic drivers). A bad one raises ValueError: it is
-        refused, and ends its run in ERROR with these words unless the action reads them in
-        `Remote.refused`. Any other exception refuses it, too."""
+        """Take a command from an action (cyclic drivers). Raise ValueError to refuse it: that ends
+        its run in ERROR with these words, unless the action reads them in `Remote.refused`. Any
+        other exception refuses it, too."""
+        raise ValueError(f"this device takes no commands, but was sent {dict(body)}")
 
     def step(self, now: float) -> None:
-        """One cycle (cyclic drivers)."""
+        """Do the work of one cycle (cyclic drivers)."""
 
     def state(self) -> Mapping[str, Any]:
-        """Plain data for actions, operator and report, published each cycle."""
+        """Return plain data for actions, operator and report; published each cycle."""
+        return {}
 
     def stop(self, now: float) -> None:
-        """Stop routine: bring the device to a safe standstill. May be called at any time and
-        again."""
+        """Bring the device to a safe standstill. May be called at any time, and again. A device
+        that can move must override this and `stopped`."""
 
     def stopped(self) -> bool:
-        """Whether the device is known to stand still."""
+        """Return whether the device is known to stand still."""
+        return True
 
     def hold(self, now: float) -> str:
-        """Operator's pause: answers "held", "cannot hold" or "stopped"."""
+        """Pause for the operator: answer "held", "cannot hold" or "stopped"."""
+        return "held" if self.stopped() else "cannot hold"
 
     def release(self, now: float) -> None:
-        """End of the operator's pause."""
+        """End the operator's pause."""
 
     def close(self) -> None:
-        """Let the device go."""
+        """Release the device."""
+
+
+def keys_of(driver: type) -> dict[str, Key]:
+    """Return the keys that a driver's class declares, those of its base classes first."""
+    return {
+        name: value
+        for base in reversed(driver.__mro__)
+        for name, value in vars(base).items()
+        if isinstance(value, Key)
+    }
+
+
+def read_keys(driver: type, config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of the keys that a driver's class declares. Raises ValueError with every
+    key that is missing, unknown or of another type."""
+    own = keys_of(driver)
+    values: dict[str, Any] = {}
+    faults: list[str] = []
+    for name, declared in own.items():
+        try:
+            values[name] = declared.read(config)
+        except ValueError as fault:
+            faults.append(str(fault))
+    for name in config:
+        if name not in own and name not in PORT_KEYS:
+            faults.append(f"unknown key {name!r}{nearest(name, [*own, *PORT_KEYS])}")
+    if faults:
+        raise ValueError("; ".join(faults))
+    return values
 
 
 @runtime_checkable
@@ -133,7 +232,7 @@ PICTURE = "picture"
 
 
 @runtime_checkable
-class Watched(Protocol):
+class HasPicture(Protocol):
     """A driver that can show its operator a picture of what it sees."""
 
     def picture(self) -> Mapping[str, Any]:
@@ -147,7 +246,7 @@ def picture_of(driver: Driver | None) -> Mapping[str, Any]:
     the device moves on."""
     try:
         picture: Mapping[str, Any] = (
-            plain(driver.picture(), "picture") if isinstance(driver, Watched) else {}
+            plain(driver.picture(), "picture") if isinstance(driver, HasPicture) else {}
         )
     except Exception:
         _log.exception("a driver gives no picture")

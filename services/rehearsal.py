@@ -8,22 +8,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from petrobot.services.action import Result, Status, error
+from petrobot.services.comm.calls.events import VERDICT_EVENTS, RunVerdict
 from petrobot.services.comm.location_file import MEMORY_CALLS, ActionEntry
 from petrobot.services.comm.lockstep.party import TICK
-from petrobot.services.node.inline_host import InlinePlace
-from petrobot.services.node.memory import Memory
-from petrobot.services.worker.runs import (
-    Answered,
-    Asked,
-    Begin,
-    Ended,
-    Judged,
-    Progressed,
-    Raised,
-    Report,
-    Sent,
-    Stop,
-)
+from petrobot.services.comm.protocol.messages import Call, Cancel, Event, Feedback, Outcome
+from petrobot.services.node.inline_host import InlineHost
+from petrobot.services.node.memory import GlobalMemory
+from petrobot.services.worker.context import Report
+from petrobot.services.worker.outlets import Sent
 
 NAME, RUN = "action", "rehearsal"
 
@@ -48,7 +40,9 @@ class Rehearsal:
     """Calls of services: (time, service, arguments)."""
     verdicts: list[tuple[float, str, Status, str]] = field(default_factory=list)
     """Verdicts on earlier runs: (time, run, status, cause)."""
-    memory: Memory = field(default_factory=lambda: Memory(lambda name, value, version: None))
+    memory: GlobalMemory = field(
+        default_factory=lambda: GlobalMemory(lambda name, value, version: None)
+    )
 
 
 def rehearse(
@@ -73,13 +67,13 @@ def rehearse(
     StillRunningError when it has not ended after `limit` seconds.
     """
     stage = _Stage(action, device, services or {}, streams or {})
-    stage.place.take(0.0, Begin(RUN, NAME, arguments, None, seed))
+    stage.place.take(0.0, Call(RUN, NAME, arguments, seed=seed))
     for tick in range(round(limit / TICK) + 1):
         stage.now = tick * TICK
         if world is not None:
             world(stage.now)
         if cancel_after is not None and stage.now >= cancel_after - 1e-9:
-            stage.place.take(stage.now, Stop(RUN))
+            stage.place.take(stage.now, Cancel(RUN))
             cancel_after = None
         if stage.step():
             return stage.played
@@ -116,7 +110,7 @@ class _Stage:
         self.played = Rehearsal(error("still_running"), 0.0)
         self._services = services
         driver = device if hasattr(device, "stopped") and hasattr(device, "period") else None
-        self.place = InlinePlace(
+        self.place = InlineHost(
             {NAME: ActionEntry(NAME, "", "", "")},
             clock=lambda: self.now,
             driver=driver,
@@ -132,29 +126,31 @@ class _Stage:
         reports = self.place.reports()
         for report in reports:
             self._note(report)
-        return any(isinstance(report, Ended) for report in reports)
+        return any(isinstance(report, Outcome) for report in reports)
 
     def _note(self, report: Report) -> None:
         played = self.played
-        if isinstance(report, Ended):
-            said = (report.values, report.cause, report.text, report.deferred)
-            played.result = Result(Status(report.status), *said)
+        if isinstance(report, Outcome):
+            played.result = Result(
+                Status(report.status), report.values, report.cause, report.text, report.deferred
+            )
             played.seconds = report.seconds
         elif isinstance(report, Sent):
             played.published.append((self.now, report.stream, report.values))
-        elif isinstance(report, Raised):
+        elif isinstance(report, Event) and report.name.startswith(VERDICT_EVENTS):
+            said = RunVerdict.of_data(report.data)
+            played.verdicts.append((self.now, said.run, Status(said.status), said.cause))
+        elif isinstance(report, Event):
             played.events.append((self.now, report.name, report.data))
-        elif isinstance(report, Judged):
-            played.verdicts.append((self.now, report.run, Status(report.status), report.cause))
-        elif isinstance(report, Progressed):
+        elif isinstance(report, Feedback):
             played.progress.append((self.now, report.fraction))
-        elif isinstance(report, Asked):
+        elif isinstance(report, Call):
             played.calls.append((self.now, report.service, report.arguments))
             result = self._answer(report)
-            answer = Answered(report.id, result.status, result.values, result.cause, result.text)
+            answer = Outcome(report.id, result.status, result.values, result.cause, result.text)
             self.place.take(self.now, answer)
 
-    def _answer(self, asked: Asked) -> Result:
+    def _answer(self, asked: Call) -> Result:
         if asked.service in self._services:
             return self._services[asked.service](**asked.arguments)
         if asked.service in MEMORY_CALLS:

@@ -12,7 +12,7 @@ from petrobot.services.comm.location_file import Directory, DirectoryError, load
 from petrobot.services.comm.lockstep.mesh import CellError
 from petrobot.services.comm.lockstep.process import run_member
 from petrobot.services.comm.protocol.security import KeyFileError, KeyNeededError
-from petrobot.services.host.command_line import number
+from petrobot.services.host.command_line import LOG_LEVELS, add_log_level, log_to_stderr, number
 from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.realtime import serve
 
@@ -23,7 +23,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     commands = argparse.ArgumentParser(
         prog="python -m petrobot.sim",
-        description="Launches the simulated laboratory: the node of services.toml with a key sim.",
+        description="Start the simulated laboratory: the node of services.toml with a key `sim`.",
         epilog=f"{EXAMPLE}\n\nexit codes: 0 ended by SIGTERM, 2 bad services.toml or cell "
         "file, 3 the cell lost a party",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -39,6 +39,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="S",
         help="lock step: wait so long for a coordinator that died and is resumed (s of wall time)",
     )
+    add_log_level(commands)
     return commands
 
 
@@ -63,6 +64,7 @@ def read(path: Path) -> tuple[Directory, str]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the laboratory; return the exit code."""
     options = parser().parse_args(arguments)
+    log_to_stderr(LOG_LEVELS[options.log_level])
     try:
         directory, name = read(options.services)
         if options.lockstep:

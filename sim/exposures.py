@@ -89,6 +89,14 @@ def camera_of(cell: Mapping[str, Any], truth: Truth, rng: np.random.Generator) -
         "light_gradient": truth.light_gradient,
         "vignetting": truth.vignetting,
     }
+    factor, hidden = truth.scatter.exposure_factor, truth.scatter.hidden
+    if factor != 1.0:
+        camera_cell = {**cell["camera"], "exposure": factor * cell["camera"]["exposure"]}
+        cell = {**cell, "camera": camera_cell}
+    if truth.cup.radius != cell["cup"]["radius"]:
+        cell = {**cell, "cup": {**cell["cup"], "radius": truth.cup.radius}}
+    if hidden[0] < hidden[1]:
+        view["hidden"] = hidden
     key = repr((view, [cell[part] for part in ("camera", "table", "ball", "cup")]))
     if key not in _BUILT:
         _BUILT[key] = PinholeCamera(cell, view, np.random.default_rng(_NOISE_FIELD))

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, ClassVar
 
-from petrobot.services.comm.calls.callee import Callee, CommandOrder, Offer, Order
+from petrobot.services.comm.calls.callee import Callee, Offer, Order
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.lockstep.channels import (
     can_body,
@@ -21,7 +21,7 @@ from petrobot.services.comm.lockstep.channels import (
     read_images_wanted,
 )
 from petrobot.services.comm.lockstep.party import TICK, Envelope
-from petrobot.services.comm.protocol.messages import Call, Executed, Outcome
+from petrobot.services.comm.protocol.messages import Call, Command, Executed, Outcome
 from petrobot.sim.exposures import Exposures
 
 PREPARE, SCORE, FAULT = SERVICES = ("laboratory_prepare", "laboratory_score", "laboratory_fault")
@@ -30,8 +30,8 @@ PREPARE, SCORE, FAULT = SERVICES = ("laboratory_prepare", "laboratory_score", "l
 def answer_command(now: float, callee: Callee, order: Order) -> None:
     """Answer an operator's command: a laboratory is running, and has no device that could be held
     or stopped."""
-    if isinstance(order, CommandOrder):
-        callee.answer(now, order.command.id, True, {"answers": {}, "devices": {}, "emergency": []})
+    if isinstance(order, Command):
+        callee.answer(now, order.id, True, {"answers": {}, "devices": {}, "emergency": []})
 
 
 class LaboratoryParty(ABC):
@@ -47,6 +47,9 @@ class LaboratoryParty(ABC):
     def __init__(self, name: str, where: Callable[[str], str], boot: str, directory: str) -> None:
         """`boot`, `directory`: as in services.comm.calls.callee."""
         self.name = name
+        self.physics = ""
+        """Name and version of what computes its mechanics, for records; empty: there is only one
+        way."""
         self.now = 0.0
         """Time of the world (s)."""
         offers = {

@@ -15,6 +15,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
+import logging
 import os
 import queue
 import secrets
@@ -25,7 +26,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from typing import Final
 
-from petrobot.services.comm.calls.callee import Callee, Offer, Order, StartOrder
+from petrobot.services.comm.calls.callee import Callee, Offer, Order
 from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.canopen.hub import CanHub
 from petrobot.services.comm.location_file import Directory, resolve
@@ -36,6 +37,8 @@ from petrobot.services.comm.streams.camera import ImageServer
 from petrobot.services.comm.tls.credentials import credentials
 from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.laboratory_party import LaboratoryParty, answer_command
+
+_log = logging.getLogger(__package__)
 
 SLIP: Final = 0.1
 """s behind the clock from which the world's time slips."""
@@ -82,6 +85,7 @@ class Pacemaker:
             if late > SLIP:
                 self._begin += late
                 self.slipped += late
+                _log.warning("the world stood still for %.2f s: this host is too busy", late)
             self._wait(self._begin + self._laboratory.now + TICK)
             with self.lock:
                 self._laboratory.tick(self._laboratory.now)
@@ -186,6 +190,7 @@ class LaboratoryShell:
         gc.freeze()
         self._loop = asyncio.get_running_loop()
         self._thread.start()
+        _log.info("%s: the world's clock runs", self._name)
         try:
             with listening(self._directory, self._name):
                 await self.server.start(*self._directory.address(self._name))
@@ -211,21 +216,25 @@ class LaboratoryShell:
         try:
             self.pacemaker.run()
         except BaseException as fault:
+            _log.exception("%s: the world's clock stopped", self._name)
             self._fault = fault
             if self._loop is not None:
                 self._loop.call_soon_threadsafe(self.over.set)
 
     def _answer(self, now: float, call: Call) -> Outcome:
         with self.pacemaker.lock:
-            return self.laboratory.answer(call)
+            outcome = self.laboratory.answer(call)
+        if outcome.status != "success":
+            _log.info("call %s of %s refused: %s", call.id, call.service, _words(outcome))
+        return outcome
 
     def _obey(self, now: float, orders: list[Order]) -> None:
         """Start preparations, the only calls that are runs; they cannot be stopped, only
         awaited."""
         for order in orders:
             answer_command(now, self.server.callee, order)
-            if isinstance(order, StartOrder):
-                task = asyncio.get_running_loop().create_task(self._prepare(order.call))
+            if isinstance(order, Call):
+                task = asyncio.get_running_loop().create_task(self._prepare(order))
                 self._preparing.add(task)
                 task.add_done_callback(self._preparing.discard)
 
@@ -237,16 +246,13 @@ class LaboratoryShell:
         outcome = await asyncio.wrap_future(
             self.pacemaker.submit(lambda: self.laboratory.answer(call))
         )
-        self.server.callee.finish(
-            self.server.now(),
-            call.id,
-            outcome.status,
-            outcome.values,
-            outcome.cause,
-            outcome.text,
-            outcome.executed,
-        )
+        _log.info("call %s of %s ended: %s", call.id, call.service, _words(outcome))
+        self.server.callee.finish(self.server.now(), outcome)
         self.server.flush()
+
+
+def _words(outcome: Outcome) -> str:
+    return f"{outcome.status} {outcome.cause} {outcome.text}".rstrip()
 
 
 def _made(directory: Directory, name: str) -> LaboratoryParty:
@@ -325,4 +331,5 @@ async def serve(directory: Directory, name: str) -> None:
     host, port = shell.server.address
     print(f"node {name} ready on {host}:{port}, process {os.getpid()}", flush=True)
     await shell.over.wait()
+    _log.info("node %s ends", name)
     await shell.close()

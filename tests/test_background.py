@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator import background as background
+from petrobot.coordinator.analysis.may_run import Budget
 from petrobot.coordinator.background import (
     BackgroundProcess,
     RefusedError,
@@ -48,11 +49,10 @@ async def test_an_invalid_task_is_refused_with_its_fault() -> None:
         await analyse_in_background("schema = 1\n[task]\n", "drawn.toml")
 
 
-def test_a_search_that_ran_out_of_time_leaves_verdicts_unknown(
+def test_a_search_that_ran_out_of_states_leaves_verdicts_unknown(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(background, "SECONDS", 0.0)
-    monkeypatch.setattr(background, "STATES", 1 << 40)
+    monkeypatch.setattr("petrobot.coordinator.analysis.may_run.BUDGET", Budget(10))
     answer = analysed(CATCH_BALL.replace("tokens = 4", "tokens = 4000"), "catch_ball.toml")
     assert answer["complete"] is False
     assert None in {verdict["holds"] for verdict in answer["verdicts"]}

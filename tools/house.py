@@ -1,7 +1,7 @@
 """Measure the house: sizes, names, comments and the files on the main path, as a Markdown table.
 
     python -m tools.house                 of this checkout
-    python -m tools.house REVISION ...    of revisions beside it (read from the repository's history)
+    python -m tools.house REVISION ...    of revisions beside it (read from git's history)
 
 Code lines are lines that are neither blank, comment nor docstring. A file serves one other file if
 exactly one module imports it; commands of the command line, `__main__` and package files, which are

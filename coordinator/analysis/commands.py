@@ -6,7 +6,7 @@ random generators come from the caller as well.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
@@ -21,11 +21,14 @@ from petrobot.coordinator.analysis.formats.netfile import (
     read_rates,
     unit_rates,
 )
+from petrobot.coordinator.analysis.limits import OutOfTime, until
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.picture import graph_svg
 from petrobot.coordinator.analysis.net.space import EngineName, SearchLimits, explore
 from petrobot.coordinator.analysis.report import CUT, Analysis, analyse
 from petrobot.coordinator.analysis.time.gspn import Gspn
+from petrobot.coordinator.analysis.time.measures import Measure as UserMeasure
+from petrobot.coordinator.analysis.time.measures import read_measure, value_of
 from petrobot.coordinator.analysis.time.simulate import (
     IntervalEstimate,
     Simulation,
@@ -40,13 +43,16 @@ from petrobot.coordinator.analysis.time.whatif import (
     change_task,
     read_change,
 )
-from petrobot.coordinator.task import Place, Task, Transition
+from petrobot.coordinator.task import End, Kind, Place, Task, Transition
 from petrobot.coordinator.task.net import Net
 from petrobot.services.host.whole_file import write_whole
 
 OK, FAULT, BAD_INPUT = 0, 1, 2
+SEARCHED = 0.5
+"""Share of the seconds of an analysis that its searches may use; the rest is for the verdicts."""
 
 LoadTask = Callable[[Path], Task]
+Measure = Callable[[Task], Measured]
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,45 +82,79 @@ def analyse_command(
     engine: EngineName = "auto",
     structure: bool = True,
     changes: Sequence[str] = (),
+    measure: Measure | None = None,
+    measures: Sequence[str] = (),
 ) -> CommandResult:
     """Run `petrobot analyse`: code 0 if `Analysis.ok`, 1 if not (or unknown), 2 for bad input.
 
     `rates` is a rates file, or "unit". Without a `view`, a net with rates (passed here or in its
     file) is analysed as "gspn", everything else as "ordinary". `changes` (see `whatif`) are
     compared with the file as it is; code and text are those of the changed model.
+
+    `measure` gives the measurements of a task; without it the declared estimates count. `measures`
+    are expressions of the user (see `time.measures`); they need the numbers over time.
+
+    The seconds of `limits` are for everything together: searches get SEARCHED of them, and what
+    follows stops at their end with "unknown". `structure` asks for invariants, siphons and traps
+    in the data; they are not computed otherwise.
     """
+    limits = limits or SearchLimits()
+    clock, analyses = limits.clock, 1 + bool(changes)
+    began = clock() if clock else 0.0
+    span = limits.seconds / analyses if limits.seconds is not None else None
+    due = None if span is None else began + analyses * span
     try:
         model = open_model(path, load_task)
         view = view or _view(model, rates)
         subject, name, notes = _subject(model, rates, view)
+        known = _measured(model, measure)
         wanted = [read_change(text) for text in changes]
-        altered = _changed(subject, wanted) if wanted else None
+        altered = _changed(subject, known, wanted) if wanted else None
         plain = model.net if isinstance(model, NetFile) and rates is not None else None
 
         def found(one: Subject, measured: Measured | None) -> Analysis:
+            last = one is not subject or not altered
+            ends = None if due is None or span is None else due - (0 if last else span)
+            searched = None if ends is None or span is None else ends - (1 - SEARCHED) * span
             tokens = plain and (
                 change_net(plain, _tokens_of(plain, wanted)) if one is not subject else plain
             )
-            return analyse(
-                one,
-                name=name or path.stem,
-                view=view,
-                measured=measured,
-                stages=stages,
-                limits=limits,
-                engine=engine,
-                ordinary=tokens,
-            )
+            with until(ends, clock):
+                return analyse(
+                    one,
+                    name=name or path.stem,
+                    view=view,
+                    measured=measured,
+                    stages=stages,
+                    limits=replace(limits, due=searched),
+                    engine=engine,
+                    ordinary=tokens,
+                )
 
-        now = found(subject, None)
+        now = found(subject, known)
         then = found(*altered) if altered else now
-    except (NetFileError, ValueError, OverflowError) as error:
+        with until(due, clock):
+            then, data, said = _told(then, structure)
+            if wanted:
+                what = [change.text for change in wanted]
+                data |= {"what_if": what, "as_it_is": now.to_json(structure=False)}
+                said += ["", f"what if {', '.join(what)}:", *_compared(now, then)]
+            if measures:
+                rows = {
+                    m.name: _measure_values(m, [now, then] if wanted else [then])
+                    for m in map(read_measure, measures)
+                }
+                data["measures"] = {name: values[-1] for name, values in rows.items()}
+                said += ["", "measures:"]
+                said += [
+                    f"  {name:28}" + " -> ".join(f"{value:.6g}" for value in values)
+                    for name, values in rows.items()
+                ]
+    except (NetFileError, ValueError, OverflowError, OutOfTime) as error:
         return CommandResult(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
-    then, data, said = _told(then, structure)
-    if wanted:
-        what = [change.text for change in wanted]
-        data |= {"what_if": what, "as_it_is": now.to_json(structure=False)}
-        said += ["", f"what if {', '.join(what)}:", *_compared(now, then)]
+    except MemoryError:
+        told = f"{path}: the memory was used up; give more --memory, or fewer --states"
+        return CommandResult(BAD_INPUT, told, {"error": told})
     said += [f"note: {note}" for note in notes]
     return CommandResult(
         OK if then.ok else FAULT,
@@ -122,6 +162,18 @@ def analyse_command(
         data | {"notes": [*data["notes"], *notes]},
         analysis=then,
     )
+
+
+def _measure_values(measure: UserMeasure, analyses: Sequence[Analysis]) -> list[float]:
+    """Return the value of a measure in each analysis. Raises NetFileError."""
+    values = []
+    for analysis in analyses:
+        numbers = analysis.forecast or analysis.run
+        if numbers is None:
+            why = "; ".join(analysis.notes) or "the ordinary view has no times: give --view gspn"
+            raise NetFileError("--measure", measure.text, "there are no numbers", why)
+        values.append(value_of(measure, numbers))
+    return values
 
 
 def _view(model: Task | NetFile, rates: Path | str | None) -> str:
@@ -151,23 +203,39 @@ def _tokens_of(net: Net, changes: Sequence[Change]) -> list[Change]:
 def _told(found: Analysis, structure: bool) -> tuple[Analysis, dict[str, Any], list[str]]:
     """Return the analysis with its data and text.
 
-    Structure and forecast are computed only now, so Ctrl-C may arrive here: then both are left out.
+    Structure and the distribution of the completion time are computed only now, so Ctrl-C may
+    arrive here, or the time end: then the forecast is left out.
     """
     try:
         return found, found.to_json(structure=structure), [found.text()]
     except KeyboardInterrupt:
-        part = replace(
-            found, interrupted=True, forecast=None, notes=tuple(dict.fromkeys((*found.notes, CUT)))
-        )
-        return part, part.to_json(structure=False), [part.text()]
+        note, cut = CUT, True
+    except OutOfTime as late:
+        note, cut = f"no forecast: {late}", found.interrupted
+    notes = tuple(dict.fromkeys((*found.notes, note)))
+    part = replace(found, interrupted=cut, forecast=None, notes=notes)
+    return part, part.to_json(structure=False), [part.text()]
 
 
 Subject = Task | Net | Gspn
 
 
-def _changed(subject: Subject, changes: Sequence[Change]) -> tuple[Subject, Measured | None]:
+def _measured(model: Task | NetFile, measure: Measure | None) -> Measured:
+    """Return the measurements of a task. Raises NetFileError if the model is not a task."""
+    if measure is None:
+        return Measured()
+    if not isinstance(model, Task):
+        raise NetFileError(
+            "--estimates", model.name, "this is a net; estimates are of tasks", "give --rates"
+        )
+    return measure(model)
+
+
+def _changed(
+    subject: Subject, measured: Measured, changes: Sequence[Change]
+) -> tuple[Subject, Measured | None]:
     if isinstance(subject, Task):
-        return change_task(subject, Measured(), changes)
+        return change_task(subject, measured, changes)
     return (
         change_gspn(subject, changes) if isinstance(subject, Gspn) else change_net(subject, changes)
     ), None
@@ -239,6 +307,7 @@ def simulate_command(
     firings: int = 10_000_000,
     stages: int = 64,
     changes: Sequence[str] = (),
+    measure: Measure | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> CommandResult:
     """Run `petrobot simulate`: a task until it is final or dead, a net until `horizon` (s).
@@ -247,9 +316,10 @@ def simulate_command(
     """
     try:
         model, wanted = open_model(path, load_task), [read_change(text) for text in changes]
+        known = _measured(model, measure)
         if isinstance(model, Task):
             _subject(model, rates, "gspn")  # refuses rates
-            model, measured = change_task(model, Measured(), wanted)
+            model, measured = change_task(model, known, wanted)
             view = stochastic_view(model, measured, stages=stages, timer_stages=stages)
             ends = OrdinaryView(model)
             goal = goal_by_marking(lambda m: ends.is_final(view.projected(m)))
@@ -329,13 +399,31 @@ def _interval(one: IntervalEstimate) -> str:
 
 
 def convert_command(
-    source: Path, target: Path, load_task: LoadTask, *, stages: int = 8
+    source: Path,
+    target: Path,
+    load_task: LoadTask,
+    *,
+    stages: int = 8,
+    view: str | None = None,
+    measure: Measure | None = None,
 ) -> CommandResult:
-    """Run `petrobot convert`: formats follow from the file endings; losses are listed."""
+    """Run `petrobot convert`: formats follow from the file endings; losses are listed.
+
+    `view` of a task: "ordinary" or "gspn" (default: gspn for `.drn` and `.pnpro`, which are for
+    chains and GSPNs, or if there is `measure`).
+    """
+    assumed: list[str] = []
     try:
         model = open_model(source, load_task)
         if isinstance(model, Task):
-            model, lost = _exported(model, target, stages)
+            known = _measured(model, measure)
+            timed = target.suffix.lower() in (".drn", ".pnpro") or measure is not None
+            wanted = view or ("gspn" if timed else "ordinary")
+            model, lost, assumed = _exported(model, wanted, known, stages)
+        elif view == "gspn" and model.gspn is None:
+            raise NetFileError(str(source), "rates", "the file has none", "convert it as it is")
+        elif view == "ordinary" and model.gspn is not None:
+            model, lost = replace(model, gspn=None), [*model.notes, "rates and weights"]
         else:
             lost = list(model.notes)
         text, more = written(model, target)
@@ -350,21 +438,35 @@ def convert_command(
         )
     lost += more
     lines = [f"{source} -> {target}", *(f"not kept: {what}" for what in lost)]
-    return CommandResult(
-        OK, "\n".join(lines), {"source": str(source), "target": str(target), "not_kept": lost}
-    )
+    lines += [f"assumed: {what}" for what in assumed]
+    data = {"source": str(source), "target": str(target), "not_kept": lost, "assumed": assumed}
+    return CommandResult(OK, "\n".join(lines), data)
 
 
-def _exported(task: Task, target: Path, stages: int) -> tuple[NetFile, list[str]]:
-    """Return a task as a net file, and what is lost.
-
-    For `.drn` this is its stochastic view, because that format needs rates; else its ordinary net.
-    """
-    if target.suffix == ".drn":
-        view = stochastic_view(task, stages=stages, timer_stages=stages)
-        return NetFile(view.gspn.net, task.name, view.gspn), list(view.assumptions)
-    lost = ["events, conditions, actions, times and priorities: a net file holds the ordinary view"]
-    return net_file_of(task), lost
+def _exported(
+    task: Task, view: str, measured: Measured, stages: int
+) -> tuple[NetFile, list[str], list[str]]:
+    """Return a task as a net file in one of its views, what is lost, and what is assumed."""
+    if view == "gspn":
+        timed = stochastic_view(task, measured, stages=stages, timer_stages=stages)
+        return NetFile(timed.gspn.net, task.name, timed.gspn), [], list(timed.assumptions)
+    flat = task.flat
+    transitions = flat.transitions.values()
+    parts = {
+        "actions and the ends of their runs": any(
+            p.kind is Kind.ACTION for p in flat.places.values()
+        ),
+        "events": any(t.events for t in transitions),
+        "conditions": any(t.when is not None for t in transitions),
+        "timers": any(t.after is not None for t in transitions),
+        "priorities": any(t.priority for t in transitions),
+        "weights of transitions": any(t.weight is not None for t in transitions),
+        "preemption (an ordinary arc instead)": any(
+            a.end in (End.PREEMPT, End.GOING) for t in transitions for a in t.inputs
+        ),
+    }
+    lost = [f"{part}: this is the ordinary view" for part, has in parts.items() if has]
+    return net_file_of(task), lost, []
 
 
 def net_file_of(task: Task) -> NetFile:
@@ -409,6 +511,23 @@ def graph_command(
         f"{len(space)} markings, {space.edges} edges{partial}",
         {"svg": svg, "witness": list(shown)},
     )
+
+
+def gspn_of(
+    path: Path, load_task: LoadTask, *, measure: Measure | None = None
+) -> tuple[NetFile, Mapping[str, str]]:
+    """Return the GSPN of a task or net file, and where each rate and weight comes from, by name.
+
+    Raises NetFileError, NoEstimate and the errors of `load_task`.
+    """
+    model = open_model(path, load_task)
+    known = _measured(model, measure)
+    if isinstance(model, Task):
+        view = stochastic_view(model, known)
+        return NetFile(view.gspn.net, model.name, view.gspn), view.sources
+    if model.gspn is None:
+        raise NetFileError(str(path), "rates", "the file has none", "give a file with rates")
+    return model, dict.fromkeys(model.net.transitions, f"from {path.name}")
 
 
 def limited(limits: SearchLimits, progress: Callable[[int, int], None]) -> SearchLimits:

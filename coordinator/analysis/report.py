@@ -9,6 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from petrobot.coordinator.analysis.execution.graph import STEPS, TooManyValues
+from petrobot.coordinator.analysis.execution.progress import (
+    MENDED,
+    NAMES,
+    Progress,
+    Recovery,
+    progress_of,
+)
+from petrobot.coordinator.analysis.limits import OutOfTime
 from petrobot.coordinator.analysis.net.coverability import Coverability, find_pump, settle_bounds
 from petrobot.coordinator.analysis.net.deadlocks import (
     PlaceSets,
@@ -16,16 +25,8 @@ from petrobot.coordinator.analysis.net.deadlocks import (
     minimal_siphons,
     minimal_traps,
 )
-from petrobot.coordinator.analysis.net.graph import Mask
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
-from petrobot.coordinator.analysis.net.robot import (
-    Recovery,
-    RobotVerdicts,
-    all_returned,
-    judge,
-    one_run_each,
-)
 from petrobot.coordinator.analysis.net.space import (
     INTERRUPTED,
     EngineName,
@@ -48,7 +49,7 @@ from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.analysis.time.markov import LongRun, long_run
 from petrobot.coordinator.analysis.time.stochastic import Measured, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
-from petrobot.coordinator.task import Kind, Task
+from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.net import Marking, Net
 
 
@@ -77,6 +78,20 @@ class StructureReport:
     def traps(self) -> PlaceSets:
         """Minimal traps."""
         return minimal_traps(self.net)
+
+    def gaps(self) -> list[str]:
+        """Return what was not enumerated in full, in words."""
+        parts = {
+            "place invariants": self.place_flows.complete,
+            "transition invariants": self.transition_flows.complete,
+            "siphons": self.siphons.complete,
+            "traps": self.traps.complete,
+        }
+        return [
+            f"{part}: those found; whether there are more is unknown within the limit"
+            for part, complete in parts.items()
+            if not complete
+        ]
 
     def to_json(self) -> dict[str, Any]:
         """Return plain data, with places and transitions by name."""
@@ -108,45 +123,36 @@ class StructureReport:
         }
 
 
+CERTAIN = 1e-9
+"""A probability of completion that is short of 1 by less counts as 1."""
 SHOWN = 20
 """The most entries of a list that the text shows."""
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """The result of `analyse`. For a task, `closed` and `robot` judge the net that is closed by the
-    transitions refill and repair."""
+    """The result of `analyse`. For a task, `progress` judges its execution graph, and
+    `qualitative` its ordinary net: bounds come from there."""
 
     name: str
     net: Net
     qualitative: Qualitative
-    closed: Qualitative | None
-    robot: RobotVerdicts | None
+    progress: Progress | None
     structure: StructureReport
     run: LongRun | None
     forecast: Forecast | None
     notes: tuple[str, ...]
-    one_run_each: PropertyVerdict | None = None
-    """Tasks only: whether no action place is entered while its run is active."""
-    returned: PropertyVerdict | None = None
-    """Tasks only: whether each resource has its initial tokens again at the end."""
+    unjudged: str = ""
+    """Tasks only: why there is no execution graph; empty if there is one."""
     interrupted: bool = False
     """Whether Ctrl-C ended the analysis before everything was computed."""
 
     @property
-    def progress(self) -> Qualitative:
-        """The net on which liveness, properness and home markings are judged: the closed one if
-        there is one."""
-        return self.closed or self.qualitative
-
-    @property
     def ok(self) -> bool:
         """Whether the task is known to have no objection against running it."""
-        first = (
-            self.qualitative.bounded.holds is True and self.qualitative.deadlock_free.holds is True
-        )
-        single = self.one_run_each is None or self.one_run_each.holds is True
-        return first and single and not self.objections
+        named = self.verdicts()
+        known = ("bounded", "deadlock_free", "one_run_each")
+        return not self.objections and all(named[n].holds for n in known if n in named)
 
     @property
     def objections(self) -> dict[str, PropertyVerdict]:
@@ -168,11 +174,32 @@ class Analysis:
 
     def to_json(self, *, structure: bool = True) -> dict[str, Any]:
         """Return plain data with documented keys; verdicts are true, false or null."""
-        q, again, unbounded = (
-            self.qualitative,
-            self.progress,
-            self.qualitative.bounded.holds is False,
-        )
+        q = self.qualitative
+        unbounded = q.bounded.holds is False
+        named = self.verdicts()
+        back = named.get("proper", q.reversible)
+        stuck: list[dict[str, Any]] = [
+            {
+                "marked": list(d.marked),
+                "count": d.count,
+                "emptied": list(d.emptied),
+                **d.witness.to_json(),
+            }
+            for d in q.deadlocks
+        ]
+        levels, home = q.levels, q.home_states
+        if self.progress is not None:
+            levels, home = self.progress.levels, self.progress.home_states
+            stuck = [
+                {
+                    "marked": list(d.witness.marking),
+                    "count": d.count,
+                    "reason": d.reason,
+                    **d.witness.to_json(),
+                }
+                for d in self.progress.dead_ends
+            ]
+        free = named["deadlock_free"].holds
         out: dict[str, Any] = {
             "name": self.name,
             "net": _sizes(self.net),
@@ -186,32 +213,29 @@ class Analysis:
             "max_tokens_in_marking": q.space.most_tokens if q.space.complete else None,
             "bounds": dict(zip(self.net.places, q.bounds, strict=True)),
             "safe": q.safe.holds,
-            "deadlock": None if q.deadlock_free.holds is None else not q.deadlock_free.holds,
-            "deadlocks": [
-                {
-                    "marked": list(d.marked),
-                    "count": d.count,
-                    "emptied": list(d.emptied),
-                    **d.witness.to_json(),
-                }
-                for d in q.deadlocks
+            "deadlock": None if free is None else not free,
+            "deadlocks": stuck,
+            "dead_markings": sum(one["count"] for one in stuck)
+            if self.progress
+            else q.dead_markings,
+            "quasi_live": named["quasi_live"].holds,
+            "dead_transitions": [
+                t for t, level in zip(self.net.transitions, levels, strict=True) if level == 0
             ],
-            "dead_markings": q.dead_markings,
-            "quasi_live": q.quasi_live.holds,
-            "dead_transitions": list(q.dead_transitions),
-            "live": again.live.holds,
-            "liveness": dict(zip(again.space.net.transitions, again.levels, strict=True)),
-            "reversible": again.reversible.holds,
-            "home_states": again.home_states,
-            "sound": q.sound.holds if q.sound else None,
-            "judged_on_closed_net": ["live", "liveness", "reversible", "home_states"]
-            if self.closed
-            else [],
-            "verdicts": {name: verdict.to_json() for name, verdict in self.verdicts().items()},
+            "live": named["live"].holds,
+            "liveness": dict(zip(self.net.transitions, levels, strict=True)),
+            "reversible": back.holds,
+            "home_states": home,
+            "sound": named["sound"].holds if "sound" in named else None,
+            "execution": self.progress.size() if self.progress else None,
+            "verdicts": {name: verdict.to_json() for name, verdict in named.items()},
             "notes": list(self.notes),
         }
-        out |= {"structure": self.structure.to_json()} if structure else {}
-        out |= {"recoveries": [_recovery(r) for r in self.robot.recoveries]} if self.robot else {}
+        if structure:
+            out["structure"] = self.structure.to_json()
+            out["notes"] += self.structure.gaps()
+        if self.progress is not None:
+            out["recoveries"] = [_recovery(r) for r in self.progress.recoveries]
         return out | self._numbers()
 
     def _numbers(self) -> dict[str, Any]:
@@ -252,24 +276,28 @@ class Analysis:
         return {"markings": len(self.qualitative.space)}
 
     def verdicts(self) -> dict[str, PropertyVerdict]:
-        """Return all verdicts by name; for a task also those of `robot.py`."""
-        q, again = self.qualitative, self.progress
-        out = {
-            "bounded": q.bounded,
-            "safe": q.safe,
+        """Return all verdicts by name. For a task those of progress come from the execution
+        graph."""
+        q = self.qualitative
+        structural = {
             "deadlock_free": q.deadlock_free,
             "quasi_live": q.quasi_live,
+            "live": q.live,
+            "reversible": q.reversible,
         }
-        out |= {"live": again.live, "proper" if self.closed else "reversible": again.reversible}
-        if self.one_run_each is not None:
-            out["one_run_each"] = self.one_run_each
-        if self.returned is not None:
-            out["returned"] = self.returned
-        if q.sound is not None:
-            out["sound"] = q.sound
-        if self.robot is not None:
-            out |= {"stable": self.robot.stable, "controllable": self.robot.controllable}
-        return out
+        structural |= {"sound": q.sound} if q.sound is not None else {}
+        out = {"bounded": q.bounded, "safe": q.safe}
+        if self.progress is not None and self.progress.x.complete and q.bounded.holds is not True:
+            finite = f"the task rests in {len(self.progress.x)} states only"
+            out["bounded"] = PropertyVerdict(True, finite)
+        if self.progress is None and not self.unjudged:
+            return out | structural
+        if self.progress is None:
+            unknown = PropertyVerdict(None, f"unknown: {self.unjudged}", complete=False)
+            judged = dict.fromkeys(NAMES, unknown)
+        else:
+            judged = self.progress.verdicts()
+        return out | {name: _beside(one, structural.get(name)) for name, one in judged.items()}
 
     def text(self) -> str:
         """Return the analysis as text for the terminal."""
@@ -280,17 +308,23 @@ class Analysis:
             f"{size['arcs']} arcs; "
             f"{len(q.space)} markings, {q.space.edges} edges"
             + ("" if q.space.complete else f" (partial: {q.space.reason})"),
-            "",
         ]
+        lines += [f"executed: {self.progress.size_text()}", ""] if self.progress else [""]
         for name, verdict in self.verdicts().items():
             lines += _verdict_lines(name, verdict)
-        lines += [
-            f"  deadlock       {d.count} x: {' '.join(d.witness.firings) or '(initial marking)'}"
-            for d in q.deadlocks[:SHOWN]
-        ]
-        if self.robot is not None:
-            lines += ["", "error exits     possible  sure  further errors  run      recovery"]
-            lines += [_recovery_line(r) for r in self.robot.recoveries]
+        if self.progress is None:
+            lines += [
+                f"  deadlock       {d.count} x: "
+                f"{' '.join(d.witness.firings) or '(initial marking)'}"
+                for d in q.deadlocks[:SHOWN]
+            ]
+        else:
+            lines += [
+                f"  dead end       {d.count} x: {d.reason}" for d in self.progress.dead_ends[:SHOWN]
+            ]
+            if self.progress.recoveries:
+                lines += ["", "error exits     possible  sure  further errors  run      recovery"]
+                lines += [_recovery_line(r) for r in self.progress.recoveries]
         assumed = dict.fromkeys(
             v.assumption for v in self.verdicts().values() if v.holds and v.assumption
         )
@@ -326,8 +360,11 @@ class Analysis:
             f"  time {done.mean:.3f} s, standard deviation {done.variance**0.5:.3f} s; mean time "
             f"back to the nominal flow at most {f.recovery_time:.3f} s; residual "
             f"{done.residual:.1e}",
+            *_missing_lines(self),
             "worth improving:",
             *rows,
+            *(f"approximated: {text}" for text in f.approximations),
+            *(f"{source}: {', '.join(names)}" for source, names in f.view.numbers.items()),
             *(f"assumed: {text}" for text in f.view.assumptions),
         ]
 
@@ -342,16 +379,18 @@ def analyse(
     limits: SearchLimits | None = None,
     engine: EngineName = "auto",
     ordinary: Net | None = None,
+    steps: int = STEPS,
 ) -> Analysis:
     """Return all verdicts on a net or task; with `view="gspn"` also the numbers over time.
 
     A GSPN yields its long run from the initial marking, a task its forecast. Numbers that cannot be
     computed (incomplete space, timeless trap) leave a note instead. `limits` apply to each state
     space that is explored. `ordinary` is the net for the qualitative verdicts on a GSPN, if it is
-    not the GSPN's own net because the rates and priorities came from another file.
+    not the GSPN's own net because the rates and priorities came from another file. `steps` limits
+    the execution graph of a task, in stimuli and firings.
     """
     if isinstance(model, Task):
-        return _analyse_task(model, view, measured, stages, limits, engine)
+        return _analyse_task(model, view, measured, stages, limits, engine, steps)
     net = ordinary or (model.net if isinstance(model, Gspn) else model)
     notes: list[str] = []
     found = _examined(net, limits, engine, notes)
@@ -364,7 +403,6 @@ def analyse(
         net,
         found,
         None,
-        None,
         StructureReport(net),
         run,
         None,
@@ -376,6 +414,8 @@ def analyse(
 LOOK = 10_000
 """Markings after which boundedness is checked, before the search continues to its limits."""
 ENDLESS = "the net is unbounded"
+FULL = "the memory was used up: verdicts from the first markings only; give more --memory"
+LATE = "the time was used up: verdicts from the first markings only; give more --seconds"
 CUT = "Ctrl-C: a partial result, from what had been found by then"
 
 
@@ -407,14 +447,19 @@ def _examined(
 ) -> Qualitative:
     """Return all verdicts; after Ctrl-C only the quick ones, and add a note."""
     space: Space | None = None
+    reason = INTERRUPTED
     try:
         space, cover = _search(net, limits, engine)
         if space.reason != INTERRUPTED:
             return examine(space, final=final, cover=cover)
     except KeyboardInterrupt:
         space = space or explore(net, limits=SearchLimits(states=1))
-    notes.append(CUT)
-    return examine(replace(space, complete=False, reason=INTERRUPTED), final=final, in_haste=True)
+    except MemoryError:
+        space, reason = explore(net, limits=SearchLimits(states=LOOK)), "memory limit"
+    except OutOfTime:
+        space, reason = explore(net, limits=SearchLimits(states=LOOK)), "time limit"
+    notes.append({INTERRUPTED: CUT, "memory limit": FULL}.get(reason, LATE))
+    return examine(replace(space, complete=False, reason=reason), final=final, in_haste=True)
 
 
 def _long_run(
@@ -426,7 +471,7 @@ def _long_run(
         if space.reason != INTERRUPTED:
             return long_run(Chain.of(model, space=space))
     except (ValueError, ArithmeticError, MemoryError) as why:
-        notes.append(f"no long run: {str(why) or 'out of memory'}")
+        notes.append(f"no long run: {_why(why)}")
         return None
     except KeyboardInterrupt:
         pass
@@ -441,77 +486,45 @@ def _analyse_task(
     stages: int,
     limits: SearchLimits | None,
     engine: EngineName,
+    steps: int,
 ) -> Analysis:
     ordinary, notes = OrdinaryView(task), list[str]()
     found = _examined(ordinary.net, limits, engine, notes, ordinary.is_end)
-    single = [
-        p.name for p in task.flat.places.values() if p.kind is Kind.ACTION and p.servers is None
-    ]
-    alone, whole = one_run_each(found.space, single), StructureReport(ordinary.net)
-    closed = robot = numbers = back = None
+    progress = numbers = None
+    why = "the analysis was interrupted"
     try:
         if not notes:
-            resources = [p.name for p in task.flat.places.values() if p.kind is Kind.RESOURCE]
-            final = found.space.where(ordinary.is_final)
-            back = all_returned(found.space, final, resources)
-            notes += _uneven(found.space, final)
-            closed, robot = _closed(ordinary, found.space, limits, engine, notes)
+            # An unbounded net seldom has a finite execution graph, but its dead ends may be near.
+            most = steps if found.bounded.holds is not False else min(steps, LOOK)
+            try:
+                progress = progress_of(ordinary, most)
+                notes += progress.notes
+            except TooManyValues as fault:
+                why = str(fault)
         if view == "gspn" and CUT not in notes:
             numbers = _forecast(task, measured, stages, limits, notes)
     except KeyboardInterrupt:
         notes.append(CUT)
-    stopped = CUT in notes
     return Analysis(
         task.name,
         ordinary.net,
         found,
-        closed,
-        robot,
-        whole,
+        progress,
+        StructureReport(ordinary.net),
         None,
         numbers,
         tuple(notes),
-        alone,
-        back,
-        stopped,
+        "" if progress is not None else why,
+        CUT in notes,
     )
 
 
-def _uneven(space: Space, final: Mask) -> list[str]:
-    """Return a note for each place whose tokens at the end depend on the path taken.
-
-    The tokens may be left over, lost, or a counter on purpose; only the author knows.
-    """
-    ends = np.flatnonzero(final)
-    held = (
-        [(name, space.tokens(p)[ends]) for p, name in enumerate(space.net.places)]
-        if len(ends)
-        else []
-    )
-    return [
-        f"{name} holds {tokens.min()} to {tokens.max()} tokens at the end, depending on the path"
-        for name, tokens in held
-        if tokens.min() < tokens.max()
-    ]
-
-
-def _closed(
-    ordinary: OrdinaryView,
-    space: Space,
-    limits: SearchLimits | None,
-    engine: EngineName,
-    notes: list[str],
-) -> tuple[Qualitative | None, RobotVerdicts | None]:
-    """Return the verdicts on the closed net and those of `robot.py`, or add a note why not."""
-    try:
-        net = ordinary.closed(space)
-        again = explore(net, limits=limits, engine=engine)
-        if again.reason == INTERRUPTED:
-            raise KeyboardInterrupt
-        return examine(again), judge(again, ordinary.roles(net), space)
-    except ValueError as why:
-        notes.append(f"live and proper are judged on the open net: {why}")
-        return None, None
+def _beside(judged: PropertyVerdict, structural: PropertyVerdict | None) -> PropertyVerdict:
+    """Return a verdict on the execution graph; where it is unknown, with what the ordinary net
+    says."""
+    if judged.holds is not None or structural is None or structural.holds is not False:
+        return judged
+    return replace(judged, reason=f"{judged.reason}; the ordinary net: {structural.reason}")
 
 
 def _forecast(
@@ -526,10 +539,58 @@ def _forecast(
     except (ValueError, ArithmeticError, MemoryError) as why:
         if INTERRUPTED in str(why):
             raise KeyboardInterrupt from why
-        notes.append(f"no forecast: {str(why) or 'out of memory'}")
+        notes.append(f"no forecast: {_why(why)}")
         return None
     _ = found.worth, found.recovery_time, found.throughput, found.mean_tokens
     return found
+
+
+def _why(error: Exception) -> str:
+    """Return why something stayed unknown."""
+    used_up = "the memory was used up; give more --memory, or simulate instead"
+    return used_up if isinstance(error, MemoryError) else str(error)
+
+
+def missing(forecast: Forecast) -> list[tuple[float, Marking, tuple[str, ...]]]:
+    """Return where a task ends without `final`: states that cover 99 % of 1 - P_complete, each with
+    its probability, its marking and the firings of a shortest path, most probable first."""
+    chain, view = forecast.chain, forecast.view
+    ends = ~forecast.transient & ~forecast.done.goal
+    into = forecast.transient[chain.source] & ends[chain.target]
+    mass = np.bincount(chain.target[into], weights=forecast.flow[into], minlength=chain.n)
+    found: dict[Marking, tuple[float, int]] = {}
+    for i in np.flatnonzero(mass).tolist():
+        marking = view.projected(chain.space.marking(i))
+        share, first = found.get(marking, (0.0, i))
+        found[marking] = (share + float(mass[i]), first)
+    out, left = list[tuple[float, Marking, tuple[str, ...]]](), 0.99 * float(mass.sum())
+    for marking, (share, i) in sorted(found.items(), key=lambda one: -one[1][0]):
+        if left <= 0:
+            break
+        left -= share
+        names = (view.origin.get(name) for name in chain.space.path(i))
+        out.append((share, marking, tuple(name for name in names if name)))
+    return out
+
+
+def _missing_lines(found: Analysis) -> list[str]:
+    """Say where the forecast and the verdict "sound" part: what completes with a probability below
+    1 ends somewhere else."""
+    sound = found.verdicts().get("sound")
+    if found.forecast is None or sound is None or not sound.holds:
+        return []
+    short = 1.0 - found.forecast.completion_probability
+    if short <= CERTAIN:
+        return []
+    lines = [
+        f"sound, but P_complete is {short:.3g} short of 1: an end can always be reached, and not "
+        "every end is `final`. The rest of the probability goes to:"
+    ]
+    net = found.forecast.view.task.net
+    return lines + [
+        f"  {share:.3g}  {net.describe(marking)}  by: {' '.join(path) or '(initial marking)'}"
+        for share, marking, path in missing(found.forecast)[:SHOWN]
+    ]
 
 
 def _sizes(net: Net) -> dict[str, int]:
@@ -543,6 +604,7 @@ def _recovery(r: Recovery) -> Mapping[str, Any]:
         "possible": r.possible.to_json(),
         "almost_sure": r.almost_sure.to_json(),
         "kappa": r.kappa,
+        "while_another_is_handled": not r.alone,
         "resumed": r.resumed,
         "strategy": list(r.strategy),
     }
@@ -553,7 +615,8 @@ def _word(holds: bool | None) -> str:
 
 
 def _verdict_lines(name: str, verdict: PropertyVerdict) -> list[str]:
-    lines = [f"  {name.replace('_', ' '):15}{_word(verdict.holds):8} {verdict.reason}"]
+    word = "if mended" if verdict.holds and verdict.assumption == MENDED else _word(verdict.holds)
+    lines = [f"  {name.replace('_', ' '):15}{word:9} {verdict.reason}"]
     if verdict.witness is not None:
         firings = " ".join(verdict.witness.firings) or "(initial marking)"
         lines.append(
@@ -568,7 +631,8 @@ def _verdict_lines(name: str, verdict: PropertyVerdict) -> list[str]:
 
 
 def _recovery_line(r: Recovery) -> str:
-    kappa = "any number" if r.kappa is None else "none" if r.kappa <= 0 else str(r.kappa)
+    named = {None: "any number", -1: "not recoverable", 0: "none tolerated"}
+    kappa = named.get(r.kappa, str(r.kappa))
     run = {True: "resumed", False: "lost", None: "-"}[r.resumed]
     back = " ".join(r.strategy) or (
         "(immediate)" if r.possible.holds and r.kappa != -1 else "(none)"

@@ -1,4 +1,4 @@
-"""The `petrobot` command: finds the sub-command, runs it, and turns every fault into one clear line
+"""The `petrobot` command: find the sub-command, run it, and turn every fault into one clear line
 and an exit code."""
 
 from __future__ import annotations
@@ -11,29 +11,34 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 EXIT_CODES = """\
-exit codes: 0 the task reached its final marking (or the command did its work, and its answer is yes),
-            1 the task ended in ERROR or was aborted; or the answer is no: analyse refuses a verdict or does not know it,
-              simulate was cut short, forecast disagrees, replay differs, a running task refuses an operator's command,
-            2 bad input (check: the task may not run), 3 a node is unreachable, 130 interrupted"""
+exit codes:
+    0  the task reached its final marking, or the command did its work and the answer is yes
+    1  the task ended in ERROR or was aborted, or the answer is no: analyse refutes or cannot decide
+       a property, simulate was cut short, forecast or replay disagrees, the active task refuses an
+       operator's command
+    2  bad input (check: the task may not run)
+    3  a node cannot be reached
+  130  interrupted"""
 
 
 FILE_FAULTS = {
     **dict.fromkeys(
         (errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
-        "free some space, or name a place on another disk",
+        "free some space, or choose a path on another disk",
     ),
-    **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM), "name a place that you may write to"),
     **dict.fromkeys(
-        (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST), "name another place"
+        (errno.EROFS, errno.EACCES, errno.EPERM), "choose a path that you may write to"
     ),
-    errno.EIO: "look after the disk",
+    **dict.fromkeys(
+        (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST), "choose another path"
+    ),
+    errno.EIO: "check the disk",
 }
-"""What to do about a file that cannot be written, by errno(3), where a command has no better
-words."""
+"""What to do about a file that cannot be written, by errno(3), unless the command says more."""
 
 
 class CommandError(Exception):
-    """A command cannot go on: what to print and the exit code."""
+    """A command cannot continue: its exit code, and the text to print."""
 
     def __init__(self, code: int, text: str) -> None:
         super().__init__(text)
@@ -41,57 +46,62 @@ class CommandError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
-    """One sub-command; its module is imported only when it is used, so that quick commands stay
-    quick."""
+class Subcommand:
+    """One sub-command. Its module is imported only when it is used: quick commands stay quick."""
 
     name: str
     summary: str
     module: str = ""
-    """Under `coordinator.cli`; empty: that of its name."""
+    """Name of the module below `coordinator.cli`; empty if it is the name of the command."""
 
 
 COMMANDS = (
-    Command("run", "run a task"),
-    Command("serve", "the operator's page: draw tasks and start them"),
-    Command("resume", "go on with a run whose coordinator was killed"),
-    Command("watch", "follow the run that goes on", "operate.watch"),
-    Command("pause", "pause it; every node says whether its devices hold", "operate.pause"),
-    Command("continue", "let it go on", "operate.go_on"),
-    Command("step", "let it go on for one firing", "operate.step"),
-    Command("break", "pause it before a transition or at a place", "operate.breakpoints"),
-    Command("token", "put tokens into a control place, or take some out", "operate.tokens"),
-    Command("raise", "raise an external event by hand", "operate.events"),
-    Command("force", "leave an action place whatever its run does", "operate.force"),
-    Command("override", "choose the alternative of a primitive task by hand", "operate.override"),
-    Command("abort", "give it up", "operate.abort"),
-    Command("estop", "emergency stop, straight to the nodes and their bus"),
-    Command("log", "print or export a recorded run"),
-    Command("campaign", "run a task many times in parallel lock-step cells"),
-    Command("report", "write a report of a run or a campaign, or compare two campaigns"),
-    Command("forecast", "forecast further runs from measured ones, and compare"),
-    Command("learned", "what was learned: show, merge, freeze, reset an estimates file"),
-    Command("replay", "derive a recorded run again and compare"),
-    Command("check", "check a task before it runs"),
-    Command("analyse", "verify a net or task, and forecast it"),
-    Command("simulate", "play a net many times by chance"),
-    Command("convert", "read a net in one format, write it in another"),
-    Command("show", "draw a task as SVG"),
-    Command("up", "launch the nodes that services.toml places on this host"),
-    Command("nodes", "who is up, and what it offers"),
-    Command("node", "launch one node"),
-    Command("sim", "launch the simulated laboratory"),
-    Command("calibrate", "calibrate a camera from images of a board"),
-    Command("keys", "make the shared key that several hosts need"),
-    Command("new", "write the skeleton of an action or a task"),
+    Subcommand("run", "run a task"),
+    Subcommand("serve", "the operator's page: draw tasks and start them"),
+    Subcommand("resume", "continue a run whose coordinator was killed"),
+    Subcommand("watch", "follow the active run", "operate.watch"),
+    Subcommand(
+        "pause", "pause the active run; each node reports whether its devices hold", "operate.pause"
+    ),
+    Subcommand("continue", "continue the paused run", "operate.go_on"),
+    Subcommand("step", "fire one transition of the paused run", "operate.step"),
+    Subcommand(
+        "break", "pause before a transition fires or when a place is entered", "operate.breakpoints"
+    ),
+    Subcommand("token", "add or remove tokens of a control place", "operate.tokens"),
+    Subcommand("raise", "raise an external event by hand", "operate.events"),
+    Subcommand(
+        "force", "take a token out of an action place, whatever its run does", "operate.force"
+    ),
+    Subcommand("override", "choose the action of a primitive task by hand", "operate.override"),
+    Subcommand("abort", "abort the active run", "operate.abort"),
+    Subcommand("estop", "emergency stop: stop all devices through their nodes and their bus"),
+    Subcommand("log", "print or export a recorded run"),
+    Subcommand("campaign", "run a task many times in parallel lock-step cells"),
+    Subcommand("report", "write a report of a run or a campaign, or compare two campaigns"),
+    Subcommand("forecast", "forecast further runs from measured ones, and compare"),
+    Subcommand("learned", "show, merge, freeze or reset what was learned (an estimates file)"),
+    Subcommand("replay", "replay a recorded run and compare"),
+    Subcommand("check", "check a task before it runs"),
+    Subcommand("analyse", "verify a net or task, and forecast its times"),
+    Subcommand("simulate", "simulate a net many times with random times and choices"),
+    Subcommand("convert", "convert a net from one file format to another"),
+    Subcommand("show", "draw a task as SVG"),
+    Subcommand("up", "start the nodes that services.toml places on this host"),
+    Subcommand("nodes", "show which nodes are up, and what they offer"),
+    Subcommand("node", "start one node"),
+    Subcommand("sim", "start the simulated laboratory"),
+    Subcommand("calibrate", "calibrate a camera from images of a board"),
+    Subcommand("keys", "make the shared key or the certificates that several hosts need"),
+    Subcommand("new", "write a working skeleton of an action or a task"),
 )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; gives the exit code."""
+    """Run the command line and return the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] == ["--version"]:
-        from importlib.metadata import version  # takes longer to import than all else here
+        from importlib.metadata import version  # slower to import than all the rest here
 
         print(f"petrobot {version('petrobot')}")
         return 0
@@ -109,7 +119,7 @@ def _overview(arguments: Sequence[str]) -> int:
             "usage: petrobot COMMAND ...   (petrobot COMMAND --help shows its options and an "
             "example)",
             "",
-            "coordinates real robots with Petri nets: a task is one net, its actions run on "
+            "coordinates real robots with Petri nets: a task is one net, and its actions run on "
             "the nodes of services.toml",
             "",
             *lines,
@@ -120,11 +130,11 @@ def _overview(arguments: Sequence[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(text)
         return 0
-    print(f"petrobot: no command {arguments[0]!r}\n\n{text}", file=sys.stderr)
+    print(f"petrobot: unknown command {arguments[0]!r}\n\n{text}", file=sys.stderr)
     return 2
 
 
-def _dispatch(command: Command, arguments: Sequence[str]) -> int:
+def _dispatch(command: Subcommand, arguments: Sequence[str]) -> int:
     module = importlib.import_module(f"petrobot.coordinator.cli.{command.module or command.name}")
     parser = argparse.ArgumentParser(
         prog=f"petrobot {command.name}",
@@ -150,13 +160,12 @@ def _dispatch(command: Command, arguments: Sequence[str]) -> int:
         print("interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        sys.stderr.close()  # the reader went away; Python would complain once more at exit
+        sys.stderr.close()  # the reader is gone; Python would complain about it again at exit
         return 1
 
 
 def _run(run: Callable[[argparse.Namespace], int], options: argparse.Namespace) -> int:
-    """Run a command; keys and files that cannot be used are bad input, whichever command needs
-    them."""
+    """Run a command. Keys and files that cannot be used are bad input in every command."""
     try:
         return int(run(options))
     except OSError as fault:

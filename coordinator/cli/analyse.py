@@ -11,7 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.loading import task_path, write_json
+from petrobot.coordinator.cli.loading import (
+    add_estimates_argument,
+    measurements,
+    task_path,
+    write_json,
+)
 from petrobot.services.host.command_line import number, whole
 from petrobot.services.host.whole_file import make_folder, write_whole
 
@@ -58,8 +63,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=number(least=0.0),
         default=60.0,
         metavar="S",
-        help="longest search of a state space, 0 for no limit; what was found by then is "
-        "told (default: %(default)g)",
+        help="longest time of the analysis, 0 for no limit; what was found by then is "
+        "reported, the rest is unknown (default: %(default)g)",
     )
     parser.add_argument(
         "--memory",
@@ -75,6 +80,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="CHANGE",
         help="judge a change beside the file as it is: runs=10, "
         "locate_ball.error.share=0.05, serve.rate=2 (may be repeated)",
+    )
+    add_estimates_argument(parser)
+    parser.add_argument(
+        "--measure",
+        action="append",
+        default=[],
+        metavar="NAME=EXPRESSION",
+        help="also report a number of your own: 'p95=time(0.95)', 'late(20)', "
+        "'busy=1-marked(arm_free)', 'rate(serve)/rate(arrive)' (may be repeated)",
     )
     parser.add_argument(
         "--pictures",
@@ -97,7 +111,7 @@ def run(options: argparse.Namespace) -> int:
         states=options.states, seconds=longest, memory=options.memory << 20, clock=time.monotonic
     )
     path = task_path(options.file)
-    with progress_of_search(limits) as watched:
+    with progress_of_search(limits) as watched, bounded_memory(limits.memory or 0):
         outcome = analyse_command(
             path,
             load,
@@ -105,6 +119,9 @@ def run(options: argparse.Namespace) -> int:
             rates=options.rates,
             limits=watched,
             changes=options.what_if,
+            structure=bool(options.json),
+            measure=measurements(options.estimates),
+            measures=options.measure,
         )
     code = give(outcome, options.json)
     if options.pictures and outcome.analysis is not None:
@@ -150,6 +167,34 @@ def progress_of_search(limits: SearchLimits) -> Iterator[SearchLimits]:
         print(file=sys.stderr)
 
 
+LEAST = 64 << 20
+"""Bytes that an analysis may always take, whatever the process holds already."""
+
+
+@contextmanager
+def bounded_memory(most: int) -> Iterator[None]:
+    """Let this process hold at most so many bytes; beyond them Python raises MemoryError.
+
+    The system counts private writable mappings (RLIMIT_DATA, setrlimit(2)), which is what numpy
+    allocates. Mappings that are reserved but not resident are allowed for.
+    """
+    import resource
+
+    held = {}
+    for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+        key, _, rest = line.partition(":")
+        if key in ("VmData", "VmRSS"):
+            held[key] = int(rest.split()[0]) << 10
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    wanted = held["VmData"] + max(most - held["VmRSS"], LEAST)
+    limit = min((n for n in (wanted, soft, hard) if n != resource.RLIM_INFINITY), default=wanted)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+
 def give(outcome: CommandResult, json_file: str | None) -> int:
     """Print and write what an analysis command found; gives its exit code. Raises CommandError for
     bad input."""
@@ -193,10 +238,10 @@ def refused(analysis: Analysis) -> Iterator[tuple[str, PropertyVerdict]]:
         if (
             verdict.holds is False
             and verdict.witness is not None
-            and not (analysis.robot and name == "safe")
+            and not (analysis.progress and name == "safe")
         ):
             yield name, verdict
-    for recovery in analysis.robot.recoveries if analysis.robot else ():
+    for recovery in analysis.progress.recoveries if analysis.progress else ():
         for name, verdict in (("possible", recovery.possible), ("sure", recovery.almost_sure)):
             if verdict.holds is False and verdict.witness is not None:
                 yield f"{recovery.error_exit}-recovery-{name}", verdict

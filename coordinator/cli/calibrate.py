@@ -1,5 +1,4 @@
-"""Calibrate a camera from images of a board: lens, and where the camera stands in the base
-frame."""
+"""Calibrate a camera from images of a board: its lens, and its pose in the base frame."""
 
 from __future__ import annotations
 
@@ -10,11 +9,11 @@ from petrobot.coordinator.cli import CommandError
 EXAMPLE = "petrobot calibrate --views board_images --simulated --output calibration.toml"
 ROOM = "petrobot.services.vision.calibrate"
 LABORATORY = "petrobot.sim.catching.board:main"
-"""Takes board images with the simulated camera as it truly hangs: `main([folder])`."""
+"""Takes board images with the simulated camera at its true pose: `main([folder])`."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options are the calibration's own, and one that makes images first."""
+    """Add the options of the calibration, and one that takes simulated images first."""
     from petrobot.coordinator.launch import load_object
 
     load_object(f"{ROOM}:add_arguments")(parser)
@@ -41,15 +40,15 @@ def _take(options: argparse.Namespace) -> None:
     if options.source:
         raise CommandError(
             2,
-            f"--simulated takes all images, so none is left for --source {options.source}; "
-            "leave one out",
+            f"--simulated takes all the images, so --source {options.source} cannot be used with "
+            "it; leave one out",
         )
     try:
         if folder.exists() and any(folder.iterdir()):
             raise CommandError(
                 2,
-                f"{folder} is not empty; give --simulated a folder that is, so that nothing "
-                "is overwritten",
+                f"{folder} is not empty; give --simulated an empty folder, so that nothing is "
+                "overwritten",
             )
         load_object(LABORATORY)([str(folder)])
     except OSError as fault:

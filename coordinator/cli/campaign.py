@@ -23,6 +23,7 @@ from petrobot.coordinator.cli.loading import (
     task_path,
     write_json,
 )
+from petrobot.services.comm.location_file import physics_of
 from petrobot.services.host.command_line import number, probability, whole
 
 if TYPE_CHECKING:
@@ -233,14 +234,13 @@ def _print_check(check: dict[str, Any] | None) -> None:
 
 
 def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
-    from petrobot.coordinator.task.check import check
+    from petrobot.coordinator.analysis.may_run import Cell, may_run
 
     directory = load_directory(options.services)
-    report = check(task, {action: entry.node for action, entry in directory.actions.items()})
-    faults = [f for f in report.findings if f.severity == "error"]
-    if faults:
-        lines = "\n".join(f"  {f.key}: {f.text}\n    {f.remedy}" for f in faults)
-        raise CommandError(2, f"{task.name} may not run with {directory.source}:\n{lines}")
+    cell = Cell({action: entry.node for action, entry in directory.actions.items()})
+    refusal = may_run(task, cell).refusal(str(directory.source))
+    if refusal:
+        raise CommandError(2, refusal)
     refuse_script(options.mock, directory)
     if not options.cluster:
         refuse_misplaced(directory, everywhere=True, scripted=options.mock is not None)
@@ -287,7 +287,17 @@ def _plan(options: argparse.Namespace, task: Task) -> CampaignPlan:
         batch=options.batch if learns(options.selector) else 0,
         options=_selector_options(options),
         digests={key: digest(path) for key, path in paths.items()},
+        physics=_physics(options.services),
     )
+
+
+def _physics(services: Path) -> str:
+    """Return the physics of the simulated laboratory, so that all workers use the same. Raises
+    CommandError."""
+    try:
+        return physics_of(load_directory(services))
+    except ValueError as fault:
+        raise CommandError(2, str(fault)) from fault
 
 
 def _block(task: Task, wanted: int | None) -> int:

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import time
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli.loading import (
-    SHIPPED_CELL,
+    MISSING_CELL,
     add_services_argument,
     cell_path,
+    find_cell,
     load_directory,
     load_task,
     refuse_misplaced,
@@ -22,17 +22,17 @@ from petrobot.coordinator.cli.loading import (
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from petrobot.coordinator.analysis.may_run import MayRun
+    from petrobot.coordinator.analysis.net.verdict import PropertyVerdict
     from petrobot.coordinator.analysis.report import Analysis
     from petrobot.coordinator.task import Task
-    from petrobot.coordinator.task.check import Report
+    from petrobot.coordinator.task.check import CheckReport
 
 EXAMPLE = "petrobot check catch_ball"
 NO_CELL = "no-cell"
 """Code of the finding about the location file that was not given."""
 PATIENCE = 2.0
 """Seconds that a node has to answer."""
-MOST_STATES, LONGEST, MOST_MEMORY = 200_000, 5.0, 500_000_000
-"""Markings, seconds and bytes that this quick gate spends on the state space."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,12 +53,12 @@ def run(options: argparse.Namespace) -> int:
     """Check; 0 when the task may run, 2 when it may not, 3 when only a node that it needs is
     missing."""
     task = load_task(options.task)
-    services = cell_path(options.services, options.task, task)
-    report = _checked(task, services)
+    services = find_cell(options.services, options.task, task)
+    if options.live:
+        services = cell_path(services, options.task, task)
+    judged, report = _checked(task, services)
     missing = _missing(task, services) if options.live else []
-    broken = any(finding.code == "inconsistent" for finding in report.errors)
-    analysis = None if broken else _analysed(task)
-    ok = report.ok and (analysis is None or not analysis.objections)
+    analysis, ok = judged.analysis, judged.ok
     live = {"live": missing} if options.live else {}
     if options.json:
         found = {} if analysis is None else _plain_analysis(analysis)
@@ -80,37 +80,32 @@ def run(options: argparse.Namespace) -> int:
     )
 
 
-def _checked(task: Task, services: Path) -> Report:
-    """What is to be said of the task, and of the actions that a location file offers it."""
-    from petrobot.coordinator.task.check import check
+def _checked(task: Task, services: Path | None) -> tuple[MayRun, CheckReport]:
+    """Return the judgement of the task in the cell of a location file, and its findings with a
+    note about that file."""
+    from petrobot.coordinator.analysis.may_run import BUDGET, Cell, may_run
 
-    if services == SHIPPED_CELL and not services.exists():
-        said = (
-            "there is none here, and none came with petrobot: whether nodes offer the "
-            "actions was not checked"
-        )
-        return _noted(check(task), said)
+    if services is None:
+        judged = may_run(task, None, BUDGET)
+        said = f"{MISSING_CELL}: whether nodes offer the actions was not checked"
+        return judged, _noted(judged.report, said)
     directory = load_directory(services)
     refuse_misplaced(directory)
-    report = check(
-        task,
+    cell = Cell(
         {action: entry.node for action, entry in directory.actions.items()},
-        translates={action: entry.task for action, entry in directory.actions.items()},
-        source=str(services),
+        str(services),
+        {action: entry.task for action, entry in directory.actions.items() if entry.task},
     )
-    if services == SHIPPED_CELL and any(finding.code == "unoffered" for finding in report.findings):
-        return _noted(
-            report, f"there is none here, so {services} was used, which comes with petrobot"
-        )
-    return report
+    judged = may_run(task, cell, BUDGET)
+    return judged, judged.report
 
 
-def _noted(report: Report, said: str) -> Report:
+def _noted(report: CheckReport, said: str) -> CheckReport:
     """The findings with a note about the location file that was not given."""
-    from petrobot.coordinator.task.check import Finding, Report, Severity
+    from petrobot.coordinator.task.check import CheckReport, Finding, Severity
 
     remedy = "write one of your own, or give --services FILE"
-    return Report(
+    return CheckReport(
         (*report.findings, Finding(Severity.NOTE, NO_CELL, "services.toml", said, remedy))
     )
 
@@ -145,23 +140,13 @@ def _missing(task: Task, services: Path | None) -> list[str]:
     return lines
 
 
-def _analysed(task: Task) -> Analysis:
-    from petrobot.coordinator.analysis.net.space import SearchLimits
-    from petrobot.coordinator.analysis.report import analyse
-
-    limits = SearchLimits(
-        states=MOST_STATES, seconds=LONGEST, memory=MOST_MEMORY, clock=time.monotonic
-    )
-    return analyse(task, limits=limits)
-
-
 def _plain_analysis(analysis: Analysis) -> dict[str, Any]:
     data = analysis.to_json(structure=False)
     objections = {name: verdict.to_json() for name, verdict in analysis.objections.items()}
     return {"complete": data["complete"], "objections": objections, "analysis": data}
 
 
-def _plain(report: Report, name: str) -> list[dict[str, Any]]:
+def _plain(report: CheckReport, name: str) -> list[dict[str, Any]]:
     fields = ("severity", "key", "text", "remedy")
     return [
         {**{field: str(getattr(finding, field)) for field in fields}, "line": line}
@@ -169,7 +154,7 @@ def _plain(report: Report, name: str) -> list[dict[str, Any]]:
     ]
 
 
-def _told(report: Report, name: str) -> list[str]:
+def _told(report: CheckReport, name: str) -> list[str]:
     """The findings for people, each with the place in the task file that it is about."""
     path = task_path(name)
     places = [f"{path}:{line}: " if line else "" for line in _lines(report, name)]
@@ -179,7 +164,7 @@ def _told(report: Report, name: str) -> list[str]:
     ]
 
 
-def _lines(report: Report, name: str) -> list[int | None]:
+def _lines(report: CheckReport, name: str) -> list[int | None]:
     """The line of each finding's key, or of the macro place in which it is; None for what is not
     about the task file."""
     from petrobot.coordinator.task.file.errors import key_lines, line_of
@@ -191,39 +176,63 @@ def _lines(report: Report, name: str) -> list[int | None]:
 def _text(name: str, analysis: Analysis | None, ok: bool) -> str:
     ended, lines = "", list[str]()
     if analysis is not None:
-        verdicts = {True: "yes", False: "NO", None: "unknown"}
         shown = {
             k: v for k, v in analysis.verdicts().items() if k != "safe"
-        }  # runs to do are several tokens
-        told = [f"{key.replace('_', ' ')} {verdicts[v.holds]}" for key, v in shown.items()]
-        lines += [f"{'note':8}final: {note}" for note in analysis.notes]
-        lines.append(
-            f"{len(analysis.qualitative.space)} markings: {', '.join(told)}{_cut(analysis)}"
-        )
-        lines += _objections(analysis)
+        }  # a place may hold several tokens: they count
+        told = [f"{key.replace('_', ' ')} {_word(v)}" for key, v in shown.items()]
+        lines += [f"{'note':8}{note}" for note in analysis.notes]
+        lines.append(f"{_size(analysis)}: {', '.join(told)}{_cut(analysis)}")
+        lines += _reasons(analysis)
         if analysis.objections:
             lines.append(f"petrobot analyse {name} --pictures FOLDER shows how it comes to that")
         ended = "was not checked to its end (Ctrl-C)" if ok and analysis.interrupted else ""
     return "\n".join([*lines, f"{name}: {ended or ('may run' if ok else 'may not run')}"])
 
 
+def _word(verdict: PropertyVerdict) -> str:
+    from petrobot.coordinator.analysis.execution.progress import MENDED
+
+    if verdict.holds and verdict.assumption == MENDED:
+        return "if mended"
+    return {True: "yes", False: "NO", None: "unknown"}[verdict.holds]
+
+
+def _size(analysis: Analysis) -> str:
+    markings = f"{len(analysis.qualitative.space)} markings"
+    if analysis.progress is None:
+        return markings
+    return f"{len(analysis.progress.x)} states, {markings}"
+
+
 def _cut(analysis: Analysis) -> str:
-    """Why the search ended early, and whether `analyse` would go on: not beyond a proof that the
-    net has no end."""
+    """Return why a search ended early, and whether `analyse` would continue it: not beyond a proof
+    that the net is unbounded."""
     from petrobot.coordinator.analysis.report import ENDLESS
 
-    space = analysis.qualitative.space
-    if space.complete:
+    space, x = analysis.qualitative.space, analysis.progress and analysis.progress.x
+    reason = space.reason if not space.complete else x.reason if x and not x.complete else ""
+    if not reason:
         return ""
-    longer = "" if space.reason == ENDLESS else "; petrobot analyse goes on longer"
-    return f"; the search was cut short ({space.reason}{longer})"
+    longer = "" if space.reason == ENDLESS else "; petrobot analyse continues longer"
+    return f"; the search was cut short ({reason}{longer})"
 
 
-def _objections(analysis: Analysis) -> list[str]:
-    """What speaks against running it, each with the firings that lead there."""
-    lines = []
-    for name, verdict in analysis.objections.items():
-        lines.append(f"{'error':8}{name.replace('_', ' ')}: {verdict.reason}")
-        if verdict.witness is not None:
-            lines.append(f"        by: {' '.join(verdict.witness.firings) or '(initial marking)'}")
+def _reasons(analysis: Analysis) -> list[str]:
+    """Return the reason of each verdict that does not hold, with the stimuli and firings that lead
+    there, and what is assumed by those that hold."""
+    from petrobot.coordinator.analysis.execution.progress import MENDED
+
+    lines, against = list[str](), analysis.objections
+    refused = {n: v for n, v in analysis.verdicts().items() if v.holds is False and n != "safe"}
+    for name in sorted(refused, key=lambda name: name not in against):
+        verdict = refused[name]
+        word = "error" if name in against else "warning"
+        lines.append(f"{word:8}{name.replace('_', ' ')}: {verdict.reason}")
+        if verdict.witness is not None and name in against:
+            path = "; ".join(verdict.witness.steps) or " ".join(verdict.witness.firings)
+            lines.append(f"        by: {path or '(initial marking)'}")
+    unknown = [v.reason for v in analysis.verdicts().values() if v.holds is None]
+    lines += [f"{'warning':8}{reason}" for reason in dict.fromkeys(unknown)]
+    if any(v.holds and v.assumption == MENDED for v in analysis.verdicts().values()):
+        lines.append(f"{'note':8}if mended: {MENDED}")
     return lines

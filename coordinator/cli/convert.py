@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from petrobot.coordinator.cli.loading import task_path
+from petrobot.coordinator.cli.loading import add_estimates_argument, measurements, task_path
 
 EXAMPLE = "petrobot convert catch_ball catch_ball.pnml"
 
@@ -17,8 +17,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "source", help="a net or task file, or the name of a task that comes with petrobot"
     )
     parser.add_argument(
-        "target", type=Path, help="the file to write: .pnml, .net (TINA), .dot, .drn (Storm)"
+        "target",
+        type=Path,
+        help="the file to write: .pnml, .net (TINA), .pnpro (GreatSPN, Storm), .dot, .drn (Storm)",
     )
+    parser.add_argument(
+        "--view",
+        choices=("ordinary", "gspn"),
+        help="which net of a task: the ordinary one, or the stochastic view with rates (default: "
+        "gspn for .pnpro, .drn and with --estimates, else ordinary)",
+    )
+    add_estimates_argument(parser)
     parser.add_argument(
         "--json", metavar="FILE", help="write what was not kept as JSON (- for standard output)"
     )
@@ -30,4 +39,11 @@ def run(options: argparse.Namespace) -> int:
     from petrobot.coordinator.cli.analyse import give
     from petrobot.coordinator.task.file import load
 
-    return give(convert_command(task_path(options.source), options.target, load), options.json)
+    found = convert_command(
+        task_path(options.source),
+        options.target,
+        load,
+        view=options.view,
+        measure=measurements(options.estimates),
+    )
+    return give(found, options.json)

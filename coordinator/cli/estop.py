@@ -1,5 +1,5 @@
-"""Emergency stop: straight to the nodes and their bus, whatever the coordinator does; everybody may
-say it."""
+"""Emergency stop: stop all devices through their nodes and their bus, whatever the coordinator
+does. Anybody may give it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 EXAMPLE = "petrobot estop"
 COORDINATOR_PATIENCE = 1.0
-"""Seconds that the coordinator has to hear of it; the devices have been stopped before it is
-told."""
+"""How long to wait for the coordinator's answer (s). The devices are stopped before it is
+notified."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,17 +28,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--clear",
         action="store_true",
-        help="devices take orders again; nothing moves before an action moves it",
+        help="let the devices accept commands again; nothing moves until an action moves it",
     )
     parser.add_argument(
         "--bus",
         action="store_true",
-        help="stop the devices on this host's buses, too, without waiting for their node",
+        help="also stop the devices on this host's buses, without waiting for their node",
     )
     parser.add_argument(
         "--run",
         metavar="RUN",
-        help="the run whose cell is meant (default: the newest that goes on)",
+        help="stop the cell of this run (default: the newest active run)",
     )
     parser.add_argument(
         "--journal",
@@ -54,9 +54,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Stop, or clear; 0 when every node with devices has answered, 3 otherwise."""
+    """Stop, or clear. Return 0 if every node with devices has answered, 3 otherwise."""
     from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
-    from petrobot.services.comm.tls.credentials import COORDINATOR, credentials
+    from petrobot.services.comm.protocol.messages import COORDINATOR
+    from petrobot.services.comm.tls.credentials import credentials
 
     door = _door(options)
     path = options.services or (Path(door.services) if door is not None and door.services else None)
@@ -75,8 +76,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _door(options: argparse.Namespace) -> Door | None:
-    """The run that goes on, if one does: it says which cell is meant, and its coordinator is
-    told."""
+    """Return the door of the active run, or None. The run names the cell, and its coordinator is
+    notified."""
     from petrobot.coordinator.operator.door_file import find_door
     from petrobot.coordinator.run.folder import NoRunError
 
@@ -89,8 +90,8 @@ def _door(options: argparse.Namespace) -> Door | None:
 
 
 async def _tell(door: Door, folder: Path) -> str:
-    """Let the coordinator abort its run, so that it does not look for a way around; what came of
-    it, in words."""
+    """Ask the coordinator to abort its run, so that it starts no recovery. Return what happened, in
+    words."""
     from petrobot.coordinator.cli.operate.hand import connect
     from petrobot.coordinator.operator.client import OperatorError
 
@@ -99,13 +100,13 @@ async def _tell(door: Door, folder: Path) -> str:
             answer = await client.command("estop")
     except (OperatorError, TimeoutError):
         return f"{door.run}: " + (
-            "the coordinator does not answer" if _goes_on(door, folder) else "has ended"
+            "the coordinator does not answer" if _is_active(door, folder) else "has ended"
         )
     return f"{door.run}: aborted" if answer.get("ok") else f"{door.run}: {answer.get('text')}"
 
 
-def _goes_on(door: Door, folder: Path) -> bool:
-    """Whether the run's door is still there: a run whose devices stop may end by itself."""
+def _is_active(door: Door, folder: Path) -> bool:
+    """Whether the run is still active: a run whose devices are stopped may end by itself."""
     from petrobot.coordinator.operator.door_file import find_door
     from petrobot.coordinator.run.folder import NoRunError
 
@@ -127,7 +128,7 @@ def _show(
     if options.json == "-":
         return
     if not answers:
-        print("no node of this cell owns devices: nothing to stop")
+        print("no node of this cell has devices: nothing to stop")
     for answer in answers:
         for device, said in answer.devices.items():
             print(f"{answer.node:12} {device:12} {said}")
@@ -140,4 +141,4 @@ def _show(
     if coordinator:
         print(coordinator)
     if not options.clear:
-        print("`petrobot estop --clear` lets the devices take orders again")
+        print("`petrobot estop --clear` lets the devices accept commands again")

@@ -1,5 +1,4 @@
-"""How a command becomes another program: signals, exit code and terminal are that program's own,
-and nothing is left behind."""
+"""Replace a command by another program, which then has its signals, exit code and terminal."""
 
 from __future__ import annotations
 
@@ -9,8 +8,8 @@ from typing import NoReturn
 
 
 def become(module: str, *arguments: str) -> NoReturn:
-    """Replace this process by `python -m module arguments`. A child process would outlive a kill of
-    its parent."""
+    """Replace this process by `python -m module arguments`. A child process would survive when its
+    parent is killed."""
     sys.stdout.flush()
     sys.stderr.flush()
     os.execv(sys.executable, [sys.executable, "-m", module, *arguments])

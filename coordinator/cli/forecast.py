@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import load_directory, load_task, write_json
+from petrobot.services.comm.location_file import FIRST_PHYSICS, same_physics
 from petrobot.services.host.command_line import whole
 from petrobot.services.host.whole_file import make_folder, write_whole
 
@@ -152,12 +153,12 @@ def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, 
     )
 
     if not path.is_dir():
-        known = read_estimates(path)
+        known, physics = read_estimates(path)
         _refuse_other_names(task, path, {key.primitive_task: [key.action] for key in known.tallies})
         return (
             trainings_of(task, known),
             known,
-            {"estimates": {"file": path.name, "sha256": digest(path)}},
+            {"estimates": {"file": path.name, "sha256": digest(path)}, **_told(physics)},
         )
     plan = read_manifest(path)
     _refuse_other_task(task, plan, path)
@@ -174,8 +175,14 @@ def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, 
             "sha256": digest(path / TABLE),
         },
         "task_sha256": plan.digests["task"],
+        **_told(plan.physics),
     }
     return found, estimates_of(task, rows, path.name), about
+
+
+def _told(physics: str) -> dict[str, str]:
+    """Return what a forecast says of the simulated laboratory's physics, if it has several."""
+    return {"physics": physics} if physics else {}
 
 
 def _refuse_other_task(task: Task, plan: CampaignPlan, path: Path) -> None:
@@ -372,6 +379,14 @@ def compared(registered: Path, folder: Path) -> dict[str, Any]:
 
     forecast, plan = read(registered), read_manifest(folder)
     task = fitting(registered, forecast, plan)
+    expected = forecast.get("physics", "")
+    if not same_physics(expected, plan.physics):
+        raise CommandError(
+            2,
+            f"{registered}: forecast for the physics {expected or FIRST_PHYSICS!r}, but {folder} "
+            f"ran with {plan.physics or FIRST_PHYSICS!r}; compare it with a campaign of the same "
+            "physics ([nodes.NAME] physics in services.toml)",
+        )
     measured = by_regime(task, read_table(folder / TABLE))
     for regime, training in measured.items():
         _refuse_other_choices(registered, forecast, regime, choice_counts(training))

@@ -1,5 +1,5 @@
-"""Make what several hosts need to trust each other: one shared key, or certificates (--tls); and
-say where to copy it, and how to put it in the place of an older one without an outage."""
+"""Make a shared key, or certificates (--tls), so that several hosts trust each other. The output
+says where to copy them, and how to replace older ones without an outage."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import add_services_argument, load_directory
+from petrobot.services.comm.protocol.messages import COORDINATOR
 
 if TYPE_CHECKING:
     from petrobot.services.comm.location_file import Directory
@@ -22,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--file",
         type=Path,
         default=Path("cell.key"),
-        help="the shared key file to write (default: %(default)s)",
+        help="file to write the shared key to (default: %(default)s)",
     )
     parser.add_argument(
         "--tls",
@@ -30,15 +31,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FOLDER",
         nargs="?",
         const=Path("keys"),
-        help="make certificates for mutual TLS in this folder (%(const)s) instead: they also "
-        "keep others from reading",
+        help="make certificates for mutual TLS in this folder (default: %(const)s) instead; TLS "
+        "also encrypts",
     )
     add_services_argument(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the key or the certificates; what exists is never overwritten, but for certificates
-    that end within 30 days."""
+    """Write the key or the certificates. Existing files are kept, except certificates that expire
+    within 30 days."""
     directory = load_directory(options.services)
     print(
         _certificates(directory, options.tls)
@@ -57,7 +58,7 @@ def _shared_key(directory: Directory, file: Path) -> str:
         raise CommandError(2, str(fault)) from fault
     hosts = ", ".join(sorted({node.host for node in directory.nodes.values()}))
     return (
-        f"wrote {file}: readable by you alone, never printed, never logged\n"
+        f"wrote {file}: only you can read it; it is never printed or logged\n"
         f"1. copy it beside services.toml on every host ({hosts}), for example: scp -p "
         f"{file} HOST:FOLDER/\n"
         f"2. name it in {directory.source}, the same on every host:\n"
@@ -66,8 +67,8 @@ def _shared_key(directory: Directory, file: Path) -> str:
 
 
 def _instead(directory: Directory, kind: str, new: str) -> str:
-    """How to replace what services.toml names now, host by host; empty if it names none of this
-    kind, or this one."""
+    """Describe how to replace the key that services.toml names now, host by host. Empty if it names
+    none of this kind, or already this one."""
     old = directory.keys.get(kind, new)
     if old == new:
         return ""
@@ -78,8 +79,8 @@ def _instead(directory: Directory, kind: str, new: str) -> str:
         both.insert(0, f'{kind} = "{old}", also = "{new}"')
     passes = [*both, f'{kind} = "{new}" alone']
     lines = [
-        f"in the place of {old}, in {len(passes)} rounds; in each, change one host after the "
-        "other and start its nodes again:"
+        f"to replace {old}, make {len(passes)} rounds; in each round change one host after the "
+        "other and restart its nodes:"
     ]
     lines += [f"   round {number}: [keys] {keys}" for number, keys in enumerate(passes, 1)]
     return "\n" + "\n".join([*lines, f"then remove {old} from every host"])
@@ -98,7 +99,7 @@ def _certificates(directory: Directory, folder: Path) -> str:
             f"'petrobot[tls]' ({fault})"
         )
         raise CommandError(2, text) from fault
-    from petrobot.services.comm.tls.credentials import CA_FILE, COORDINATOR
+    from petrobot.services.comm.tls.credentials import CA_FILE
 
     try:
         written = make_certificates(folder, [COORDINATOR, *directory.nodes])

@@ -9,21 +9,30 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.learned_show import refuse_unknown_context, show
+from petrobot.coordinator.cli.learned_show import (
+    asked_question,
+    refuse_unknown_context,
+    refuse_unknown_cost,
+    show,
+)
 from petrobot.coordinator.cli.loading import load_task, write_json
 from petrobot.services.host.command_line import number, probability
 
-# `learned task`: R, C and J of primitive tasks and of a whole task, from an estimates file through the task's net.
+# `learned task`: R, C and J of primitive tasks and of a whole task, from an estimates file through
+# the task's net.
 
 if TYPE_CHECKING:
     from petrobot.coordinator.learning.estimates_file import FileContents
+    from petrobot.coordinator.learning.propagation import Uncertain
 
 
 def show_task(kept: FileContents, options: argparse.Namespace) -> int:
     """Print what the actions' estimates come to, for one run of the task."""
     if len(options.more) != 1:
         raise CommandError(2, "which task? Write `petrobot learned task FILE TASK`")
-    found = figures(kept, options.more[0], options.context)
+    if options.budget is not None:
+        raise CommandError(2, "--budget is for `learned show`; a task has one cost")
+    found = figures(kept, options.more[0], options)
     if options.json:
         write_json(options.json, found)
     if options.json != "-":
@@ -31,25 +40,32 @@ def show_task(kept: FileContents, options: argparse.Namespace) -> int:
     return 0
 
 
-def figures(kept: FileContents, name: str, context: str | None) -> dict[str, Any]:
+def figures(kept: FileContents, name: str, options: argparse.Namespace) -> dict[str, Any]:
     """Plain data: the parts, and the whole for one token in the runs place."""
     from petrobot.coordinator.analysis.time.stochastic import NoEstimate
     from petrobot.coordinator.launch import with_runs
     from petrobot.coordinator.learning.propagation import propagate
 
     task, _ = with_runs(load_task(name), 1)
+    context = options.context
+    known = {name: kept.estimates.of(name, context) for name in task.primitive_tasks}
+    refuse_unknown_cost({name: of for name, of in known.items() if of}, options)
+    asked = {name: asked_question(kept, name, options) for name in known}
     try:
-        found = propagate(task, kept.estimates, context)
+        found = propagate(task, kept.estimates, context, questions=asked, rho=options.rho)
     except (NoEstimate, ValueError) as fault:
         raise CommandError(2, f"{task.name}: {fault}") from fault
-    units = {p.cost for p in task.primitive_tasks.values() if p.name in found.parts}
     parts = [
         {
             "primitive_task": p.primitive_task,
             "runs": p.runs,
-            "R": p.reliability,
-            "C": _known(p.cost),
+            "measure": p.measure,
+            "R": _known(p.reliability.value),
+            "R_interval": _interval(p.reliability),
+            "C": _known(p.cost.value),
+            "C_interval": _interval(p.cost),
             "J": _known(p.j),
+            "declared_costs": dict(task.primitive_tasks[p.primitive_task].costs),
         }
         for p in found.parts.values()
     ]
@@ -57,14 +73,25 @@ def figures(kept: FileContents, name: str, context: str | None) -> dict[str, Any
         "task": task.name,
         "context": context,
         "primitive_tasks": parts,
+        "scenario": found.scenario,
         "R_conj": found.conjunctive,
+        "R_conj_interval": _interval(found.reliability),
         "R_goal": found.goal,
         "P_complete": found.complete,
         "product": found.product,
-        "cost": _known(found.cost) if len(units) == 1 else None,
+        "cost": _known(found.cost.value),
+        "cost_interval": _interval(found.cost),
+        "rho": found.rho,
+        "J": _known(found.j.value),
+        "J_interval": _interval(found.j),
         "mean_time": _known(found.forecast.done.mean),
         "assumptions": list(found.forecast.view.assumptions),
     }
+
+
+def _interval(number: Uncertain) -> list[float] | None:
+    bounds = [number.lower, number.upper]
+    return bounds if all(map(isfinite, bounds)) else None
 
 
 def _known(x: float) -> float | None:
@@ -86,23 +113,44 @@ def _print(found: dict[str, Any]) -> None:
             column, justify="left" if column == "primitive task" else "right", no_wrap=True
         )
     for part in found["primitive_tasks"]:
-        table.add_row(part["primitive_task"], *(_cell(part[k]) for k in ("runs", "R", "C", "J")))
+        table.add_row(
+            part["primitive_task"],
+            _cell(part["runs"]),
+            _cell(part["R"], part["R_interval"]),
+            _cell(part["C"], part["C_interval"]),
+            _cell(part["J"]),
+        )
     console.print(table)
     for key, words in (
         ("R_conj", "every run a success"),
         ("product", "product of the primitive tasks' R (R_conj of a mere series)"),
         ("R_goal", "met goals for each run"),
         ("P_complete", "reaches its final marking"),
-        ("cost", "expected cost of one run of the task"),
+        ("cost", "expected cost of one run of the task" + _why_no_cost(found)),
+        ("J", f"1 - R_conj + rho C, with rho {found['rho']:.4g}"),
         ("mean_time", "s, mean time of one run of the task"),
     ):
-        console.print(f"  {key:10} {_cell(found[key]):>8}  {words}", highlight=False)
+        number = _cell(found[key], found.get(f"{key}_interval"))
+        console.print(f"  {key:10} {number:>8}  {words}", highlight=False)
+    if found["scenario"] is not None and found["context"] is None:
+        console.print(
+            f"  The task is judged in the scenario that is hardest for it: {found['scenario']}.",
+            highlight=False,
+        )
     for assumption in found["assumptions"]:
         console.print(f"  assumed: {assumption}", highlight=False, style="dim")
 
 
-def _cell(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
+def _why_no_cost(found: dict[str, Any]) -> str:
+    measures = {p["measure"] for p in found["primitive_tasks"]}
+    mixed = f"; {', '.join(sorted(measures))} do not add: give --cost" if len(measures) > 1 else ""
+    return mixed if found["cost"] is None else ""
+
+
+def _cell(value: float | None, interval: list[float] | None = None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" + (f" [{interval[0]:.4g}, {interval[1]:.4g}]" if interval else "")
 
 
 if TYPE_CHECKING:

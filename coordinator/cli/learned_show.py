@@ -29,10 +29,10 @@ def show(kept: FileContents, tasks: Sequence[str], options: argparse.Namespace) 
     known = {task: kept.estimates.of(task, options.context) for task in tasks}
     refuse_unknown_context(kept, tasks, options)
     try:
-        _refuse_unknown_cost(known, options)
+        refuse_unknown_cost(known, options)
         shown = {}
         for task, tallies in known.items():
-            question = _question(kept, task, options)
+            question = asked_question(kept, task, options)
             shown[task] = _plain(kept, task, tallies, question, compare(tallies, question), options)
     except ValueError as fault:
         raise CommandError(2, str(fault)) from fault
@@ -44,7 +44,7 @@ def show(kept: FileContents, tasks: Sequence[str], options: argparse.Namespace) 
     return 0
 
 
-def _question(kept: FileContents, task: str, options: argparse.Namespace) -> Question:
+def asked_question(kept: FileContents, task: str, options: argparse.Namespace) -> Question:
     """As given; else by what the file says that the actions were judged (its target counts over
     contexts, not in one)."""
     asked = kept.question(task)
@@ -73,7 +73,7 @@ def refuse_unknown_context(
         )
 
 
-def _refuse_unknown_cost(known: Mapping[str, Tallies], options: argparse.Namespace) -> None:
+def refuse_unknown_cost(known: Mapping[str, Tallies], options: argparse.Namespace) -> None:
     """A number that no result has would be a cost of 0 for everything."""
     kind, _, name = (options.cost or "").partition(":")
     tallies = [

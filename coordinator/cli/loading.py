@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,36 +12,71 @@ from petrobot.services.host.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
+    from petrobot.coordinator.analysis.time.stochastic import Measured
     from petrobot.coordinator.task import Task
     from petrobot.services.comm.location_file import Directory
 
 SHIPPED = Path(__file__).parents[1] / "tasks"
-"""Tasks that come with petrobot; they are known by their bare names."""
+"""Tasks that come with petrobot; a command accepts their names without a path."""
 SHIPPED_CELL = (Path(__file__).parents[2] / "services.toml").resolve()
 """The location file that comes with petrobot: that of the catching cell."""
-NODE_LOGS = Path("runs/logs")
-"""Where the commands that start nodes keep their logs, a file each."""
 OWN = Path("tasks")
-"""Where the operator's page saves tasks: beside what one works on."""
+"""Folder of the user's own tasks; the operator's page saves there."""
 
 
 def add_services_argument(parser: argparse.ArgumentParser) -> None:
-    """`--services FILE`, the same for all commands."""
+    """Add `--services FILE`, the same for all commands."""
     parser.add_argument(
         "--services",
         metavar="FILE",
         type=Path,
-        help="the location file (default: the one that the task names in `services`, where "
-        "there is a task that does, "
-        "else services.toml here, else the one that comes with petrobot)",
+        help="the location file (default: the one that the task names in its key `services`, else "
+        "services.toml in this folder, else the one that comes with petrobot)",
     )
 
 
+def add_estimates_argument(parser: argparse.ArgumentParser) -> None:
+    """`--estimates FILE`, the same for all commands that compute with a task's numbers."""
+    parser.add_argument(
+        "--estimates",
+        metavar="FILE",
+        type=Path,
+        help="an estimates file (`run --learn FILE` keeps it): its measurements replace the "
+        "estimates declared in the task",
+    )
+
+
+def measurements(file: Path | None) -> Callable[[Task], Measured] | None:
+    """Return how a task gets the measurements of an estimates file; None without a file. Raises
+    CommandError."""
+    if file is None:
+        return None
+    from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
+    from petrobot.coordinator.learning.propagation import measured_from
+
+    if not file.exists():
+        raise CommandError(2, f"{file}: no such file; `petrobot run ... --learn {file}` makes it")
+    try:
+        kept = EstimatesFile(file).read()
+    except EstimatesError as fault:
+        raise CommandError(2, str(fault)) from fault
+
+    def of(task: Task) -> Measured:
+        found = measured_from(task, kept.estimates, kinds=kept.kinds)
+        if not found.runs:
+            known = ", ".join(sorted({k.primitive_task for k in kept.estimates.tallies})) or "none"
+            text = f"{file}: nothing was measured of {task.name}; it knows: {known}"
+            raise CommandError(2, text)
+        return found
+
+    return of
+
+
 def task_path(name: str) -> Path:
-    """The file of a task given by path, or by its bare name: one's own in `tasks` here, else a
-    shipped one."""
+    """Return the file of a task, given by its path or by its name. A name is looked up in the
+    folder `tasks` here, then among the shipped tasks."""
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
         return path
@@ -52,7 +88,7 @@ def task_path(name: str) -> Path:
         return shipped
     known = ", ".join(sorted(p.stem for p in SHIPPED.glob("*.toml")))
     raise CommandError(
-        2, f"no task {name!r}: give a .toml file, or one of those that come with petrobot: {known}"
+        2, f"no task {name!r}: give a .toml file, or a task that comes with petrobot: {known}"
     )
 
 
@@ -70,7 +106,7 @@ def load_task(name: str) -> Task:
 
 
 def services_path(given: Path | None) -> Path:
-    """services.toml: the given one, the one here, or the shipped one."""
+    """Return the location file: the given one, else services.toml here, else the shipped one."""
     if given is not None:
         return given
     here = Path("services.toml")
@@ -78,17 +114,38 @@ def services_path(given: Path | None) -> Path:
 
 
 def cell_path(given: Path | None, name: str, task: Task) -> Path:
-    """services.toml for a task, which was named so on the command line: the given one, the task's
-    own, or the one at hand.
+    """Return the location file of `find_cell`. Raises CommandError if there is none."""
+    path = find_cell(given, name, task)
+    if path is None:
+        remedy = "write one (docs/location-file.md), or give --services FILE"
+        raise CommandError(2, f"{name}: {MISSING_CELL}; {remedy}")
+    return path
 
-    Raises CommandError where the task names a file that is not there.
+
+MISSING_CELL = "there is no services.toml beside the task, one folder above it, or here"
+
+
+def find_cell(given: Path | None, name: str, task: Task) -> Path | None:
+    """Return the location file for a task: the given one, else the one that the task names, else
+    services.toml beside the task, one folder above it, or here; None if there is none.
+
+    A task that comes with petrobot falls back to the location file that comes with it. `name` is
+    the task as the command line names it. Raises CommandError if the task names a file that does
+    not exist.
     """
-    if given is not None or not task.services:
-        return services_path(given)
+    if given is not None:
+        return given
     written = task_path(name)
+    if not task.services:
+        if written.parent == SHIPPED:
+            return services_path(None)
+        folder = written.parent
+        above = Path(os.path.normpath(folder / ".." / "services.toml"))
+        near = (folder / "services.toml", above, Path("services.toml"))
+        return next((path for path in near if path.is_file()), None)
     path = written.parent / task.services
     if not path.is_file():
-        what = f"{path} is no file" if path.exists() else f"no such file: {path}"
+        what = f"{path} is not a file" if path.exists() else f"no such file: {path}"
         remedy = f"name one relative to {written.name}, drop the key, or give --services FILE"
         raise CommandError(
             2, f"{file_line(written, 'task.services')}: task.services: {what}; {remedy}"
@@ -97,7 +154,7 @@ def cell_path(given: Path | None, name: str, task: Task) -> Path:
 
 
 def file_line(path: Path, key: str) -> str:
-    """FILE:LINE of a key of a TOML file."""
+    """Return FILE:LINE of a key of a TOML file."""
     from petrobot.coordinator.task.file.errors import key_lines, line_of
 
     return f"{path}:{line_of(key, key_lines(path.read_text(encoding='utf-8')))}"
@@ -122,10 +179,10 @@ def load_directory(given: Path | None) -> Directory:
 def refuse_misplaced(
     directory: Directory, *, everywhere: bool = False, scripted: bool = False
 ) -> None:
-    """Refuse a location file that names code, keys or files which this host has not: for commands
-    that launch nodes or judge it.
+    """Refuse a location file that names code, keys or files that this host does not have: for
+    commands that start nodes or check the file.
 
-    `everywhere`: all nodes are launched here, wherever they belong; `scripted`: actions are
+    `everywhere`: all nodes run on this host, whatever their address; `scripted`: actions are
     replaced (`--mock`).
     """
     from petrobot.services.comm.location_file.host_checks import misplaced
@@ -146,8 +203,8 @@ def refuse_script(mock: Path | None, directory: Directory) -> None:
 
 
 def pictures_of(task: Task, result: Mapping[str, Any]) -> dict[str, str]:
-    """What the task's own function draws of a mission run's result, SVG by title. Raises
-    CommandError when it cannot be had."""
+    """Return the pictures that the task's own function draws from a result, as SVG by title.
+    Raises CommandError if the function cannot be loaded."""
     if not task.pictures:
         return {}
     from petrobot.coordinator.launch import load_object

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.loading import NODE_LOGS, add_services_argument, load_directory
+from petrobot.coordinator.cli.loading import add_services_argument, load_directory
 from petrobot.coordinator.cli.recorded_runs import recorded
+from petrobot.coordinator.run.folder import NODE_LOGS
 from petrobot.services.host.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -40,10 +41,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--mcap",
         metavar="FILE",
         type=Path,
-        help="write it as MCAP instead (needs the package mcap)",
+        help="write the run as MCAP instead (needs the package mcap)",
     )
     parser.add_argument(
-        "--out", metavar="FILE", default="-", help="where to write it (default: standard output)"
+        "--out", metavar="FILE", default="-", help="file to write to (default: standard output)"
     )
 
 
@@ -79,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _node_log(options: argparse.Namespace) -> Path | None:
-    """The log of the node that is named; None where the name is that of a run, or of no node."""
+    """Return the log of the named node; None if the name is that of a run, or of no node."""
     from petrobot.coordinator.run.folder import NoRunError, journal_of
 
     with contextlib.suppress(NoRunError):
@@ -90,7 +91,7 @@ def _node_log(options: argparse.Namespace) -> Path | None:
     except CommandError:
         if options.services is not None:
             raise
-        return None  # a broken location file must not hide that there is no such run
+        return None  # the error to report is that there is no such run, not a broken location file
     if options.run not in directory.nodes:
         return None
     path: Path = options.logs / f"{options.run}.log"
@@ -98,8 +99,8 @@ def _node_log(options: argparse.Namespace) -> Path | None:
         host = directory.nodes[options.run].host
         raise CommandError(
             2,
-            f"{path}: node {options.run} has no log here; it is written on the node's own host "
-            f"({host}) by `petrobot up`, `run` or `serve`: give its folder with --logs",
+            f"{path}: node {options.run} has no log here; `petrobot up`, `run` or `serve` write it "
+            f"on the node's own host ({host}); give its folder with --logs",
         )
     return path
 

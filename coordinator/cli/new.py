@@ -20,7 +20,8 @@ from petrobot import Context, Result, error, failure, success
 
 
 async def {name}(ctx: Context, *, duration: float = 0.5, timeout: float = 2.0) -> Result:
-    """Say here when its specification is met (SUCCESS), when the task may go on all the same (FAILURE), and when not (ERROR)."""
+    """Say here when its specification is met (SUCCESS), when it is not but the task can continue
+    (FAILURE), and when the robot must recover (ERROR)."""
     if duration <= 0.0:
         return error("bad_duration", f"duration is {{duration}} s; give more than 0")
     begun = ctx.now
@@ -51,7 +52,7 @@ def test_nonsense_is_an_error():
 '''
 
 TASK = """\
-# {name}: say here what the task is for. `petrobot show {name}.toml` draws it, `petrobot check {name}.toml` checks it.
+# {name}: say here what the task is for. Draw it with `petrobot show {name}.toml`.
 schema = 1
 
 [task]
@@ -63,7 +64,7 @@ runs_place = "runs"
 
 [primitive_tasks.work]
 goal = "say here what this step is for"
-alternatives = ["work"]      # names of actions in services.toml; with several, one is chosen at each start
+alternatives = ["work"]      # names of actions in services.toml; each start chooses one of them
 deadline = 10.0              # s
 
 [primitive_tasks.recover]
@@ -114,7 +115,7 @@ out = ["out_of_order"]
 """
 
 TASK_TEST = '''\
-"""The task {name} with scripted actions: its error branch comes back, and a robot that cannot be recovered ends it honestly."""
+"""The task {name} with scripted actions: after an error the robot recovers, and the task ends."""
 
 import json
 import subprocess
@@ -152,9 +153,10 @@ seconds = 0.2
 def test_an_error_is_recovered(tmp_path):
     (tmp_path / "services.toml").write_text(SERVICES)
     (tmp_path / "script.toml").write_text(SCRIPT)
-    command = [sys.executable, "-m", "petrobot.coordinator", "run", str(HERE / "{name}.toml"), "--mode", "lockstep", "--json", "-"]
-    given = ["--services", str(tmp_path / "services.toml"), "--mock", str(tmp_path / "script.toml")]
-    done = subprocess.run([*command, *given], capture_output=True, text=True)
+    command = [sys.executable, "-m", "petrobot.coordinator", "run", str(HERE / "{name}.toml")]
+    command += ["--services", str(tmp_path / "services.toml")]
+    command += ["--mock", str(tmp_path / "script.toml"), "--mode", "lockstep", "--json", "-"]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     assert result["status"] == "success" and result["firings"] == 5
@@ -164,23 +166,21 @@ def test_an_error_is_recovered(tmp_path):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("what", choices=("action", "task"))
-    parser.add_argument("name", help="a Python name, such as close_gripper")
+    parser.add_argument("name", help="its name, such as close_gripper")
     parser.add_argument(
-        "--folder", type=Path, default=Path(), help="where to write it (default: here)"
+        "--folder", type=Path, default=Path(), help="folder to write to (default: this folder)"
     )
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the files; none that exists is touched."""
+    """Write the files. Existing files are never overwritten."""
     name = options.name
     if keyword.iskeyword(name):
-        raise CommandError(
-            2, f"{name!r} is a word of Python itself (a keyword): choose another name"
-        )
+        raise CommandError(2, f"{name!r} is a keyword of Python: choose another name")
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise CommandError(
             2,
-            f"{name!r} is no name for it: use small letters, digits and _, beginning with a letter",
+            f"{name!r} cannot be the name: use small letters, digits and _, a letter first",
         )
     folder: Path = options.folder
     if options.what == "action":

@@ -1,4 +1,4 @@
-"""Launch one node of services.toml on this host (the same as python -m petrobot.services NAME)."""
+"""Start one node of services.toml on this host (the same as python -m petrobot.services NAME)."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=number(above=0.0),
         default=2.0,
         metavar="S",
-        help="seconds to wait (default: %(default)s)",
+        help="how long to wait for answers (default: %(default)s s)",
     )
     parser.add_argument(
         "--json", metavar="FILE", help="write the answers as JSON (- for standard output)"
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Ask; 0 when all are up, that is take calls, 3 otherwise."""
+    """Ask all nodes. Return 0 if all accept calls, 3 otherwise."""
     from petrobot.coordinator.run.node_status import ask_all
 
     directory = load_directory(options.services)
@@ -52,8 +52,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _troubles(status: Mapping[str, Any]) -> dict[str, str]:
-    """What of a node that answers would not take a call now, and why: devices, and `actions` for
-    those without a device."""
+    """Return the devices of a node that would not accept a call now, with the reason. The key
+    `actions` stands for actions without a device."""
     said = {
         name: (word, status["devices"].get(name, {})) for name, word in status["answers"].items()
     }

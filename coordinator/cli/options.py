@@ -1,4 +1,5 @@
-"""Options that several commands share: parameters of a task, the port of the page, the log level."""
+"""Options that several commands share: parameters of a task, the port of the page, the log
+level."""
 
 from __future__ import annotations
 
@@ -18,58 +19,58 @@ if TYPE_CHECKING:
 
 
 def parameter_of(task: Task, name: str, text: str) -> Any:
-    """The value of a parameter from its text, of the same type as its default. Raises
+    """Return the value of a parameter from its text, in the type of its default. Raises
     CommandError."""
     if name not in task.parameters:
         known = ", ".join(task.parameters) or "none"
-        raise CommandError(2, f"{task.name} has no parameter {name!r}; it has: {known}")
+        raise CommandError(2, f"task {task.name} has no parameter {name!r}; it has: {known}")
     default = task.parameters[name]
     if isinstance(default, bool):
         if text not in ("true", "false"):
-            raise CommandError(2, f"parameter {name}: {text!r} is neither true nor false")
+            raise CommandError(2, f"parameter {name}: expected true or false, got {text!r}")
         return text == "true"
     try:
         return type(default)(text) if isinstance(default, int | float) else text
     except ValueError as fault:
         raise CommandError(
-            2, f"parameter {name}: {text!r} is no {type(default).__name__}"
+            2, f"parameter {name}: expected {type(default).__name__}, got {text!r}"
         ) from fault
 
 
 def pairs(option: str, texts: list[str]) -> Iterator[tuple[str, str]]:
-    """NAME=VALUE as users write it. Raises CommandError."""
+    """Split each NAME=VALUE. Raises CommandError."""
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals:
-            raise CommandError(2, f"{option} {text}: write NAME=VALUE")
+            raise CommandError(2, f"{option} {text}: expected NAME=VALUE")
         yield name, value
 
 
-# The port of the operator's page: how it is given, and what is said when it cannot be had.
+# The port of the operator's page: its option, and the message when it cannot be used.
 
 
 def add_page_port_argument(parser: argparse.ArgumentParser) -> None:
-    """`--page-port`."""
+    """Add `--page-port`."""
     parser.add_argument(
         "--page-port",
         type=_port,
         default=0,
         metavar="PORT",
-        help="the page's port (default: a free one)",
+        help="port of the page (default: a free one)",
     )
 
 
 def _port(text: str) -> int:
     if not text.isdecimal() or int(text) > 65535:
         raise argparse.ArgumentTypeError(
-            f"{text} is no port: give a number from 1 to 65535, or 0 for a free one"
+            f"expected a port from 1 to 65535, or 0 for a free one, got {text}"
         )
     return int(text)
 
 
 @contextmanager
 def named_port(port: int) -> Iterator[None]:
-    """Around the start of a page. Raises CommandError (2) when its port cannot be had."""
+    """Turn the OSError of a port that cannot be used into CommandError (2)."""
     try:
         yield
     except OSError as fault:
@@ -84,12 +85,12 @@ LOG_LEVELS = ("debug", "info", "warning", "error")
 
 
 def add_log_level_argument(parser: argparse.ArgumentParser, default: str = "warning") -> None:
-    """`--log-level`."""
+    """Add `--log-level`."""
     parser.add_argument(
         "--log-level",
         choices=LOG_LEVELS,
         default=default,
-        help="what is logged to standard error; info: links to nodes, runs, restarts, refusals "
+        help="how much is logged to standard error; info: links to nodes, runs, restarts, refusals "
         "(default: %(default)s)",
     )
 
@@ -103,7 +104,7 @@ class _StandardError(logging.Handler):
 
 
 def log_to_stderr(level: str) -> None:
-    """Log what the project's loggers say, from this level on."""
+    """Log the records of this level and above to standard error."""
     logger = logging.getLogger("petrobot")
     logger.setLevel(level.upper())
     if not any(isinstance(handler, _StandardError) for handler in logger.handlers):

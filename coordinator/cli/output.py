@@ -1,5 +1,4 @@
-"""What a run shows and leaves: progress in the terminal, then its result there, as JSON, beside its
-journal and as a report."""
+"""What a run shows: progress in the terminal, then its result there, as JSON and as a report."""
 
 from __future__ import annotations
 
@@ -26,15 +25,15 @@ COLOURS = {"success": "green", "failure": "yellow", "error": "red"}
 REFRESH = 0.1
 LONGEST_TABLE = 24
 WIDEST_TABLE = 9
-"""Columns; wider tables are for --json and the report."""
+"""Most columns of a table in the terminal; --json and the report show wider ones."""
 LAST_ERRORS = "last_errors"
-"""Key of a result under which the actions stand whose errors came last (`Mission.result`): a line
-each instead of a table."""
+"""Key of the last actions that ended in ERROR in a result (`Mission.result`). They are printed as
+lines, not as a table."""
 
 
 @contextmanager
 def progress(options: argparse.Namespace) -> Iterator[Callable[[Mission, float], None] | None]:
-    """Shows how far a run is, unless the terminal is to be quiet or takes the JSON."""
+    """Show the progress of a run, unless --quiet is given or the JSON goes to the terminal."""
     if options.quiet or options.json == "-":
         yield None
         return
@@ -44,8 +43,8 @@ def progress(options: argparse.Namespace) -> Iterator[Callable[[Mission, float],
 
 @contextmanager
 def live_progress() -> Iterator[Callable[[Mission, float], None]]:
-    """A line that follows the mission run; calls more often than every 0.1 s of wall time cost next
-    to nothing."""
+    """Show a line about the active run. Calls within 0.1 s of wall time of the last one return at
+    once."""
     shown = 0.0
     with Live(
         Text("connecting"), console=Console(stderr=True), auto_refresh=False, transient=True
@@ -77,7 +76,7 @@ def _line(mission: Mission, now: float) -> Text:
 
 
 def print_result(result: Mapping[str, Any]) -> None:
-    """The result: lists of tables as tables, everything else in one line each."""
+    """Print a result: lists of rows as tables, everything else as one line each."""
     console = Console()
     for key, value in result.items():
         if (
@@ -99,12 +98,12 @@ def print_result(result: Mapping[str, Any]) -> None:
 
 
 def _error(row: Mapping[str, Any]) -> str:
-    """One action that ended in ERROR, in a line."""
+    """Describe one action that ended in ERROR in one line."""
     place = f" on {row['node']}" if row["node"] else ""
     why = ": ".join(filter(None, (row["cause"], row["text"])))
     return (
         f"{row['run']}, {row['action'] or 'no action'}{place} for "
-        f"{row['primitive_task']}: {why or 'it does not say why'}"
+        f"{row['primitive_task']}: {why or 'no reason given'}"
     )
 
 

@@ -1,5 +1,5 @@
-"""Recorded runs on the command line: where runs are kept, how many, how durable; and one of them read
-again."""
+"""Recorded runs on the command line: where runs are kept, how many, how durably, and how one is
+read."""
 
 from __future__ import annotations
 

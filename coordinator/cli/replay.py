@@ -1,4 +1,4 @@
-"""Derive every marking and instruction of a recorded run again, and fail on the first
+"""Replay a recorded run: compute every marking and instruction again, and fail at the first
 difference."""
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Replay; 0 when all is the same, 1 at a difference."""
+    """Replay. Return 0 if everything is the same, 1 at a difference."""
     from petrobot.coordinator.run.journal import JournalError
     from petrobot.coordinator.run.recording import ReplayError
 
@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
     if options.json != "-":
         tail = f"; a torn tail of {torn} bytes was dropped" if torn else ""
         print(
-            f"{outcome['run']}: {count} stimuli, {firings} firings, all derived again as "
-            f"they were{tail}"
+            f"{outcome['run']}: {count} stimuli and {firings} firings replayed, all as "
+            f"recorded{tail}"
         )
     return 0

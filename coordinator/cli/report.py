@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from petrobot.coordinator.operator.start_from import Recorded
-    from petrobot.coordinator.run.recording import Step
+    from petrobot.coordinator.run.recording import RecordedStep
     from petrobot.coordinator.studies.campaign.plan import CampaignPlan
     from petrobot.coordinator.studies.campaign.rows import TrialRow
     from petrobot.coordinator.studies.report.run_page import ObservedRun
@@ -240,7 +240,7 @@ def _observer(found: Recorded) -> ObservedRun:
     return ObservedRun(found.task, None if session is None else session.selector)
 
 
-def _steps(found: Recorded) -> Iterator[Step]:
+def _steps(found: Recorded) -> Iterator[RecordedStep]:
     from petrobot.coordinator.run.journal import JournalError
     from petrobot.coordinator.run.recording import ReplayError
 

@@ -1,5 +1,5 @@
-"""Go on with a run whose coordinator was killed: marking restored, nodes asked for their runs,
-nothing done twice."""
+"""Continue a run whose coordinator was killed: restore its state from the journal, ask the nodes
+for their runs, and execute nothing twice."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--json", metavar="FILE", help="write the result as JSON (- for standard output)"
     )
     parser.add_argument(
-        "--report", metavar="FOLDER", type=Path, help="leave a report in this folder"
+        "--report", metavar="FOLDER", type=Path, help="write a report into this folder"
     )
     add_page_arguments(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
@@ -43,8 +43,8 @@ def run(options: argparse.Namespace) -> int:
     folder, mode = found.journal.path.parent, found.journal.header["mode"]
     if (result := _result_of(folder / RESULT)) is not None:
         print(
-            f"{options.run}: the run had ended, {result['status']}; its result is "
-            f"{folder / RESULT}",
+            f"{options.run}: this run has ended already, with status {result['status']}; "
+            f"its result is {folder / RESULT}",
             file=sys.stderr,
         )
         if options.json:
@@ -60,8 +60,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _result_of(path: Path) -> dict[str, Any] | None:
-    """The result that a run has left; None if it has none yet, or only a part of one, which is then
-    written again."""
+    """Return the result that a run has written. None if there is none, or a partial one, which the
+    resumed run then overwrites."""
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError):

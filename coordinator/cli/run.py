@@ -1,5 +1,4 @@
-"""Run a task: in real time over the nodes of services.toml, or in lock step, where simulated time
-is exact."""
+"""Run a task: in real time over the nodes of services.toml, or in lock step in simulated time."""
 
 from __future__ import annotations
 
@@ -7,7 +6,6 @@ import argparse
 import asyncio
 import os
 import sys
-import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager, nullcontext
 from pathlib import Path
@@ -46,8 +44,6 @@ if TYPE_CHECKING:
 
 MODES = ("realtime", "lockstep")
 SEED = 1
-MOST_STATES, LONGEST = 20_000, 1.0
-"""Markings and seconds that are spent on a task's state space before it runs."""
 EXAMPLE = "petrobot run catch_ball --mode lockstep --runs 20 --seed 1 --json out.json"
 SELECTORS = (
     "nikolic_fu",
@@ -60,20 +56,20 @@ SELECTORS = (
     "fixed",
     "round_robin",
 )
-"""Names for --help without importing numpy; a test compares them with the selectors that there
-are."""
+"""The selectors' names, for --help without importing numpy. A test compares them with the
+selectors themselves."""
 
 
 REFUSED = {
-    "task": "the task comes from the run",
-    "runs": "how many runs are left is in the marking",
-    "learn": "a run from the middle of another teaches nothing",
-    "use": "the choices are those of the run",
-    "services": "the cell is that of the run",
-    "join": "it has a cell of its own",
-    "up": "it has a cell of its own",
+    "task": "the task is that of the recorded run",
+    "runs": "the marking says how many runs are left",
+    "learn": "a run that starts in the middle of another would distort what was learned",
+    "use": "the choices are those of the recorded run",
+    "services": "the cell is that of the recorded run",
+    "join": "it simulates its own cell",
+    "up": "it simulates its own cell",
 }
-"""Options that do not go with --from, and why."""
+"""Options that cannot be combined with --from, and why."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -81,14 +77,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "task",
         nargs="?",
-        help="a task file, or the name of a task that comes with petrobot (with --from: that "
-        "of the run)",
+        help="a task file, or the name of a task that comes with petrobot (with --from: leave it "
+        "out)",
     )
     parser.add_argument(
         "--runs",
         type=whole(),
         metavar="N",
-        help="how many runs (default: tokens in the task's runs place)",
+        help="how many times to run the task (default: the tokens in its runs place)",
     )
     parser.add_argument(
         "--mode", choices=MODES, help=f"default: {MODES[0]}, with --from {MODES[1]}"
@@ -97,35 +93,39 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seed",
         type=whole(0),
         metavar="S",
-        help=f"of all chance in the run (default: {SEED}, with --from that of the run)",
+        help=f"seed of all random numbers (default: {SEED}, with --from that of the recorded run)",
     )
-    parser.add_argument("--regime", metavar="NAME", help="the same as --set regime=NAME")
+    parser.add_argument("--regime", metavar="NAME", help="short for --set regime=NAME")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task"
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="value of a parameter of the task",
     )
     parser.add_argument(
         "--use",
         action="append",
         default=[],
         metavar="TASK=ACTION",
-        help="the action for a primitive task",
+        help="always use this action for this primitive task",
     )
     parser.add_argument(
         "--processes",
         type=int,
         choices=(1, 0),
         default=1,
-        help="lock step: 1 for one process, 0 for one a node",
+        help="lock step: 1 for one process, 0 for one process per node",
     )
     parser.add_argument(
         "--join",
         action="store_true",
-        help="lock step, one process a node: the nodes wait already (`petrobot up --lockstep`)",
+        help="lock step, one process per node: use the nodes that `petrobot up --lockstep` started",
     )
     parser.add_argument(
         "--up",
         action="store_true",
-        help="launch the nodes of this host for this run, and end them after it",
+        help="start the nodes of this host for this run, and stop them after it",
     )
     parser.add_argument(
         "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
@@ -136,7 +136,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--json", metavar="FILE", help="write the result as JSON (- for standard output)"
     )
     parser.add_argument(
-        "--report", metavar="FOLDER", type=Path, help="leave a report in this folder"
+        "--report", metavar="FOLDER", type=Path, help="write a report into this folder"
     )
     add_journal_arguments(parser)
     add_page_arguments(parser)
@@ -147,78 +147,77 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_page_arguments(parser: argparse.ArgumentParser) -> None:
-    """Whether and where the operator's page is served while a real-time run goes on."""
+    """Add the options that say whether and where a real-time run serves the operator's page."""
     parser.add_argument(
         "--no-page",
         action="store_true",
-        help="serve no operator's page; the command line still steers the run",
+        help="do not serve the operator's page; commands such as `petrobot pause` still work",
     )
     add_page_port_argument(parser)
 
 
 def add_learning_arguments(parser: argparse.ArgumentParser) -> None:
-    """Whether, where and how a command learns."""
+    """Add the options that say whether, where and how a command learns."""
     parser.add_argument(
         "--learn",
         metavar="FILE",
         type=Path,
-        help="learn which actions are best, and keep it in this estimates file",
+        help="learn which actions are best, and store it in this estimates file",
     )
     parser.add_argument(
         "--selector",
         choices=SELECTORS,
         metavar="NAME",
-        help=f"who chooses: {', '.join(SELECTORS)} (with --learn)",
+        help=f"how actions are chosen: {', '.join(SELECTORS)} (with --learn)",
     )
     parser.add_argument(
         "--target",
         type=probability,
         metavar="R",
-        help="choose among actions that reach this reliability (with --learn)",
+        help="choose only among actions that reach this reliability (with --learn)",
     )
     parser.add_argument(
         "--context",
         action="append",
         metavar="NAME|CONDITION",
-        help="learn apart for each value of a parameter or variable, or for a condition "
-        "(default: regime, if there is one)",
+        help="learn separately for each value of a parameter or variable, or for a condition "
+        "(default: regime, if the task has it)",
     )
     parser.add_argument(
         "--frozen",
         action="store_true",
-        help="choose the best that was learned, and learn nothing (with --learn)",
+        help="choose by what was learned before, and learn nothing (with --learn)",
     )
 
 
 def add_departing_arguments(parser: argparse.ArgumentParser) -> None:
-    """`--from`, `--going`."""
+    """Add `--from` and `--going`."""
     parser.add_argument(
         "--from",
         dest="departs",
         metavar="RUN[:RECORD]",
-        help="simulate the task of a recorded run from the state after one of its records "
-        "(`petrobot log` numbers them; "
-        "0, the default, is its beginning), in lock step, in a run folder of its own",
+        help="start from a recorded run: simulate its task from the state after one of its "
+        "records, in lock step, as a new run (`petrobot log` numbers the records; default: 0, the "
+        "beginning)",
     )
     parser.add_argument(
         "--going",
         action="append",
         default=[],
         metavar="[PLACE=]END",
-        help="with --from: what becomes of the runs that went on then: again (begin anew, "
-        "the default), success, failure or "
-        "error[:CAUSE]; of one place, or of all",
+        help="with --from: how the actions that were active at that record continue: again (start "
+        "again, the default), success, failure or error[:CAUSE]; for one place, or for all",
     )
 
 
 def run(options: argparse.Namespace) -> int:
-    """Check the task, run it, print and write the result."""
+    """Check the task, run it, print and write its result."""
     if options.departs is not None:
         return conduct(_from_record(options), options, "lockstep")
     if options.task is None:
-        raise CommandError(2, "give a task, or with --from a recorded run")
+        raise CommandError(2, "give a task to run, or a recorded run with --from")
     if options.going:
-        raise CommandError(2, "--going goes with --from")
+        raise CommandError(2, "--going needs --from RUN")
     options.mode = options.mode or MODES[0]
     options.seed = SEED if options.seed is None else options.seed
     lockstep = options.mode == "lockstep"
@@ -226,7 +225,8 @@ def run(options: argparse.Namespace) -> int:
     directory = load_directory(cell_path(options.services, options.task, task))
     if options.join and (not lockstep or options.processes != 0):
         raise CommandError(
-            2, "--join is for --mode lockstep --processes 0: nodes in real time are joined always"
+            2,
+            "--join needs --mode lockstep --processes 0; in real time, nodes are always joined",
         )
     _refuse_unfit(task, directory)
     if (lockstep or options.up) and not options.join:
@@ -252,9 +252,10 @@ def conduct(
     *,
     resumed: bool = False,
 ) -> int:
-    """Make a session, lead it to its end, print and write its result; gives the exit code.
+    """Make a session, lead it to its end, print and write its result. Return the exit code.
 
-    `resumed`: a supervisor that resumes whatever ends must be able to rely on 2 for damage alone.
+    `resumed`: return 2 for a damaged journal only. A supervisor that restarts `petrobot resume`
+    until it succeeds gives up at 2.
     """
     from petrobot.coordinator.cli.output import give
     from petrobot.coordinator.launch import RequestError
@@ -301,7 +302,7 @@ async def _lead_lockstep(session: RunSession, options: argparse.Namespace) -> No
 
 
 async def _lead_realtime(session: RunSession, options: argparse.Namespace) -> None:
-    """Lead it over its nodes, and launch those of this host first if asked to."""
+    """Lead a session over its nodes; with --up, start those of this host first."""
     from petrobot.coordinator.cli.output import progress
     from petrobot.coordinator.launch import local_nodes
 
@@ -314,7 +315,7 @@ async def _lead_realtime(session: RunSession, options: argparse.Namespace) -> No
                 with progress(options) as watch:
                     await session.lead(watch)
     finally:
-        await session.abandon()  # does nothing if it was led
+        await session.abandon()  # does nothing after `lead`
 
 
 @asynccontextmanager
@@ -352,46 +353,37 @@ async def _page(session: RunSession, options: argparse.Namespace) -> AsyncIterat
         await page.close()
 
 
-# --- what is asked for ------------------------------------------------------------------------
+# --- the request ------------------------------------------------------------------------------
 
 
 def _refuse_unfit(task: Task, directory: Directory) -> None:
-    from petrobot.coordinator.task.check import check
+    from petrobot.coordinator.analysis.may_run import Cell, may_run
 
     offers = {action: entry.node for action, entry in directory.actions.items()}
-    report = check(task, offers, source=str(directory.source))
-    faults = [f for f in report.findings if f.severity == "error"]
-    if faults:
-        lines = "\n".join(f"  {f.key}: {f.text}\n    {f.remedy}" for f in faults)
-        raise CommandError(2, f"{task.name} may not run:\n{lines}")
+    refusal = may_run(task, Cell(offers, str(directory.source))).refusal()
+    if refusal:
+        raise CommandError(2, refusal)
 
 
 def _warn(task: Task, options: argparse.Namespace) -> None:
-    """Say what a short look at the state space finds against running it: whoever runs it all the
-    same may want to see that."""
-    from petrobot.coordinator.analysis.net.space import SearchLimits
-    from petrobot.coordinator.analysis.report import analyse
+    """Print what a short search of the state space finds against the task. The run still starts."""
+    from petrobot.coordinator.analysis.may_run import BUDGET, may_run
 
     if options.quiet:
         return
-    limits = SearchLimits(states=MOST_STATES, seconds=LONGEST, clock=time.monotonic)
-    for name, verdict in analyse(task, limits=limits).objections.items():
-        told = (
-            f"warning: {task.name}: {name.replace('_', ' ')}: {verdict.reason} (petrobot "
-            f"check {options.task} says more)"
-        )
-        print(told, file=sys.stderr)
+    for objection in may_run(task, None, BUDGET).objections():
+        print(f"warning: {objection} (details: petrobot check {options.task})", file=sys.stderr)
 
 
 def _refuse_stopped(directory: Directory) -> None:
-    """A run whose devices obey nobody would end at once, having done nothing."""
+    """Refuse to run while an emergency stop holds devices: every action would fail at once."""
     from petrobot.coordinator.operator.emergency_stop import still_stopped
 
     stopped = still_stopped(directory)
     if stopped:
         text = (
-            f"{', '.join(stopped)}: an emergency stop still holds the devices; once the "
-            "cell is safe: petrobot estop --clear"
+            f"{', '.join(stopped)}: an emergency stop still holds the devices; when the cell is "
+            "safe, run `petrobot estop --clear`"
         )
         raise CommandError(2, text)
 
@@ -405,11 +397,11 @@ def _request(task: Task, directory: Directory, options: argparse.Namespace) -> R
         if known is None or action not in known.alternatives:
             choices = ", ".join(known.alternatives) if known else ", ".join(task.primitive_tasks)
             raise CommandError(
-                2, f"--use {primitive}={action}: not known to {task.name}; choose among {choices}"
+                2, f"--use {primitive}={action}: unknown in task {task.name}; choose from {choices}"
             )
         if action not in directory.actions:
             raise CommandError(
-                2, f"--use {primitive}={action}: {directory.source} places no action {action}"
+                2, f"--use {primitive}={action}: {directory.source} has no action {action}"
             )
     nodes = JOINED if options.join else LAUNCHED if options.processes == 0 else ONE_PROCESS
     return RunRequest(
@@ -435,12 +427,12 @@ def _parameters(task: Task, options: argparse.Namespace) -> Mapping[str, Any]:
 
 
 def _learning(options: argparse.Namespace) -> LearningSetting | None:
-    """How the run learns; None if it does not, and then no estimates file is read."""
+    """How the run learns. None if it does not learn; then no estimates file is read."""
     if options.learn is None:
         for name in ("selector", "target", "context", "frozen"):
             if getattr(options, name):
                 raise CommandError(
-                    2, f"--{name} needs --learn FILE: without it nothing is learned or read"
+                    2, f"--{name} needs --learn FILE: without it nothing is read or learned"
                 )
         return None
     from petrobot.coordinator.learning.selectors import DEFAULT
@@ -456,15 +448,15 @@ def _learning(options: argparse.Namespace) -> LearningSetting | None:
 
 
 def _from_record(options: argparse.Namespace) -> Callable[[], RunSession]:
-    """What makes a simulated run that starts at a point of a recorded one."""
+    """Return a function that prepares a simulated run from a point of a recorded one."""
     for name, why in REFUSED.items():
         if getattr(options, name):
             raise CommandError(
-                2, f"--from goes with no {'--' if name != 'task' else ''}{name}: {why}"
+                2, f"--from cannot have {'--' if name != 'task' else 'a '}{name}: {why}"
             )
     if options.mode == "realtime" or options.processes != 1:
         raise CommandError(
-            2, "--from simulates in one process: a real cell does not stand where a marking says"
+            2, "--from only simulates, in one process: a real cell is not in the recorded state"
         )
     name, record = _named(options.departs)
     found: Recorded = recorded(name)
@@ -494,7 +486,7 @@ def _named(text: str) -> tuple[str, int]:
     if not colon:
         return text, 0
     if not record.isascii() or not record.isdigit():
-        raise CommandError(2, f"--from {text}: write RUN:RECORD, the record as a number")
+        raise CommandError(2, f"--from {text}: expected RUN:RECORD with a number, such as last:20")
     return run, int(record)
 
 
@@ -503,6 +495,6 @@ def _going(texts: list[str]) -> dict[str, str] | str:
 
     if any("=" not in text for text in texts):
         if len(texts) > 1:
-            raise CommandError(2, "--going: give one END for all, or PLACE=END for each")
+            raise CommandError(2, "--going: give one END for all places, or PLACE=END for each")
         return texts[0]
     return dict(text.split("=", 1) for text in texts) if texts else AGAIN

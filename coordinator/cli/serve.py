@@ -1,5 +1,4 @@
-"""Serve the operator's page and stay: draw tasks, start them over the nodes, as often as wanted,
-until Ctrl-C."""
+"""Serve the operator's page until Ctrl-C: draw tasks there, and start them over the nodes."""
 
 from __future__ import annotations
 
@@ -42,13 +41,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FOLDER",
         type=Path,
         default=OWN,
-        help="your own tasks, made when first needed; those that come with petrobot are "
-        "offered, too (%(default)s)",
+        help="folder of your own tasks, made when needed; tasks that come with petrobot are also "
+        "offered (%(default)s)",
     )
     parser.add_argument(
         "--up",
         action="store_true",
-        help="launch the nodes of this host, and end them with this command",
+        help="start the nodes of this host, and stop them when this command ends",
     )
     parser.add_argument(
         "--mock", metavar="FILE", type=Path, help="with --up: replace actions by scripted ones"
@@ -59,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FOLDER",
         type=Path,
         default=ESTIMATES,
-        help="where runs that learn keep what they learned, one file a name (%(default)s)",
+        help="folder of the estimates files of runs that learn (%(default)s)",
     )
     parser.add_argument(
         "--journal", metavar="FOLDER", type=Path, help="where runs are kept (default: runs)"
@@ -70,9 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
     if options.mock is not None and not options.up:
-        raise CommandError(
-            2, "--mock is for nodes that are launched here: give --up, too, or `petrobot up --mock`"
-        )
+        raise CommandError(2, "--mock replaces actions of nodes that are started here: add --up")
     directory = load_directory(options.services)
     refuse_script(options.mock, directory)
     return asyncio.run(_serve(directory, options))
@@ -89,7 +86,7 @@ async def _serve(directory: Directory, options: argparse.Namespace) -> int:
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    credentials_of(directory)  # keys that cannot be used are told before anything is launched
+    credentials_of(directory)  # report unusable keys before anything is started
     runs = options.journal or DEFAULT
     try:
         async with (
@@ -113,7 +110,7 @@ async def _serve(directory: Directory, options: argparse.Namespace) -> int:
 async def _page(
     station: Station, runs: Path, options: argparse.Namespace, stop: asyncio.Event
 ) -> None:
-    """The page, until told to stop; a run that goes on then is aborted before the page goes."""
+    """Serve the page until `stop` is set; then abort the active run and close the page."""
     from petrobot.coordinator.operator.history import JournalHistory
     from petrobot.coordinator.page.server import start_page
 
@@ -129,7 +126,7 @@ async def _page(
         )
     station.door = _doors(station.directory, page)
     try:
-        print(f"page: {page.url}\nCtrl-C ends it", flush=True)
+        print(f"page: {page.url}\nCtrl-C stops it", flush=True)
         await stop.wait()
         await station.close()
     finally:

@@ -4,15 +4,22 @@ asked for."""
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.loading import load_task, task_path
+from petrobot.coordinator.cli.loading import (
+    add_estimates_argument,
+    load_task,
+    measurements,
+    task_path,
+)
 from petrobot.services.host.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.drawing import Overlay
+    from petrobot.coordinator.analysis.time.gspn import Gspn
+    from petrobot.coordinator.drawing import Caption, Overlay
     from petrobot.coordinator.task import Task
 
 EXAMPLE = "petrobot show catch_ball --errors --out catch_ball.svg"
@@ -29,6 +36,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--graph", action="store_true", help="draw the reachability graph instead (of any net file)"
     )
     parser.add_argument(
+        "--view",
+        choices=("ordinary", "gspn"),
+        default="ordinary",
+        help="gspn: the stochastic view, with timed (boxes) and immediate transitions (bars), "
+        "their rates and weights, and where these come from",
+    )
+    add_estimates_argument(parser)
+    parser.add_argument(
         "--heat",
         action="store_true",
         help="colour the action places by their share of the mean time",
@@ -43,7 +58,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Draw."""
-    svg = _graph(options.task) if options.graph else _net(options)
+    _refuse_idle(options)
+    svg = (
+        _graph(options.task)
+        if options.graph
+        else _gspn(options)
+        if options.view == "gspn"
+        else _net(options)
+    )
     if options.out == "-":
         print(svg)
         return 0
@@ -59,20 +81,73 @@ def _net(options: argparse.Namespace) -> str:
     from petrobot.coordinator.drawing import draw
 
     task = load_task(options.task)
-    overlay = _heat(task) if options.heat else None
+    overlay = _heat(task, options.estimates) if options.heat else None
     try:
         return draw(task, error_branches=options.errors, overlay=overlay, inside=options.inside)
     except ValueError as fault:
         raise CommandError(2, str(fault)) from fault
 
 
-def _heat(task: Task) -> Overlay:
+def _refuse_idle(options: argparse.Namespace) -> None:
+    """Refuse an option that this drawing would ignore. Raises CommandError."""
+    if options.estimates is not None and (
+        options.graph or not (options.heat or options.view == "gspn")
+    ):
+        raise CommandError(2, "--estimates is for --heat and --view gspn; add one of them")
+
+
+def _gspn(options: argparse.Namespace) -> str:
+    """Draw the stochastic view of a task, or a net file that has rates. Raises CommandError."""
+    from petrobot.coordinator.analysis.commands import gspn_of
+    from petrobot.coordinator.drawing import draw
+    from petrobot.coordinator.task.file import load
+
+    for name in ("errors", "inside", "heat"):
+        if getattr(options, name):
+            problem = f"--{name} is of the ordinary view; leave out --view gspn"
+            raise CommandError(2, problem)
+    path = task_path(options.task)
+    try:
+        model, sources = gspn_of(path, load, measure=measurements(options.estimates))
+    except (ValueError, OverflowError) as fault:
+        text = str(fault)
+        named = text if text.startswith(str(path)) else f"{path}: {text}"
+        raise CommandError(2, named) from fault
+    # In a GSPN of a task a place and a transition may have the same name; a drawing needs two.
+    renamed, _ = model.with_names(re.compile(".+", re.DOTALL))
+    gspn = renamed.gspn
+    assert gspn is not None
+    pairs = zip(gspn.net.transitions, model.net.transitions, strict=True)
+    captions = {
+        name: _caption(gspn, t, old, sources.get(old, "")) for t, (name, old) in enumerate(pairs)
+    }
+    return draw(renamed.net, title=model.name or path.stem, captions=captions)
+
+
+def _caption(gspn: Gspn, t: int, name: str, source: str) -> Caption:
+    """What the drawing says of a transition of a GSPN: its rate or weight, and their source."""
+    from petrobot.coordinator.drawing import Caption
+
+    rate, servers = gspn.rate[t], gspn.servers[t]
+    if rate is not None:
+        said = f"{rate:.4g}/s"
+        if servers != 1:
+            said += " for each token" if servers is None else f", {servers} servers"
+    else:
+        said = f"weight {gspn.weight[t]:.4g}" if source or gspn.weight[t] != 1.0 else ""
+    kind = "immediate" if rate is None else "timed"
+    hint = "; ".join(text for text in (f"{kind} transition {name}", said, source) if text)
+    return Caption(tuple(text for text in (name, said, source) if text), hint, kind)
+
+
+def _heat(task: Task, estimates: Path | None) -> Overlay:
     """The forecast's bottleneck: how much of the mean time each action place takes. Raises
     CommandError."""
     from petrobot.coordinator.analysis.report import analyse, heat
     from petrobot.coordinator.drawing import Overlay
 
-    analysis = analyse(task, view="gspn")
+    measure = measurements(estimates)
+    analysis = analyse(task, view="gspn", measured=measure(task) if measure else None)
     shares = heat(analysis)
     if not shares:
         raise CommandError(

@@ -1,4 +1,4 @@
-"""Launch the simulated laboratory on this host (the same as python -m petrobot.sim)."""
+"""Start the simulated laboratory on this host (the same as python -m petrobot.sim)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 
 from petrobot.coordinator.cli.exec import become
 from petrobot.coordinator.cli.loading import add_services_argument, services_path
+from petrobot.coordinator.cli.options import add_log_level_argument
 
 EXAMPLE = "petrobot sim --services services.toml"
 
@@ -13,8 +14,10 @@ EXAMPLE = "petrobot sim --services services.toml"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     add_services_argument(parser)
+    add_log_level_argument(parser, "info")
 
 
 def run(options: argparse.Namespace) -> int:
     """Become the laboratory."""
-    become("petrobot.sim", "--services", str(services_path(options.services)))
+    services = str(services_path(options.services))
+    become("petrobot.sim", "--services", services, "--log-level", options.log_level)

@@ -1,10 +1,12 @@
-"""Play a net many times by chance: times and probabilities with confidence intervals."""
+"""Simulate a net many times with random times and choices: mean times and probabilities with
+confidence intervals."""
 
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
-from petrobot.coordinator.cli.loading import task_path
+from petrobot.coordinator.cli.loading import add_estimates_argument, measurements, task_path
 from petrobot.services.host.command_line import number, whole
 
 EXAMPLE = "petrobot simulate catch_ball --replicas 2000 --seed 1"
@@ -25,24 +27,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=whole(),
         default=1000,
         metavar="N",
-        help="how often (default: %(default)s)",
+        help="number of simulations (default: %(default)s)",
     )
     parser.add_argument(
         "--horizon",
         type=number(above=0.0),
         metavar="S",
-        help="simulated seconds; a net that never ends needs it",
+        help="stop each simulation after S simulated seconds; needed for a net that never ends",
     )
     parser.add_argument(
-        "--seed", type=whole(0), default=1, metavar="S", help="default: %(default)s"
+        "--seed",
+        type=whole(0),
+        default=1,
+        metavar="S",
+        help="seed of all random numbers (default: %(default)s)",
     )
+    add_estimates_argument(parser)
     parser.add_argument(
         "--what-if",
         "-w",
         action="append",
         default=[],
         metavar="CHANGE",
-        help="as of `petrobot analyse` (may be repeated)",
+        help="a change, written as for `petrobot analyse`; may be repeated",
     )
     parser.add_argument(
         "--json", metavar="FILE", help="write the answer as JSON (- for standard output)"
@@ -58,6 +65,11 @@ def run(options: argparse.Namespace) -> int:
     from petrobot.coordinator.task.file import load
 
     random = np.random.default_rng(options.seed)
-    given = {"rates": options.rates, "replicas": options.replicas, "horizon": options.horizon}
+    given: dict[str, Any] = {
+        "rates": options.rates,
+        "replicas": options.replicas,
+        "horizon": options.horizon,
+    }
     given["changes"] = options.what_if
+    given["measure"] = measurements(options.estimates)
     return give(simulate_command(task_path(options.file), load, random, **given), options.json)

@@ -1,4 +1,5 @@
-"""Launch the nodes that services.toml places on this host, and keep them alive until Ctrl-C."""
+"""Start the nodes that services.toml places on this host, and restart those that die, until
+Ctrl-C."""
 
 from __future__ import annotations
 
@@ -11,13 +12,13 @@ from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
-    NODE_LOGS,
     add_services_argument,
     load_directory,
     refuse_misplaced,
     refuse_script,
 )
 from petrobot.coordinator.cli.options import add_log_level_argument
+from petrobot.coordinator.run.folder import NODE_LOGS
 from petrobot.services.host.command_line import number
 
 if TYPE_CHECKING:
@@ -33,30 +34,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--logs",
         type=Path,
         default=NODE_LOGS,
-        help="folder of the nodes' logs (%(default)s)",
+        help="folder of the nodes' logs (default: %(default)s)",
     )
     parser.add_argument(
         "--lockstep",
         action="store_true",
-        help="members of a lock-step cell, for one `petrobot run --join` and its resumes",
+        help="start them as members of a lock-step cell, for one `petrobot run --join`",
     )
     parser.add_argument(
         "--await-coordinator",
         type=number(least=0.0),
         default=600.0,
         metavar="S",
-        help="lock step: how long a coordinator that died is waited for (%(default)g s of "
-        "wall time)",
+        help="lock step: how long to wait for a coordinator that died to be resumed (default: "
+        "%(default)g s of wall time)",
     )
     parser.add_argument(
         "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
     )
-    parser.add_argument("--no-respawn", action="store_true", help="leave a node that died dead")
+    parser.add_argument("--no-respawn", action="store_true", help="do not restart a node that died")
     add_log_level_argument(parser, "info")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Launch and watch."""
+    """Start the nodes and watch them."""
     directory = load_directory(options.services)
     refuse_misplaced(directory, scripted=options.mock is not None)
     refuse_script(options.mock, directory)
@@ -81,7 +82,7 @@ async def _up(directory: Directory, options: argparse.Namespace) -> int:
         asyncio.get_running_loop().add_signal_handler(each, stop.set)
     respawn = not (
         options.no_respawn or options.lockstep
-    )  # a member that died has left its cell for good
+    )  # a member of a lock-step cell that died cannot join again
     supervisor = Supervisor(programs, options.logs, respawn=respawn)
     try:
         async with supervisor:
@@ -96,7 +97,7 @@ async def _up(directory: Directory, options: argparse.Namespace) -> int:
 
 
 async def _until(stop: asyncio.Event, ended: Awaitable[None] | None) -> None:
-    """Until Ctrl-C, or until all nodes have ended by themselves, as members of a lock-step cell
+    """Wait for Ctrl-C, or until all nodes have ended by themselves, as members of a lock-step cell
     do."""
     waiting = [
         asyncio.ensure_future(stop.wait()),

@@ -146,6 +146,8 @@ def _tokens(
 RADIUS = 21.0
 BAR = (4.0, 21.0)
 """Half thickness and half length of a transition."""
+BOX = 8.0
+"""Half thickness of a timed transition: a box, as usual for GSPNs; immediate ones are bars."""
 TURNS = 4
 """The most firings of one transition that are numbered along a path."""
 
@@ -176,7 +178,17 @@ class DrawnNode:
         """Half width and half height."""
         if self.is_place:
             return RADIUS, RADIUS
-        return BAR if self.upright else (BAR[1], BAR[0])
+        thickness = BOX if "timed" in self.style.split() else BAR[0]
+        return (thickness, BAR[1]) if self.upright else (BAR[1], thickness)
+
+
+@dataclass(frozen=True, slots=True)
+class Caption:
+    """What a drawing says of one node of a net: its label, its tooltip, and CSS classes."""
+
+    lines: tuple[str, ...]
+    hint: str
+    style: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,8 +294,13 @@ def _elsewhere(sheet: Sheet) -> dict[str, str]:
     return shown
 
 
-def scene_of_net(net: Net, marking: Marking | None, title: str | None) -> Scene:
-    """Return the scene of a net."""
+def scene_of_net(
+    net: Net,
+    marking: Marking | None,
+    title: str | None,
+    captions: Mapping[str, Caption] | None = None,
+) -> Scene:
+    """Return the scene of a net; captions replace the names of some nodes."""
     arcs: list[Arc] = []
     for t, name in enumerate(net.transitions):
         arcs += [Arc(net.places[p], name, w) for p, w in net.consume[t]]
@@ -297,16 +314,20 @@ def scene_of_net(net: Net, marking: Marking | None, title: str | None) -> Scene:
         [p for p, n in zip(net.places, tokens, strict=True) if n],
     )
     at = layout.at
-    nodes = {
-        p: DrawnNode(p, True, at[p], "place resource", (p,), f"place {p}", n)
-        for p, n in zip(net.places, tokens, strict=True)
-    }
-    nodes |= {
-        t: DrawnNode(
-            t, False, at[t], "transition", (t,), f"transition {t}", upright=_upright(t, at, arcs)
+    captions = captions or {}
+    nodes: dict[str, DrawnNode] = {}
+    for name, n in zip(net.places, tokens, strict=True):
+        said = captions.get(name, Caption((name,), f"place {name}", "resource"))
+        nodes[name] = DrawnNode(
+            name, True, at[name], f"place {said.style}", said.lines, said.hint, n
         )
-        for t in net.transitions
-    }
+    for name in net.transitions:
+        said = captions.get(name, Caption((name,), f"transition {name}"))
+        style = f"transition {said.style}".rstrip()
+        upright = _upright(name, at, arcs)
+        nodes[name] = DrawnNode(
+            name, False, at[name], style, said.lines, said.hint, upright=upright
+        )
     return Scene(title or "Petri net", net.describe(tokens), nodes, tuple(arcs), layout.through)
 
 
@@ -359,6 +380,7 @@ def _place_node(sheet: Sheet, p: Place, at: Point) -> DrawnNode:
         Kind.ACTION: f"action place, primitive task {p.task}",
         Kind.RESOURCE: "resource place",
         Kind.CONTROL: "control place: the operator may change its tokens",
+        Kind.PLAIN: "place",
         Kind.MACRO: f"macro place, subnet {p.subnet}"
         if p.subnet
         else f"macro place of {listed(inside - {p.name})}",
@@ -366,12 +388,25 @@ def _place_node(sheet: Sheet, p: Place, at: Point) -> DrawnNode:
     lines = [p.label or p.name]
     if p.kind is Kind.ACTION and p.task != p.name:
         lines.append(f"({p.task})")
+    if short := _in_short(p):
+        lines.append(short)
     capacity = f", at most {p.capacity}" if p.capacity is not None else ""
     hint = f"{p.name}: {what}{capacity}"
     style = f"place {p.kind}" + (" error" if p.name in task.error_elements else "")
     return DrawnNode(
         p.name, True, at, style, tuple(lines), hint, sheet.tokens.get(p.name, 0), hidden
     )
+
+
+def _in_short(p: Place) -> str:
+    """What the place says in short and the drawing therefore does not show as net elements."""
+    parts = (
+        f"{p.tries} tries" if p.tries > 1 else "",
+        f"{p.timeout:g} s" if p.timeout is not None else "",
+        f"holds {listed(p.holds)}" if p.holds else "",
+        "listens" if p.listen else "",
+    )
+    return ", ".join(filter(None, parts))
 
 
 def _transition_node(

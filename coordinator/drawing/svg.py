@@ -38,6 +38,7 @@ text{font:12.5px system-ui,-apple-system,"Segoe UI","DejaVu Sans",sans-serif;fil
 .place.error{stroke:#c0262d}
 .transition{fill:#1c2430}
 .transition.error{fill:#c0262d}
+.transition.timed{fill:#ffffff;stroke:#1c2430;stroke-width:1.6}
 .outside{fill-opacity:.35}
 .token{fill:#1c2430}
 .count{font-weight:600}
@@ -71,6 +72,7 @@ text{fill:#e6eaf0}
 .place.error{stroke:#ff7b81}
 .transition,.token{fill:#e6eaf0}
 .transition.error,.head.error{fill:#ff7b81}
+.transition.timed{fill:#12161d;stroke:#e6eaf0}
 .arc{stroke:#aab4c3}
 .arc.preempt{stroke:#e5b04f}
 .arc.error{stroke:#ff7b81}

@@ -1,17 +1,18 @@
-"""A task compiled for execution: the transitions by index, and which of them must be looked at again
-when a token, a variable or an event changes."""
+"""A task compiled for execution: the transitions by index, and which of them must be looked at
+again when a token, a variable or an event changes."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
-from petrobot.coordinator.task import Early, Kind, PrimitiveTask, Task
+from petrobot.coordinator.task import EarlyEvent, Kind, Place, PrimitiveTask, Task
 from petrobot.coordinator.task.compiled_task import CompiledTransition, compile_transitions
+from petrobot.coordinator.task.conditions import Domain
 from petrobot.coordinator.task.instant_firings import endless
 from petrobot.coordinator.task.net import Net
-from petrobot.coordinator.task.validation import faults
+from petrobot.coordinator.task.validation import condition_domains, faults
 
 FIRINGS_OF_A_FINITE_NET: Final = 1_000_000
 """Firings without a stimulus of a net that must come to an end by itself: no laboratory has so many
@@ -29,7 +30,14 @@ class Compiled:
     """In net order."""
     action_places: Mapping[str, int]
     primitives: Mapping[str, PrimitiveTask]
-    """By action place."""
+    """By action place; with the deadline that its `timeout` leaves."""
+    executed: frozenset[str]
+    """Action places of which a condition reads whether the run was executed."""
+    copies: Mapping[str, tuple[int, ...]]
+    """By written transition: those that were made from it (`expansion`)."""
+    setting: Mapping[str, tuple[int, ...]]
+    """By variable: transitions that write it. Arguments that read one are taken when the token
+    enters."""
     touching: tuple[tuple[int, ...], ...]
     """By place: transitions that its tokens, runs or room can enable or disable."""
     timed: tuple[tuple[int, ...], ...]
@@ -42,6 +50,10 @@ class Compiled:
     """Latched events that are kept when nothing waits for them."""
     devices: Mapping[str, str]
     """By action: the device that it uses."""
+    domains: Mapping[str, Domain]
+    """What the names in conditions can be."""
+    free: frozenset[str]
+    """Variables that no place or transition writes: only the global memory changes them."""
     firing_limit: int
     """Firings without a stimulus after which the engine gives up (docs/semantics.md, section 6)."""
 
@@ -67,18 +79,42 @@ def compile_task(task: Task, devices: Mapping[str, str]) -> Compiled:
             p.name: net.place_index[p.name] for p in flat.places.values() if p.kind is Kind.ACTION
         },
         primitives={
-            p.name: flat.primitive_tasks[p.task]
-            for p in flat.places.values()
-            if p.kind is Kind.ACTION
+            p.name: _primitive_of(flat, p) for p in flat.places.values() if p.kind is Kind.ACTION
         },
+        executed=frozenset(
+            p for p in flat.places if any(f"{p}.executed" in _names(t) for t in transitions)
+        ),
+        copies=_index(
+            (net.transition_index[t.name], [t.expanded_from])
+            for t in flat.transitions.values()
+            if t.expanded_from in flat.transitions
+        ),
+        setting=_index(
+            (net.transition_index[t.name], dict(t.sets)) for t in flat.transitions.values()
+        ),
         touching=touching,
         timed=tuple(tuple(t for t in ts if transitions[t].after is not None) for ts in touching),
         reading=_index((x.index, sorted(x.when.names)) for x in transitions if x.when is not None),
         waiting=_index((net.transition_index[t.name], t.events) for t in flat.transitions.values()),
-        kept=frozenset(e.name for e in flat.events.values() if e.early is Early.KEEP),
+        kept=frozenset(e.name for e in flat.events.values() if e.early is EarlyEvent.KEEP),
         devices=dict(devices),
+        domains=condition_domains(flat),
+        free=frozenset(flat.variables)
+        - {v for p in flat.places.values() for v in p.out.values()}
+        - {name for t in flat.transitions.values() for name, _ in t.sets},
         firing_limit=_firing_limit(flat, net),
     )
+
+
+def _primitive_of(flat: Task, place: Place) -> PrimitiveTask:
+    primitive = flat.primitive_tasks[place.task]
+    if place.timeout is None:
+        return primitive
+    return replace(primitive, deadline=min(primitive.deadline, place.timeout))
+
+
+def _names(t: CompiledTransition) -> frozenset[str]:
+    return t.when.names if t.when is not None else frozenset()
 
 
 def _firing_limit(flat: Task, net: Net) -> int:

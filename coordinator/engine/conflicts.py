@@ -22,19 +22,25 @@ class Draw:
 
 
 def choose_step(
-    draft: Draft, pulse: str, choices: Sequence[str], only: Sequence[str] | None
+    draft: Draft,
+    pulse: str,
+    choices: Sequence[str],
+    only: Sequence[str] | None,
+    *,
+    ask: bool = False,
 ) -> list[Match] | Draw:
     """The transitions that fire together on the marking as it is, in an order in which each can
     fire after the others.
 
-    `choices` are the outcomes of earlier draws for this same step. Looks at the dirty transitions
-    and forgets them.
+    `choices` are the outcomes of earlier draws for this same step. With `ask` a conflict that is
+    else left to the order in the file is drawn too, with the weight 0 for its transitions. Looks at
+    the dirty transitions and forgets them.
     """
     fireable = [found for x in _marked(draft, pulse, only) if (found := match(draft, x, pulse))]
     draft.dirty.clear()
     if len(fireable) < 2:
         return fireable
-    return _settle(draft, pulse, sorted(fireable, key=_rank_and_place), list(choices))
+    return _settle(draft, pulse, sorted(fireable, key=_rank_and_place), list(choices), ask)
 
 
 def _marked(draft: Draft, pulse: str, only: Sequence[str] | None) -> Iterator[CompiledTransition]:
@@ -52,7 +58,9 @@ def _marked(draft: Draft, pulse: str, only: Sequence[str] | None) -> Iterator[Co
             yield x
 
 
-def _settle(draft: Draft, pulse: str, rest: list[Match], choices: list[str]) -> list[Match] | Draw:
+def _settle(
+    draft: Draft, pulse: str, rest: list[Match], choices: list[str], ask: bool
+) -> list[Match] | Draw:
     claims, step = Claims(), list[Match]()
     while rest:
         rest = [m for old in rest if (m := match(draft, old.transition, pulse, claims))]
@@ -62,11 +70,12 @@ def _settle(draft: Draft, pulse: str, rest: list[Match], choices: list[str]) -> 
         rivals = [m for m in _rivals(draft, pulse, head, rest, claims) if _rank(m) == _rank(head)]
         if rivals:
             contest = sorted([head, *rivals], key=_rank_and_place)
-            if all(m.transition.weight is not None for m in contest):
+            weighed = all(m.transition.weight is not None for m in contest)
+            if weighed or ask:
                 if not choices:
                     return Draw(
                         tuple(m.transition.name for m in contest),
-                        tuple(m.transition.weight or 0.0 for m in contest),
+                        tuple(m.transition.weight or 0.0 if weighed else 0.0 for m in contest),
                     )
                 drawn = choices.pop(0)
                 head = next((m for m in contest if m.transition.name == drawn), head)

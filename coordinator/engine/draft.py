@@ -46,6 +46,7 @@ class Draft:
         self.early = state.early
         self.told: set[str] = set(state.told)
         self.ending = state.ending
+        self.closing = state.closing
 
     def freeze(self) -> State:
         """The next state."""
@@ -73,6 +74,7 @@ class Draft:
             early=self.early,
             told=frozenset(self.told),
             ending=self.ending,
+            closing=self.closing,
         )
 
     def emit(self, instruction: Instruction) -> None:

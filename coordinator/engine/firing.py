@@ -12,7 +12,11 @@ from petrobot.coordinator.engine.state import ACTIVE, LIVE, Phase, Run
 from petrobot.coordinator.task import Counts, End, Status, Value
 from petrobot.coordinator.task.compiled_task import ActionArc, CompiledTransition
 from petrobot.coordinator.task.conditions import ConditionFault
+from petrobot.coordinator.task.conditions.regions import can_hold
 from petrobot.coordinator.task.wording import Severity
+
+DEAD_END = "dead_end"
+"""Key of the report that nothing can happen any more although the net is not at an end."""
 
 
 class Match(NamedTuple):
@@ -25,7 +29,7 @@ class Match(NamedTuple):
 class Claims:
     """What the transitions chosen so far for one step have taken and given."""
 
-    __slots__ = ("change", "flags", "raised", "runs", "used")
+    __slots__ = ("change", "flags", "raised", "runs", "sets", "used")
 
     def __init__(self) -> None:
         self.used: dict[int, int] = {}
@@ -33,12 +37,14 @@ class Claims:
         self.flags: set[str] = set()
         self.raised: set[tuple[str, str]] = set()
         self.change: dict[int, int] = {}
+        self.sets: set[str] = set()
 
     def copy(self) -> Claims:
         """An independent copy."""
         other = Claims()
         other.used, other.change = dict(self.used), dict(self.change)
         other.runs, other.flags, other.raised = set(self.runs), set(self.flags), set(self.raised)
+        other.sets = set(self.sets)
         return other
 
     def add(self, match: Match) -> None:
@@ -55,6 +61,7 @@ class Claims:
         for p, w, _ in x.produce:
             self.change[p] = self.change.get(p, 0) + w
         self.flags.update(x.flags)
+        self.sets.update(name for name, _ in x.sets)
 
 
 _NOTHING = Claims()
@@ -70,6 +77,8 @@ def match(
     for f in x.flags:
         if f not in draft.flags or f in claims.flags:
             return None
+    if claims.sets and any(name in claims.sets for name, _ in x.sets):
+        return None
     if x.after is not None and not ((timer := draft.timers.get(x.name)) and timer.elapsed):
         return None
     eligible: list[list[Run]] = []
@@ -101,6 +110,87 @@ def token_enabled(draft: Draft, x: CompiledTransition) -> bool:
     """Whether tokens, inhibitors and room enable the transition in the ordinary sense, whatever its
     runs do."""
     return _marking_allows(draft, x, _NOTHING)
+
+
+def can_still_fire(draft: Draft, x: CompiledTransition) -> bool:
+    """Return whether the transition can fire although no run is active and no timer runs: now, or
+    when an external event comes or the global memory changes a variable."""
+    if x.never or not _marking_allows(draft, x, _NOTHING):
+        return False
+    eligible = [eligible_runs(draft, arc, _NOTHING) for arc in x.actions]
+    if any(len(runs) < arc.weight for arc, runs in zip(x.actions, eligible, strict=True)):
+        return False
+    return any(_condition_can_hold(draft, x, runs) for runs in _selections(x, eligible))
+
+
+def waiting_for(draft: Draft) -> str:
+    """Return in words what keeps each transition that could take an ended run, or with no such run
+    any that has some of its tokens, from firing."""
+    ended = {r.place for runs in draft.tokens.values() for r in runs if r.phase is Phase.DONE}
+    near = [x for x in draft.compiled.transitions if ended & {a.name for a in x.actions}]
+    if not ended:
+        marked = {p for p, n in enumerate(draft.marking) if n}
+        near = [x for x in draft.compiled.transitions if marked & {p for p, _ in x.needs}]
+    found = [
+        f"{x.name} {' and '.join(o.text for o in lacks)}"
+        for x in near
+        if (lacks := obstacles(draft, x))
+    ]
+    return "; ".join(found) or "no transition takes any of its tokens"
+
+
+class Obstacle(NamedTuple):
+    """What keeps a transition from firing, events and time aside. `place` is the place that holds
+    too few tokens or too many, or no run that the arc may take."""
+
+    place: int | None
+    kind: str
+    """`short`, `full`, `run` (no run there that ended so), `condition` or `event`."""
+    text: str
+    """What the transition does not have, to be read after its name."""
+
+
+def obstacles(draft: Draft, x: CompiledTransition) -> list[Obstacle]:
+    """Return what keeps the transition from firing, whatever external event comes; empty if nothing
+    does."""
+    places, found = draft.compiled.net.places, list[Obstacle]()
+    if x.never:
+        return [Obstacle(None, "event", "waits for an event that none of its inputs can raise")]
+    acted = {arc.place: arc for arc in x.actions}
+    for p, w in x.needs:
+        if p in acted:
+            continue
+        if draft.marking[p] < w:
+            found.append(Obstacle(p, "short", f"needs {_tokens(places[p], w, draft.marking[p])}"))
+    for arc in x.actions:
+        runs = eligible_runs(draft, arc, _NOTHING, heard=False)
+        if len(runs) < arc.weight:
+            found.append(Obstacle(arc.place, "run", f"needs a run of {arc.name} {_ENDED[arc.end]}"))
+        elif len(eligible_runs(draft, arc, _NOTHING)) < arc.weight:
+            text = f"waits for {', '.join(arc.raised)}, which no run of {arc.name} has raised"
+            found.append(Obstacle(arc.place, "event", text))
+    for p, k in x.bars:
+        if draft.occupied(p) >= k:
+            found.append(
+                Obstacle(p, "full", f"is barred by {places[p]}, which holds {draft.occupied(p)}")
+            )
+    if not found and not can_still_fire(draft, x):
+        found.append(Obstacle(None, "condition", f"has a false condition ({x.when})"))
+    return found
+
+
+_ENDED = {
+    End.NORMAL: "that ended in success or failure",
+    End.ERROR: "that ended in error",
+    End.PREEMPT: "that is active",
+    End.GOING: "that is active",
+}
+
+
+def _tokens(place: str, wanted: int, held: int) -> str:
+    if wanted == 1:
+        return f"{place}, which is empty"
+    return f"{wanted} of {place}, which holds {held}"
 
 
 def eligible_runs(draft: Draft, arc: ActionArc, claims: Claims, heard: bool = True) -> list[Run]:
@@ -136,6 +226,7 @@ def fire(draft: Draft, fireable: Match, cause: str) -> None:
     draft.firings += 1
     draft.timeless += 1
     draft.told.discard(x.name)
+    draft.told.discard(DEAD_END)
     draft.instructions.insert(
         at, Fired(draft.firings, x.name, before, draft.snapshot(), cause, taken)
     )
@@ -251,7 +342,24 @@ def _condition_holds(
         return False
 
 
+def _condition_can_hold(
+    draft: Draft, x: CompiledTransition, runs: tuple[tuple[Run, ...], ...]
+) -> bool:
+    if x.when is None:
+        return True
+    values = dict(draft.variables)
+    for run in (r for rs in runs for r in rs if r.phase is Phase.DONE):
+        values |= verdict_variables(run)
+    return can_hold(x.when, values, draft.compiled.free, draft.compiled.domains)
+
+
 def verdict_variables(run: Run) -> dict[str, Value]:
     """The variables that tell how a run of its place ended."""
     status = None if run.status is None else run.status.value
-    return {f"{run.place}.status": status, f"{run.place}.reason": run.cause}
+    verdict: dict[str, Value] = {
+        f"{run.place}.status": status,
+        f"{run.place}.reason": run.cause,
+    }
+    if run.executed is not None:
+        verdict[f"{run.place}.executed"] = run.executed.value
+    return verdict

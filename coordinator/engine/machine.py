@@ -51,10 +51,11 @@ from petrobot.coordinator.engine.stimuli import (
     Verdict,
 )
 from petrobot.coordinator.engine.timers import elapse, hold_timers_of
-from petrobot.coordinator.task import Counts, Memory, Scope, Task, VariableType
+from petrobot.coordinator.task import Counts, EventMemory, Scope, Task, VariableType
 from petrobot.coordinator.task.wording import Severity
 
-# Where a mission run sets out that does not begin at the initial marking: tokens, runs that are over, variables, latches.
+# Where a mission run sets out that does not begin at the initial marking: tokens, runs that are
+# over, variables, latches.
 
 
 def set_out(draft: Draft, point: Point) -> None:
@@ -107,7 +108,11 @@ def _stand(draft: Draft, standing: Standing) -> None:
 
 def _is_latched(draft: Draft, name: str) -> bool:
     event = draft.compiled.task.events.get(name)
-    return event is not None and event.scope is Scope.EXTERNAL and event.memory is not Memory.PULSE
+    return (
+        event is not None
+        and event.scope is Scope.EXTERNAL
+        and event.memory is not EventMemory.PULSE
+    )
 
 
 _AFTER_THE_END = (RunEnded, StopConfirmed, StopFailed, Verdict)
@@ -316,7 +321,7 @@ class Engine:
             _warn(
                 draft, "unknown_event", f"{name!r} is no external event of the task; ignored", name
             )
-        elif event.memory is Memory.PULSE:
+        elif event.memory is EventMemory.PULSE:
             draft.dirty.update(self.compiled.waiting.get(name, ()))
             settle(draft, self.policy, cause, pulse=name)
         elif name in self.compiled.kept or awaited(draft, name):

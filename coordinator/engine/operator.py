@@ -124,18 +124,26 @@ def force_exit(draft: Draft, policy: Policy, command: ForceExit) -> None:
     if draft.mode not in (*MOVING, Mode.PAUSED):
         refuse(draft, f"{x.name} cannot be forced now: the mission run is {draft.mode}", x.name)
         return
+    for t in (index, *draft.compiled.copies.get(x.name, ())):
+        found = _forced(draft, t)
+        if found is not None:
+            _fire_forced(draft, found)
+            settle(draft, policy, "stability")
+            return
+    why = (
+        "it leaves no action place"
+        if not x.actions
+        else "a token that it needs is missing, or a place is full"
+    )
+    refuse(draft, f"{x.name} cannot be forced: {why}", x.name)
+
+
+def _forced(draft: Draft, index: int) -> Match | None:
+    """The runs that the transition would take by force; None if tokens do not allow it."""
+    x = draft.compiled.transitions[index]
     runs = tuple(tuple(_forced_runs(draft, a.name, a.end)[: a.weight]) for a in x.actions)
     enough = all(len(taken) == a.weight for taken, a in zip(runs, x.actions, strict=True))
-    if not x.actions or not enough or not _others_allow(draft, index):
-        why = (
-            "it leaves no action place"
-            if not x.actions
-            else "a token that it needs is missing, or a place is full"
-        )
-        refuse(draft, f"{x.name} cannot be forced: {why}", x.name)
-        return
-    _fire_forced(draft, Match(x, runs))
-    settle(draft, policy, "stability")
+    return Match(x, runs) if x.actions and enough and _others_allow(draft, index) else None
 
 
 def refuse(draft: Draft, text: str, of: str) -> None:
@@ -150,7 +158,7 @@ def _control_place(draft: Draft, name: str, tokens: int) -> int | None:
         refuse(draft, f"{name!r} is no control place{nearest(name, controls)}", name)
     elif tokens < 1:
         refuse(draft, f"{tokens} tokens are none", name)
-    elif draft.mode in (Mode.FRESH, Mode.ABORTING, Mode.FINISHED):
+    elif draft.mode in (Mode.FRESH, Mode.ABORTING, Mode.CLOSING, Mode.FINISHED):
         refuse(draft, f"no tokens move: the mission run is {draft.mode}", name)
     else:
         return draft.compiled.net.place_index[name]

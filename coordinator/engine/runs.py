@@ -61,6 +61,7 @@ def end_run(draft: Draft, run: Run, end: RunEnded) -> None:
         phase=Phase.DONE,
         status=end.status,
         cause=end.cause,
+        executed=end.executed if run.place in draft.compiled.executed else None,
         ended=draft.end_order,
         arguments={},
         raised=run.raised,
@@ -217,7 +218,7 @@ def _start(draft: Draft, run: Run) -> bool:
     if holders:
         return False
     arguments = {
-        name: _argument(draft, value)
+        name: run.arguments[name] if name in run.arguments else _argument(draft, value)
         for name, value in draft.compiled.task.places[run.place].args.items()
     }
     draft.put(run, phase=Phase.STARTING, arguments=arguments)
@@ -234,6 +235,21 @@ def _holders(draft: Draft, run: Run) -> list[Run]:
     return [
         r for r in (*going, *draft.stopping.values()) if r.device == run.device and r.id != run.id
     ]
+
+
+def take_arguments(draft: Draft, since: int) -> None:
+    """Read the arguments that transitions set for the runs whose tokens entered after run number
+    `since`: each token keeps the values with which it came."""
+    for place, runs in draft.tokens.items():
+        for run in runs:
+            if run.order > since:
+                taken = {
+                    name: _argument(draft, value)
+                    for name, value in draft.compiled.task.places[place].args.items()
+                    if isinstance(value, Reference) and value.variable in draft.compiled.setting
+                }
+                if taken:
+                    draft.put(run, arguments=taken)
 
 
 def _argument(draft: Draft, value: Value) -> Value:

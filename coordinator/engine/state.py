@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from petrobot.coordinator.engine.stimuli import Stimulus
-from petrobot.coordinator.task import Counts, Status, Value
+from petrobot.coordinator.task import Counts, Executed, Status, Value
 from petrobot.coordinator.task.net import Marking
 
 
@@ -24,6 +24,8 @@ class Mode(StrEnum):
     """Runs until one transition has fired."""
     ABORTING = "aborting"
     """Waits until every cancelled run has stopped."""
+    CLOSING = "closing"
+    """`final` or `final_error` holds: waits until the runs that only listened have stopped."""
     FINISHED = "finished"
 
 
@@ -70,6 +72,8 @@ class Run:
     at_once: bool = False
     status: Status | None = None
     cause: str = ""
+    executed: Executed | None = None
+    """Whether it touched the world; kept only where a condition reads it."""
     ended: int = 0
     """Counts up over all ends: first done, first taken."""
     raised: frozenset[str] = frozenset()
@@ -178,6 +182,8 @@ class State:
     """Elements of standing reports that were made already."""
     ending: str = ""
     """Why the mission run was aborted or has finished."""
+    closing: Status | None = None
+    """How the mission run ends once the runs that only listened have stopped."""
 
     def runs(self) -> Iterator[Run]:
         """All runs with a token, by place."""

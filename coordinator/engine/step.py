@@ -3,19 +3,23 @@ of the mission run."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from petrobot.coordinator.engine.compiled import Compiled
 from petrobot.coordinator.engine.conflicts import Draw, choose_step
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import (
+    DEAD_END,
     Match,
+    can_still_fire,
     cancel,
     fire,
     forget_flags,
     token_enabled,
     verdict_variables,
+    waiting_for,
 )
 from petrobot.coordinator.engine.instructions import (
     Choose,
@@ -26,7 +30,7 @@ from petrobot.coordinator.engine.instructions import (
     Resumed,
     Subject,
 )
-from petrobot.coordinator.engine.runs import admit
+from petrobot.coordinator.engine.runs import admit, take_arguments
 from petrobot.coordinator.engine.state import ACTIVE, UNSTARTED, Mode, Phase, Run, Suspended
 from petrobot.coordinator.engine.timers import (
     disarm_all,
@@ -34,7 +38,7 @@ from petrobot.coordinator.engine.timers import (
     refresh_timers,
     release_timers,
 )
-from petrobot.coordinator.task import Counts, End, Status
+from petrobot.coordinator.task import Counts, End, Status, Value
 from petrobot.coordinator.task.conditions import ConditionFault
 from petrobot.coordinator.task.wording import Severity
 
@@ -51,11 +55,19 @@ class Policy:
     end_when_dead: bool = True
     """End in ERROR when nothing can ever happen again; else only report it and leave it to the
     operator."""
+    report_dead_ends: bool = True
+    """Report every state from which neither a firing nor an end can be reached; journals with
+    `semantics` 2 in their header were recorded without that."""
+    ask_undecided: bool = False
+    """Ask with `Choose` for each conflict that is else left to the order in the file. The analysis
+    does so to learn whether a verdict depends on it."""
 
 
-RECORDED: Final = Policy(firing_limit=1000)
-"""How the engine treated the runs in journals whose header does not say that they end in ERROR
-instead."""
+RECORDED: Final[Mapping[int, Policy]] = {
+    1: Policy(firing_limit=1000, report_dead_ends=False),
+    2: Policy(report_dead_ends=False),
+}
+"""How the engine treated the runs of older journals, by the `semantics` of their header."""
 
 
 def settle(
@@ -129,7 +141,9 @@ def abort(draft: Draft, reason: str) -> None:
 
 def _fire_until_stable(draft: Draft, policy: Policy, current: Suspended) -> None:
     while True:
-        step = choose_step(draft, current.pulse, current.choices, current.only)
+        step = choose_step(
+            draft, current.pulse, current.choices, current.only, ask=policy.ask_undecided
+        )
         if isinstance(step, Draw):
             _ask(draft, current, step)
             return
@@ -137,14 +151,31 @@ def _fire_until_stable(draft: Draft, policy: Policy, current: Suspended) -> None
             return
         limit = 1 if draft.mode is Mode.STEPPING else len(step)
         entered = draft.run_order, draft.snapshot()
+        written = [_new_values(draft, fireable) for fireable in step[:limit]]
         for fireable in step[:limit]:
             fire(draft, fireable, current.cause)
+        if draft.compiled.setting:
+            _set_variables(draft, dict(pair for pairs in written for pair in pairs))
+            take_arguments(draft, entered[0])
         if draft.mode is Mode.STEPPING:
             _end_single_step(draft, current, step)
         elif not _stops_after(draft, policy, entered[1], step):
             current = Suspended("", "stability")
             continue
         return
+
+
+def _new_values(draft: Draft, fireable: Match) -> list[tuple[str, Value]]:
+    """What the firing writes, read before any transition of its step fires."""
+    return [(name, e.value(draft.variables)) for name, e in fireable.transition.sets]
+
+
+def _set_variables(draft: Draft, values: Mapping[str, Value]) -> None:
+    """Write what the firings of a step set. A transition that writes the same variable had to wait
+    for the next step."""
+    for name, value in values.items():
+        draft.write(name, value)
+        draft.dirty.update(draft.compiled.setting[name])
 
 
 def _ask(draft: Draft, current: Suspended, draw: Draw) -> None:
@@ -249,40 +280,71 @@ def _nowhere_to_go(draft: Draft, run: Run) -> bool:
 
 
 class _Tokens(Mapping[str, int]):
-    """The marking by place name, as `final` reads it."""
+    """A marking by place name, as `final` reads it."""
 
-    def __init__(self, draft: Draft) -> None:
-        self.draft = draft
+    def __init__(self, compiled: Compiled, marking: Sequence[int]) -> None:
+        self.index, self.marking = compiled.net.place_index, marking
 
     def __getitem__(self, name: str) -> int:
-        return self.draft.marking[self.draft.compiled.net.place_index[name]]
+        return self.marking[self.index[name]]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.draft.compiled.net.places)
+        return iter(self.index)
 
     def __len__(self) -> int:
-        return len(self.draft.marking)
+        return len(self.marking)
+
+
+def at_end(compiled: Compiled, marking: Sequence[int]) -> Status | None:
+    """Return how a mission run that rests in the marking ends: SUCCESS by `final`, ERROR by
+    `final_error`, None if it is at no end."""
+    task, tokens = compiled.task, _Tokens(compiled, marking)
+    if task.final.holds(tokens):
+        return Status.SUCCESS
+    if task.final_error is not None and task.final_error.holds(tokens):
+        return Status.ERROR
+    return None
 
 
 def _end_if_over(draft: Draft, policy: Policy) -> None:
-    if draft.suspended is not None or any(
-        r.phase is not Phase.STUCK for r in draft.stopping.values()
-    ):
+    if draft.suspended is not None or _stops_to_come(draft):
         return
     if draft.mode is Mode.ABORTING:
         _finish(draft, Status.ERROR, draft.ending)
-    elif draft.mode in MOVING and not draft.live():
-        task, tokens = draft.compiled.task, _Tokens(draft)
-        if task.final.holds(tokens):
-            _finish(draft, Status.SUCCESS, f"final marking reached: {task.final}")
-        elif task.final_error is not None and task.final_error.holds(tokens):
-            _finish(draft, Status.ERROR, f"given up: {task.final_error}")
-        else:
+    elif draft.mode is Mode.CLOSING:
+        _finish(draft, draft.closing or Status.ERROR, draft.ending)
+    elif draft.mode in MOVING:
+        task, live = draft.compiled.task, draft.live()
+        if any(not task.places[r.place].listen for r in live):
+            return
+        end = at_end(draft.compiled, draft.marking)
+        if end is Status.SUCCESS:
+            _close(draft, live, end, f"final marking reached: {task.final}")
+        elif end is Status.ERROR:
+            _close(draft, live, end, f"given up: {task.final_error}")
+        elif not live:
             _end_if_dead(draft, policy)
+
+
+def _stops_to_come(draft: Draft) -> bool:
+    return any(r.phase is not Phase.STUCK for r in draft.stopping.values())
+
+
+def _close(draft: Draft, listening: list[Run], status: Status, reason: str) -> None:
+    """End the mission run once the runs that only listen have stopped."""
+    for run in listening:
+        cancel(draft, run, Counts.NONE, "the mission run is finished")
+    if _stops_to_come(draft):
+        draft.mode, draft.closing, draft.ending = Mode.CLOSING, status, reason
+        disarm_all(draft)
+    else:
+        _finish(draft, status, reason)
 
 
 def _end_if_dead(draft: Draft, policy: Policy) -> None:
     if draft.timers or any(token_enabled(draft, x) for x in draft.compiled.transitions):
+        if policy.report_dead_ends:
+            _report_dead_end(draft)
         return
     text = (
         "no transition can ever fire again in "
@@ -291,6 +353,19 @@ def _end_if_dead(draft: Draft, policy: Policy) -> None:
     draft.report_once(Severity.ERROR, "dead", text, "dead")
     if policy.end_when_dead:
         _finish(draft, Status.ERROR, text)
+
+
+def _report_dead_end(draft: Draft) -> None:
+    """Report a state in which no run is active and no external event can make anything fire."""
+    if any(not timer.elapsed for timer in draft.timers.values()):
+        return
+    if any(can_still_fire(draft, x) for x in draft.compiled.transitions):
+        return
+    text = (
+        f"nothing can happen any more in {draft.compiled.net.describe(draft.snapshot())}, which "
+        f"is not final: {waiting_for(draft)}"
+    )
+    draft.report_once(Severity.ERROR, DEAD_END, text, DEAD_END)
 
 
 def _finish(draft: Draft, status: Status, reason: str) -> None:

@@ -57,6 +57,8 @@ class Batch:
     """Number of runs that never began."""
     rho: float | None = None
     """Declared weight of the cost; None: 1 / max C of the row."""
+    declared: Array | None = None
+    """Declared costs, shape (n,), used where none was measured; nan or None: none is declared."""
     own: dict[str, Array] = field(default_factory=dict)
     """Further arrays that a rule needs, by name; their first axis is the row."""
 
@@ -106,8 +108,11 @@ class Batch:
         return np.where(started > 0, self.runs / np.maximum(started, 1e-300), 1.0)
 
     def mean_cost(self) -> Array:
-        """C of each action; 0 where nothing is known."""
-        return self.cost / np.maximum(self.costed, 1e-300)
+        """C of each action: measured, else declared; 0 where nothing is known."""
+        measured: Array = self.cost / np.maximum(self.costed, 1e-300)
+        if self.declared is None:
+            return measured
+        return np.where(self.costed > 0, measured, np.nan_to_num(self.declared))
 
     def weight(self) -> Array:
         """Return rho of each row, shape (rows, 1); 0 where no cost above 0 is known."""

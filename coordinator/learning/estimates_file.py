@@ -30,6 +30,7 @@ from petrobot.coordinator.learning.estimate import (
 )
 from petrobot.coordinator.learning.estimates_tables import (
     APPLICATION,
+    CAMPAIGN,
     CHOICE,
     COUNTED,
     SCHEMA,
@@ -59,10 +60,13 @@ from petrobot.coordinator.learning.estimates_tables import (
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.records import Correction
+from petrobot.services.comm.location_file import FIRST_PHYSICS, same_physics
 from petrobot.services.host.whole_file import make_folder
 
 BUSY = 20.0
 """Seconds that a command waits while another one writes the file."""
+PHYSICS = "physics"
+"""Row of the table `about`."""
 MACHINE_ID = Path("/etc/machine-id")
 """Distinguishes machines (machine-id(5)). Without it, only the inode of the file tells copies
 apart."""
@@ -80,8 +84,14 @@ class FileContents:
     origin: str = ""
     generation: int = 0
     """Number of mission runs learned from so far."""
+    physics: str = ""
+    """Name and version of the physics of the simulated laboratory in which all of it was learned;
+    empty: not said."""
     estimates: Estimates = field(default_factory=Estimates)
     selectors: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
+    kinds: dict[tuple[str, str], dict[str, int]] = field(default_factory=dict)
+    """By (primitive task, action): in which kind of runs it was measured, and how often. Campaigns
+    run in simulated laboratories; a file does not record where a mission ran."""
     asked: dict[str, tuple[Question, ...]] = field(default_factory=dict)
     """By primitive task: the questions (cost measure, target, rho) by which its actions were judged
     when they ran. Several if origins differ; the first one is this file's own, otherwise the one of
@@ -122,10 +132,14 @@ class EstimatesFile:
         if is_empty(db):  # created, but killed before anything was written
             return FileContents()
         about = dict(db.execute("SELECT name, value FROM about"))
-        kept = FileContents(about["origin"], int(about["generation"]))
+        kept = FileContents(about["origin"], int(about["generation"]), about.get(PHYSICS, ""))
         for row in db.execute("SELECT * FROM tally"):
             key = TallyKey(*row[1:4])
-            kept.estimates.tallies[key] = merge_tallies(kept.estimates.tally(key), tally_of(row))
+            tally = tally_of(row)
+            kept.estimates.tallies[key] = merge_tallies(kept.estimates.tally(key), tally)
+            kinds = kept.kinds.setdefault((key.primitive_task, key.action), {})
+            kind = "simulated campaigns" if row[0].startswith(CAMPAIGN) else "missions"
+            kinds[kind] = kinds.get(kind, 0) + tally.runs + tally.censored
         for row in db.execute("SELECT * FROM flow"):
             where = FiringsKey(*row[1:4])
             kept.estimates.flows[where] = merge_firings(
@@ -140,6 +154,11 @@ class EstimatesFile:
             question = question_of(asked)
             kept.asked[task] = known if question in known else (*known, question)
         return kept
+
+    def refuse_other_physics(self, kept: FileContents, physics: str) -> None:
+        """Raise EstimatesError if the file's contents were learned with another physics."""
+        if kept.estimates.tallies or kept.estimates.flows or kept.selectors:
+            _refuse_other_physics(self.path, kept.physics, physics)
 
     def records_of(self, mission: str) -> int:
         """Return how many records of a mission run the file has counted already."""
@@ -161,6 +180,7 @@ class EstimatesFile:
         records: int | None = None,
         late: Iterable[Correction] = (),
         asked: Mapping[str, Question] | None = None,
+        physics: str = "",
     ) -> None:
         """Add what a session gained to this file's own origin, and store the states of its
         selectors (primitive task -> state).
@@ -169,9 +189,11 @@ class EstimatesFile:
         none counts twice when it is resumed; None: the run finished, nothing to remember. `late`:
         verdicts on runs that this file counted before; sums that were reset since then, or came
         from a copied file, stay as they are. `asked`: by what actions were judged (primitive task
-        -> question).
+        -> question). `physics`: of the simulated laboratory. Raises EstimatesError, also if the
+        file was learned with another one.
         """
         with self._writing() as db:
+            self._note_physics(db, physics)
             if fact(db, "origin") == fact(db, "closed"):
                 renew_origin(db)
             origin = fact(db, "origin")
@@ -203,14 +225,16 @@ class EstimatesFile:
         estimates: Estimates,
         selectors: Mapping[str, Mapping[str, Any]],
         asked: Mapping[str, Question],
+        physics: str = "",
     ) -> None:
         """Write all that was counted under a closed origin, to which nothing is ever added (a
         campaign's).
 
         Writing it a second time changes nothing. What others have added to the file stays, and what
-        was reset stays forgotten.
+        was reset stays forgotten. `physics`: as for `add`.
         """
         with self._writing() as db:
+            self._note_physics(db, physics)
             db.execute("INSERT OR IGNORE INTO about VALUES ('closed', ?)", (origin,))
             gone = {
                 task
@@ -268,6 +292,7 @@ class EstimatesFile:
             if primitive_task is None:
                 db.execute("INSERT OR IGNORE INTO forgotten SELECT DISTINCT origin, '' FROM flow")
                 db.execute("DELETE FROM flow")
+                db.execute("DELETE FROM about WHERE name = ?", (PHYSICS,))
 
     def merge(self, other: Path) -> None:
         """Merge another file into this one. Raises EstimatesError.
@@ -282,7 +307,7 @@ class EstimatesFile:
         with EstimatesFile(other)._open() as db:
             if is_empty(db):
                 return
-            origin = fact(db, "origin")
+            origin, physics = fact(db, "origin"), fact(db, PHYSICS)
             rows = {
                 name: db.execute(f"SELECT * FROM {name}").fetchall()
                 for name in ("tally", "flow", "selector")
@@ -297,6 +322,8 @@ class EstimatesFile:
                 question_of(asked)
             states = [(task, name, state_of(body)) for task, name, _, body in rows["selector"]]
         with self._writing() as mine:
+            if any(rows.values()):
+                self._note_physics(mine, physics)
             for table in ("tally", "flow", "question"):
                 take_later(mine, table, rows[table])
             for task, name, state in states:
@@ -331,6 +358,14 @@ class EstimatesFile:
             if not existed and self.path.is_file() and not self.path.stat().st_size:
                 self.path.unlink()  # created by this attempt, on a disk that is full
             raise
+
+    def _note_physics(self, db: sqlite3.Connection, physics: str) -> None:
+        """Note the physics of what is added, or refuse it if that of the contents is another."""
+        tables = ("tally", "flow", "selector")
+        if any(db.execute(f"SELECT 1 FROM {name} LIMIT 1").fetchone() for name in tables):
+            _refuse_other_physics(self.path, fact(db, PHYSICS), physics)
+        if physics:
+            db.execute("INSERT OR REPLACE INTO about VALUES (?, ?)", (PHYSICS, physics))
 
     def _make(self, db: sqlite3.Connection) -> None:
         for statement in TABLES.split(";"):
@@ -386,6 +421,17 @@ class EstimatesFile:
                 f"{'upgrade petrobot' if version > SCHEMA else 'start a new file'} or give "
                 "another one"
             )
+
+
+def _refuse_other_physics(path: Path, recorded: str, now: str) -> None:
+    if not same_physics(recorded, now):
+        raise EstimatesError(
+            f"{path}: learned in a laboratory with the physics {recorded or FIRST_PHYSICS!r}, to "
+            f"be used with {now or FIRST_PHYSICS!r}: estimates of different physics are not "
+            "pooled; "
+            "give another file, or write the same `physics` in services.toml ([nodes.NAME] of the "
+            "simulated node)"
+        )
 
 
 def _home(path: Path) -> str:

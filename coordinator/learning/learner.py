@@ -33,7 +33,7 @@ from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.conditions import ConditionError, ConditionFault, Expression
 from petrobot.coordinator.task.conditions import parse as parse_condition
-from petrobot.services.comm.calls.caller import CallProgress
+from petrobot.services.comm.protocol.messages import Feedback
 
 LARGEST = 1e150
 """Numbers of results from this magnitude on are not used as costs: the sum of their squares would
@@ -208,7 +208,7 @@ class LearningSelector(FirstAlternative):
         elif isinstance(instruction, Corrected):
             self._corrected(instruction)
 
-    def progress(self, now: float, run: str, notice: CallProgress) -> None:
+    def progress(self, now: float, run: str, notice: Feedback) -> None:
         """Ignore progress: nothing is learned from it."""
 
     def settled(self, now: float, state: State) -> None:

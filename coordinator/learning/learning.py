@@ -117,10 +117,9 @@ class Learning:
     def question(self, primitive_task: str) -> Question:
         """Return measure, target and rho for a primitive task: as given, with the cost measure that
         the task file declares."""
-        given = self.given or Question()
-        return Question(
-            self.task.primitive_tasks[primitive_task].cost, given.target, given.rho, given.level
-        )
+        given, primitive = self.given or Question(), self.task.primitive_tasks[primitive_task]
+        declared = tuple(primitive.costs.items())
+        return Question(primitive.cost, given.target, given.rho, given.level, declared)
 
     # --- choosing and learning ----------------------------------------------------------------
 

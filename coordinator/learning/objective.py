@@ -13,7 +13,7 @@ computed from sums with one rho; J values made with different rho are never aver
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from math import inf, isnan, nan
 
@@ -29,6 +29,13 @@ class Question:
     target: float | None = None
     rho: float | None = None
     level: float = 0.95
+    declared: tuple[tuple[str, float], ...] = field(default=(), compare=False)
+    """Costs that the task file declares, by action, in the unit of its own measure: C of an action
+    without a measured cost."""
+
+    def declared_cost(self, action: str) -> float:
+        """Return the declared cost of an action; nan if there is none."""
+        return dict(self.declared).get(action, nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +63,8 @@ class Figures:
     """All scenarios that meet the target."""
     largest_cost: float
     """The largest mean cost over the scenarios that meet the target."""
+    declared_cost: float
+    """The cost that the task file declares, beside the measured one; nan if there is none."""
     j: float
     """J with the common rho of the comparison; inf for an inadmissible action, nan if nothing is
     known."""
@@ -197,8 +206,9 @@ def _row(
     there = known[worst] if worst is not None else Tally()
     among = tuple(known) if unmet else inside
     scenario = hardest(known, among)
-    costs = {s: _mean_cost(known[s], question.measure) for s in among}
-    cost = costs[scenario] if scenario is not None else (inf if known else nan)
+    declared = question.declared_cost(action)
+    costs = {s: _mean_cost(known[s], question.measure, declared) for s in among}
+    cost = costs[scenario] if scenario is not None else (inf if known else declared)
     largest = max((c for c in costs.values() if not isnan(c)), default=cost)
     return Figures(
         action,
@@ -211,13 +221,14 @@ def _row(
         scenario if inside else None,
         inside,
         largest,
+        declared,
         nan,
     )
 
 
-def _mean_cost(tally: Tally, measure: str) -> float:
+def _mean_cost(tally: Tally, measure: str, declared: float) -> float:
     moments = tally.cost(measure)
-    return moments.mean if moments.n else nan
+    return moments.mean if moments.n else declared
 
 
 def _judged(figures: Figures, rho: float) -> Figures:

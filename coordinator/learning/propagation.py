@@ -8,10 +8,11 @@ conjunctive product R = R_1 R_2 ..., C = C_1 + C_2 + ..., which is computed as a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import reduce
-from math import log, nan, prod, sqrt
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, reduce
+from math import inf, isnan, log, nan, prod, sqrt
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,13 @@ from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.learning.batch import Array
 from petrobot.coordinator.learning.estimate import CENSORED, Tally, merge_tallies
 from petrobot.coordinator.learning.learning import Estimates
-from petrobot.coordinator.learning.objective import cost_weight, objective
+from petrobot.coordinator.learning.objective import (
+    Comparison,
+    Figures,
+    Question,
+    compare,
+    objective,
+)
 from petrobot.coordinator.task import Estimate, Kind, Status, Task
 
 # --- competing risks ---
@@ -94,18 +101,24 @@ SHORTEST = 1e-3
 
 
 def measured_from(
-    task: Task, estimates: Estimates, context: str | None = None, choice: ChoiceShares | None = None
+    task: Task,
+    estimates: Estimates,
+    context: str | None = None,
+    choice: ChoiceShares | None = None,
+    kinds: Mapping[tuple[str, str], Mapping[str, int]] | None = None,
 ) -> Measured:
     """Return the input of the stochastic view from estimates of one context (None: of all contexts
     together).
 
     `choice`: the selector's probabilities by primitive task; None: each alternative is chosen as
-    often as it ran. For a place whose runs can be preempted, the ends of its runs and the events or
+    often as it ran. `kinds`: in which kind of runs each (primitive task, action) was measured, for
+    the sources. For a place whose runs can be preempted, the ends of its runs and the events or
     timers that preempt them are competing risks. A transition that preempts as soon as the marking
     allows it (another run ended) is not a risk; it only cuts the run off, as an abort does, and the
     net says when.
     """
     runs: dict[tuple[str, str], dict[Status, Estimate]] = {}
+    sources: dict[tuple[str, str], str] = {}
     preempted: dict[tuple[str, str], dict[str, Estimate]] = {}
     often: dict[str, dict[str, float]] = {}
     for place in task.flat.places.values():
@@ -120,6 +133,7 @@ def measured_from(
             often.setdefault(place.task, {})[action] = float(started)
             key = (place.name, action)
             runs[key], preempted[key] = _ends(tally, takers)
+            sources[key] = _source(tally, (kinds or {}).get((place.task, action), {}))
             if not takers:
                 del preempted[key]
     return Measured(
@@ -128,7 +142,16 @@ def measured_from(
         _waits(task, estimates, context),
         _switches(task, estimates, context),
         preempted,
+        sources,
     )
+
+
+def _source(tally: Tally, kinds: Mapping[str, int]) -> str:
+    """Return how an action was measured, in words: number of runs, and in which kind of runs."""
+    ended, cut = tally.runs, tally.censored
+    text = f"measured in {ended} run{'s' * (ended != 1)}" + (f" and {cut} cut off" if cut else "")
+    parts = [f"{n} in {kind}" for kind, n in sorted(kinds.items()) if n]
+    return f"{text} ({', '.join(parts)})" if parts else text
 
 
 def _preempting(task: Task, place: str) -> set[str]:
@@ -197,8 +220,8 @@ def _incident(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _EndS
     times, ends = [k.seconds for k in kept], [causes.get(k.exit) for k in kept]
     left, longest = unended(times, ends)
     found = incidences(times, ends)
-    # -log(left) / longest is the mean hazard up to the longest run; it continues beyond it
-    # (B. W. Brown, M. Hollander and R. M. Korwar, in Reliability and Biometry, SIAM 1974).
+    # -log(left) / longest is the mean hazard up to the longest run; nothing is known of later
+    # times, so it continues there.
     if not 0.0 < left < 1.0 or longest <= 0.0:
         return dict(found)
     return {c: _with_tail(end, left, longest, longest / -log(left)) for c, end in found.items()}
@@ -285,35 +308,78 @@ def _switches(task: Task, estimates: Estimates, context: str | None) -> dict[str
 
 
 @dataclass(frozen=True, slots=True)
+class Uncertain:
+    """A number and its confidence interval; all nan if it is unknown."""
+
+    value: float
+    lower: float
+    upper: float
+
+    @classmethod
+    def combined(cls, value: float, parts: Iterable[tuple[float, float]]) -> Uncertain:
+        """Return a number whose independent parts move it down and up by so much at most.
+
+        The distances add up as squares, each side by itself, so that intervals which are wider on
+        one side (shares near 0 or 1) stay so.
+        """
+        moves = list(parts)
+        below, above = (sqrt(sum(move[side] ** 2 for move in moves)) for side in (0, 1))
+        return cls(value, value - below, value + above)
+
+    def within(self, low: float, high: float) -> Uncertain:
+        """Return the same with bounds inside a range."""
+        return Uncertain(self.value, max(self.lower, low), min(self.upper, high))
+
+
+UNKNOWN = Uncertain(nan, nan, nan)
+
+
+@dataclass(frozen=True, slots=True)
 class PrimitiveFigures:
-    """Figures of a primitive task, with its alternatives mixed as they are chosen: R, mean C, J,
-    and the expected number of runs in one mission run."""
+    """Figures of a primitive task, with its alternatives mixed as they are chosen: A R, mean C, J,
+    and the expected number of runs in one mission run.
+
+    R and C of each alternative are those of `objective.compare`: over several scenarios, R in the
+    hardest one and C in the hardest admitted one.
+    """
 
     primitive_task: str
-    reliability: float
-    cost: float
+    measure: str
+    reliability: Uncertain
+    cost: Uncertain
     j: float
     runs: float
+    largest_cost: float
+    """C of the alternative that costs most; nan if none is known."""
 
 
 @dataclass(frozen=True)
 class Propagated:
-    """R and C of the task. R_conj, R_goal and P_complete are three different numbers
-    (docs/analysis.md)."""
+    """R, C and J of the task. R_conj, R_goal and P_complete are three different numbers
+    (docs/analysis.md); J takes R_conj, as the paper's definition is conjunctive."""
 
     parts: Mapping[str, PrimitiveFigures]
     forecast: Forecast
-    cost: float
+    """In the scenario that is hardest for the task."""
+    scenario: str | None
+    """That scenario; None if the runs of all scenarios were taken together, because no two
+    scenarios have runs of all primitive tasks."""
+    reliability: Uncertain
+    """R_conj: the task completed and every run was a SUCCESS."""
+    cost: Uncertain
     """Expected cost of a mission run: the sum over its runs, including those of parallel branches.
-    The expected time is in `forecast`."""
+    The expected time is in `forecast`. Unknown if the measures of the parts differ."""
+    rho: float
+    """Weight of the cost in J: the given one, else 1 / C with the alternatives that cost most."""
+    j: Uncertain
     product: float
     """Product of R over the primitive tasks that every mission run contains; equal to R_conj if the
     net is a mere series."""
 
     @property
     def conjunctive(self) -> float:
-        """R_conj: the task completed and every run was a SUCCESS."""
-        return self.forecast.conjunctive_reliability
+        """R_conj."""
+        return self.reliability.value
 
     @property
     def goal(self) -> float | None:
@@ -332,51 +398,239 @@ def propagate(
     context: str | None = None,
     choice: ChoiceShares | None = None,
     *,
-    measure: str | None = None,
+    questions: Mapping[str, Question] | None = None,
+    rho: float | None = None,
     limits: SearchLimits | None = None,
 ) -> Propagated:
     """Compute R, C and J of the primitive tasks and of the whole task from estimates of actions,
     through the net.
 
-    `measure`: the cost to add up; None: what each primitive task declares, so units may differ
-    between primitive tasks, and the sum over the task means something only if they do not. Raises
-    NoEstimate and ValueError as the stochastic view does.
+    `questions`: by what the actions of each primitive task are judged; by default the cost that it
+    declares. `rho`: weight of the task's cost. Without a context, the task is judged as an action
+    is: in the scenario in which its R is lowest. Raises NoEstimate and ValueError as the stochastic
+    view does.
     """
-    measured = measured_from(task, estimates, context, choice)
-    solved = forecast(stochastic_view(task, measured), limits=limits)
-    visits = _visits(solved)
-    parts: dict[str, PrimitiveFigures] = {}
+    asked = {name: Question(p.cost) for name, p in task.primitive_tasks.items()}
+    asked |= questions or {}
     for name, primitive in task.primitive_tasks.items():
+        if asked[name].measure == primitive.cost:  # declared costs are in the unit of this measure
+            asked[name] = replace(asked[name], declared=tuple(primitive.costs.items()))
+    scenarios = [context] if context is not None else _scenarios(task, estimates)
+    where: Sequence[str | None] = scenarios or [None]
+    solved = [(_solve(task, measured_from(task, estimates, w, choice), limits), w) for w in where]
+    hardest = min(solved, key=lambda one: (one[0].solved.conjunctive_reliability, one[1] or ""))
+    return _figures(task, estimates, *hardest, asked, context, rho, limits)
+
+
+def _scenarios(task: Task, estimates: Estimates) -> list[str]:
+    """Return the contexts in which every measured primitive task has runs; none if it is one."""
+    runs = [
+        {
+            where
+            for by_context in estimates.of(name).values()
+            for where, tally in by_context.items()
+            if tally.runs
+        }
+        for name in task.primitive_tasks
+    ]
+    known = [contexts for contexts in runs if contexts]
+    shared = sorted(set.intersection(*known)) if known else []
+    return shared if len(shared) > 1 else []
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """A stochastic view and its solution."""
+
+    measured: Measured
+    solved: Forecast
+
+    @cached_property
+    def visits(self) -> dict[tuple[str, str], float]:
+        return _visits(self.solved)
+
+
+def _solve(task: Task, measured: Measured, limits: SearchLimits | None) -> _Solved:
+    return _Solved(measured, forecast(stochastic_view(task, measured), limits=limits))
+
+
+def _figures(
+    task: Task,
+    estimates: Estimates,
+    found: _Solved,
+    scenario: str | None,
+    asked: Mapping[str, Question],
+    context: str | None,
+    rho: float | None,
+    limits: SearchLimits | None,
+) -> Propagated:
+    parts: dict[str, PrimitiveFigures] = {}
+    costs: dict[tuple[str, str], Uncertain] = {}
+    for name in task.primitive_tasks:
         places = [p.name for p in task.flat.places.values() if p.task == name]
-        runs = sum(n for (place, _), n in visits.items() if place in places)
-        by_context = estimates.of(name, context)
-        tallies = {a: reduce(merge_tallies, by_context[a].values(), Tally()) for a in by_context}
-        part = _part(name, tallies, measured.choice.get(name, {}), measure or primitive.cost, runs)
+        runs = sum(n for (place, _), n in found.visits.items() if place in places)
+        judged = compare(estimates.of(name, context), asked[name])
+        shares = found.measured.choice.get(name, {})
+        part = _part(name, judged, estimates.of(name, context), shares, asked[name], runs)
         if part is not None:
-            parts[name] = part
-    whole = sum(p.runs * p.cost for p in parts.values() if p.runs > 0)
-    product = prod(p.reliability for p in parts.values() if p.runs > 0)
-    return Propagated(parts, solved, whole, product)
+            parts[name] = part[0]
+            costs |= {(place, a): c for place in places for a, c in part[1].items()}
+    needed = [p for p in parts.values() if p.runs > 0]
+    alike = len({p.measure for p in needed}) == 1
+    largest = sum(p.runs * p.largest_cost for p in needed) if alike else nan
+    weight = rho if rho is not None else 1.0 / largest if largest > 0 else 0.0
+    moves = _moves(task, estimates, found, scenario, costs if alike else {}, asked, limits)
+    r = found.solved.conjunctive_reliability
+    c = _total(found.visits, costs) if alike else nan
+    of_r = [(-min(low, high), max(low, high)) for (low, _), (high, _) in moves]
+    of_c = [(-min(low, high), max(low, high)) for (_, low), (_, high) in moves]
+    of_j = [_span(weight * c1 - r1, weight * c2 - r2) for (r1, c1), (r2, c2) in moves]
+    known = [
+        (n * (cost.value - cost.lower), n * (cost.upper - cost.value))
+        for key, n in found.visits.items()
+        if n > 0 and (cost := costs.get(key)) is not None
+    ]
+    return Propagated(
+        parts,
+        found.solved,
+        scenario,
+        Uncertain.combined(r, of_r).within(0.0, 1.0),
+        Uncertain.combined(c, [*of_c, *known]) if c == c else UNKNOWN,
+        weight,
+        Uncertain.combined(
+            objective(r, c, weight),
+            [*of_j, *((weight * low, weight * high) for low, high in known if weight > 0)],
+        )
+        if c == c
+        else UNKNOWN,
+        prod(p.reliability.value for p in needed),
+    )  # fmt: skip
+
+
+def _span(one: float, other: float) -> tuple[float, float]:
+    """Return how far two changes reach below and above zero."""
+    return max(0.0, -one, -other), max(0.0, one, other)
+
+
+def _total(
+    visits: Mapping[tuple[str, str], float], costs: Mapping[tuple[str, str], Uncertain]
+) -> float:
+    """Return the expected cost of a mission run; nan if an action that it runs has none."""
+    return sum(n * costs.get(key, UNKNOWN).value for key, n in visits.items() if n > 0)
+
+
+STEP = 0.01
+"""Change of a share of SUCCESS by which the derivatives of the task's figures are measured."""
+
+
+def _moves(
+    task: Task,
+    estimates: Estimates,
+    found: _Solved,
+    scenario: str | None,
+    costs: Mapping[tuple[str, str], Uncertain],
+    asked: Mapping[str, Question],
+    limits: SearchLimits | None,
+) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+    """Return, for each action, by how much R_conj and C of the task change when its R is at the
+    lower and at the upper end of its confidence interval.
+
+    To first order: one more solution for each action, with its share of SUCCESS changed by STEP.
+    """
+    out = []
+    r, c = found.solved.conjunctive_reliability, _total(found.visits, costs)
+    for (place, action), known in found.measured.runs.items():
+        primitive = task.primitive_task_of(place).name
+        tally = reduce(
+            merge_tallies, estimates.of(primitive, scenario).get(action, {}).values(), Tally()
+        )
+        if not tally.runs or not known or found.visits.get((place, action), 0.0) <= 0:
+            continue
+        own = known[Status.SUCCESS].share if Status.SUCCESS in known else 0.0
+        step = -STEP if own > 0.5 else STEP
+        runs = {**found.measured.runs, (place, action): _shifted(known, step)}
+        other = _solve(task, replace(found.measured, runs=runs), limits)
+        slope_r = (other.solved.conjunctive_reliability - r) / step
+        slope_c = (_total(other.visits, costs) - c) / step if c == c else 0.0
+        low, high = (bound - tally.reliability for bound in tally.interval(asked[primitive].level))
+        out.append(((low * slope_r, low * slope_c), (high * slope_r, high * slope_c)))
+    return out
+
+
+def _shifted(known: Mapping[Status, Estimate], step: float) -> dict[Status, Estimate]:
+    """Return the estimates with another share of SUCCESS; the other statuses share the rest as
+    before. A status that was never seen takes as long as the others."""
+    example = next(iter(known.values()))
+    success = known.get(Status.SUCCESS, replace(example, share=0.0))
+    others = {s: e for s, e in known.items() if s is not Status.SUCCESS}
+    rest = sum(e.share for e in others.values())
+    left: dict[Status, Estimate] = {
+        s: replace(e, share=e.share * (rest - step) / rest) for s, e in others.items() if rest
+    }
+    if not rest:
+        left = {Status.ERROR: replace(example, share=-step)}
+    return {Status.SUCCESS: replace(success, share=success.share + step), **left}
 
 
 def _part(
-    name: str, tallies: Mapping[str, Tally], shares: Mapping[str, float], measure: str, runs: float
-) -> PrimitiveFigures | None:
-    """Return the figures of a primitive task; None if no alternative that is chosen was
-    measured."""
-    used = [a for a, share in shares.items() if share > 0 and a in tallies and tallies[a].runs]
+    name: str,
+    judged: Comparison,
+    tallies: Mapping[str, Mapping[str, Tally]],
+    shares: Mapping[str, float],
+    question: Question,
+    runs: float,
+) -> tuple[PrimitiveFigures, dict[str, Uncertain]] | None:
+    """Return the figures of a primitive task and the cost of each alternative; None if no
+    alternative that is chosen was measured."""
+    figures = {f.action: f for f in judged.figures if f.runs}
+    used = [a for a, share in shares.items() if share > 0 and a in figures]
     if not used:
         return None
-    costs = {a: tally.cost(measure).mean for a, tally in tallies.items() if tally.cost(measure).n}
-    costed = [a for a in used if a in costs]
-    r = _mixed(shares, {a: tallies[a].availability * tallies[a].reliability for a in used})
-    c = _mixed(shares, {a: costs[a] for a in costed}) if costed else nan
-    return PrimitiveFigures(name, r, c, objective(r, c, cost_weight(costs.values())), runs)
+    weight = {a: shares[a] / sum(shares[b] for b in used) for a in used}
+    costs = {
+        a: _cost(figures[a], tallies[a], question)
+        for a in used
+        if not isnan(figures[a].cost) and figures[a].cost < inf
+    }
+    r = Uncertain.combined(
+        sum(w * figures[a].effective for a, w in weight.items()),
+        [
+            (w * f.availability * (f.reliability - f.lower),
+             w * f.availability * (f.upper - f.reliability))
+            for a, w in weight.items() if (f := figures[a])
+        ],
+    )  # fmt: skip
+    costed = sum(weight[a] for a in costs)
+    c = (
+        Uncertain.combined(
+            sum(weight[a] * cost.value for a, cost in costs.items()) / costed,
+            [
+                (weight[a] / costed * (cost.value - cost.lower),
+                 weight[a] / costed * (cost.upper - cost.value))
+                for a, cost in costs.items()
+            ],
+        )
+        if costs
+        else UNKNOWN
+    )  # fmt: skip
+    largest = max(
+        (f.cost for f in judged.figures if not isnan(f.cost) and f.cost < inf), default=nan
+    )
+    j = objective(r.value, c.value, judged.rho)
+    return PrimitiveFigures(name, question.measure, r, c, j, runs, largest), costs
 
 
-def _mixed(shares: Mapping[str, float], values: Mapping[str, float]) -> float:
-    weight = sum(shares[a] for a in values)
-    return sum(shares[a] * value for a, value in values.items()) / weight
+def _cost(figures: Figures, tallies: Mapping[str, Tally], question: Question) -> Uncertain:
+    """Return the mean cost of an action with the confidence interval of a mean (normal)."""
+    among = figures.scenario if figures.scenario is not None else figures.worst
+    moments = tallies[among].cost(question.measure) if among is not None else None
+    if not isnan(figures.declared_cost) and (moments is None or not moments.n):
+        return Uncertain(figures.cost, figures.cost, figures.cost)  # declared, taken as exact
+    z = NormalDist().inv_cdf(0.5 + question.level / 2)
+    # One run says nothing of the spread, so the interval is unbounded.
+    several = moments is not None and moments.n > 1
+    error = z * moments.deviation / sqrt(moments.n) if moments is not None and several else inf
+    return Uncertain(figures.cost, figures.cost - error, figures.cost + error)
 
 
 def _visits(solved: Forecast) -> dict[tuple[str, str], float]:

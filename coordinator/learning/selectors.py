@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri
 
 from petrobot.coordinator.learning.batch import SUMS, Batch, Mask, Response
 from petrobot.coordinator.learning.estimate import COUNT, Observation, Tally
@@ -37,6 +36,8 @@ def eligible(batch: Batch, target: float, before: Mask, level: float = 0.95) -> 
     An action enters when Wilson's lower bound of its R reaches the target, and leaves when R itself
     falls below it (hysteresis, as in `objective.admitted`, here for many learners at once).
     """
+    from scipy.special import ndtri  # here, because it takes 0.15 s: each coordinator pays
+
     z = float(ndtri(0.5 * (1 + level)))
     n = np.maximum(batch.runs, 1e-9)
     share = batch.successes / n
@@ -93,6 +94,8 @@ class RuleSelector:
     def _fresh(self, actions: Sequence[str]) -> Batch:
         batch = self.rule.begin(1, len(actions), self.question.rho)
         batch.own["admitted"] = np.zeros((1, len(actions)))
+        if self.question.declared:
+            batch.declared = np.array([self.question.declared_cost(a) for a in actions])
         return batch
 
     # --- choosing -----------------------------------------------------------------------------

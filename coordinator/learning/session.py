@@ -35,6 +35,9 @@ class LearningSetting:
     """Choose by what was learned and write nothing."""
     declared: Mapping[str, float] | None = None
     """In lock step: declared compute time of each action (s)."""
+    physics: str = ""
+    """Name and version of the simulated laboratory's physics; empty: it has only one, or is
+    real."""
 
     def to_plain(self) -> dict[str, Any]:
         """Return plain data for a journal's header."""
@@ -46,6 +49,7 @@ class LearningSetting:
             "chosen": dict(self.chosen),
             "frozen": self.frozen,
             "declared": None if self.declared is None else dict(self.declared),
+            "physics": self.physics,
         }
 
     @classmethod
@@ -60,7 +64,7 @@ class LearningSetting:
             data["frozen"],
             data["declared"],
         )
-        return cls(Path(data["path"]), *given)
+        return cls(Path(data["path"]), *given, data.get("physics", ""))
 
 
 class LearningSession:
@@ -90,6 +94,7 @@ class LearningSession:
                 "--learn and without --frozen first"
             )
         kept = self.file.read()
+        self.file.refuse_other_physics(kept, setting.physics)
         contexts = usual_contexts(task) if setting.contexts is None else Contexts(setting.contexts)
         generation = kept.generation if begun is None else int(begun["generation"])
         self._generation = generation
@@ -125,7 +130,13 @@ class LearningSession:
         gained, late = (self.learning.gained, ()) if not done else self._gained_after(done)
         counted = len(self.selector.records) if interrupted else None
         self.file.add(
-            gained, self.learning.state(), self._token, counted, late, self.learning.asked()
+            gained,
+            self.learning.state(),
+            self._token,
+            counted,
+            late,
+            self.learning.asked(),
+            self.setting.physics,
         )
         return sum(t.runs + t.censored for t in gained.tallies.values())
 

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from math import inf, sqrt
 from typing import Any
 
-from scipy.special import betaincinv, ndtri
-
 
 @dataclass(frozen=True, slots=True)
 class Moments:
@@ -129,6 +127,8 @@ def clopper_pearson(successes: float, n: float, level: float = 0.95) -> tuple[fl
     404-413). Covers every probability with at least `level`; (0, 1) for n = 0."""
     if n <= 0:
         return 0.0, 1.0
+    from scipy.special import betaincinv  # here, because it takes 0.15 s: each coordinator pays
+
     tail = 0.5 * (1 - level)
     low = 0.0 if successes <= 0 else float(betaincinv(successes, n - successes + 1, tail))
     high = 1.0 if successes >= n else float(betaincinv(successes + 1, n - successes, 1 - tail))
@@ -147,5 +147,8 @@ _QUANTILES: dict[float, float] = {
 def _z(level: float) -> float:
     if not 0 < level < 1:
         raise ValueError(f"confidence level: expected 0 < level < 1, got {level}")
-    known = _QUANTILES.get(level)
-    return float(ndtri(0.5 * (1 + level))) if known is None else known
+    if (known := _QUANTILES.get(level)) is not None:
+        return known
+    from scipy.special import ndtri
+
+    return float(ndtri(0.5 * (1 + level)))

@@ -1,9 +1,9 @@
 """The operator's side of a live mission run: what clients see, and their commands turned into
 stimuli.
 
-Implements `coordinator.operator.port.MissionPort` over a mission run in real time. Every command is a
-journaled stimulus; who holds the controls is settled here. The emergency stop waits for nobody: it
-goes straight to the nodes.
+Implements `coordinator.operator.port.MissionPort` over a mission run in real time. Every command is
+a journaled stimulus; who holds the controls is settled here. The emergency stop waits for nobody:
+it goes straight to the nodes.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Mission, Stage
 from petrobot.coordinator.run.realtime import credentials_of
-from petrobot.services.comm.calls.caller import CallProgress
+from petrobot.services.comm.protocol.messages import Feedback
 
 _log = logging.getLogger(__package__)
 
@@ -140,7 +140,7 @@ class Operation:
         if isinstance(stimulus, RunHeld):
             self._holding.pop(stimulus.run, None)
 
-    def progress(self, now: float, run: str, notice: CallProgress) -> None:
+    def progress(self, now: float, run: str, notice: Feedback) -> None:
         """Nothing to keep."""
 
     def settled(self, now: float, state: State) -> None:

@@ -18,10 +18,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from petrobot.coordinator.run.supervisor import is_local
-from petrobot.services.comm.calls.caller import Caller, CommandAnswered, Notice, PeerLost
+from petrobot.services.comm.calls.caller import Caller, Notice, PeerLost
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.location_file import Directory
-from petrobot.services.comm.protocol.messages import Command, Hello
+from petrobot.services.comm.protocol.messages import Answer, Command, Hello
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 from petrobot.services.comm.tls.credentials import Credentials
 from petrobot.services.host.emergency_latch import ALL, LatchError, latch_of
@@ -158,10 +158,10 @@ class EmergencyLine:
 
     def _hear(self, _: float, notices: list[Notice]) -> None:
         for notice in notices:
-            if isinstance(notice, CommandAnswered):
-                told = self._answers.get(notice.answer.id)
+            if isinstance(notice, Answer):
+                told = self._answers.get(notice.id)
                 if told is not None and not told.done():
-                    told.set_result(notice.answer.data)
+                    told.set_result(notice.data)
             elif isinstance(notice, PeerLost):
                 self.why = notice.reason
 

@@ -14,7 +14,7 @@ from petrobot.coordinator.operator.event_texts import reason_of, told
 from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.run.folder import JOURNAL, RESULT
 from petrobot.coordinator.run.journal import Journal, JournalError, read_journal
-from petrobot.coordinator.run.recording import ReplayError, Step, replay
+from petrobot.coordinator.run.recording import RecordedStep, ReplayError, replay
 from petrobot.coordinator.task import End, Task
 from petrobot.coordinator.task.file import TaskFileError, loads
 
@@ -147,7 +147,7 @@ class _Teller:
             if any(i.end is End.ERROR for i in t.inputs)
         }
 
-    def record(self, step: Step) -> dict[str, Any]:
+    def record(self, step: RecordedStep) -> dict[str, Any]:
         """{number, t, text, firings, marking (what changed), notes, error, going (places whose runs
         go on)}."""
         firings, notes = [], []
@@ -180,7 +180,7 @@ class _Teller:
             ),
         }
 
-    def _firing(self, step: Step, fired: Fired) -> dict[str, Any]:
+    def _firing(self, step: RecordedStep, fired: Fired) -> dict[str, Any]:
         ends = [self._ends[run] for run in fired.runs if run in self._ends]
         worst = max(
             ends,

@@ -20,7 +20,8 @@ from petrobot.coordinator.task import (
 
 def picture(task: Task) -> dict[str, Any]:
     """The snapshot's `task`: the flat net (its names are those of markings and firings) and the
-    macro places above it."""
+    macro places above it. `made_from` names the element that stands for one of a short form: it
+    is drawn in its place."""
     flat = task.flat
     errors = flat.error_elements
     macros = dict(_macros(task, task.places, ""))
@@ -64,6 +65,7 @@ def _place(place: Place, error: bool) -> dict[str, Any]:
         "kind": place.kind.value,
         "label": place.label,
         "in_macro": place.macro,
+        "made_from": place.expanded_from,
         "x": place.x,
         "y": place.y,
         "tokens": place.tokens,
@@ -83,6 +85,7 @@ def _transition(transition: Transition, task: Task, error: bool) -> dict[str, An
         "name": transition.name,
         "label": transition.label,
         "in_macro": transition.macro,
+        "made_from": transition.expanded_from,
         "x": transition.x,
         "y": transition.y,
         "events": [_event_words(e, task) for e in transition.events],

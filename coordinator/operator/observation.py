@@ -18,8 +18,7 @@ from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.task import Task
-from petrobot.services.comm.calls.caller import CallProgress
-from petrobot.services.comm.protocol.messages import Command
+from petrobot.services.comm.protocol.messages import Command, Feedback
 
 POLL = 0.2
 """Seconds between questions to a node, each asked only when the one before is answered."""
@@ -46,7 +45,7 @@ def shown_alternatives(task: Task, selector: FirstAlternative, name: str) -> lis
     return [{"action": a, **figures.get(a, {})} for a in task.primitive_tasks[name].alternatives]
 
 
-class Watched(Protocol):
+class WatchedShell(Protocol):
     """What drives a mission run: its clock, and the way to the nodes."""
 
     mission: Mission
@@ -64,7 +63,7 @@ class Watching:
 
     def __init__(
         self,
-        shell: Watched,
+        shell: WatchedShell,
         feed: Feed,
         selector: FirstAlternative,
         origin: float,
@@ -224,7 +223,7 @@ class Watching:
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Nothing to show that the narrator does not tell."""
 
-    def progress(self, now: float, run: str, notice: CallProgress) -> None:
+    def progress(self, now: float, run: str, notice: Feedback) -> None:
         """Nothing to show that the narrator does not tell."""
 
     def settled(self, now: float, state: State) -> None:

@@ -40,7 +40,7 @@ from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.task import End, Executed, Scope, Task
 from petrobot.coordinator.task.net import Marking
 from petrobot.coordinator.task.wording import Severity
-from petrobot.services.comm.calls.caller import CallProgress
+from petrobot.services.comm.protocol.messages import Feedback
 
 _AFTER_HOLD = {Hold.HELD: "held", Hold.CANNOT: "running", Hold.STOPPED: "stopping"}
 _GOING = ACTIVE | {Phase.STOPPING, Phase.STUCK}
@@ -151,7 +151,7 @@ class Narrator:
         if tell is not None:
             tell(now - self.origin, instruction)
 
-    def progress(self, now: float, run: str, notice: CallProgress) -> None:
+    def progress(self, now: float, run: str, notice: Feedback) -> None:
         """A run says how far it is."""
         self.feed.emit(
             "run_progress", time=now - self.origin, id=run, progress=round(notice.fraction, 4)
@@ -280,9 +280,14 @@ class Narrator:
         self._ends.setdefault(record.run, reason)
         status = record.status.value if record.status is not None else "none"
         self.feed.emit(
-            "run_ended", time=time, id=record.run, status=status, ended=round(time, 4), reason=reason,
+            "run_ended",
+            time=time,
+            id=record.run,
+            status=status,
+            ended=round(time, 4),
+            reason=reason,
             cancelled=record.cancelled,
-        )  # fmt: skip
+        )
 
     def _corrected(self, time: float, corrected: Corrected) -> None:
         reason = reason_of(corrected.status, corrected.cause, corrected.text, Executed.YES)

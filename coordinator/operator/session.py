@@ -3,7 +3,7 @@ and lead their runs through it.
 
     prepare, prepare_from or resume  ->  connect  ->  operate  ->  lead  ->  result
 
-`prepare` opens what the run learns into and its journal; `connect` reaches the nodes (in real time);
+`prepare` opens what the run learns into and its journal; `connect` reaches the nodes (real time);
 `operate` lets operators see and steer it; `lead` runs it to its end, saves what was learned and
 closes the journal. A run that cannot be led after `prepare` is given up with `abandon`.
 docs/decisions/one-session.md says what this replaced.
@@ -65,7 +65,12 @@ from petrobot.coordinator.run.realtime import RealtimeMission, credentials_of
 from petrobot.coordinator.run.recording import JournalStore, RetracingStore, clock_reading
 from petrobot.coordinator.run.timeline import Timeline
 from petrobot.coordinator.task import Task
-from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.location_file import (
+    FIRST_PHYSICS,
+    Directory,
+    physics_of,
+    same_physics,
+)
 from petrobot.services.comm.lockstep.cell import LockStepCell
 from petrobot.services.comm.lockstep.mesh import Member
 from petrobot.services.host.json_text import json_text
@@ -132,16 +137,20 @@ def prepare(request: RunRequest, task: Task, text: str, directory: Directory) ->
     """Make a new run of a task; `text` is the task file's. In real time, call it in the event loop
     that leads the run; in lock step it may take seconds (it loads the simulated cell).
 
-    Raises EstimatesError or RequestError for what it cannot learn or replace, JournalError or OSError
-    when its journal cannot be written, KeyFileError. No folder is left behind then.
+    Raises EstimatesError or RequestError for what it cannot learn or replace, JournalError or
+    OSError when its journal cannot be written, KeyFileError. No folder is left behind then.
     """
     seed = SEED if request.seed is None else request.seed
     learning = None
+    physics = _physics(directory)
     if request.learning is not None:
         declared = {a.name: a.compute_time for a in directory.actions.values()}
         lockstep = request.mode == LOCKSTEP
         setting = replace(
-            request.learning, chosen=request.chosen, declared=declared if lockstep else None
+            request.learning,
+            chosen=request.chosen,
+            declared=declared if lockstep else None,
+            physics=physics,
         )
         try:
             learning = LearningSession(task, setting, seed)
@@ -166,6 +175,7 @@ def prepare_from(request: RunRequest, found: Recorded) -> RunSession:
     """
     assert request.start is not None
     journal, then = found.journal, found.journal.header
+    _refuse_other_physics(found)
     point = departure(
         journal, found.engine, request.start.run, request.start.record, request.start.going
     )
@@ -195,6 +205,7 @@ def resume(found: Recorded) -> RunSession:
     Raises EstimatesError, RequestError, JournalError, ReplayError, KeyFileError.
     """
     then, folder = found.journal.header, found.journal.path.parent
+    _refuse_other_physics(found)
     try:
         learning = session_of(found.task, then)
     except ValueError as fault:
@@ -224,6 +235,26 @@ def resume(found: Recorded) -> RunSession:
     return RealtimeSession(found.directory, mission, selector, learning, folder, begin, timeline)
 
 
+def _physics(directory: Directory) -> str:
+    """Return `physics_of` a location file. Raises RequestError."""
+    try:
+        return physics_of(directory)
+    except ValueError as fault:
+        raise RequestError(str(fault)) from fault
+
+
+def _refuse_other_physics(found: Recorded) -> None:
+    """Raise RequestError if a recorded run would go on in a laboratory with another physics."""
+    then, now = found.journal.header.get("physics", ""), _physics(found.directory)
+    if now and not same_physics(then, now):
+        raise RequestError(
+            f"{found.journal.path}: recorded with the physics {then or FIRST_PHYSICS!r}, but this "
+            f"computer's laboratory has {now!r}: it would go on as another run; write the same "
+            "`physics` in services.toml ([nodes.NAME] of the simulated node), or resume it where "
+            "that physics is installed"
+        )
+
+
 def _new(
     request: RunRequest,
     directory: Directory,
@@ -235,6 +266,7 @@ def _new(
     """A run that no journal knows yet; `texts` are those of the task file and of services.toml."""
     lockstep = request.mode == LOCKSTEP
     script = scripted_actions(request.mock, directory)  # refused before a folder is made
+    physics = _physics(directory)
     identity = mission_id(setting.task)
     folder = None if request.folder is None else request.folder / identity
     name = lockstep_id(setting) if lockstep else identity
@@ -249,6 +281,7 @@ def _new(
             "clock": clock_reading(origin),
             "durable": request.durable,
             "mock": str(request.mock.resolve()) if request.mock else "",
+            **({"physics": physics} if physics else {}),
             **({"cell": JOINED if request.nodes == JOINED else LAUNCHED} if lockstep else {}),
             **more,
         }

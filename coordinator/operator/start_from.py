@@ -31,7 +31,7 @@ from petrobot.coordinator.launch import Setting, with_runs
 from petrobot.coordinator.learning.session import fixed_by_user, session_of
 from petrobot.coordinator.run.interfaces import FirstAlternative, Observer
 from petrobot.coordinator.run.journal import Journal, JournalError, read_journal
-from petrobot.coordinator.run.recording import STIMULUS, Step, replay
+from petrobot.coordinator.run.recording import STIMULUS, RecordedStep, replay
 from petrobot.coordinator.task import Kind, Status, Task
 from petrobot.coordinator.task.file import loads
 from petrobot.services.comm.location_file import Directory, parse
@@ -55,7 +55,7 @@ class Recorded:
     directory: Directory
     engine: Engine
 
-    def steps(self) -> Iterator[Step]:
+    def steps(self) -> Iterator[RecordedStep]:
         """Derive every stimulus again."""
         return replay(self.journal, self.engine)
 

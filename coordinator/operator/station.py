@@ -2,8 +2,8 @@
 starts one.
 
 Implements `coordinator.operator.port.MissionPort`. The feed and the holder of the controls outlive
-each run, which a `RunSession` leads. While no run is active, the station looks after the rest: which
-nodes are up, breakpoints and choices for the next run, and the emergency stop.
+each run, which a `RunSession` leads. While no run is active, the station looks after the rest:
+which nodes are up, breakpoints and choices for the next run, and the emergency stop.
 """
 
 from __future__ import annotations
@@ -430,7 +430,7 @@ def offered(directory: Directory, up: Callable[[str, str], bool]) -> list[dict[s
     return [
         {
             "action": name,
-            "primitive_task": entry.task,
+            "primitive_task": entry.task or entry.name,
             "node": entry.node,
             "device": entry.device,
             "args": dict(entry.args),

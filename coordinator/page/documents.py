@@ -100,7 +100,7 @@ async def _analyse(request: web.Request) -> web.StreamResponse:
             "analysis", {"text": text, "filename": f"{drawing['name']}.toml"}, desk
         )
     except RefusedError as refusal:
-        raise refused(refusal) from refusal
+        return _refusal(refusal)
     return await send_json(request, said)
 
 
@@ -158,10 +158,15 @@ async def _done(
     try:
         said = await request.app[HOUSE].apart.do(work, given, desk)
     except RefusedError as refusal:
-        if refusal.more:
-            return json_answer(refusal.more, refusal.status)
-        raise refused(refusal) from refusal
+        return _refusal(refusal)
     return await send_json(request, said)
+
+
+def _refusal(refusal: RefusedError) -> web.Response:
+    """The answer to work that was not done. Raises it if it says nothing but its text."""
+    if refusal.more:
+        return json_answer(refusal.more, refusal.status)
+    raise refused(refusal) from refusal
 
 
 def _where(house: House) -> dict[str, str] | None:

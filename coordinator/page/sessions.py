@@ -37,7 +37,7 @@ _NAME = re.compile(r"[^\w .'-]+")
 Encode = Callable[[dict[str, Any]], str]
 
 
-class ProtocolError(Exception):
+class BadMessageError(Exception):
     """A client said what nobody may say; its text is sent as the reason of the close."""
 
 
@@ -94,7 +94,7 @@ class Session:
             finally:
                 stop()
                 await _end(sender)
-        except ProtocolError as fault:
+        except BadMessageError as fault:
             await self._socket.close(
                 code=WSCloseCode.POLICY_VIOLATION, message=str(fault).encode()[:120]
             )
@@ -122,7 +122,7 @@ class Session:
         async with asyncio.timeout(HELLO_S):
             hello = _plain(await self._socket.receive())
         if hello.get("type") != "hello" or hello.get("protocol") != PROTOCOL:
-            raise ProtocolError(f"say hello first, with protocol {PROTOCOL}")
+            raise BadMessageError(f"say hello first, with protocol {PROTOCOL}")
         self.who = who_is(str(hello.get("name", "")), str(hello.get("tab", "")))
 
     async def _read_all(self, sender: asyncio.Task[None]) -> None:
@@ -138,7 +138,7 @@ class Session:
         self._budget_at = now
         self._budget -= 1
         if self._budget < 0:
-            raise ProtocolError("too many messages a second")
+            raise BadMessageError("too many messages a second")
 
     def _take(self, message: Mapping[str, Any]) -> None:
         kind = message.get("type")
@@ -148,12 +148,12 @@ class Session:
         elif kind == "command":
             self._begin(message)
         else:
-            raise ProtocolError("unknown type of message")
+            raise BadMessageError("unknown type of message")
 
     def _begin(self, message: Mapping[str, Any]) -> None:
         number, verb, data = message.get("id"), message.get("verb"), message.get("data", {})
         if not isinstance(number, int) or not isinstance(data, dict):
-            raise ProtocolError("a command has a whole number as id and an object as data")
+            raise BadMessageError("a command has a whole number as id and an object as data")
         if number in self._numbers:
             self._answer(
                 number,
@@ -246,13 +246,13 @@ async def carry_out(
 
 def _plain(message: Any) -> dict[str, Any]:
     if message.type is not WSMsgType.TEXT:
-        raise ProtocolError("send JSON text")
+        raise BadMessageError("send JSON text")
     try:
         value = json.loads(message.data)
     except (ValueError, RecursionError):
-        raise ProtocolError("send JSON text") from None
+        raise BadMessageError("send JSON text") from None
     if not isinstance(value, dict):
-        raise ProtocolError("send one JSON object")
+        raise BadMessageError("send one JSON object")
     return value
 
 

@@ -1,8 +1,8 @@
 """Work on task files that may take long for a large net, as plain functions of plain data: open,
 save, check, convert.
 
-The page's server has all of it done in a process of its own (`coordinator.background.BackgroundProcess`), in the
-names of `WORKS`.
+The page's server has all of it done in a process of its own
+(`coordinator.background.BackgroundProcess`), in the names of `WORKS`.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ import tomlkit
 from petrobot.coordinator.analysis.commands import net_file_of
 from petrobot.coordinator.analysis.formats.netfile import NetFile, NetFileError
 from petrobot.coordinator.analysis.formats.pnml import parse_pnml, write_pnml
+from petrobot.coordinator.analysis.may_run import Cell, may_run
 from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.page.edits import EditError, Rename, parse, plain
 from petrobot.coordinator.page.task_store import Conflict, StoreError, TaskStore, TaskText
 from petrobot.coordinator.task import Kind, Task
-from petrobot.coordinator.task.check import check
 from petrobot.coordinator.task.file import TaskFileError, dumps, loads
 
-# Nets of other tools as the text of a task file, to go on drawing: names, marking, weights, inhibitors and positions; pure.
+# Nets of other tools as the text of a task file, to go on drawing: names, marking, weights,
+# inhibitors and positions; pure.
 
 _NOT_NAME = re.compile(r"\W+")
 
@@ -115,7 +116,7 @@ def findings(text: str, filename: str, where: Mapping[str, str] | None) -> list[
         task = loads(text, filename)
     except TaskFileError as error:
         return [_finding("error", fault.key, fault.text, fault.remedy) for fault in error.faults]
-    report = check(task, where)
+    report = may_run(task, None if where is None else Cell(where)).report
     return [_finding(f.severity.value, f.key, f.text, f.remedy) for f in report.findings]
 
 

@@ -43,22 +43,19 @@ from petrobot.coordinator.run.interfaces import (
     Selector,
     Store,
 )
-from petrobot.coordinator.run.recording import Step
+from petrobot.coordinator.run.recording import RecordedStep
 from petrobot.coordinator.task import Scope, Status, Task
-from petrobot.services.comm.calls.caller import (
-    CallAccepted,
-    CallEnded,
-    Caller,
-    CallProgress,
-    CommandAnswered,
-    EventArrived,
-    LateResult,
-    Notice,
-    PeerBack,
-)
+from petrobot.services.comm.calls.caller import Caller, LateResult, Notice
 from petrobot.services.comm.calls.events import VERDICT_EVENTS, RunVerdict, verdict_event
 from petrobot.services.comm.location_file import Directory
-from petrobot.services.comm.protocol.messages import Answer, Event, Outcome
+from petrobot.services.comm.protocol.messages import (
+    Accept,
+    Answer,
+    Event,
+    Feedback,
+    Outcome,
+    Welcome,
+)
 
 MEMORY_EVENTS: Final = "memory:"
 SYNC_WITHIN: Final = 0.5
@@ -106,7 +103,7 @@ class Executor:
         for caller in self.callers.values():
             caller.subscribe(now, names)
 
-    def relive(self, now: float, step: Step) -> None:
+    def relive(self, now: float, step: RecordedStep) -> None:
         """Take in a step that an earlier process recorded at `now`; observers see it, nothing is
         carried out again."""
         self.state = step.state
@@ -135,19 +132,19 @@ class Executor:
     def take(self, now: float, node: str, notices: Iterable[Notice]) -> None:
         """Take what a node's caller noticed."""
         for notice in notices:
-            if isinstance(notice, CallEnded):
-                self._ended(now, node, notice.outcome)
-            elif isinstance(notice, CallAccepted):
+            if isinstance(notice, Outcome):
+                self._ended(now, node, notice)
+            elif isinstance(notice, Accept):
                 self._queue.extend(self.dispatch.accepted(now, notice.id))
-            elif isinstance(notice, EventArrived):
-                self._event(now, node, notice.event)
-            elif isinstance(notice, CallProgress):
+            elif isinstance(notice, Event):
+                self._event(now, node, notice)
+            elif isinstance(notice, Feedback):
                 self._progress(now, notice)
-            elif isinstance(notice, CommandAnswered):
-                self._answered(now, notice.answer)
+            elif isinstance(notice, Answer):
+                self._answered(now, notice)
             elif isinstance(notice, LateResult):
                 self._queue.extend(self.dispatch.late(now, notice.outcome))
-            elif isinstance(notice, PeerBack):
+            elif isinstance(notice, Welcome):
                 self.dispatch.back(now, node, notice.boot, notice.runs)
         self._work(now)
 
@@ -281,7 +278,7 @@ class Executor:
             said.run.removeprefix(f"{self.mission}/"), Status(said.status), said.cause, said.text
         )
 
-    def _progress(self, now: float, notice: CallProgress) -> None:
+    def _progress(self, now: float, notice: Feedback) -> None:
         run = self.dispatch.run_of(notice.id)
         if run is not None:
             for observer in self.observers:

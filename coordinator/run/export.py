@@ -21,13 +21,13 @@ from petrobot.coordinator.engine import (
     to_plain,
 )
 from petrobot.coordinator.run.journal import Journal
-from petrobot.coordinator.run.recording import Step
+from petrobot.coordinator.run.recording import RecordedStep
 from petrobot.coordinator.task.net import Net
 from petrobot.services.host.json_text import json_text
 from petrobot.services.host.whole_file import write_whole
 
 
-def jsonl(journal: Journal, steps: Iterator[Step]) -> Iterator[str]:
+def jsonl(journal: Journal, steps: Iterator[RecordedStep]) -> Iterator[str]:
     """One line for the header, then one for each stimulus with the instructions that followed."""
     yield json_text({"kind": "header", **journal.header}, ensure_ascii=False)
     for step in steps:
@@ -41,7 +41,7 @@ def jsonl(journal: Journal, steps: Iterator[Step]) -> Iterator[str]:
         yield json_text(line, ensure_ascii=False)
 
 
-def xes(journal: Journal, steps: Iterator[Step]) -> Iterator[str]:
+def xes(journal: Journal, steps: Iterator[RecordedStep]) -> Iterator[str]:
     """The run as an XES log (IEEE 1849-2016) with one trace; times count from the date in the
     header."""
     origin = datetime.fromisoformat(
@@ -127,7 +127,8 @@ def _strings(values: dict[str, str]) -> str:
     )
 
 
-# A journal as an MCAP file (mcap.dev), to be looked at in Foxglove beside other recordings. Needs the package `mcap`.
+# A journal as an MCAP file (mcap.dev), to be looked at in Foxglove beside other recordings. Needs
+# the package `mcap`.
 
 _TEXT: Final = {"type": "string"}
 _NUMBER: Final = {"type": "number"}
@@ -157,7 +158,7 @@ class McapMissingError(Exception):
     """The package `mcap` is not installed; the text says how to get it."""
 
 
-def write_mcap(path: Path, journal: Journal, net: Net, steps: Iterable[Step]) -> int:
+def write_mcap(path: Path, journal: Journal, net: Net, steps: Iterable[RecordedStep]) -> int:
     """Write the file; gives the number of messages. Raises McapMissingError, OSError."""
     try:
         writing = importlib.import_module("mcap.writer")
@@ -184,7 +185,7 @@ def write_mcap(path: Path, journal: Journal, net: Net, steps: Iterable[Step]) ->
 
 
 def messages(
-    journal: Journal, net: Net, steps: Iterable[Step]
+    journal: Journal, net: Net, steps: Iterable[RecordedStep]
 ) -> Iterator[tuple[str, int, dict[str, Any]]]:
     """Channel, time (ns since 1970) and body of each message, in order."""
     origin = round(datetime.fromisoformat(journal.header["date"]).timestamp() * 1e9)

@@ -14,11 +14,14 @@ from typing import Any
 JOURNAL = "run.journal"
 RESULT = "result.json"
 DEFAULT = Path("runs")
-SEMANTICS = 2
+NODE_LOGS = DEFAULT / "logs"
+"""Where the programs that are started for a run keep their logs, a file each."""
+SEMANTICS = 3
 """The rules by which this engine executes a net, in the header of each journal (key `semantics`).
 
 1 (and no such key): after 1,000 firings without time the net pauses. 2: endless firing ends in
-ERROR. A journal is replayed and resumed under its own rules (`recording.as_recorded`).
+ERROR. 3: every dead end is reported. A journal is replayed and resumed under its own rules
+(`recording.as_recorded`).
 """
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from petrobot.coordinator.engine import Instruction, State, Stimulus
-from petrobot.services.comm.calls.caller import CallProgress
+from petrobot.services.comm.protocol.messages import Feedback
 
 
 class Selector(Protocol):
@@ -61,7 +61,7 @@ class Observer(Protocol):
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """The engine takes a stimulus in."""
 
-    def progress(self, now: float, run: str, notice: CallProgress) -> None:
+    def progress(self, now: float, run: str, notice: Feedback) -> None:
         """A run says how far it is."""
 
     def settled(self, now: float, state: State) -> None:

@@ -3,6 +3,7 @@ machine like its parts."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -20,25 +21,20 @@ from petrobot.coordinator.engine.instructions import (
 )
 from petrobot.coordinator.engine.stimuli import Begin, Point, Stimulus
 from petrobot.coordinator.run.executor import Executor
-from petrobot.coordinator.run.recording import PREPARED, SCORED, Step
+from petrobot.coordinator.run.recording import PREPARED, SCORED, RecordedStep
 from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.net import Marking
-from petrobot.services.comm.calls.caller import (
-    CallEnded,
-    Caller,
-    CallProgress,
-    Notice,
-    PeerBack,
-    PeerLost,
-)
+from petrobot.services.comm.calls.caller import Caller, Notice, PeerLost
 from petrobot.services.comm.calls.events import RunVerdict
 from petrobot.services.comm.location_file import Directory, DirectoryError
-from petrobot.services.comm.protocol.messages import Call, Outcome
+from petrobot.services.comm.protocol.messages import Call, Feedback, Outcome, Welcome
 
 SERVICE_DEADLINE = 20.0
 TOLD_ERRORS = 6
 """How many of the last runs that ended in ERROR the result of a mission run tells that ended so
 itself."""
+BAD_VALUE = "bad_value"
+"""Key of the engine's report of a result that did not give a value, or gave one of another type."""
 VERDICTS = "verdicts"
 """Key of a score under which it judges runs that ended provisionally: {run: {status, cause,
 text}}."""
@@ -103,8 +99,12 @@ class Cycle:
         return {"n": self.number, **ages, "status": status.value, "cause": cause, "text": text}
 
 
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}{'' if n == 1 else 's'}"
+
+
 @dataclass
-class Tally:
+class MissionTally:
     """An observer that counts what the result needs: firings, cycles, runs and reports."""
 
     runs_place: int | None
@@ -135,7 +135,7 @@ class Tally:
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Nothing to count."""
 
-    def progress(self, now: float, run: str, notice: CallProgress) -> None:
+    def progress(self, now: float, run: str, notice: Feedback) -> None:
         """Nothing to count."""
 
     def settled(self, now: float, state: State) -> None:
@@ -156,6 +156,25 @@ class Tally:
             }
             for record in failed
         ]
+
+    def happened(self, reached_end: bool) -> str:
+        """What a reader of the result should know of the way there: runs, errors by primitive task
+        and cause, and values that a result did not give."""
+        ended = [record for record in self.runs if not record.cancelled]
+        failed = Counter(
+            f"{record.primitive_task}: {record.cause or 'no cause'}"
+            for record in ended
+            if record.status is Status.ERROR
+        )
+        parts = [_count(len(ended), "run")]
+        if failed:
+            causes = ", ".join(f"{name} ({n})" if n > 1 else name for name, n in failed.items())
+            recovered = ", all recovered" if reached_end else ""
+            parts.append(f"{_count(failed.total(), 'error')}{recovered} [{causes}]")
+        missing = [report.text for report in self.reports if report.key == BAD_VALUE]
+        if missing:
+            parts.append(f"{_count(len(missing), 'value')} missing [{missing[0]}]")
+        return "; ".join(parts)
 
     def _correct(self, corrected: Corrected) -> None:
         run, said = corrected.run, (corrected.status, corrected.cause, corrected.text)
@@ -209,7 +228,7 @@ class Mission:
         """Whether an earlier process may have asked for the preparation or the score."""
         task = executor.task.flat
         index = task.net.place_index.get(task.runs_place) if task.runs_place else None
-        self.tally = Tally(index)
+        self.tally = MissionTally(index)
         executor.observers.append(self.tally)
 
     @property
@@ -225,7 +244,7 @@ class Mission:
         else:
             self.stage = Stage.PREPARING
 
-    def relive(self, now: float, step: Step) -> None:
+    def relive(self, now: float, step: RecordedStep) -> None:
         """Take in a step that another process recorded at `now` (on this process's clock)."""
         if isinstance(step.stimulus, Begin):
             self.begun = now
@@ -260,13 +279,13 @@ class Mission:
         self._note_links(node, notices)
         if self.stage is Stage.CONNECTING:
             self._early.extend(
-                (node, notice) for notice in notices if not isinstance(notice, PeerBack | PeerLost)
+                (node, notice) for notice in notices if not isinstance(notice, Welcome | PeerLost)
             )
-            notices = [notice for notice in notices if isinstance(notice, PeerBack | PeerLost)]
-        own = [n for n in notices if isinstance(n, CallEnded) and self._is_own(n.outcome)]
+            notices = [notice for notice in notices if isinstance(notice, Welcome | PeerLost)]
+        own = [n for n in notices if isinstance(n, Outcome) and self._is_own(n)]
         for notice in own:
-            self._answered(now, notice.outcome)
-            self.callers[node].acknowledge(now, notice.outcome.id)
+            self._answered(now, notice)
+            self.callers[node].acknowledge(now, notice.id)
         self.executor.take(now, node, [n for n in notices if n not in own])
         self.advance(now)
 
@@ -299,6 +318,7 @@ class Mission:
             "runs": self.runs,
             "status": finished.status.value if finished else Status.ERROR.value,
             "reason": finished.reason if finished else "not finished",
+            "happened": self.tally.happened(reached_end=not failed),
             **({"last_errors": errors} if errors else {}),
             **self.remarks,
         }
@@ -385,7 +405,7 @@ class Mission:
         for notice in notices:
             if isinstance(notice, PeerLost):
                 self.lost[node] = notice.reason
-            elif isinstance(notice, PeerBack):
+            elif isinstance(notice, Welcome):
                 self.lost.pop(node, None)
                 self.executor.store.node(node, notice.boot)
 

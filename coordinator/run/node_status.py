@@ -9,10 +9,10 @@ from datetime import UTC, datetime
 from typing import Any
 
 from petrobot.coordinator.run.realtime import credentials_of
-from petrobot.services.comm.calls.caller import Caller, CommandAnswered, Notice, PeerLost
+from petrobot.services.comm.calls.caller import Caller, Notice, PeerLost
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.location_file import Directory
-from petrobot.services.comm.protocol.messages import Command, Hello
+from petrobot.services.comm.protocol.messages import Answer, Command, Hello
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 
 
@@ -41,8 +41,8 @@ async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any
 
     def hear(_: float, notices: list[Notice]) -> None:
         for notice in notices:
-            if isinstance(notice, CommandAnswered) and not told.done():
-                told.set_result(dict(notice.answer.data))
+            if isinstance(notice, Answer) and not told.done():
+                told.set_result(dict(notice.data))
             elif isinstance(notice, PeerLost):
                 refused.append(notice.reason)
 

@@ -12,14 +12,16 @@ from typing import Final
 
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Mission, MissionError, Stage
-from petrobot.services.comm.calls.caller import Notice, PeerBack, PeerLost
+from petrobot.services.comm.calls.caller import Notice, PeerLost
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.location_file import Directory
-from petrobot.services.comm.tls.credentials import COORDINATOR, Credentials, credentials
+from petrobot.services.comm.protocol.messages import COORDINATOR, Welcome
+from petrobot.services.comm.tls.credentials import Credentials, credentials
 
 _log = logging.getLogger(__package__)
 
-# How punctual the coordinator's own event loop is: its host's load, seen by one who only wants to wake up in time.
+# How punctual the coordinator's own event loop is: its host's load, seen by one who only wants to
+# wake up in time.
 
 PERIOD: Final = 0.05
 """Seconds between looks."""
@@ -220,7 +222,7 @@ class RealtimeMission:
                 if isinstance(notice, PeerLost):
                     self._lost_at[node] = self._loop.time()
                     _log.info("link to node %s lost: %s", node, notice.reason)
-                elif isinstance(notice, PeerBack):
+                elif isinstance(notice, Welcome):
                     self._lost_at.pop(node, None)
                     _log.info("link to node %s is up", node)
             if not self._closed:

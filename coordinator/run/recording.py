@@ -139,7 +139,7 @@ def _unmeasured(data: Mapping[str, Any]) -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class RecordedStep:
     """One stimulus derived again."""
 
     number: int
@@ -162,12 +162,12 @@ def as_recorded(engine: Engine, header: Mapping[str, Any]) -> Engine:
             f"semantics: expected at most {SEMANTICS}, found {semantics}: this run was recorded by "
             "a newer petrobot; use that one to replay or resume it"
         )
-    if semantics == 1:
-        return Engine(engine.task, engine.compiled.devices, RECORDED)
+    if semantics in RECORDED:
+        return Engine(engine.task, engine.compiled.devices, RECORDED[semantics])
     return engine
 
 
-def replay(journal: Journal, engine: Engine) -> Iterator[Step]:
+def replay(journal: Journal, engine: Engine) -> Iterator[RecordedStep]:
     """Derive every state and instruction of a journal again. Raises ReplayError at the first
     difference."""
     engine = as_recorded(engine, journal.header)
@@ -185,7 +185,7 @@ def replay(journal: Journal, engine: Engine) -> Iterator[Step]:
             ) from fault
         state, instructions = engine.handle(state, stimulus)
         _compare(journal.path, record.number, record.data, engine, state, instructions)
-        yield Step(record.number, record.data["t"], stimulus, instructions, state, boots)
+        yield RecordedStep(record.number, record.data["t"], stimulus, instructions, state, boots)
 
 
 def _compare(

@@ -15,7 +15,7 @@ from petrobot.coordinator.engine.instructions import (
 )
 from petrobot.coordinator.engine.stimuli import Stimulus
 from petrobot.coordinator.task import Status
-from petrobot.services.comm.calls.caller import CallProgress
+from petrobot.services.comm.protocol.messages import Feedback
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ class Timeline:
         """The first stimulus begins the time axis."""
         self._since(now)
 
-    def progress(self, now: float, run: str, notice: CallProgress) -> None:
+    def progress(self, now: float, run: str, notice: Feedback) -> None:
         """Progress is not kept."""
 
     def settled(self, now: float, state: State) -> None:

@@ -61,6 +61,8 @@ class CompiledTransition:
     pulse: str
     flags: tuple[str, ...]
     when: Expression | None
+    sets: tuple[tuple[str, Expression], ...]
+    """Variables that a firing writes, with their new values."""
     judges_runs: bool
     """Whether its condition reads status or reason of a run that it takes."""
     after: float | None
@@ -105,6 +107,7 @@ def _compiled(task: Task, net: Net, t: Transition) -> CompiledTransition:
         pulse=next((e.name for e in events if is_pulse(e)), ""),
         flags=tuple(e.name for e in events if e.scope is Scope.EXTERNAL and not is_pulse(e)),
         when=t.when,
+        sets=t.sets,
         judges_runs=t.when is not None and any(n.rpartition(".")[0] in taken for n in t.when.names),
         after=t.after,
         priority=t.priority,

@@ -36,25 +36,28 @@ class Kind(StrEnum):
     ACTION = "action"
     """A primitive task: a token in it is a run of one of its actions."""
     RESOURCE = "resource"
-    """Something that runs share: an arm, a camera."""
+    """Something that several runs share, such as an arm or a camera."""
     CONTROL = "control"
     """Task flow alone; the operator may put tokens in and take them out."""
+    PLAIN = "plain"
+    """A token on its way; the file leaves `kind` out. It must be empty at the end, unless `final`
+    names it."""
     MACRO = "macro"
     """A part of the net drawn as one place: a subnet of its own, or the places and transitions that
     name it."""
 
 
 class End(StrEnum):
-    """When an arc out of an action place may take the token."""
+    """When an arc from an action place may take the token."""
 
     NORMAL = "normal"
-    """The run is done with SUCCESS or FAILURE."""
+    """The run has ended with SUCCESS or FAILURE."""
     ERROR = "error"
-    """The run is done with ERROR."""
+    """The run has ended with ERROR."""
     PREEMPT = "preempt"
-    """The run still goes on; it is cancelled."""
+    """The run is still active; the firing cancels it."""
     GOING = "going"
-    """The run still goes on and keeps going on: the token is only looked at."""
+    """The run is active and stays so: the arc only tests for the token."""
 
 
 class Counts(StrEnum):
@@ -64,35 +67,35 @@ class Counts(StrEnum):
     FAILURE = "failure"
     ERROR = "error"
     NONE = "none"
-    """Censored: it says nothing about reliability, only that it had lasted so long."""
+    """Censored: the run says nothing about reliability, only that it lasted at least so long."""
 
 
 class Scope(StrEnum):
     """Who detects an event (paper, section 2)."""
 
     INTERNAL = "internal"
-    """A primitive task raises it while its run goes on; it is latched to that run and gone with
+    """Raised by an active run of a primitive task. It is latched to that run and disappears with
     it."""
     EXTERNAL = "external"
     """A sensor, a timer, another node or the operator."""
 
 
-class Memory(StrEnum):
+class EventMemory(StrEnum):
     """How long an external event is remembered."""
 
     PULSE = "pulse"
-    """It serves the transitions that are enabled when it comes, then it is gone."""
+    """It serves the transitions that are enabled when it occurs, then it disappears."""
     LATCHED = "latched"
     """A flag that stays set until a firing consumes it."""
 
 
-class Early(StrEnum):
-    """What becomes of a latched event that comes before any transition waits for it."""
+class EarlyEvent(StrEnum):
+    """What happens to a latched event that occurs before any transition waits for it."""
 
     DROP = "drop"
-    """It is recorded and forgotten: nothing stale fires later."""
+    """It is recorded and dropped, so that nothing fires on an old event."""
     KEEP = "keep"
-    """Its flag is set and waits."""
+    """Its flag is set and stays set until a firing consumes it."""
 
 
 class Start(StrEnum):
@@ -100,51 +103,56 @@ class Start(StrEnum):
 
     WHEN_FREE = "when_free"
     AT_ONCE = "at_once"
-    """For actions such as hold, which must begin although another run on the device has not stopped
+    """For actions such as hold, which must start although another run on the device has not stopped
     yet."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What the designer expects of runs that end with one status, until runs have been measured."""
+    """What the designer expects of runs that end with one status, before runs were measured."""
 
     share: float
     """Probability of the status."""
     mean: float
     """Mean duration (s)."""
     cv: float = 1.0
-    """Standard deviation of the duration over its mean; 1 is an exponential law."""
+    """Standard deviation of the duration over its mean; 1 for the exponential distribution."""
 
 
 @dataclass(frozen=True, slots=True)
 class PrimitiveTask:
-    """A step of the task with a goal of its own, translated into one of several primitive actions
-    (paper, section 2)."""
+    """A step of the task with its own goal, carried out by one of several actions (paper, section
+    2)."""
 
     name: str
     goal: str
     alternatives: tuple[str, ...]
-    """Names of actions; with more than one, a selector chooses at each start."""
+    """Names of actions. If there are several, a selector chooses one at each start."""
     deadline: float
-    """Seconds that a run may take before the runtime ends it with ERROR, cause `deadline`."""
+    """Longest run (s). The runtime ends a longer one with ERROR, cause `deadline`."""
     specification: str = ""
     target_reliability: float = 0.9
-    """R_d of docs: cost is taken in the hardest scenario whose reliability is not below it."""
+    """R_d (docs/learning.md): the cost is that of the hardest scenario with at least this
+    reliability."""
     cost: str = "wall"
-    """`wall` or `cpu` (s), `count` (what the result says in `count`, else 1), or `value:NAME`: a
-    number of that name in it."""
+    """Measure of the cost of a run: `wall` or `cpu` (s), `count` (the result's value `count`, else
+    1), or `value:NAME` (that value of the result)."""
     error_causes: Mapping[str, str] = field(default_factory=dict)
-    """Cause codes that its actions give with ERROR, with a sentence for people."""
+    """Codes of the causes that its actions may return with ERROR, each with a sentence for
+    people."""
     start: Start = Start.WHEN_FREE
     stop_within: float = 2.0
-    """Seconds in which a cancelled run has to stop before its device is stopped and its worker
-    killed."""
+    """Time for a cancelled run to stop (s); then its device is stopped and its worker killed."""
     estimates: Mapping[Status, Estimate] = field(default_factory=dict)
+    costs: Mapping[str, float] = field(default_factory=dict)
+    """What a run of each action costs as far as it is known before any run, in the unit of `cost`;
+    used until runs of the action were measured."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """An argument that is read from a variable or parameter when the run starts."""
+    """An argument that is read from a variable or parameter: when the run starts, or, for a
+    variable that some transition sets, when the token enters the place."""
 
     variable: str
 
@@ -160,18 +168,33 @@ class Place:
     task: str = ""
     """Action place: its primitive task."""
     args: Mapping[str, Value] = field(default_factory=dict)
-    """Action place: arguments of the action, plain values or `Reference`s."""
+    """Action place: arguments of the action. Macro place: what the parameters of its subnet stand
+    for. Plain values or `Reference`s."""
     out: Mapping[str, str] = field(default_factory=dict)
     """Action place: which value of the result goes to which variable."""
     servers: int | None = None
     """Action place: how many runs go on at once, further tokens queue; None: one, and a second
     token is a fault."""
+    tries: int = 1
+    """Action place: largest number of runs for one token, as long as each ends in ERROR."""
+    retry_unknown: bool = False
+    """Action place: also try again when it is not known whether the failed run was executed."""
+    timeout: float | None = None
+    """Action place: seconds that a run may take here; shorter than the deadline of its primitive
+    task."""
+    listen: bool = False
+    """Its token may be left at the end: a branch that always waits for an event."""
+    holds: tuple[str, ...] = ()
+    """Resource places from which a token in this place holds one token each."""
     subnet: str = ""
-    """Macro place: the subnet that it stands for; empty for one that only shows those that name it
+    """Macro place: the subnet that it stands for; empty if it only groups the elements that name it
     in `macro`."""
     macro: str = ""
     """Macro place within which it is drawn; empty: none. Its meaning is the same with and
     without."""
+    expanded_from: str = ""
+    """Element of the file that this place was made from (`expansion`); empty if it stands
+    there."""
     label: str = ""
     x: float | None = None
     y: float | None = None
@@ -207,25 +230,29 @@ class Inhibitor:
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """A transition: what it takes and gives, and what must happen for it to fire."""
+    """A transition: its arcs, and what must happen before it fires."""
 
     name: str
     inputs: tuple[Input, ...] = ()
     outputs: tuple[Output, ...] = ()
     inhibitors: tuple[Inhibitor, ...] = ()
     events: tuple[str, ...] = ()
-    """All must have occurred; at most one of them a pulse."""
+    """Events that must all have occurred; at most one of them may be a pulse."""
     when: Expression | None = None
     priority: int = 0
-    """Settles conflicts only: the highest of a conflict set fires."""
+    """Decides conflicts only: of transitions in conflict, that with the highest priority fires."""
     weight: float | None = None
-    """Settles conflicts of equal priority by a draw."""
+    """Decides conflicts of equal priority by a random draw with these weights."""
     after: float | None = None
     """Fires so many seconds after its arcs became satisfied."""
+    sets: tuple[tuple[str, Expression], ...] = ()
+    """Variables that its firing writes, with their new values: a literal, a variable or a
+    parameter each. Conditions of the same step still read the old values."""
     error_branch: bool = False
-    """Said to belong to an error branch; those behind an `error` arc belong there without saying
-    so."""
+    """Whether it is declared to be part of an error branch. Transitions behind an `error` arc are
+    part of one anyway."""
     macro: str = ""  # as of a place
+    expanded_from: str = ""  # as of a place
     label: str = ""
     x: float | None = None
     y: float | None = None
@@ -237,14 +264,14 @@ class Event:
 
     name: str
     scope: Scope
-    memory: Memory = Memory.PULSE
+    memory: EventMemory = EventMemory.PULSE
     """External events only; an internal one is always latched to its run."""
-    early: Early = Early.DROP
+    early: EarlyEvent = EarlyEvent.DROP
     """Latched external events only."""
     by: str = ""
     """Internal events only: the primitive task that raises it."""
     mean_wait: float | None = None
-    """Expected seconds from the moment something waits for it until it comes, for forecasts before
+    """Expected time from when a transition waits for it until it occurs (s), for forecasts before
     any measurement."""
     text: str = ""
 
@@ -257,10 +284,10 @@ class VariableType(StrEnum):
     FLOAT = "float"
     STR = "str"
     ANY = "any"
-    """Any plain data; conditions may compare it with none only."""
+    """Any plain data. Conditions may only compare it with none."""
 
     def admits(self, value: Value) -> bool:
-        """Whether the value is of this type (none is of every type: not written yet)."""
+        """Whether the value is of this type. None, for not written yet, is of every type."""
         if value is None or self is VariableType.ANY:
             return True
         if isinstance(value, bool):
@@ -274,7 +301,7 @@ class VariableType(StrEnum):
 
     @classmethod
     def of(cls, value: Value) -> VariableType:
-        """The narrowest type that admits the value."""
+        """Return the narrowest type that admits the value."""
         return next(
             t
             for t in (cls.ANY if value is None else cls.BOOL, cls.INT, cls.FLOAT, cls.STR, cls.ANY)
@@ -290,8 +317,21 @@ class Variable:
     type: VariableType
     initial: Value = None
     values: tuple[str, ...] = ()
-    """A `str` variable's possible values, if they are few: then `check` can prove that conditions
-    cover all cases."""
+    """Possible values of a `str` variable, if they are few. `check` uses them to prove that
+    conditions cover all cases."""
+
+
+class Parameter(StrEnum):
+    """What a parameter of a subnet stands for: a place or a variable of the net around it, or a
+    value of a type."""
+
+    PLACE = "place"
+    VARIABLE = "variable"
+    BOOL = "bool"
+    INT = "int"
+    FLOAT = "float"
+    STR = "str"
+    ANY = "any"
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,8 +343,12 @@ class Subnet:
     places: Mapping[str, Place]
     transitions: Mapping[str, Transition]
     entry: str
-    """Place that receives the tokens put into the macro place."""
+    """Place that receives the tokens of arcs to the macro place."""
     normal: str
-    """Place from which arcs `macro:normal` take."""
+    """Place from which arcs `macro:normal` take tokens."""
     error: str = ""
     """Place from which arcs `macro:error` take."""
+    errors_to: str = ""
+    """Place that receives the errors of its action places without an `error` arc; empty: none."""
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)
+    """What a macro place has to give in `args`."""

@@ -8,7 +8,7 @@ priorities, weights and times dropped.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 from petrobot.coordinator.task.conditions import Expression
@@ -16,7 +16,6 @@ from petrobot.coordinator.task.elements import (
     End,
     Event,
     Input,
-    Kind,
     Output,
     Place,
     PrimitiveTask,
@@ -25,62 +24,60 @@ from petrobot.coordinator.task.elements import (
     Value,
     Variable,
 )
-from petrobot.coordinator.task.macros import unfolded
+from petrobot.coordinator.task.expansion import expand
 from petrobot.coordinator.task.net import Net
 
 
 @dataclass(frozen=True)
 class Task:
-    """A whole robot task. Immutable; `flat` and `net` are derived once."""
+    """A whole robot task. It never changes; `flat` and `net` are computed once."""
 
     name: str
     places: Mapping[str, Place]
     transitions: Mapping[str, Transition]
     primitive_tasks: Mapping[str, PrimitiveTask]
     final: Expression
-    """Predicate on markings (names are places): the task has ended as designed."""
+    """Condition on the marking (names are places) under which the task has ended as designed."""
     final_error: Expression | None = None
-    """Predicate on markings: the task has given up honestly and ends in ERROR."""
+    """Condition on the marking under which the task ends in ERROR, as designed."""
     goal: str = ""
-    """What counts as a met specification, for people."""
+    """When the task has met its specification, as a sentence for people."""
     goal_transitions: tuple[str, ...] = ()
-    """Firings that each stand for one met goal (R_goal of the forecasts)."""
+    """Transitions whose firing means one met goal (R_goal of the forecasts)."""
     runs_place: str = ""
-    """Control place whose tokens are the mission runs still to do."""
+    """Control place whose tokens are the runs that are left to do."""
     parameters: Mapping[str, Value] = field(default_factory=dict)
-    """Names and defaults of what a user sets for a mission run; read like variables, never
-    written."""
+    """Names and default values of what a user sets for a run. They are read like variables and
+    never written."""
     variables: Mapping[str, Variable] = field(default_factory=dict)
     events: Mapping[str, Event] = field(default_factory=dict)
     subnets: Mapping[str, Subnet] = field(default_factory=dict)
     prepare: str = ""
-    """Service that is called with the parameters before a mission run; empty: none."""
+    """Service that is called with the parameters before a mission run; empty: none is called."""
     score: str = ""
-    """Service that is called at its end and gives the task's own results; empty: none."""
+    """Service that is called at the end and returns the task's own results; empty: none."""
     text: str = ""
     pictures: str = ""
-    """Import path "module:function" of what draws a mission run's result for its report: SVG by
-    title; empty: nothing."""
+    """Function ("module:function") that draws pictures of a result for the report, as SVG by title;
+    empty: none."""
     services: str = ""
     """Location file that the task is usually run with, relative to the task's own file; empty: the
     one at hand."""
+    errors_to: str = ""
+    """Place that receives the errors of action places without an `error` arc; empty: none."""
 
     @cached_property
     def flat(self) -> Task:
-        """The task with every macro place replaced by its subnet or by those drawn within it;
-        itself if there is none."""
-        if not any(p.kind is Kind.MACRO for p in self.places.values()):
-            return self
-        places, transitions = unfolded(self.places, self.transitions, self.subnets)
-        return replace(self, places=places, transitions=transitions, subnets={})
+        """The task with all that is written in short expanded; itself if nothing is."""
+        return expand(self)
 
     @cached_property
     def net(self) -> Net:
         """The ordinary net of the flat task: places, arcs, inhibitors, capacities and initial
-        marking alone.
+        marking.
 
-        Priorities are left out on purpose: they settle conflicts among transitions whose events
-        have come, so as priorities of the ordinary net they would forbid firings that do happen.
+        Priorities are left out on purpose. They decide conflicts among transitions whose events
+        have occurred; as priorities of the ordinary net they would forbid firings that do happen.
         """
         flat = self.flat
         return Net.build(
@@ -95,8 +92,8 @@ class Task:
 
     @cached_property
     def error_elements(self) -> frozenset[str]:
-        """Names of places and transitions that only error branches reach (of `self`, macro places
-        unexpanded)."""
+        """Names of the places and transitions that only error branches reach, with macro places as
+        they are."""
         transitions = {
             t.name
             for t in self.transitions.values()
@@ -116,7 +113,7 @@ class Task:
             transitions |= new_transitions
 
     def _only_fed_by(self, transitions: set[str]) -> Iterator[str]:
-        """Places without tokens of their own whose every producer is among the transitions."""
+        """Yield the places without initial tokens that only these transitions feed."""
         for place in self.places.values():
             feeders = [
                 t.name
@@ -127,11 +124,11 @@ class Task:
                 yield place.name
 
     def primitive_task_of(self, place: str) -> PrimitiveTask:
-        """The primitive task of an action place of the flat task. Raises KeyError."""
+        """Return the primitive task of an action place of the flat task. Raises KeyError."""
         return self.primitive_tasks[self.flat.places[place].task]
 
     def initial_variables(self) -> dict[str, Value]:
-        """Variables and parameters before a mission run begins."""
+        """Return variables and parameters before a mission run begins."""
         return {v.name: v.initial for v in self.variables.values()} | dict(self.parameters)
 
 
@@ -140,7 +137,7 @@ def _weights(arcs: tuple[Input, ...] | tuple[Output, ...]) -> dict[str, int]:
 
 
 def _produced(transition: Transition) -> dict[str, int]:
-    """What a transition puts back: its outputs, and the tokens that `going` arcs only look at."""
+    """Return what a transition produces: outputs, and the tokens that `going` arcs only test."""
     produced = _weights(transition.outputs)
     for arc in transition.inputs:
         if arc.end is End.GOING:

@@ -1,5 +1,4 @@
-"""An ordinary Petri net with weighted and inhibitor arcs: places, transitions, marking, enabled,
-fire."""
+"""An ordinary Petri net with weighted arcs, inhibitor arcs, capacities and priorities."""
 
 from __future__ import annotations
 
@@ -12,7 +11,7 @@ from petrobot.coordinator.task.compiled import Marking as Marking
 
 
 class NotEnabled(Exception):  # noqa: N818 - a fact about a marking that callers may ask for
-    """A transition was fired in a marking that does not enable it."""
+    """A transition was to fire in a marking that does not enable it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +37,7 @@ class Net:
     transition_index: Mapping[str, int] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Refuse a malformed net with one clear ValueError."""
+        """Compile the firing rule. Raises ValueError for a malformed net."""
         for what, names in (("place", self.places), ("transition", self.transitions)):
             if len(set(names)) != len(names):
                 twice = sorted({n for n in names if names.count(n) > 1})
@@ -78,8 +77,8 @@ class Net:
         capacity: Mapping[str, int] | None = None,
         priority: Mapping[str, int] | None = None,
     ) -> Net:
-        """A net from names: initial tokens by place, and (consumed, produced) weights by place for
-        each transition."""
+        """Return a net from names: initial tokens of each place, and for each transition the
+        weights (consumed, produced) by place."""
         index = {p: i for i, p in enumerate(places)}
         inhibitors, capacity, priority = inhibitors or {}, capacity or {}, priority or {}
 
@@ -109,17 +108,17 @@ class Net:
         return self.compiled.is_enabled(marking, t)
 
     def enabled(self, marking: Marking) -> list[int]:
-        """All transitions that may fire in the marking, in transition order."""
+        """Return the transitions that may fire in the marking, in transition order."""
         return self.compiled.enabled(marking)
 
     def fire(self, marking: Marking, t: int) -> Marking:
-        """The marking after transition t. Raises NotEnabled."""
+        """Return the marking after transition t. Raises NotEnabled."""
         if not self.is_enabled(marking, t):
             raise NotEnabled(f"{self.transitions[t]} is not enabled in {self.describe(marking)}")
         return self.compiled.after(marking, t)
 
     def replay(self, firings: Iterable[str], marking: Marking | None = None) -> Iterator[Marking]:
-        """The markings along a firing sequence of transition names, starting with the given or
+        """Yield the markings along a sequence of transition names, beginning with the given or the
         initial one."""
         current = self.initial if marking is None else marking
         yield current
@@ -128,7 +127,7 @@ class Net:
             yield current
 
     def describe(self, marking: Marking) -> str:
-        """The marking for people: marked places with their tokens."""
+        """Return the marking as text: the marked places with their tokens."""
         return (
             " ".join(
                 f"{p}:{n}" if n != 1 else p for p, n in zip(self.places, marking, strict=True) if n

@@ -1,8 +1,8 @@
-"""What every task must satisfy before anything is done with it: names that exist, arcs that mean
-something, kinds that fit.
+"""Faults of a task's description: names that do not exist, arcs without a meaning, kinds that do
+not fit. A task with a fault can be neither run nor analysed.
 
-These are faults of the description. What a sound description may still do wrong (missing branches,
-conflicts that nothing settles) is for `check`; what its state space does is for the analysis.
+What a sound description may still do wrong is found elsewhere: missing branches and undecided
+conflicts by `check`, deadlocks and other properties of the state space by the analysis.
 """
 
 from __future__ import annotations
@@ -10,17 +10,19 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from math import isfinite
+from math import inf, isfinite, prod
 
-from petrobot.coordinator.task.conditions import Expression
+from petrobot.coordinator.task.conditions import Expression, Literal, Name
 from petrobot.coordinator.task.conditions.regions import Domain, kind_faults
 from petrobot.coordinator.task.elements import (
-    Early,
+    EarlyEvent,
     End,
     Event,
+    EventMemory,
+    Executed,
     Input,
     Kind,
-    Memory,
+    Parameter,
     Place,
     PrimitiveTask,
     Reference,
@@ -32,17 +34,20 @@ from petrobot.coordinator.task.elements import (
     Variable,
     VariableType,
 )
-from petrobot.coordinator.task.macros import CircleError, macro_faults
+from petrobot.coordinator.task.expansion import CircleError
+from petrobot.coordinator.task.macros import macro_faults
 from petrobot.coordinator.task.model import Task
 from petrobot.coordinator.task.wording import Fault, listed, nearest
 
 _IDENTIFIER = re.compile(r"[^\W\d]\w*\Z")
 _RESERVED = frozenset({"and", "or", "not", "true", "false", "none"})
+MOST_COPIES = 1_000
+"""Largest number of copies that `tries` may make of one transition (`expansion`)."""
 _COST = re.compile(r"(wall|cpu|count|value:[^\W\d]\w*)\Z")
 
 
 def faults(task: Task) -> tuple[Fault, ...]:
-    """Everything that makes the task meaningless, in file order; empty for a usable task."""
+    """Return all faults of the description, in file order; empty for a usable task."""
     found = list(_names(task))
     for primitive in task.primitive_tasks.values():
         found += _primitive_task(primitive)
@@ -50,7 +55,7 @@ def faults(task: Task) -> tuple[Fault, ...]:
         found += _variable(task, variable)
     for event in task.events.values():
         found += _event(task, event)
-    found += _net(task, "", task.places, task.transitions)
+    found += _net(task, "", _Names(task), task.places, task.transitions, task.errors_to)
     for subnet in task.subnets.values():
         found += _subnet(task, subnet)
     if not found:
@@ -59,8 +64,8 @@ def faults(task: Task) -> tuple[Fault, ...]:
 
 
 def condition_domains(task: Task) -> dict[str, Domain]:
-    """What the names in transitions' conditions can be: variables, parameters, `place.status` and
-    `place.reason`."""
+    """Return what each name in a transition's condition can be: variables, parameters,
+    `place.status` and `place.reason`."""
     domains = {v.name: Domain(v.type.value, v.values) for v in task.variables.values()}
     domains |= {
         name: Domain(VariableType.of(value).value) for name, value in task.parameters.items()
@@ -69,11 +74,12 @@ def condition_domains(task: Task) -> dict[str, Domain]:
         if place.kind is Kind.ACTION:
             domains[f"{place.name}.status"] = Domain("str", tuple(s.value for s in Status))
             domains[f"{place.name}.reason"] = Domain("str")
+            domains[f"{place.name}.executed"] = Domain("str", tuple(e.value for e in Executed))
     return domains
 
 
 def marking_domains(task: Task) -> dict[str, Domain]:
-    """What the names in `final` can be: the tokens of places."""
+    """Return what each name in `final` can be: the number of tokens of a place."""
     return {name: Domain("int", least=0) for name in task.places}
 
 
@@ -92,15 +98,15 @@ def _names(task: Task) -> Iterator[Fault]:
             if not _IDENTIFIER.match(name) or name in _RESERVED:
                 yield Fault(
                     f"{group}.{name}",
-                    f"{name!r} is no name",
-                    "use letters, digits and _, and no reserved word",
+                    f"{name!r} cannot be a name",
+                    "use letters, digits and _, and not a reserved word",
                 )
     for name, value in task.parameters.items():
         if not is_plain(value):
             yield Fault(
                 f"task.parameters.{name}",
-                f"{value!r} is no default value",
-                "use a finite number, text, ...",
+                f"expected a default value, got {value!r}",
+                "use a finite number, a text, true or false",
             )
     for name in set(task.variables) & set(task.parameters):
         yield Fault(f"variables.{name}", "a parameter has this name too", "rename one of them")
@@ -111,32 +117,41 @@ def _names(task: Task) -> Iterator[Fault]:
 def _primitive_task(p: PrimitiveTask) -> Iterator[Fault]:
     key = f"primitive_tasks.{p.name}"
     if not p.goal:
-        yield Fault(
-            f"{key}.goal", "it has no goal", "say in one sentence what is reached when it succeeds"
-        )
+        yield Fault(f"{key}.goal", "it has no goal", "say in one sentence what its success means")
     if not p.alternatives:
-        yield Fault(f"{key}.alternatives", "no action translates it", "name at least one action")
+        yield Fault(f"{key}.alternatives", "it has no action", "name at least one action")
     for action, n in Counter(p.alternatives).items():
         if n > 1:
-            yield Fault(f"{key}.alternatives", f"{action!r} stands there {n} times", "name it once")
+            yield Fault(f"{key}.alternatives", f"{action!r} is listed {n} times", "name it once")
     for name, seconds in (("deadline", p.deadline), ("stop_within", p.stop_within)):
         if not seconds > 0:
             yield Fault(
                 f"{key}.{name}",
-                f"{seconds} s is no time to do anything in",
+                f"expected a time above 0, got {seconds} s",
                 "give a positive number of seconds",
             )
     if not 0 < p.target_reliability <= 1:
         yield Fault(
             f"{key}.target_reliability",
-            f"{p.target_reliability} is no probability",
+            f"expected a probability, got {p.target_reliability}",
             "give 0 < R <= 1",
         )
     if not _COST.match(p.cost):
         yield Fault(
-            f"{key}.cost", f"{p.cost!r} is no cost measure", "write wall, cpu, count or value:NAME"
+            f"{key}.cost",
+            f"unknown cost measure {p.cost!r}",
+            "write wall, cpu, count or value:NAME",
         )
     yield from _estimates(p, f"{key}.estimates")
+    for action, cost in p.costs.items():
+        if action not in p.alternatives:
+            yield Fault(
+                f"{key}.costs.{action}",
+                f"{action!r} is not an alternative of {p.name}",
+                f"its alternatives are {', '.join(p.alternatives)}",
+            )
+        if not 0 <= cost < inf:
+            yield Fault(f"{key}.costs.{action}", f"a cost of {cost}", "give a number of at least 0")
 
 
 def _estimates(p: PrimitiveTask, key: str) -> Iterator[Fault]:
@@ -144,7 +159,8 @@ def _estimates(p: PrimitiveTask, key: str) -> Iterator[Fault]:
         if not 0 <= e.share <= 1 or not e.mean >= 0 or not e.cv >= 0:
             yield Fault(
                 f"{key}.{status}",
-                "a share lies in 0 to 1, mean and cv are not negative",
+                f"expected a share from 0 to 1 and no negative mean or cv, got share {e.share}, "
+                f"mean {e.mean}, cv {e.cv}",
                 "correct the numbers",
             )
     total = sum(e.share for e in p.estimates.values())
@@ -156,12 +172,14 @@ def _variable(task: Task, v: Variable) -> Iterator[Fault]:
     key = f"variables.{v.name}"
     if not v.type.admits(v.initial):
         yield Fault(
-            f"{key}.initial", f"{v.initial!r} is no {v.type}", "change the value or the type"
+            f"{key}.initial",
+            f"expected {v.type}, got {v.initial!r}",
+            "change the value or the type",
         )
     if v.values and v.type is not VariableType.STR:
         yield Fault(
             f"{key}.values",
-            f"a {v.type} has no list of values",
+            f"only a variable of type str can list its values, not one of type {v.type}",
             "drop `values` or make the type str",
         )
     elif v.values and v.initial is not None and v.initial not in v.values:
@@ -176,96 +194,236 @@ def _event(task: Task, e: Event) -> Iterator[Fault]:
     key = f"events.{e.name}"
     if e.scope is Scope.INTERNAL and e.by not in task.primitive_tasks:
         remedy = f"`by` names the one that raises it{nearest(e.by, task.primitive_tasks)}"
-        yield Fault(f"{key}.by", f"{e.by!r} is no primitive task", remedy)
+        yield Fault(f"{key}.by", f"unknown primitive task {e.by!r}", remedy)
     if e.scope is Scope.EXTERNAL and e.by:
         yield Fault(
             f"{key}.by",
-            "an external event is raised by no primitive task",
+            "a primitive task cannot raise an external event",
             "drop `by` or make it internal",
         )
-    if e.early is Early.KEEP and (e.scope is Scope.INTERNAL or e.memory is Memory.PULSE):
+    if e.early is EarlyEvent.KEEP and (e.scope is Scope.INTERNAL or e.memory is EventMemory.PULSE):
         yield Fault(f"{key}.early", "only a latched external event can be kept", "drop `early`")
     if e.mean_wait is not None and not e.mean_wait > 0:
         yield Fault(
             f"{key}.mean_wait",
-            f"{e.mean_wait} s is no mean time",
+            f"expected a mean time above 0, got {e.mean_wait} s",
             "give a positive number of seconds",
         )
 
 
+class _Names:
+    """What arguments, results and arcs of one net may name besides its own places."""
+
+    def __init__(self, task: Task, subnet: Subnet | None = None) -> None:
+        parameters = {} if subnet is None else subnet.parameters
+        kinds = parameters.items()
+        self.subnets = task.subnets
+        self.primitive_tasks = task.primitive_tasks
+        self.places = {n for n, kind in kinds if kind is Parameter.PLACE}
+        self.outer = set() if subnet is None else set(task.places)
+        """Places of the task itself: resources that a place of a subnet may hold."""
+        self.written = {*task.variables, *(n for n, k in kinds if k is Parameter.VARIABLE)}
+        self.read = {*self.written, *task.parameters, *parameters} - self.places
+
+
 def _net(
-    task: Task, prefix: str, places: Mapping[str, Place], transitions: Mapping[str, Transition]
+    task: Task,
+    prefix: str,
+    names: _Names,
+    places: Mapping[str, Place],
+    transitions: Mapping[str, Transition],
+    errors_to: str,
 ) -> Iterator[Fault]:
     for place in places.values():
-        yield from _place(task, f"{prefix}places.{place.name}", place)
+        key = f"{prefix}places.{place.name}"
+        yield from _place(names, key, place)
+        yield from _short_forms(task, names, key, place, places)
+        if place.subnet in task.subnets and place.kind is Kind.MACRO:
+            yield from _arguments_of_macro(names, key, place, places)
     for transition in transitions.values():
         key = f"{prefix}transitions.{transition.name}"
-        yield from _arcs(key, transition, places)
+        yield from _arcs(key, transition, places, names.places)
         yield from _trigger(task, key, transition)
+        yield from _sets(names, key, transition)
+        yield from _copies(key, transition, places)
+    if errors_to:
+        yield from _errors_to(f"{prefix}errors.to", errors_to, places, transitions)
     yield from macro_faults(prefix, places, transitions)
 
 
-def _place(task: Task, key: str, p: Place) -> Iterator[Fault]:
+def _copies(key: str, t: Transition, places: Mapping[str, Place]) -> Iterator[Fault]:
+    copies = prod(max(1, places[a.place].tries) for a in t.inputs if a.place in places)
+    if copies > MOST_COPIES:
+        text = f"the `tries` of its input places make {copies} cases of it"
+        yield Fault(key, text, f"lower them: {MOST_COPIES} cases are the limit")
+
+
+def _errors_to(
+    key: str, to: str, places: Mapping[str, Place], transitions: Mapping[str, Transition]
+) -> Iterator[Fault]:
+    if to not in places:
+        yield Fault(key, f"{to!r} is not a place{nearest(to, places)}", "declare it in [places]")
+    elif places[to].kind is Kind.ACTION and not any(
+        a.place == to and a.end is End.ERROR for t in transitions.values() for a in t.inputs
+    ):
+        remedy = f'add a transition with in = ["{to}:error"]'
+        yield Fault(key, f"{to!r} is an action place whose own errors lead nowhere", remedy)
+
+
+def _sets(names: _Names, key: str, t: Transition) -> Iterator[Fault]:
+    for name, expression in t.sets:
+        if name not in names.written:
+            remedy = f"declare it in [variables]{nearest(name, names.written)}"
+            yield Fault(f"{key}.set.{name}", f"{name!r} is not a variable", remedy)
+        if not isinstance(expression.tree, Literal | Name):
+            yield Fault(
+                f"{key}.set.{name}",
+                f"{expression.text!r} is neither a literal nor a name",
+                "write 'text', 3, true, none, or the name of a variable or parameter",
+            )
+        elif unknown := sorted(expression.names - names.read):
+            remedy = f"texts stand in quotes: \"'{unknown[0]}'\"{nearest(unknown[0], names.read)}"
+            yield Fault(f"{key}.set.{name}", f"{unknown[0]!r} is not a variable", remedy)
+
+
+def _short_forms(
+    task: Task, names: _Names, key: str, p: Place, places: Mapping[str, Place]
+) -> Iterator[Fault]:
+    """Faults in what a place says in short: tries, timeout, listen, holds."""
+    runs = p.kind is Kind.ACTION
+    given = {
+        "tries": p.tries != 1,
+        "retry_unknown": p.retry_unknown,
+        "timeout": p.timeout is not None,
+    }
+    for name in (n for n, is_given in given.items() if is_given and not runs):
+        yield Fault(f"{key}.{name}", f"a {p.kind} place runs no action", f"drop `{name}`")
+    if p.tries < 1:
+        yield Fault(f"{key}.tries", f"{p.tries} tries", "give 1 or more")
+    if p.tries > 1 and p.servers is not None:
+        text = "the tries of several tokens in one place cannot be told apart"
+        yield Fault(f"{key}.tries", text, "drop `servers`, or use several places")
+    if p.retry_unknown and p.tries == 1:
+        yield Fault(f"{key}.retry_unknown", "there is only one try", "give `tries`")
+    if p.timeout is not None and runs:
+        primitive = task.primitive_tasks.get(p.task)
+        if not p.timeout > 0:
+            yield Fault(f"{key}.timeout", f"{p.timeout} s", "give a positive number of seconds")
+        elif primitive is not None and p.timeout > primitive.deadline:
+            text = f"{p.timeout} s is longer than the deadline of {p.task}, {primitive.deadline} s"
+            yield Fault(f"{key}.timeout", text, "give less, or raise the deadline")
+    if p.listen and p.kind not in (Kind.ACTION, Kind.PLAIN):
+        yield Fault(f"{key}.listen", f"a {p.kind} place listens to nothing", "drop `listen`")
+    if p.holds and p.kind not in (Kind.ACTION, Kind.PLAIN, Kind.MACRO):
+        text = f"a {p.kind} place holds nothing: the operator or another branch may fill it"
+        yield Fault(f"{key}.holds", text, "drop `holds`, or leave `kind` out")
+    if p.holds and p.kind is Kind.MACRO and not p.subnet:
+        yield Fault(f"{key}.holds", "this macro place only shows what is in it", "drop `holds`")
+    for resource in p.holds:
+        here = places.get(resource) or (task.places.get(resource) if names.outer else None)
+        if here is None and resource in names.places:
+            continue  # judged when it is bound
+        if here is None or here.kind is not Kind.RESOURCE:
+            known = [q.name for q in (*task.places.values(), *places.values())]
+            remedy = f'name a place with kind = "resource"{nearest(resource, known)}'
+            yield Fault(f"{key}.holds", f"{resource!r} is not a resource", remedy)
+
+
+def _arguments_of_macro(
+    names: _Names, key: str, p: Place, inside: Iterable[str]
+) -> Iterator[Fault]:
+    """Faults in what a macro place gives to the parameters of its subnet."""
+    parameters = names.subnets[p.subnet].parameters
+    for name in sorted({*p.args, *parameters}):
+        if name not in parameters:
+            remedy = f"drop it, or declare it in [subnets.{p.subnet}.parameters]"
+            yield Fault(f"{key}.args.{name}", f"{p.subnet!r} has no such parameter", remedy)
+        elif name not in p.args:
+            kind = parameters[name]
+            yield Fault(f"{key}.args", f"{name!r} is missing", f"give it as a {kind}")
+        else:
+            known = names.written if parameters[name] is Parameter.VARIABLE else names.places
+            known = known | set(inside) if parameters[name] is Parameter.PLACE else known
+            yield from _argument_of_macro(
+                names, f"{key}.args.{name}", parameters[name], p.args[name], known
+            )
+
+
+def _argument_of_macro(
+    names: _Names, key: str, kind: Parameter, value: Value, known: set[str]
+) -> Iterator[Fault]:
+    if kind in (Parameter.PLACE, Parameter.VARIABLE):
+        if value not in known:
+            remedy = f"name one{nearest(str(value), known)}"
+            yield Fault(key, f"{value!r} is not a {kind}", remedy)
+    elif isinstance(value, Reference):
+        if value.variable not in names.read:
+            remedy = f"declare it in [variables]{nearest(value.variable, names.read)}"
+            yield Fault(key, f"{value.variable!r} is not a variable or parameter", remedy)
+    elif not is_plain(value) or value is None or not VariableType(kind.value).admits(value):
+        yield Fault(key, f"{value!r} is not of type {kind}", "change the value or the type")
+
+
+def _place(names: _Names, key: str, p: Place) -> Iterator[Fault]:
     if p.tokens < 0:
-        yield Fault(f"{key}.tokens", f"{p.tokens} tokens", "give 0 or more")
+        yield Fault(f"{key}.tokens", f"expected 0 or more tokens, got {p.tokens}", "give 0 or more")
     if p.capacity is not None and p.capacity < max(1, p.tokens):
         yield Fault(
             f"{key}.capacity",
-            f"a capacity of {p.capacity} holds no {p.tokens or 1} tokens",
+            f"expected a capacity of at least {p.tokens or 1}, got {p.capacity}",
             "raise it",
         )
     if p.kind is Kind.ACTION:
-        yield from _action_place(task, key, p)
-    elif p.task or p.args or p.out or p.servers is not None:
+        yield from _action_place(names, key, p)
+    elif p.task or (p.args and not p.subnet) or p.out or p.servers is not None:
         yield Fault(
             key,
-            f"a {p.kind} place runs no action",
+            f"a {p.kind} place cannot run an action",
             "drop task, args, out and servers, or make its kind action",
         )
     if p.kind is Kind.MACRO:
-        if p.subnet and p.subnet not in task.subnets:
-            remedy = f"name one of [subnets]{nearest(p.subnet, task.subnets)}"
-            yield Fault(f"{key}.subnet", f"{p.subnet!r} is no subnet", remedy)
+        if p.subnet and p.subnet not in names.subnets:
+            remedy = f"name one of [subnets]{nearest(p.subnet, names.subnets)}"
+            yield Fault(f"{key}.subnet", f"unknown subnet {p.subnet!r}", remedy)
         if p.tokens or p.capacity is not None:
             yield Fault(
                 key,
-                "a macro place holds no tokens of its own",
+                "a macro place cannot hold tokens",
                 "put them into the places inside it",
             )
     elif p.subnet:
         yield Fault(
             f"{key}.subnet",
-            f"a {p.kind} place stands for no subnet",
+            f"a {p.kind} place cannot have a subnet",
             "drop `subnet` or make its kind macro",
         )
 
 
-def _action_place(task: Task, key: str, p: Place) -> Iterator[Fault]:
-    if p.task not in task.primitive_tasks:
-        remedy = f"name one of [primitive_tasks]{nearest(p.task, task.primitive_tasks)}"
-        yield Fault(f"{key}.task", f"{p.task!r} is no primitive task", remedy)
+def _action_place(names: _Names, key: str, p: Place) -> Iterator[Fault]:
+    if p.task not in names.primitive_tasks:
+        remedy = f"name one of [primitive_tasks]{nearest(p.task, names.primitive_tasks)}"
+        yield Fault(f"{key}.task", f"unknown primitive task {p.task!r}", remedy)
     if p.servers is not None and p.servers < 1:
         yield Fault(f"{key}.servers", f"{p.servers} servers", "give 1 or more")
-    known = {**task.variables, **task.parameters}
     for name, value in p.args.items():
         if isinstance(value, Reference):
-            if value.variable not in known:
-                remedy = f"declare it in [variables]{nearest(value.variable, known)}"
+            if value.variable not in names.read:
+                remedy = f"declare it in [variables]{nearest(value.variable, names.read)}"
                 yield Fault(
                     f"{key}.args.{name}",
-                    f"{value.variable!r} is no variable and no parameter",
+                    f"unknown variable or parameter {value.variable!r}",
                     remedy,
                 )
         elif not is_plain(value):
             yield Fault(
                 f"{key}.args.{name}",
-                f"{value!r} is no plain value",
+                f"expected plain data, got {value!r}",
                 "use finite numbers, texts, booleans, lists, tables",
             )
     for name, variable in p.out.items():
-        if variable not in task.variables:
-            remedy = f"declare it in [variables]{nearest(variable, task.variables)}"
-            yield Fault(f"{key}.out.{name}", f"{variable!r} is no variable", remedy)
+        if variable not in names.written:
+            remedy = f"declare it in [variables]{nearest(variable, names.written)}"
+            yield Fault(f"{key}.out.{name}", f"unknown variable {variable!r}", remedy)
 
 
 def is_plain(value: Value) -> bool:
@@ -277,19 +435,25 @@ def is_plain(value: Value) -> bool:
     return isinstance(value, bool | int | str) or (isinstance(value, float) and isfinite(value))
 
 
-def _arcs(key: str, t: Transition, places: Mapping[str, Place]) -> Iterator[Fault]:
+def _arcs(
+    key: str, t: Transition, places: Mapping[str, Place], parameters: Iterable[str] = ()
+) -> Iterator[Fault]:
     ends: list[tuple[str, str, int]] = [("in", a.place, a.weight) for a in t.inputs]
     ends += [("out", a.place, a.weight) for a in t.outputs]
     ends += [("in", i.place, i.threshold) for i in t.inhibitors]
     for side, name, weight in ends:
-        if name not in places:
+        if name not in places and name not in parameters:
             yield Fault(
                 f"{key}.{side}",
-                f"{name!r} is no place{nearest(name, places)}",
+                f"unknown place {name!r}{nearest(name, places)}",
                 "declare it in [places]",
             )
         if weight < 1:
-            yield Fault(f"{key}.{side}", f"an arc of weight {weight} to {name!r}", "give 1 or more")
+            yield Fault(
+                f"{key}.{side}",
+                f"expected a weight of 1 or more for the arc with {name!r}, got {weight}",
+                "give 1 or more",
+            )
     named = (("in", [a.place for a in t.inputs]), ("out", [a.place for a in t.outputs]))
     for side, names in (*named, ("in", [i.place for i in t.inhibitors])):
         for name, n in Counter(names).items():
@@ -315,21 +479,21 @@ def _input(key: str, arc: Input, place: Place) -> Iterator[Fault]:
     if place.kind is Kind.ACTION and arc.end is None:
         remedy = f"write {name}:normal, {name}:error, {name}:preempt=COUNTS or {name}:going"
         yield Fault(
-            key, f"{name!r} is an action place, so its arc says when it takes the token", remedy
+            key, f"{name!r} is an action place, so its arc must say when it takes the token", remedy
         )
     if place.kind is Kind.MACRO and place.subnet and arc.end not in (End.NORMAL, End.ERROR):
         yield Fault(key, f"{name!r} is a macro place", f"write {name}:normal or {name}:error")
-    if place.kind in (Kind.RESOURCE, Kind.CONTROL) and arc.end is not None:
+    if place.kind in (Kind.RESOURCE, Kind.CONTROL, Kind.PLAIN) and arc.end is not None:
         yield Fault(key, f"{name!r} runs no action that could end", f"write {name} alone")
     if arc.end is End.PREEMPT and arc.counts is None:
         remedy = f"write {name}:preempt=success, =failure, =error or =none"
-        yield Fault(key, f"how does a preempted run of {name!r} count", remedy)
+        yield Fault(key, f"the arc does not say how a preempted run of {name!r} counts", remedy)
     if arc.end is not End.PREEMPT and arc.counts is not None:
         yield Fault(key, f"only a preempted run counts as {arc.counts}", "drop it")
     if place.kind is Kind.ACTION and place.servers is None and arc.weight > 1:
         yield Fault(
             key,
-            f"{name!r} is 1-safe, so {arc.weight} tokens never come together",
+            f"{name!r} holds one token at most, so {arc.weight} tokens never come together",
             "give the place `servers`",
         )
 
@@ -338,27 +502,31 @@ def _trigger(task: Task, key: str, t: Transition) -> Iterator[Fault]:
     for event in t.events:
         if event not in task.events:
             remedy = f"declare it in [events]{nearest(event, task.events)}"
-            yield Fault(f"{key}.event", f"{event!r} is no declared event", remedy)
+            yield Fault(f"{key}.event", f"unknown event {event!r}", remedy)
     pulses = [e for e in t.events if e in task.events and is_pulse(task.events[e])]
     if len(pulses) > 1:
         remedy = "two pulses never come together: make one of them latched, or use two transitions"
         yield Fault(f"{key}.event", f"it waits for the pulses {listed(pulses)} at once", remedy)
     if len(set(t.events)) < len(t.events):
-        yield Fault(f"{key}.event", "an event stands there twice", "name it once")
+        yield Fault(f"{key}.event", "an event is listed twice", "name it once")
     if t.after is not None and not t.after > 0:
         yield Fault(
-            f"{key}.after", f"{t.after} s is no waiting time", "give a positive number of seconds"
+            f"{key}.after",
+            f"expected a time above 0, got {t.after} s",
+            "give a positive number of seconds",
         )
     if t.after is not None and t.events:
         remedy = "put the timer on a transition of its own beside this one"
         yield Fault(f"{key}.after", "it waits for an event and for a time", remedy)
     if t.weight is not None and not t.weight > 0:
-        yield Fault(f"{key}.weight", f"{t.weight} is no weight", "give a positive number")
+        yield Fault(
+            f"{key}.weight", f"expected a weight above 0, got {t.weight}", "give a positive number"
+        )
 
 
 def is_pulse(event: Event) -> bool:
-    """Whether the event is gone as soon as it has come."""
-    return event.scope is Scope.EXTERNAL and event.memory is Memory.PULSE
+    """Whether the event disappears as soon as it has occurred."""
+    return event.scope is Scope.EXTERNAL and event.memory is EventMemory.PULSE
 
 
 def _subnet(task: Task, s: Subnet) -> Iterator[Fault]:
@@ -367,23 +535,28 @@ def _subnet(task: Task, s: Subnet) -> Iterator[Fault]:
     for port, place in ports:
         if place not in s.places:
             remedy = f"name one of its places{nearest(place, s.places)}"
-            yield Fault(f"{key}.{port}", f"{place!r} is no place of the subnet", remedy)
-        elif port != "entry" and s.places[place].kind not in (Kind.CONTROL, Kind.RESOURCE):
+            yield Fault(f"{key}.{port}", f"the subnet has no place {place!r}", remedy)
+        elif port != "entry" and s.places[place].kind in (Kind.ACTION, Kind.MACRO):
             yield Fault(
                 f"{key}.{port}",
                 f"{place!r} is a {s.places[place].kind} place",
-                "end in a control place",
+                "end in a place without `kind`",
             )
     for name in set(s.places) & set(s.transitions):
         yield Fault(f"{key}.transitions.{name}", "a place has this name too", "rename one of them")
     for name in (*s.places, *s.transitions):
         if not _IDENTIFIER.match(name):
-            yield Fault(f"{key}.{name}", f"{name!r} is no name", "use letters, digits and _")
-    yield from _net(task, f"{key}.", s.places, s.transitions)
+            yield Fault(f"{key}.{name}", f"{name!r} cannot be a name", "use letters, digits and _")
+    for name in sorted({*s.parameters} & {*s.places, *task.variables, *task.parameters}):
+        text = f"{name!r} is also a place of the subnet, a variable or a parameter of the task"
+        yield Fault(f"{key}.parameters.{name}", text, "rename one of them")
+    names = _Names(task, s)
+    yield from _net(task, f"{key}.", names, s.places, s.transitions, s.errors_to)
 
 
 def _whole(task: Task) -> Iterator[Fault]:
-    """What can be judged only when the parts are right: expansion, conditions, predicates."""
+    """Find faults that can be judged only when all parts are right: macro places, conditions,
+    predicates."""
     try:
         flat = task.flat
     except CircleError as circle:
@@ -392,8 +565,12 @@ def _whole(task: Task) -> Iterator[Fault]:
     yield from _macro_exits(task)
     domains = condition_domains(flat)
     for t in flat.transitions.values():
-        if t.when is not None:
-            yield from _expression(_written_key(task, t.name), t.when, domains)
+        if t.when is not None and not t.expanded_from:
+            yield from _expression(f"{_written_key(task, t)}.when", t.when, domains)
+        for name, expression in t.sets:
+            yield from _value(f"{_written_key(task, t)}.set.{name}", name, expression, domains)
+    if flat is not task:
+        yield from _expanded_arcs(task, flat)
     for key, predicate in (("task.final", task.final), ("task.final_error", task.final_error)):
         if predicate is not None:
             yield from _expression(key, predicate, marking_domains(flat))
@@ -402,11 +579,11 @@ def _whole(task: Task) -> Iterator[Fault]:
     ):
         known = [p.name for p in flat.places.values() if p.kind is Kind.CONTROL]
         remedy = f"name one of {listed(known)}{nearest(task.runs_place, known)}"
-        yield Fault("task.runs_place", f"{task.runs_place!r} is no control place", remedy)
+        yield Fault("task.runs_place", f"expected a control place, got {task.runs_place!r}", remedy)
     for name in task.goal_transitions:
         if name not in flat.transitions:
             remedy = f"name a transition{nearest(name, flat.transitions)}"
-            yield Fault("task.goal_transitions", f"{name!r} is no transition", remedy)
+            yield Fault("task.goal_transitions", f"unknown transition {name!r}", remedy)
 
 
 def _macro_exits(task: Task) -> Iterator[Fault]:
@@ -435,12 +612,46 @@ def _expression(key: str, expression: Expression, domains: Mapping[str, Domain])
         yield Fault(key, f"in {expression.text!r}, {text}", "")
 
 
-def _written_key(task: Task, flat_name: str) -> str:
-    """The key in the task file of a flat transition's condition: that of the subnet in which it is
-    written."""
-    *macros, name = flat_name.split(".")
-    key, places = "", task.places
+def _value(
+    key: str, name: str, expression: Expression, domains: Mapping[str, Domain]
+) -> Iterator[Fault]:
+    """A new value that its variable cannot hold."""
+    into, tree = domains[name], expression.tree
+    kinds = set(VariableType) if into.kind == VariableType.ANY else {into.kind}
+    if into.kind == VariableType.FLOAT:
+        kinds.add(VariableType.INT)
+    if isinstance(tree, Name):
+        if domains[tree.name].kind not in kinds:
+            text = f"{tree.name} is {domains[tree.name].kind}, {name} is {into.kind}"
+            yield Fault(key, text, "change one of the types")
+    elif isinstance(tree, Literal):
+        if not VariableType(into.kind).admits(tree.value):
+            yield Fault(key, f"{tree.value!r} is not of type {into.kind}", "change one of them")
+        elif into.values and tree.value is not None and tree.value not in into.values:
+            remedy = f"use one of {listed(into.values)}"
+            yield Fault(key, f"{tree.value!r} is not among the `values` of {name}", remedy)
+
+
+def _expanded_arcs(task: Task, flat: Task) -> Iterator[Fault]:
+    """Arcs that are wrong only once parameters and held resources are in place."""
+    nets = [task.places, *(s.places for s in task.subnets.values())]
+    held = {name for places in nets for p in places.values() for name in p.holds}
+    seen: set[tuple[str, str]] = set()
+    for t in flat.transitions.values():
+        key = _written_key(task, t)
+        for fault in _arcs(key, t, flat.places):
+            if (fault.key, fault.text) not in seen:
+                seen.add((fault.key, fault.text))
+                twice = any(f"{name!r}" in fault.text for name in held)
+                remedy = "drop that arc: `holds` makes it" if twice else fault.remedy
+                yield Fault(fault.key, fault.text, remedy)
+
+
+def _written_key(task: Task, t: Transition) -> str:
+    """The key in the task file of what a flat transition was made from."""
+    *macros, name = (t.expanded_from or t.name).split(".")
+    key, places, transitions = "", task.places, task.transitions
     for macro in macros:
         subnet = task.subnets[places[macro].subnet]
-        key, places = f"subnets.{subnet.name}.", subnet.places
-    return f"{key}transitions.{name}.when"
+        key, places, transitions = f"subnets.{subnet.name}.", subnet.places, subnet.transitions
+    return f"{key}{'transitions' if name in transitions else 'places'}.{name}"

@@ -1,4 +1,5 @@
-"""argparse types for numbers that state their range in the error message.
+"""What the command lines of nodes share: the log of a node, and argparse types for numbers that
+state their range in the error message.
 
 argparse words a ValueError with the name of the function that raised it. The ArgumentTypeError
 raised here is printed as it is: `argument --runs: abc is not a whole number of at least 1`.
@@ -6,9 +7,38 @@ raised here is printed as it is: `argument --runs: abc is not a whole number of 
 
 from __future__ import annotations
 
-from argparse import ArgumentTypeError
+import logging
+from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Callable
 from math import isfinite
+
+LOG_LEVELS = {
+    "debug": logging.DEBUG,
+    "info": logging.INFO,
+    "warning": logging.WARNING,
+    "error": logging.ERROR,
+}
+
+
+def add_log_level(parser: ArgumentParser) -> None:
+    """Add `--log-level` of a node."""
+    parser.add_argument(
+        "--log-level",
+        choices=LOG_LEVELS,
+        default="info",
+        help="log records of this level and above, to standard error (default: %(default)s; "
+        "debug: also every message)",
+    )
+
+
+def log_to_stderr(level: int = logging.INFO) -> None:
+    """Write log records of this level and above to the process's standard error, which is its
+    node's log."""
+    logging.basicConfig(
+        format="%(asctime)s %(levelname)s %(name)s, process %(process)d: %(message)s", level=level
+    )
+    # A compiler that a kernel needs: it logs each of its steps at DEBUG.
+    logging.getLogger("numba").setLevel(max(level, logging.INFO))
 
 
 def whole(least: int = 1) -> Callable[[str], int]:

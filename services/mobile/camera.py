@@ -10,7 +10,7 @@ import cv2
 
 from petrobot.services.action import Context
 from petrobot.services.comm.streams.image import Image
-from petrobot.services.device import Ports
+from petrobot.services.device import Driver, Ports
 from petrobot.services.mobile.model import NOMINAL, nominal_rover, read_rover
 from petrobot.services.mobile.watching import FloorWatch
 
@@ -19,15 +19,13 @@ class FloorCameraError(ValueError):
     """The camera's configuration or its images cannot be used; the message says what to change."""
 
 
-class FloorCamera:
+class FloorCamera(Driver):
     """A device without cyclic work. Its keys in services.toml, all optional except those of its
     source:
 
     `rover`: file of numbers beside services.toml (default: the shipped one); `rate`: images/s
     (default: the file's); `threads`: for OpenCV (default 1: other nodes share the cores).
     """
-
-    period: float | None = None
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         name = str(config.get("rover", ""))
@@ -91,13 +89,6 @@ class FloorCamera:
 
     # For the node
 
-    def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Refuse: actions call the methods above instead."""
-        raise ValueError("the camera takes no commands; its actions read images")
-
-    def step(self, now: float) -> None:
-        """Do nothing: nothing is due between images."""
-
     def state(self) -> Mapping[str, Any]:
         """Return plain data for operator and report."""
         return {"rate": self._rate, "images": self._count}
@@ -113,9 +104,6 @@ class FloorCamera:
     def hold(self, now: float) -> str:
         """Accept a pause: images may continue, since the rover itself stops."""
         return "held"
-
-    def release(self, now: float) -> None:
-        """Do nothing: nothing was held."""
 
     def close(self) -> None:
         """Stop the images and close the source."""

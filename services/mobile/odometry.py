@@ -52,8 +52,7 @@ class Odometry:
         way, turn = 0.5 * (left + right), (right - left) / self._width
         x, y, heading = self.pose
         # Between two calls both wheels are taken to turn evenly, so the rover moves on an arc:
-        # chord = 2 R sin(turn / 2), in the mean direction (J. Borenstein et al., "Where am I?",
-        # 1996, section 1.1).
+        # chord = 2 R sin(turn / 2), in the mean direction (the chord of a circle).
         chord = way if abs(turn) < 1e-9 else 2.0 * way / turn * math.sin(0.5 * turn)
         middle = heading + 0.5 * turn
         self.pose = Pose(x + chord * math.cos(middle), y + chord * math.sin(middle), heading + turn)

@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from petrobot.services.device import Ports, Setpoint
+from petrobot.services.device import Driver, Ports, Setpoint
 from petrobot.services.mobile.following import LAWS, PurePursuit, SpeedProfile, capped
 from petrobot.services.mobile.model import RoverModel as Numbers
 from petrobot.services.mobile.model import nominal_rover, read_rover
@@ -54,7 +54,7 @@ DRIVES_SHARE: Final = 0.95
 """Share of the wheels' top speed that set points use; the rest is for the lead over their lag."""
 
 
-class Rover:
+class Rover(Driver):
     """Driver of the rover (see `services.device.Driver`). Its keys in services.toml, all optional
     except those of its bus:
 
@@ -67,7 +67,7 @@ class Rover:
             read_rover(ports.file(name).decode(), name) if name else nominal_rover()
         )
         wheels, bus = self.numbers.wheels, self.numbers.bus
-        self.period: float | None = bus.period
+        self.period = bus.period
         self._ports = ports
         self._bus = ports.can()
         self._setpoint: Setpoint = ports.stream(STREAM)

@@ -28,7 +28,7 @@ from typing import Any, Final
 import numpy as np
 
 from petrobot.services.comm.canopen.master import MasterPhase
-from petrobot.services.device import Ports, Setpoint, refuse_unknown_keys
+from petrobot.services.device import Driver, Ports, Setpoint, refuse_unknown_keys
 from petrobot.services.motion.drive_master import DriveMaster, DriveSettings
 from petrobot.services.motion.following import Follower
 from petrobot.services.motion.interception import STRATEGIES, Interceptor, Strategy
@@ -182,7 +182,7 @@ BALL: Final = 0x01
 POWER: Final = 0x02
 
 
-class Arm:
+class Arm(Driver):
     """Driver of the PUMA (see `services.device.Driver`)."""
 
     period: float | None = PERIOD

@@ -15,12 +15,11 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
-from typing import Any
 
 from petrobot.services.host.parent_death import STOP_ROUTINE, until_ended
 from petrobot.services.worker.keeper import KILL_ORDER
-from petrobot.services.worker.pipe import Counter, counter_memory, pipe_pair
-from petrobot.services.worker.process import BORN, Setup
+from petrobot.services.worker.pipe import Counter, Item, counter_memory, pipe_pair
+from petrobot.services.worker.process import BORN, SETUP, Setup
 
 _log = logging.getLogger(__name__)
 
@@ -37,13 +36,13 @@ worker by the kernel."""
 
 class Child:
     """A running process of `services.worker` under its keeper. `heard(child, received)` receives
-    the lists that it has sent, all that came at once; `ended(child)` is called once, when neither
+    the items that it has sent, all that came at once; `ended(child)` is called once, when neither
     it nor anything that it has started runs any more."""
 
     def __init__(
         self,
         setup: Setup,
-        heard: Callable[[Child, list[list[Any]]], None],
+        heard: Callable[[Child, list[Item]], None],
         ended: Callable[[Child], None],
         link: socket.socket | None = None,
     ) -> None:
@@ -90,7 +89,7 @@ class Child:
         self._killed = ""
         self._let_go = False
         self._limits: list[asyncio.TimerHandle] = []
-        self.pipe.post([dict(setup.items())])
+        self.pipe.post([SETUP, dict(setup.items())])
         self._loop.add_reader(self.pipe.socket, self._read)
         self._watch = self._loop.create_task(self._wait_for_end())
 
@@ -115,11 +114,11 @@ class Child:
         """Its exit code, minus the number of the signal that ended it, None while it runs."""
         return self.process.poll()
 
-    def post(self, items: list[Any]) -> None:
-        """Send it a list; what does not fit now is sent when it reads."""
-        if _log.isEnabledFor(logging.DEBUG):  # kind and id alone: the rest may hold tickets
-            _log.debug("to %d: %s", self._worker, items[:2])
-        self.pipe.post(items)
+    def post(self, item: Item) -> None:
+        """Send it an item; what does not fit now is sent when it reads."""
+        if _log.isEnabledFor(logging.DEBUG):
+            _log.debug("to %d: %s", self._worker, _named(item))
+        self.pipe.post(item)
         if self.pipe.unsent and not self.pipe.closed:
             self._loop.add_writer(self.pipe.socket, self._flush)
 
@@ -173,12 +172,14 @@ class Child:
         except ValueError:
             received = []
             self._close_pipe()
-            self.kill("it wrote into its pipe what is no record, and was killed")
-        if received and not self._worker and received[0] and received[0][0] == BORN:
-            self._worker = received.pop(0)[1]
+            self.kill("it wrote into its pipe what is no message, and was killed")
+        first = received[0] if received and not self._worker else None
+        if isinstance(first, list) and first[0] == BORN:
+            self._worker = first[1]
+            del received[0]
         if received:
             if _log.isEnabledFor(logging.DEBUG):
-                named = ", ".join(str(items[:2]) for items in received)
+                named = ", ".join(map(_named, received))
                 _log.debug("from %d: %s", self._worker, named)
             self._heard(self, received)
         if self.pipe.closed and not self._let_go:
@@ -211,3 +212,10 @@ class Child:
             self._loop.remove_reader(self.pipe.socket)
             self._loop.remove_writer(self.pipe.socket)
             self.pipe.close()
+
+
+def _named(item: Item) -> str:
+    """Return kind and id of an item for the log: the rest may hold tickets."""
+    if isinstance(item, list):
+        return str(item[:2])
+    return f"{type(item).__name__} {getattr(item, 'id', '')}"

@@ -21,7 +21,12 @@ def make_driver(directory: Directory, device: DeviceEntry, ports: Ports) -> Driv
         driver: Driver = resolve(device.driver)(device.config, ports)
     except ImportError as fault:
         raise DirectoryError((f"{here}.driver: {fault}",)) from fault
-    except (KeyError, TypeError, ValueError, OSError) as fault:
+    except OSError as fault:
+        text = f"{here}: {device.driver} cannot open its device: {fault}"
+        raise DirectoryError(
+            (f"{text}; check that it is connected, and that this user may open it",)
+        ) from fault
+    except (KeyError, TypeError, ValueError) as fault:
         told = f"is missing {fault}" if isinstance(fault, KeyError) else str(fault)
         raise DirectoryError(
             (f"{here}: {device.driver} refuses it: {told}; mend the keys of this table",)

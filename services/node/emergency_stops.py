@@ -33,8 +33,10 @@ class Guard:
     """What a process with a driver watches by itself: the latch of its node, and whether its node
     speaks.
 
-    Silence counts from the node's first beat on. A process that was not scheduled itself for a
-    while gives its node another moment: what that one said meanwhile still has to be read.
+    Silence counts from the node's first beat on, or from its first word that lets the device move:
+    a node that is frozen right after that may never have sent a beat. A process that was not
+    scheduled itself for a while gives its node another moment: what that one said meanwhile still
+    has to be read.
     """
 
     def __init__(self, device: str, latch: Latch) -> None:
@@ -47,9 +49,9 @@ class Guard:
         self._again = False
         """Whether it has got another moment since."""
 
-    def heard(self, now: float, beat: bool) -> None:
-        """The node has said something, and whether it was a beat."""
-        if beat or self._heard < NEVER:
+    def heard(self, now: float, counts: bool) -> None:
+        """Note that the node has said something. With `counts` its silence counts from now on."""
+        if counts or self._heard < NEVER:
             self._heard, self._again = now, False
 
     def look(self, now: float) -> str:

@@ -10,10 +10,18 @@ from typing import Any, Protocol
 
 from petrobot.services.action import Status
 from petrobot.services.comm.location_file import ActionEntry
-from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.comm.protocol.messages import (
+    Answer,
+    Call,
+    Cancel,
+    Command,
+    Executed,
+    Outcome,
+)
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import PICTURE, Driver, picture_of, stop_at_once
 from petrobot.services.worker.callables import describe
+from petrobot.services.worker.context import Report
 from petrobot.services.worker.remote import (
     BARRED,
     CLEAR_EMERGENCY,
@@ -23,15 +31,28 @@ from petrobot.services.worker.remote import (
     DirectDevice,
     RemoteDriver,
 )
-from petrobot.services.worker.runner import DeviceControl, Runner
-from petrobot.services.worker.runs import Begin, Ended, Hold, Order, Report, Stop, Told
+from petrobot.services.worker.runner import DeviceControl, Order, Runner, stop_reason
 
 _log = logging.getLogger(__name__)
 
 SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
 
 
-class Place(Protocol):
+HOLD, RELEASE = Command("", "hold"), Command("", "release")
+"""What holds the runs of a process, and releases them."""
+
+
+def stopped_by(verb: str) -> str:
+    """Return the reason of a CANCEL that follows the command `stop` or `emergency_stop`."""
+    return stop_reason("stopped" if verb == "stop" else verb, "by command")
+
+
+def answer_of(id_: str, word: str, data: Mapping[str, Any]) -> Answer:
+    """Return a host's answer to a command: the device's word, and data about it and its runs."""
+    return Answer(id_, True, {"answer": word, **data})
+
+
+class Host(Protocol):
     """Runs of one device, or of all actions that need none. Orders in, reports out, nothing
     blocks."""
 
@@ -43,9 +64,10 @@ class Place(Protocol):
     def take(self, now: float, order: Order) -> None:
         """Take an order about a run."""
 
-    def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
+    def command(self, now: float, command: Command) -> None:
         """Carry out an operator's `hold`, `release`, `stop`, `emergency_stop`, `clear_emergency`,
-        `status` or `picture`; a report `Told` with this id answers it."""
+        `status` or `picture`; an Answer with its id follows, with the device's word as `answer` in
+        its data."""
 
     def advance(self, now: float) -> None:
         """Do all that is due."""
@@ -60,7 +82,7 @@ class Place(Protocol):
         """Stop everything and let the device go."""
 
 
-class InlinePlace:
+class InlineHost:
     """A place whose actions run in this process: in lock step, in a worker, and for services of the
     node's loop.
 
@@ -118,29 +140,30 @@ class InlinePlace:
 
     def take(self, now: float, order: Order) -> None:
         """Take an order about a run."""
-        if self.failed and isinstance(order, Begin):
+        if self.failed and isinstance(order, Call):
             text = f"its device does not work: {self.failed}"
-            self._told.append(Ended(order.id, Status.ERROR, {}, "not_ready", text, Executed.NO))
+            self._told.append(Outcome(order.id, Status.ERROR, {}, "not_ready", text, Executed.NO))
             return
         held = self._runner.held and bool(self._runner.runs)
         self._runner.take(now, order)
         if held and not self._runner.runs:
             self._carry_out(now, "release")  # what was held was stopped before it began
 
-    def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
+    def command(self, now: float, command: Command) -> None:
         """Carry out an operator's command at once."""
         if not self.failed:
             try:
-                self._told.append(Told(id, *self._carry_out(now, verb)))
+                word, data = self._carry_out(now, command.verb)
+                self._told.append(answer_of(command.id, word, data))
                 return
             except Exception as fault:
                 self._fail(now, fault)
-        self._told.append(Told(id, "not ready", {"text": self.failed}))
+        self._told.append(answer_of(command.id, "not ready", {"text": self.failed}))
 
     def bar(self, now: float, cause: str) -> None:
         """Stop the device and its runs without an order: nobody may be able to give one."""
         for run in self._runner.runs:
-            self._runner.take(now, Stop(run, cause, BARRED[cause]))
+            self._runner.take(now, Cancel(run, stop_reason(cause, BARRED[cause])))
         try:
             self._stop_driver(now, cause)
         except Exception as fault:
@@ -163,16 +186,16 @@ class InlinePlace:
         if verb == "hold":
             answer = driver.hold(now) if driver else "held"
             if answer != "cannot hold":
-                self._runner.take(now, Hold(True))
+                self._runner.take(now, HOLD)
             return answer, {}
         if verb == "release":
             if driver:
                 driver.release(now)
-            self._runner.take(now, Hold(False))
+            self._runner.take(now, RELEASE)
             return "released", {}
         if verb in ("stop", EMERGENCY_STOP):
             for run in self._runner.runs:
-                self.take(now, Stop(run, "stopped" if verb == "stop" else verb, "by command"))
+                self.take(now, Cancel(run, stopped_by(verb)))
             self._stop_driver(now, verb)
             return "stopped" if driver is None or driver.stopped() else "stopping", {}
         if verb == CLEAR_EMERGENCY:
@@ -224,7 +247,7 @@ class InlinePlace:
     def _advance(self, now: float) -> None:
         if self._outside is not None and (barred := self._outside.barred):
             for run in self._runner.runs:
-                self._runner.take(now, Stop(run, barred, BARRED[barred]))
+                self._runner.take(now, Cancel(run, stop_reason(barred, BARRED[barred])))
         held = self._runner.held and bool(self._runner.runs)
         self._runner.advance(now)
         if held and not self._runner.runs:

@@ -35,15 +35,16 @@ from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.comm.streams.camera import MemoryImages, open_images
 from petrobot.services.comm.streams.image import ImageSource
 from petrobot.services.node.drivers import make_driver
-from petrobot.services.node.inline_host import InlinePlace, Place
+from petrobot.services.node.inline_host import Host, InlineHost
 from petrobot.services.node.node import GENERAL, Node
 from petrobot.services.node.watchdog import Watchdog
 from petrobot.services.worker.callables import describe
 from petrobot.services.worker.context import checked
-from petrobot.services.worker.execution import Hung
+from petrobot.services.worker.runner import Hung
 from petrobot.services.worker.setpoints import SetpointReceiver
 
-# What a driver may reach in a lock-step cell: bus, images and streams in memory, on the other side envelopes.
+# What a driver may reach in a lock-step cell: bus, images and streams in memory, on the other side
+# envelopes.
 
 
 class MemoryCan:
@@ -215,7 +216,7 @@ class LockstepNode:
         self._ends: dict[str, tuple[str, str]] = {}
         """By call id: the endpoint that calls, and the one that is called."""
         devices = [d for d in directory.devices.values() if d.node == name]
-        places: dict[str, Place] = {d.name: self._place(d.name) for d in devices}
+        places: dict[str, Host] = {d.name: self._place(d.name) for d in devices}
         places[GENERAL] = self._place(GENERAL)
         boot = f"{name} in lock step"
         self.node = Node(directory, name, boot=boot, clock=self._clock, places=places, virtual=True)
@@ -225,7 +226,7 @@ class LockstepNode:
     def _clock(self) -> float:
         return self._now
 
-    def _place(self, device: str) -> Place:
+    def _place(self, device: str) -> Host:
         directory, driver = self._directory, None
         if device != GENERAL:
             entry = directory.devices[device]
@@ -233,7 +234,7 @@ class LockstepNode:
                 directory, entry, self._clock, self._out.append
             )
             driver = make_driver(directory, entry, ports)
-        return InlinePlace(
+        return InlineHost(
             {
                 a.name: a
                 for a in directory.actions.values()

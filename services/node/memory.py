@@ -27,7 +27,7 @@ def event_name(variable: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Variable:
+class StoredValue:
     """A value, how often it was written (from 1), and its size in bytes."""
 
     value: Any
@@ -35,13 +35,13 @@ class Variable:
     size: int
 
 
-class Memory:
+class GlobalMemory:
     """A machine without clock: `call` answers the services `memory.*`; each change goes to
     `changed(name, value, version)`."""
 
     def __init__(self, changed: Callable[[str, Any, int], None]) -> None:
         self._changed = changed
-        self._variables: dict[str, Variable] = {}
+        self._variables: dict[str, StoredValue] = {}
         self._bytes = 0
         answers = (self._get, self._put, self._compare_and_set, self._list)
         self._answers: dict[str, Callable[..., Result]] = dict(
@@ -54,9 +54,9 @@ class Memory:
         try:
             return self._answers[service](**arguments)
         except TypeError as fault:
-            return error("bad_arguments", f"{service}: {str(fault).replace('Memory._', '')}")
+            return error("bad_arguments", f"{service}: {str(fault).replace('GlobalMemory._', '')}")
 
-    def values(self) -> Mapping[str, Variable]:
+    def values(self) -> Mapping[str, StoredValue]:
         """All variables, for people and reports."""
         return dict(self._variables)
 
@@ -104,7 +104,7 @@ class Memory:
                 f"no room for {name!r}: {len(self._variables)} variables, {self._bytes} bytes",
             )
         version = present.version + 1 if present else 1
-        self._variables[name] = Variable(value, version, size)
+        self._variables[name] = StoredValue(value, version, size)
         self._bytes = total
         self._changed(name, value, version)
         return success(version=version)

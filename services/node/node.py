@@ -8,23 +8,18 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from petrobot.services.action import Status
 from petrobot.services.comm.calls.callee import (
     Callee,
-    CancelOrder,
-    CommandOrder,
     Inline,
     Offer,
     Order,
-    StartOrder,
 )
-from petrobot.services.comm.calls.caller import CallEnded as CallEnded
 from petrobot.services.comm.calls.caller import Caller, Notice
-from petrobot.services.comm.calls.events import RunVerdict, mission_of, verdict_event
-from petrobot.services.comm.calls.peers import COORDINATOR, NODE
+from petrobot.services.comm.calls.peers import NODE
 from petrobot.services.comm.location_file import (
     MEMORY,
     MEMORY_CALLS,
@@ -34,46 +29,42 @@ from petrobot.services.comm.location_file import (
     ServiceEntry,
     resolve,
 )
-from petrobot.services.comm.protocol.messages import Call, Executed, Hello, Outcome
+from petrobot.services.comm.protocol.messages import (
+    COORDINATOR,
+    Answer,
+    Call,
+    Cancel,
+    Command,
+    Event,
+    Executed,
+    Hello,
+    Outcome,
+)
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 from petrobot.services.device import PICTURE
 from petrobot.services.host.emergency_latch import Latch
 from petrobot.services.node.emergency_stops import NEVER, EmergencyStops
-from petrobot.services.node.inline_host import InlinePlace, Place
-from petrobot.services.node.memory import Memory, event_name
+from petrobot.services.node.inline_host import Host, InlineHost
+from petrobot.services.node.memory import GlobalMemory, event_name
 from petrobot.services.worker.callables import (
     check_arguments,
     describe,
     from_outside,
     log_fault,
 )
-from petrobot.services.worker.context import RunContext, checked_result
-from petrobot.services.worker.execution import Hung
-from petrobot.services.worker.outlets import Outlets
+from petrobot.services.worker.context import Report, RunContext, checked_result
+from petrobot.services.worker.outlets import Outlets, Sent
 from petrobot.services.worker.remote import CLEAR_EMERGENCY, EMERGENCY_STOP, IN_EMERGENCY
-from petrobot.services.worker.runs import (
-    Answered,
-    Asked,
-    Begin,
-    Dropped,
-    Ended,
-    Judged,
-    Progressed,
-    Raised,
-    Report,
-    Sent,
-    Stop,
-    Told,
-)
+from petrobot.services.worker.runner import Hung, stop_reason
 
 _log = logging.getLogger(__name__)
 
-# Timers of a node: external pulse events on an absolute grid.
+# EventTimers of a node: external pulse events on an absolute grid.
 
 SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
 
 
-class Timers:
+class EventTimers:
     """A machine: `advance(now)` gives the names whose time has come. Who listens is the event
     board's business.
 
@@ -104,29 +95,22 @@ class Timers:
 
 # A general-purpose service written as a plain function, answered on the spot in the node's loop.
 
-EventSink = Callable[[str, str, Mapping[str, Any]], None]
-"""Takes (service, event, data) of an event that a service raises."""
-VerdictSink = Callable[[str, Judged], None]
-"""Takes (service, verdict) of a verdict that a service gives on an earlier run."""
 
-
-def inline_service(service: ServiceEntry, raised: EventSink, judged: VerdictSink) -> Inline:
+def inline_service(service: ServiceEntry, raised: Callable[[Event], None]) -> Inline:
     """The callee's end of such a service. Raises ImportError when its function cannot be loaded.
 
     The function takes a context and keyword arguments like an action; of its context it may use
-    what does not wait.
+    what does not wait. `raised` receives its events, and its verdicts on earlier runs.
     """
     function = resolve(service.run)
 
     def report(told: Report) -> None:
-        if isinstance(told, Raised):
-            raised(service.name, told.name, told.data)
-        elif isinstance(told, Judged):
-            judged(service.name, told)
+        if isinstance(told, Event):
+            raised(replace(told, run=""))  # an event of the outside world: it is no run
 
     def answer(now: float, call: Call) -> Outcome:
         context = RunContext(
-            Begin(call.id, service.name, call.arguments), None, lambda: now, Outlets({}), report
+            Call(call.id, service.name, call.arguments), None, lambda: now, Outlets({}), report
         )
         try:
             check_arguments(function, call.arguments)
@@ -173,6 +157,9 @@ SENDERS = frozenset((COORDINATOR, NODE))
 """Roles that may ask for the ticket of a stream: an action of a node sends set points, a
 coordinator may order anything."""
 """Name of a stream's address service: this and the stream's name."""
+ACCEPT_AFTER = 0.002
+"""Seconds for which ACCEPT is held in real time: longer than most quick actions take, and shorter
+than a person or a coordinator could notice. In lock step it is sent at once."""
 ANSWER_WITHIN = 1.0
 """Seconds that the devices have to answer an operator's command."""
 VERBS = frozenset({"hold", "release", "stop", "status", PICTURE, EMERGENCY_STOP, CLEAR_EMERGENCY})
@@ -209,7 +196,7 @@ class Node:
         *,
         boot: str,
         clock: Callable[[], float],
-        places: Mapping[str, Place],
+        places: Mapping[str, Host],
         virtual: bool = False,
         connect: Callable[[str], None] | None = None,
         stream_address: Callable[[str], Mapping[str, Any] | None] | None = None,
@@ -225,24 +212,28 @@ class Node:
         waiting = {
             s.name: _as_action(s) for s in services if inspect.iscoroutinefunction(resolve(s.run))
         }
-        self.places: dict[str, Place] = {
+        self.places: dict[str, Host] = {
             **places,
-            LOOP: InlinePlace(waiting, clock=clock, virtual=virtual),
+            LOOP: InlineHost(waiting, clock=clock, virtual=virtual),
         }
-        self.memory = Memory(self._memory_changed)
+        self.memory = GlobalMemory(self._memory_changed)
         self._connect = connect
         self._stream_address = stream_address
-        self.callee = Callee(name, boot, self._offers(waiting), directory=directory.hash)
+        self.callee = Callee(
+            name,
+            boot,
+            self._offers(waiting),
+            directory=directory.hash,
+            accept_after=0.0 if virtual else ACCEPT_AFTER,
+        )
         self.callers: dict[str, Caller] = {}
         self.sent: list[tuple[str, Sent]] = []
         """Set points that left since the shell looked, with the action that published them (inline
         places only)."""
-        self._timers = Timers(
+        self._timers = EventTimers(
             {t.name: t.period for t in directory.timers.values() if t.node == name}
         )
         self._now = 0.0
-        self._at: dict[str, str] = {}
-        self._asked: dict[str, str] = {}
         self._commands: dict[str, _Commanded] = {}
         self._stops = EmergencyStops(
             [key for key in self.places if key not in (LOOP, GENERAL)], latch
@@ -271,7 +262,7 @@ class Node:
             return {call: Offer(scope, inline=self._memory_call) for call in MEMORY_CALLS}
         if waits or not service.run:
             return {service.name: Offer(scope)}
-        inline: Inline = inline_service(service, self._service_event, self._judge)
+        inline: Inline = inline_service(service, self._raise)
         return {service.name: Offer(scope, inline=inline)}
 
     def caller(self, peer: str) -> Caller:
@@ -289,9 +280,13 @@ class Node:
         )
 
     def action_of(self, run: str) -> str:
-        """Action or service that a run or call under way belongs to; the node's name when it is
-        unknown."""
-        return self.callee.running().get(run, self.name)
+        """Return the action or service of an active run; the node's name if there is none."""
+        return self.callee.service_of(run) or self.name
+
+    def _host_of(self, service: str) -> str:
+        """Return the key of the host that runs an action or a service."""
+        action = self.directory.actions.get(service)
+        return LOOP if action is None else action.device or GENERAL
 
     # --- time ---------------------------------------------------------------------------------
 
@@ -307,7 +302,7 @@ class Node:
         self.settle(now)
 
     def advance_places(self, now: float) -> bool:
-        """Timers, runs and devices alone; says whether anything came of it. That is all that
+        """EventTimers, runs and devices alone; says whether anything came of it. That is all that
         `advance` does while nothing has come in and `ends_quiet` holds: a shell that knows may call
         this instead, then `settle` if something came."""
         self._now = now
@@ -323,6 +318,15 @@ class Node:
                 self._take_report(now, key, report)
                 news = True
         return news
+
+    def take_reports(self, now: float) -> None:
+        """Take what runs and devices have reported. Nothing else is looked at: for a shell that
+        knows that only results of runs have come."""
+        self._now = now
+        for key, place in self.places.items():
+            if not place.idle:
+                for report in place.reports():
+                    self._take_report(now, key, report)
 
     def settle(self, now: float) -> None:
         """What follows from what `advance_places` has found."""
@@ -346,19 +350,16 @@ class Node:
 
     def due(self) -> float | None:
         """When `advance` has something to do at the latest (s), None if only what comes in can
-        matter."""
-        # A plain loop: this is asked twice for each run, and lists of times cost as much as the rest.
+        matter. Both ends of calls are left out: server and clients have timers of their own."""
+        # A plain loop: lists of times cost as much as the rest.
         soonest = self._stops.due
         for command in self._commands.values():
             soonest = min(soonest, command.due)
-        parts: tuple[Callee | Timers | Caller | Place, ...] = (
-            self.callee,
-            self._timers,
-            *self.callers.values(),
-            *self.places.values(),
-        )
-        for part in parts:
-            due = part.due()
+        due = self._timers.due()
+        if due is not None and due < soonest:
+            soonest = due
+        for place in self.places.values():
+            due = place.due()
             if due is not None and due < soonest:
                 soonest = due
         return soonest if soonest < NEVER else None
@@ -373,39 +374,34 @@ class Node:
     def obey(self, now: float, orders: Iterable[Order]) -> None:
         """Carry out what the callee orders."""
         for order in orders:
-            if isinstance(order, StartOrder):
-                self._start(now, order.call)
-            elif isinstance(order, CancelOrder):
+            if isinstance(order, Call):
+                self._start(now, order)
+            elif isinstance(order, Cancel):
                 cause = order.reason if order.reason in _OWN_CAUSES else "cancelled"
-                self.places[self._at[order.id]].take(now, Stop(order.id, cause, order.reason))
-            elif isinstance(order, CommandOrder):
+                service = self.callee.service_of(order.id)
+                if service is not None:
+                    stop = Cancel(order.id, stop_reason(cause, order.reason))
+                    self.places[self._host_of(service)].take(now, stop)
+            else:
                 self._command(now, order)
 
     def _start(self, now: float, call: Call) -> None:
-        action = self.directory.actions.get(call.service)
-        key = LOOP if action is None else action.device or GENERAL
-        deadline = call.deadline
-        if deadline is None and action is not None:
-            deadline = action.deadline
+        key = self._host_of(call.service)
         if key not in (LOOP, GENERAL):  # a look opens files; what has no device needs none
             self._stop_places(now, self._stops.look(now))
         if key in self._stops:
             _log.info("run %s of %s refused: %s", call.id, call.service, EMERGENCY_STOP)
-            self.callee.finish(
-                now, call.id, Status.ERROR, {}, EMERGENCY_STOP, IN_EMERGENCY, Executed.NO
-            )
+            refused = (EMERGENCY_STOP, IN_EMERGENCY, Executed.NO)
+            self.callee.finish(now, Outcome(call.id, Status.ERROR, {}, *refused))
             return
-        self._at[call.id] = key
         _log.info("run %s of %s started", call.id, call.service)
-        self.places[key].take(
-            now, Begin(call.id, call.service, call.arguments, deadline, call.seed)
-        )
+        self.places[key].take(now, call)
 
-    def _command(self, now: float, order: CommandOrder) -> None:
-        command = order.command
+    def _command(self, now: float, command: Command) -> None:
         keys = [k for k in self.places if k != LOOP and command.target in ("", k or self.name)]
         level = logging.DEBUG if command.verb in ("status", PICTURE) else logging.INFO
-        _log.log(level, "%s orders %s of %s", order.peer, command.verb, command.target or "all")
+        peer = self.callee.commander(command.id)
+        _log.log(level, "%s orders %s of %s", peer, command.verb, command.target or "all")
         if command.verb not in VERBS:
             self.callee.answer(
                 now,
@@ -422,7 +418,7 @@ class Node:
                 return
             self._commands[command.id] = _Commanded(command.verb, now + ANSWER_WITHIN, set(keys))
             for key in keys:
-                self.places[key].command(now, command.id, command.verb)
+                self.places[key].command(now, command)
             if (
                 command.verb == EMERGENCY_STOP
             ):  # the devices first, the disk then; both before the answer
@@ -436,7 +432,7 @@ class Node:
 
     def _stop_places(self, now: float, keys: Iterable[str]) -> None:
         for key in keys:
-            self.places[key].command(now, "", EMERGENCY_STOP)
+            self.places[key].command(now, Command("", EMERGENCY_STOP))
 
     def _answer_commands(self, now: float) -> None:
         if not self._commands:
@@ -459,83 +455,53 @@ class Node:
     # --- reports of places --------------------------------------------------------------------
 
     def _take_report(self, now: float, key: str, report: Report) -> None:
-        if isinstance(report, Ended):
+        if isinstance(report, Outcome):
             self._end(now, report)
-        elif isinstance(report, Asked):
+        elif isinstance(report, Call):
             self._ask(now, key, report)
         elif isinstance(report, Sent):
             self.sent.append((self.action_of(report.run), report))
-        elif isinstance(report, Raised):
-            self._raise(now, key, report)
-        elif isinstance(report, Judged):
-            self._judge(self.action_of(report.by), report)
-        elif isinstance(report, Told):
+        elif isinstance(report, Event):
+            self._raise(report, key)
+        elif isinstance(report, Answer):
             if report.id in self._commands:
-                command = self._commands[report.id]
+                command, data = self._commands[report.id], dict(report.data)
                 command.missing.discard(key)
-                command.answers[key or self.name] = report.answer
-                command.data[key or self.name] = report.data
-        elif isinstance(report, Dropped):
+                command.answers[key or self.name] = data.pop("answer")
+                command.data[key or self.name] = data
+        elif isinstance(report, Cancel):
             for caller in self.callers.values():
-                caller.cancel(now, report.id, "its run no longer waits")
-        elif isinstance(report, Progressed) and report.id in self._at:
+                caller.cancel(now, report.id, report.reason)
+        elif self.callee.service_of(report.id) is not None:
             self.callee.feedback(now, report.id, report.fraction, report.data)
 
-    def _end(self, now: float, end: Ended) -> None:
-        if self._at.pop(end.id, None) is None:
+    def _end(self, now: float, end: Outcome) -> None:
+        if self.callee.service_of(end.id) is None:
             return
         for caller in self.callers.values():
             caller.cancel_children(now, end.id, "its run is over")
-        executed = Executed(end.executed)
         _log.info("run %s ended: %s %s %s", end.id, end.status, end.cause, end.text)
-        self.callee.finish(
-            now,
-            end.id,
-            end.status,
-            end.values,
-            end.cause,
-            end.text,
-            executed,
-            end.seconds,
-            end.cpu_seconds,
-            end.deferred,
-        )
+        self.callee.finish(now, end, plain_already=True)  # its host has checked it
 
-    def _raise(self, now: float, key: str, raised: Raised) -> None:
-        if not raised.run:
-            self.callee.raise_event(
-                now, raised.name, raised.data, source=key or self.name, latched=True
-            )
-        elif raised.run in self._at:
-            source = self.action_of(raised.run)
-            self.callee.raise_event(
-                now, raised.name, raised.data, source=source, latched=True, run=raised.run
-            )
-
-    def _judge(self, source: str, judged: Judged) -> None:
-        """The verdict goes to the coordinator of the judged run: latched, so that a lost link only
-        delays it."""
-        said = RunVerdict(judged.run, judged.status, judged.cause, judged.text)
-        name = verdict_event(mission_of(judged.run))
-        self.callee.raise_event(self._now, name, said.to_data(), source=source, latched=True)
-
-    def _ask(self, now: float, key: str, asked: Asked) -> None:
-        try:
-            peer = self.directory.where(asked.service)
-        except DirectoryError as fault:
-            self.places[key].take(
-                now, Answered(asked.id, Status.ERROR, {}, "unknown_service", str(fault))
-            )
+    def _raise(self, event: Event, key: str = "") -> None:
+        """Send an event of a run to its caller, or any other to its subscribers: one of a device
+        (`key`), of a service, or a verdict, which goes to the coordinator of the judged run. All
+        are latched, so that a lost link only delays them."""
+        if event.run and self.callee.service_of(event.run) is None:
             return
-        self._asked[asked.id] = key
-        call = Call(
-            asked.id,
-            asked.service,
-            asked.arguments,
-            asked.deadline,
-            parent=asked.run,
-            seed=asked.seed,
+        source = self.action_of(event.run) if event.run else event.source or key or self.name
+        self.callee.raise_event(
+            self._now, event.name, event.data, source=source, latched=True, run=event.run
         )
+
+    def _ask(self, now: float, key: str, call: Call) -> None:
+        """A run calls a service."""
+        try:
+            peer = self.directory.where(call.service)
+        except DirectoryError as fault:
+            unknown = Outcome(call.id, Status.ERROR, {}, "unknown_service", str(fault))
+            self.places[key].take(now, unknown)
+            return
         self.caller(peer).call(now, call)
 
     def _answer_runs(self, now: float) -> None:
@@ -547,13 +513,11 @@ class Node:
     def take_notices(self, now: float, notices: Iterable[Notice]) -> None:
         """Hand the ends of calls to the runs that made them."""
         for notice in notices:
-            if isinstance(notice, CallEnded):
-                end = notice.outcome
-                key = self._asked.pop(end.id, None)
-                if key is not None:
-                    self.places[key].take(
-                        now, Answered(end.id, end.status, end.values, end.cause, end.text)
-                    )
+            if isinstance(notice, Outcome):
+                # The id of a call that a run makes is that of the run, a slash and a number.
+                service = self.callee.service_of(notice.id.rpartition("/")[0])
+                if service is not None:
+                    self.places[self._host_of(service)].take(now, notice)
 
     # --- services of the node itself ----------------------------------------------------------
 
@@ -575,9 +539,6 @@ class Node:
             text = f"nobody receives {stream!r} at the moment"
             return Outcome(call.id, Status.ERROR, {}, "not_ready", text, Executed.NO)
         return Outcome(call.id, Status.SUCCESS, address)
-
-    def _service_event(self, service: str, name: str, data: Mapping[str, Any]) -> None:
-        self.callee.raise_event(self._now, name, data, source=service, latched=True)
 
 
 def _as_action(service: ServiceEntry) -> ActionEntry:

@@ -13,25 +13,29 @@ from dataclasses import replace
 from typing import Any
 
 from petrobot.services.action import Status
-from petrobot.services.comm.calls.callee import Order, StartOrder
+from petrobot.services.comm.calls.callee import Order
 from petrobot.services.comm.calls.caller import Notice
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.location_file import Directory, DirectoryError
 from petrobot.services.comm.location_file.host_checks import listening, refuse_unusable
+from petrobot.services.comm.protocol.messages import Call
 from petrobot.services.comm.protocol.security import require_key
 from petrobot.services.comm.tls.credentials import credentials
 from petrobot.services.host.emergency_latch import STATE, latch_of
 from petrobot.services.host.parent_death import GOOD_ORDER, outlive, wanted_with_parent
 from petrobot.services.node.emergency_stops import BEAT, BEAT_EVERY
-from petrobot.services.node.inline_host import Place
+from petrobot.services.node.inline_host import Host
 from petrobot.services.node.node import GENERAL, LOOP, Node, stream_service
-from petrobot.services.node.worker_host import START_LIMIT, Hosting, WorkerPlace
+from petrobot.services.node.worker_host import START_LIMIT, Hosting, WorkerHost
 from petrobot.services.node.worker_pool import WorkerPool
 from petrobot.services.worker.process import Setup
 from petrobot.services.worker.remote import IN_EMERGENCY
 
 _log = logging.getLogger(__name__)
+
+LOOK = 0.25
+"""Seconds after a run was given to a worker when its node looks at it at the latest."""
 
 
 class NodeShell:
@@ -53,7 +57,7 @@ class NodeShell:
         )
         self._credentials = credentials(directory, name)
         self._workers = {device: self._worker_place(device) for device in self._devices()}
-        places: dict[str, Place] = {**self._workers}
+        places: dict[str, Host] = {**self._workers}
         self.latch = latch_of(directory.source, name)
         self.node = Node(
             directory,
@@ -83,7 +87,7 @@ class NodeShell:
         )
         return [*devices, GENERAL] if general else devices
 
-    def _worker_place(self, device: str) -> WorkerPlace | WorkerPool:
+    def _worker_place(self, device: str) -> WorkerHost | WorkerPool:
 
         def wanted(stream: str) -> None:
             self._find_stream(device, stream)
@@ -92,7 +96,7 @@ class NodeShell:
         hosting = Hosting(setup, self._loop.time, self._heard, wanted)
         if device == GENERAL:
             return WorkerPool(hosting, self._directory.nodes[self._name].workers)
-        return WorkerPlace(hosting)
+        return WorkerHost(hosting)
 
     # --- life ---------------------------------------------------------------------------------
 
@@ -167,8 +171,12 @@ class NodeShell:
 
     def _obey(self, now: float, orders: list[Order]) -> None:
         self.node.obey(now, orders)
-        if self.node.places[LOOP].idle and all(type(order) is StartOrder for order in orders):
-            self._arm()  # workers have been told; what they answer brings the next step
+        quiet = self.node.places[LOOP].idle and not any(p.news for p in self._workers.values())
+        if quiet and all(type(order) is Call for order in orders):
+            # Workers have been told; what they answer brings the next step. Only a worker that
+            # says nothing needs one by itself, and that in some seconds: computing when would cost
+            # every run more than a look now and then.
+            self._arm_at(now + LOOK)
         else:
             self._changed()
 
@@ -182,11 +190,22 @@ class NodeShell:
         if self._soon is None:
             self._soon = self._loop.call_soon(self._step)
 
-    def _heard(self) -> None:
+    def _heard(self, plain_ends: bool) -> None:
         """A process has said all that it had to say, or has ended: step now, since a turn of the
-        loop more costs as much as the step."""
-        self._change.set()
-        self._step()
+        loop more costs as much as the step. After mere results only these are passed on."""
+        if (
+            not plain_ends
+            or not self._serving
+            or not self.node.ends_quiet(now := self._loop.time())
+        ):
+            self._change.set()
+            self._step()
+            return
+        self.node.take_reports(now)
+        self.server.flush(now)
+        for client in self._clients.values():
+            client.flush(now)
+        self._arm_at(now + LOOK)
 
     def _step(self) -> None:
         if self._soon is not None:
@@ -205,7 +224,11 @@ class NodeShell:
         runs end long before their deadlines, and a step too many then costs less than a timer for
         each run."""
         due = self.node.due()
-        if due is None or (self._timer is not None and self._timer.when() <= due):
+        if due is not None:
+            self._arm_at(due)
+
+    def _arm_at(self, due: float) -> None:
+        if self._timer is not None and self._timer.when() <= due:
             return
         if self._timer is not None:
             self._timer.cancel()

@@ -19,7 +19,7 @@ import weakref
 from pathlib import Path
 from types import FrameType
 
-from petrobot.services.worker.execution import Execution, Hung
+from petrobot.services.worker.runner import Execution, Hung
 
 _log = logging.getLogger(__name__)
 LIMIT = 10.0
@@ -124,7 +124,7 @@ def _described(frame: FrameType | None) -> str:
             line = f"{code.co_name} ({code.co_filename}:{frame.f_lineno})"
         owner = frame.f_locals.get("self")
         if isinstance(owner, Execution):
-            whose = f"action {owner.begin.action}, run {owner.begin.id},"
+            whose = f"action {owner.call.service}, run {owner.call.id},"
             break
         frame = frame.f_back
     return f"{whose} in {line}" if line else whose
@@ -141,7 +141,6 @@ def _compiles(frame: FrameType | None) -> bool:
 _OWN = frozenset(
     f"petrobot.services.{name}"
     for name in (
-        "worker.execution",
         "worker.runner",
         "node.inline_host",
         "node.node",

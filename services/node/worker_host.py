@@ -17,36 +17,36 @@ from enum import Enum
 from typing import Any
 
 from petrobot.services.action import Status
-from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.comm.protocol.messages import (
+    Answer,
+    Call,
+    Cancel,
+    Command,
+    Event,
+    Executed,
+    Feedback,
+    Message,
+    Outcome,
+    Ping,
+    Pong,
+)
 from petrobot.services.device import PICTURE
 from petrobot.services.node.child import Child
+from petrobot.services.node.inline_host import HOLD, RELEASE, answer_of, stopped_by
+from petrobot.services.worker.context import Report
 from petrobot.services.worker.device_process import HALT, LINKED
-from petrobot.services.worker.pipe import link_pair
+from petrobot.services.worker.pipe import Item, link_pair
 from petrobot.services.worker.process import (
-    COMMAND,
     FAILED,
     LINK_LOST,
     NO_MEMORY,
-    PING,
-    PONG,
     READY,
     STREAM_AT,
     WANTED,
     Setup,
 )
 from petrobot.services.worker.remote import CLEAR_EMERGENCY, EMERGENCY_STOP
-from petrobot.services.worker.runner import GRACE, STOP_LIMIT
-from petrobot.services.worker.runs import (
-    Begin,
-    Ended,
-    Hold,
-    Order,
-    Report,
-    Stop,
-    Told,
-    flat,
-    record,
-)
+from petrobot.services.worker.runner import GRACE, STOP_LIMIT, Order
 
 _log = logging.getLogger(__name__)
 
@@ -76,7 +76,7 @@ DONE = {"hold": "held", "release": "released", CLEAR_EMERGENCY: "cleared", PICTU
 DRIVER_DIED = "the process of its device's driver died"
 
 
-class Stage(Enum):
+class HostStage(Enum):
     """Which processes of a place there are, and what they wait for."""
 
     DOWN = "none runs; the first is started when its pause is over"
@@ -101,68 +101,67 @@ class Happening(Enum):
     CLOSE = "the node ends"
 
 
-NEXT: Mapping[tuple[Stage, Happening], Stage] = {
-    (Stage.DOWN, Happening.START_DRIVER): Stage.DRIVER_STARTS,
-    (Stage.DOWN, Happening.START_ACTIONS): Stage.ACTIONS_START,
-    (Stage.DRIVER_STARTS, Happening.DRIVER_READY): Stage.ACTIONS_DOWN,
-    (Stage.DRIVER_STARTS, Happening.READY): Stage.READY,
-    (Stage.DRIVER_STARTS, Happening.ALL_ENDED): Stage.DOWN,
-    (Stage.ACTIONS_DOWN, Happening.START_ACTIONS): Stage.ACTIONS_START,
-    (Stage.ACTIONS_DOWN, Happening.ALL_ENDED): Stage.DOWN,
-    (Stage.ACTIONS_START, Happening.READY): Stage.READY,
-    (Stage.ACTIONS_START, Happening.ACTIONS_ENDED): Stage.ACTIONS_DOWN,
-    (Stage.ACTIONS_START, Happening.ALL_ENDED): Stage.DOWN,
-    (Stage.READY, Happening.ACTIONS_ENDED): Stage.ACTIONS_DOWN,
-    (Stage.READY, Happening.ALL_ENDED): Stage.DOWN,
-    **{(stage, Happening.CLOSE): Stage.CLOSED for stage in Stage},
+NEXT: Mapping[tuple[HostStage, Happening], HostStage] = {
+    (HostStage.DOWN, Happening.START_DRIVER): HostStage.DRIVER_STARTS,
+    (HostStage.DOWN, Happening.START_ACTIONS): HostStage.ACTIONS_START,
+    (HostStage.DRIVER_STARTS, Happening.DRIVER_READY): HostStage.ACTIONS_DOWN,
+    (HostStage.DRIVER_STARTS, Happening.READY): HostStage.READY,
+    (HostStage.DRIVER_STARTS, Happening.ALL_ENDED): HostStage.DOWN,
+    (HostStage.ACTIONS_DOWN, Happening.START_ACTIONS): HostStage.ACTIONS_START,
+    (HostStage.ACTIONS_DOWN, Happening.ALL_ENDED): HostStage.DOWN,
+    (HostStage.ACTIONS_START, Happening.READY): HostStage.READY,
+    (HostStage.ACTIONS_START, Happening.ACTIONS_ENDED): HostStage.ACTIONS_DOWN,
+    (HostStage.ACTIONS_START, Happening.ALL_ENDED): HostStage.DOWN,
+    (HostStage.READY, Happening.ACTIONS_ENDED): HostStage.ACTIONS_DOWN,
+    (HostStage.READY, Happening.ALL_ENDED): HostStage.DOWN,
+    **{(stage, Happening.CLOSE): HostStage.CLOSED for stage in HostStage},
 }
 """Every move. What is not in the table happens only out of turn (a second READY) and moves
 nothing."""
 
-STARTING = (Stage.DRIVER_STARTS, Stage.ACTIONS_START)
+STARTING = (HostStage.DRIVER_STARTS, HostStage.ACTIONS_START)
 
 
-@dataclass
-class _Watched:
-    """A run as the node watches it."""
+@dataclass(slots=True)
+class _Given:
+    """A call in the hands of a worker. Its deadline is watched by the node's `Callee`."""
 
-    begin: Begin
+    call: Call
     taken: float
-    limit: float
-    """Deadline on the node's clock."""
     posted: float | None = None
-    """When its worker was told."""
+    """When it was written to the worker's pipe (s); None while it waits for a worker."""
     number: int = 0
-    """The how-manieth run that this worker was given."""
-    stop: Stop | None = None
+    """Number of the call among those that this worker was given, from 1."""
+    cause: str = ""
+    """Why it was stopped, and a text; empty if it was not."""
+    text: str = ""
     stopped_at: float = math.inf
     pong: bool = False
     halted: bool = False
     killed: bool = False
 
 
-Spawn = Callable[
-    [Setup, Callable[[Child, list[list[Any]]], None], Callable[[Child], None], Any], Child
-]
+Spawn = Callable[[Setup, Callable[[Child, list[Item]], None], Callable[[Child], None], Any], Child]
 
 
 @dataclass(frozen=True, slots=True)
 class Hosting:
-    """What a node gives to a host of runs: a `WorkerPlace`, or a `WorkerPool` of them."""
+    """What a node gives to a host of runs: a `WorkerHost`, or a `WorkerPool` of them."""
 
     setup: Setup
     clock: Callable[[], float]
     """The node's monotonic clock (s)."""
-    changed: Callable[[], None]
-    """Called when a process has sent something or has ended."""
+    changed: Callable[[bool], None]
+    """Called when a process has sent something or has ended. True: only results of its runs came,
+    so nothing else about it has changed."""
     wanted: Callable[[str], None]
     """Called with the name of a stream whose receiver's address an action wants."""
     spawn: Spawn = Child
     """Starts a process; tests start none."""
 
 
-class WorkerPlace:
-    """Implements `inline_host.Place` with the processes of one device, or with one process of
+class WorkerHost:
+    """Implements `inline_host.Host` with the processes of one device, or with one process of
     actions that need none."""
 
     def __init__(self, hosting: Hosting) -> None:
@@ -171,7 +170,7 @@ class WorkerPlace:
         self._changed = hosting.changed
         self._wanted = hosting.wanted
         self._spawn = hosting.spawn
-        self._stage = Stage.DOWN
+        self._stage = HostStage.DOWN
         self._owner: Child | None = None
         """Process of the device's driver; None without a device."""
         self._worker: Child | None = None
@@ -182,8 +181,8 @@ class WorkerPlace:
         """Why a process could not be started, empty if it could."""
         self._died = ""
         """How the last process ended; empty once the place is ready again."""
-        self._runs: dict[str, _Watched] = {}
-        self._lost: list[Ended] = []
+        self._runs: dict[str, _Given] = {}
+        self._lost: list[Outcome] = []
         """Ends that are told when the device is known to stand still."""
         self._halt_due: float | None = None
         self._halts = 0
@@ -192,7 +191,8 @@ class WorkerPlace:
         """How many runs the worker was given."""
         self._commands: dict[str, str] = {}
         """Verb of each command that a process has not answered."""
-        self._frozen_since: float | None = None
+        self._frozen = False
+        """Whether the operator holds its runs."""
         self._reports: list[Report] = []
         self._deaths = 0
         self._started = -math.inf
@@ -206,7 +206,7 @@ class WorkerPlace:
     # --- processes ----------------------------------------------------------------------------
 
     @property
-    def stage(self) -> Stage:
+    def stage(self) -> HostStage:
         """Which processes there are."""
         return self._stage
 
@@ -214,7 +214,7 @@ class WorkerPlace:
     def ready(self) -> bool:
         """Whether a run would be taken at once: its processes are up, and none of them is known to
         end."""
-        return self._stage is Stage.READY and not self.failed and self._takes_orders()
+        return self._stage is HostStage.READY and not self.failed and self._takes_orders()
 
     def _takes_orders(self) -> bool:
         return (
@@ -231,9 +231,14 @@ class WorkerPlace:
             return "up", ""
         if self.failed:
             return "failed", self.failed
-        if self._died or self._deaths or self._stage is Stage.READY:
+        if self._died or self._deaths or self._stage is HostStage.READY:
             return "restarting", self._died or "one of its processes is ending"
         return "starting", ""
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """Ids of the runs that it has taken and that have not ended."""
+        return (*self._runs, *(end.id for end in self._lost))
 
     @property
     def busy(self) -> bool:
@@ -251,14 +256,14 @@ class WorkerPlace:
 
     def start(self) -> None:
         """Start the first process, unless there is one."""
-        if self._stage is Stage.DOWN:
+        if self._stage is HostStage.DOWN:
             self._start_due()
 
     def _start_due(self) -> None:
         """Start the process that is missing in this stage."""
         self._started, self._restart_at = self._clock(), None
         try:
-            if self._setup.device and self._stage is Stage.DOWN:
+            if self._setup.device and self._stage is HostStage.DOWN:
                 self._owner = self._spawn(self._setup, self._heard, self._ended, None)
                 self._move(Happening.START_DRIVER)
             else:
@@ -283,49 +288,58 @@ class WorkerPlace:
         self._stage = stage
         return True
 
-    def _heard(self, child: Child, received: list[list[Any]]) -> None:
+    def _heard(self, child: Child, received: list[Item]) -> None:
         """Take what a process has sent; the last words of a former process do not count."""
-        for items in received:
+        plain_ends = True
+        for item in received:
+            if type(item) is not Outcome or item.cause == OUT_OF_MEMORY:
+                plain_ends = False
             if child is self._owner or child is self._worker:
                 try:
-                    self._take_words(child, items)
+                    if isinstance(item, list):
+                        self._take_word(child, item)
+                    else:
+                        self._take_message(item)
                 except (ValueError, TypeError, IndexError, KeyError, AttributeError):
                     # The user's code has written into the pipe, or a copy of the process has.
-                    child.kill("it wrote into its pipe what is no record, and was killed")
-        self._changed()
+                    child.kill("it wrote into its pipe what is no message, and was killed")
+        self._changed(plain_ends)
 
     def _name(self) -> str:
         return self._setup.device or "actions"
 
-    def _take_words(self, child: Child, items: list[Any]) -> None:
+    def _take_word(self, child: Child, items: list[Any]) -> None:
         if items[0] == READY:
             self._take_ready(child, items[1])
         elif items[0] == FAILED:
-            self.failed = str(
-                items[1]
-            )  # it is about to end: what is ordered now waits for its successor
-        elif items[0] == PONG:
-            for run in self._runs.values():
-                run.pong = run.pong or run.stop is not None
+            # It is about to end: what is ordered now waits for its successor.
+            self.failed = str(items[1])
         elif items[0] == WANTED:
             self._wanted(items[1])
         else:
-            report = record(items)
-            if isinstance(report, Ended):
-                self._take_end(report)
-            elif isinstance(report, Told):
-                self._told(report)
-            else:
-                self._reports.append(report)  # type: ignore[arg-type]  # what is no order is a report
+            raise ValueError(f"unknown word {items[0]!r:.80}")
+
+    def _take_message(self, message: Message) -> None:
+        if isinstance(message, Outcome):
+            self._take_end(message)
+        elif isinstance(message, Answer):
+            self._answered(message)
+        elif isinstance(message, Pong):
+            for run in self._runs.values():
+                run.pong = run.pong or run.cause != ""
+        elif isinstance(message, Event | Feedback | Call | Cancel):
+            self._reports.append(message)
+        else:
+            raise ValueError(f"a process of a node sends no {type(message).__name__}")
 
     def _take_ready(self, child: Child, data: Mapping[str, Any]) -> None:
         driver = child is self._owner
-        if driver and self._stage is Stage.DRIVER_STARTS:
+        if driver and self._stage is HostStage.DRIVER_STARTS:
             self.streams = dict(data["streams"])
             if self._emergency:
-                child.post([COMMAND, "", EMERGENCY_STOP])
-            if self._frozen_since is not None:
-                child.post([COMMAND, "", "hold"])
+                child.post(Command("", EMERGENCY_STOP))
+            if self._frozen:
+                child.post(HOLD)
         if driver and data["period"]:
             if self._move(Happening.DRIVER_READY):
                 self._start_due()
@@ -335,15 +349,11 @@ class WorkerPlace:
             self._post_waiting(self._clock())
 
     def _post_waiting(self, now: float) -> None:
-        if (
-            self._frozen_since is not None
-            and self._worker is not None
-            and self._worker is not self._owner
-        ):
-            self._worker.post(flat(Hold(True)))  # it was held while it was being started
+        if self._frozen and self._worker is not None and self._worker is not self._owner:
+            self._worker.post(HOLD)  # it was held while it was being started
         for run in self._runs.values():
             if run.posted is None:
-                self._post_begin(now, run)
+                self._post_call(now, run)
 
     def _ended(self, child: Child) -> None:
         """A process has ended. That of a former one is no news."""
@@ -354,7 +364,7 @@ class WorkerPlace:
                 self._all_ended(child)
             else:
                 self._actions_ended(child)
-        self._changed()
+        self._changed(False)
 
     def _actions_ended(self, child: Child) -> None:
         """The actions of a cyclic device: its driver is stopped, and what was lost is told when it
@@ -366,7 +376,7 @@ class WorkerPlace:
         if self._move(Happening.ACTIONS_ENDED):
             self._halts += 1
             self._halt_due = self._clock() + STOP_LIMIT + MARGIN
-            self._owner.post([COMMAND, f"{HALT}{self._halts}", HALT])
+            self._owner.post(Command(f"{HALT}{self._halts}", HALT))
             self._plan_restart(child)
         else:
             self._tell_lost("")
@@ -376,7 +386,7 @@ class WorkerPlace:
         why, worker, was_ready = (
             self.failed or child.describe(),
             self._worker,
-            self._stage is not Stage.DRIVER_STARTS,
+            self._stage is not HostStage.DRIVER_STARTS,
         )
         driver = child is self._owner and worker is not child and was_ready
         self._owner = self._worker = None
@@ -415,7 +425,7 @@ class WorkerPlace:
 
     # --- runs ---------------------------------------------------------------------------------
 
-    def _take_end(self, end: Ended) -> None:
+    def _take_end(self, end: Outcome) -> None:
         if self._runs.pop(end.id, None) is None:
             return
         self._deaths = 0  # the process has done what it is there for
@@ -430,7 +440,7 @@ class WorkerPlace:
     def _end(self, id_: str, cause: str, text: str) -> None:
         """A run that no process was told of ends."""
         del self._runs[id_]
-        self._reports.append(Ended(id_, Status.ERROR, {}, cause, text, Executed.NO))
+        self._reports.append(Outcome(id_, Status.ERROR, {}, cause, text, Executed.NO))
         self._release_if_over()
 
     def _lose_runs(self, cause: str, text: str, begun: int) -> None:
@@ -442,73 +452,76 @@ class WorkerPlace:
                 continue
             if run.number > begun:
                 run.posted = None
-                if run.stop is not None:
-                    self._end(
-                        id_,
-                        run.stop.cause,
-                        f"{run.stop.text}; its process had not begun it".lstrip("; "),
-                    )
+                if run.cause:
+                    text = f"{run.text}; its process had not begun it".lstrip("; ")
+                    self._end(id_, run.cause, text)
                 continue
             del self._runs[id_]
             took = self._clock() - run.posted
-            if run.killed and run.stop is not None:
+            if run.killed:
                 how = (
                     "it did not let go"
                     if run.pong
                     else "it blocked its process, which answered nothing"
                 )
-                its_text = f"{run.stop.text}; {how}; its process was killed".lstrip("; ")
+                its_text = f"{run.text}; {how}; its process was killed".lstrip("; ")
                 self._lost.append(
-                    Ended(id_, Status.ERROR, {}, run.stop.cause, its_text, Executed.YES, took)
+                    Outcome(id_, Status.ERROR, {}, run.cause, its_text, Executed.YES, took)
                 )
             else:
                 executed = Executed.YES if cause == OUT_OF_MEMORY else Executed.UNKNOWN
-                self._lost.append(Ended(id_, Status.ERROR, {}, cause, text, executed, took))
+                self._lost.append(Outcome(id_, Status.ERROR, {}, cause, text, executed, took))
 
     def _tell_lost(self, note: str) -> None:
         for end in self._lost:
             text = f"{end.text}; {note}" if note else end.text
             self._reports.append(
-                Ended(end.id, end.status, {}, end.cause, text, end.executed, end.seconds)
+                Outcome(end.id, end.status, {}, end.cause, text, end.executed, end.seconds)
             )
         self._lost, self._halt_due = [], None
         self._release_if_over()
 
     def take(self, now: float, order: Order) -> None:
         """Take an order about a run."""
-        if isinstance(order, Begin):
-            limit = math.inf if order.deadline is None else now + order.deadline
-            self._runs[order.id] = run = _Watched(order, now, limit)
+        if isinstance(order, Call):
+            self._runs[order.id] = run = _Given(order, now)
             if self.ready:
-                self._post_begin(now, run)
-        elif isinstance(order, Stop):
+                self._post_call(now, run)
+        elif isinstance(order, Cancel):
             if order.id in self._runs:
                 self._stop(now, self._runs[order.id], order)
         elif self._worker is not None:
-            self._worker.post(flat(order))
+            self._worker.post(order)
 
-    def _post_begin(self, now: float, run: _Watched) -> None:
+    def _post_call(self, now: float, run: _Given) -> None:
         assert self._worker is not None
         self._given += 1
         run.posted, run.number = now, self._given
-        self._worker.post(flat(run.begin))
+        self._worker.post(run.call)
 
-    def _stop(self, now: float, run: _Watched, stop: Stop) -> None:
-        if run.stop is not None:
+    def _stop(self, now: float, run: _Given, cancel: Cancel) -> None:
+        if run.cause:
             return
+        cause, _, text = cancel.reason.partition(": ")
+        cause = cause or "cancelled"
         if run.posted is None or self._worker is None:
-            self._end(stop.id, stop.cause, stop.text)
+            self._end(cancel.id, cause, text)
             return
-        run.stop, run.stopped_at = stop, now
+        run.cause, run.text, run.stopped_at = cause, text, now
         self._pings += 1
-        self._worker.post(flat(stop))
-        self._worker.post([PING, self._pings])
+        self._worker.post(cancel)
+        self._worker.post(Ping(self._pings))
+
+    @property
+    def news(self) -> bool:
+        """Whether it has something to report."""
+        return bool(self._reports)
 
     idle = False
     """Its processes may say something at any time."""
 
     def advance(self, now: float) -> None:
-        """Start again what died; stop what is over its deadline; kill what hangs."""
+        """Start again what died, and kill what hangs."""
         if self._restart_at is not None and now >= self._restart_at:
             self._start_due()
         if self._stage in STARTING and now >= self._started + START_LIMIT:
@@ -519,35 +532,31 @@ class WorkerPlace:
             if run.posted is None and now >= self._wait_limit(run):
                 why = self.failed or self._died or "it is being started"
                 self._end(id_, "not_ready", f"its process is not ready: {why}")
-            elif run.stop is None and now >= run.limit and self._frozen_since is None:
-                self._stop(
-                    now, run, Stop(id_, "deadline", f"not over after {run.begin.deadline:g} s")
-                )
-            elif run.stop is not None:
+            elif run.cause:
                 self._chase(now, run)
 
-    def _wait_limit(self, run: _Watched) -> float:
+    def _wait_limit(self, run: _Given) -> float:
         """Until when a run waits for its process."""
-        return min(run.limit, run.taken + (NOT_READY if self.failed else START_LIMIT))
+        return run.taken + (NOT_READY if self.failed else START_LIMIT)
 
     def _give_start_up(self, now: float) -> None:
-        child = self._owner if self._stage is Stage.DRIVER_STARTS else self._worker
+        child = self._owner if self._stage is HostStage.DRIVER_STARTS else self._worker
         self._started = now  # once more, should even the kill come to nothing
         if child is not None:
             _log.warning("%s: not ready after %g s: killed", self._name(), START_LIMIT)
             child.kill(f"it was not ready after {START_LIMIT:g} s, and was killed")
 
-    def _chase(self, now: float, run: _Watched) -> None:
+    def _chase(self, now: float, run: _Given) -> None:
         """A stopped run that does not end: stop its device without it, then kill its process."""
         since = now - run.stopped_at
         if since >= SILENT and not run.pong and not run.halted:
             run.halted = True
             if self._owner is not None and self._owner is not self._worker:
-                self._owner.post([COMMAND, HALT, HALT])
+                self._owner.post(Command(HALT, HALT))
         patience = GRACE + STOP_LIMIT + MARGIN if run.pong else GRACE
         if since >= patience and not run.killed and self._worker is not None:
             run.killed = True
-            _log.warning("run %s did not end: its process is killed", run.begin.id)
+            _log.warning("run %s did not end: its process is killed", run.call.id)
             self._worker.kill()
 
     def due(self) -> float | None:
@@ -568,12 +577,10 @@ class WorkerPlace:
                 soonest = due
         return soonest if soonest < math.inf else None
 
-    def _due_of(self, run: _Watched) -> float:
+    def _due_of(self, run: _Given) -> float:
         if run.posted is None:
             return self._wait_limit(run)
-        if run.stop is None:
-            return run.limit if self._frozen_since is None else math.inf
-        if run.killed:
+        if not run.cause or run.killed:
             return math.inf
         if run.pong:
             return run.stopped_at + GRACE + STOP_LIMIT + MARGIN
@@ -581,20 +588,20 @@ class WorkerPlace:
 
     # --- operator -----------------------------------------------------------------------------
 
-    def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
+    def command(self, now: float, command: Command) -> None:
         """Carry out an operator's command in the process that has the driver."""
+        verb = command.verb
         if verb in (EMERGENCY_STOP, CLEAR_EMERGENCY):
             self._emergency = verb == EMERGENCY_STOP
         target = self._commanded()
         if target is None:
-            self._refuse(id, verb)
+            self._refuse(command.id, verb)
         else:
-            self._commands[id] = verb
-            target.post([COMMAND, id, verb])  # first: the device waits for nobody
+            self._commands[command.id] = verb
+            target.post(command)  # first: the device waits for nobody
         if verb in ("stop", EMERGENCY_STOP):
-            cause = "stopped" if verb == "stop" else EMERGENCY_STOP
             for run_id, run in list(self._runs.items()):
-                self._stop(now, run, Stop(run_id, cause, "by command"))
+                self._stop(now, run, Cancel(run_id, stopped_by(verb)))
         elif verb == "release":
             self._freeze(False)
         elif verb == "hold" and target is None and not self._setup.device:
@@ -602,9 +609,9 @@ class WorkerPlace:
 
     def _commanded(self) -> Child | None:
         """The process that carries out commands: the ready driver's, else the worker's."""
-        if self._stage in (Stage.DOWN, Stage.DRIVER_STARTS, Stage.CLOSED):
+        if self._stage in (HostStage.DOWN, HostStage.DRIVER_STARTS, HostStage.CLOSED):
             return None
-        found = self._owner or (self._worker if self._stage is Stage.READY else None)
+        found = self._owner or (self._worker if self._stage is HostStage.READY else None)
         return found if found is not None and not found.closed else None
 
     def _refuse(self, id_: str, verb: str) -> None:
@@ -612,9 +619,8 @@ class WorkerPlace:
         word, why = self.condition
         done = "not ready" if self._setup.device else DONE.get(verb, "stopped")
         answer = word if verb == "status" else done
-        self._reports.append(
-            Told(id_, answer, {"text": why, "runs": list(self._runs), "pids": self.pids()})
-        )
+        data = {"text": why, "runs": list(self._runs), "pids": self.pids()}
+        self._reports.append(answer_of(id_, answer, data))
 
     def _answer_commands(self) -> None:
         """The process that was to answer them has ended."""
@@ -623,47 +629,40 @@ class WorkerPlace:
             self._refuse(id_, verb)
 
     def _freeze(self, frozen: bool) -> None:
-        """Hold the runs, or let them go on with their deadlines moved by the pause."""
-        now = self._clock()
-        if frozen and self._frozen_since is None:
-            self._frozen_since = now
-        elif not frozen and self._frozen_since is not None:
-            for run in self._runs.values():
-                run.limit += now - self._frozen_since
-            self._frozen_since = None
+        """Hold the runs, or release them."""
+        self._frozen = frozen
         if self._worker is not None and self._worker is not self._owner and self._owner is not None:
-            self._worker.post(flat(Hold(frozen)))
+            self._worker.post(HOLD if frozen else RELEASE)
 
     def _release_if_over(self) -> None:
         """The last of the held runs has ended, its device was stopped: the next one must not find
         it held."""
-        if self._runs or self._frozen_since is None:
+        if self._runs or not self._frozen:
             return
         self._freeze(False)
         if self._owner is not None and self._owner is not self._worker:
-            self._owner.post([COMMAND, "", "release"])
+            self._owner.post(RELEASE)
 
-    def _told(self, told: Told) -> None:
-        if told.id.startswith(HALT):
-            if (
-                self._halt_due is not None and told.id == f"{HALT}{self._halts}"
-            ):  # not that of an earlier order
+    def _answered(self, answer: Answer) -> None:
+        """A process has answered a command."""
+        word, data = str(answer.data["answer"]), dict(answer.data)
+        if answer.id.startswith(HALT):
+            # Not the answer to an earlier order.
+            if self._halt_due is not None and answer.id == f"{HALT}{self._halts}":
                 self._tell_lost(
-                    "" if told.answer == "stopped" else "the device is not known to stand still"
+                    "" if word == "stopped" else "the device is not known to stand still"
                 )
             return
-        verb = self._commands.pop(told.id, "")
-        if verb == "hold" and told.answer != "cannot hold":
+        verb = self._commands.pop(answer.id, "")
+        if verb == "hold" and word != "cannot hold":
             self._freeze(True)
-        data, answer = {**told.data, "runs": list(self._runs), "pids": self.pids()}, told.answer
+        data.update(runs=list(self._runs), pids=self.pids())
         if verb == "status":
-            answer, data["text"] = self.condition
-            if answer == "up" and told.data.get("fenced"):
-                answer, data["text"] = (
-                    "fenced",
-                    "the device is not known to stand still after an earlier run",
-                )
-        self._reports.append(Told(told.id, answer, data))
+            word, data["text"] = self.condition
+            if word == "up" and data.get("fenced"):
+                word = "fenced"
+                data["text"] = "the device is not known to stand still after an earlier run"
+        self._reports.append(answer_of(answer.id, word, {**data, "answer": word}))
 
     def stream_at(self, stream: str, host: str, port: int, ticket: str) -> None:
         """Tell the actions where a stream is received."""

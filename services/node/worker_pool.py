@@ -13,21 +13,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from petrobot.services.action import Status
-from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.comm.protocol.messages import (
+    Answer,
+    Call,
+    Cancel,
+    Command,
+    Executed,
+    Outcome,
+)
 from petrobot.services.device import PICTURE
 from petrobot.services.node.child import Child
-from petrobot.services.node.worker_host import DONE, Hosting, Stage, WorkerPlace
-from petrobot.services.worker.runs import (
-    Answered,
-    Asked,
-    Begin,
-    Dropped,
-    Ended,
-    Order,
-    Report,
-    Stop,
-    Told,
-)
+from petrobot.services.node.inline_host import HOLD, answer_of
+from petrobot.services.node.worker_host import DONE, Hosting, HostStage, WorkerHost
+from petrobot.services.worker.context import Report
+from petrobot.services.worker.runner import Order
 
 KEPT = 2
 """Idle workers that stay however long nothing is to be done."""
@@ -45,7 +44,7 @@ class _Gathered:
 
 
 class WorkerPool:
-    """Implements `inline_host.Place` for actions without a device, with one `WorkerPlace` for each
+    """Implements `inline_host.Host` for actions without a device, with one `WorkerHost` for each
     worker.
 
     `most` is how many workers there may be; a run beyond that is refused: `busy`, executed = no.
@@ -54,20 +53,16 @@ class WorkerPool:
     def __init__(self, hosting: Hosting, most: int) -> None:
         self._hosting = hosting
         self._most = most
-        self._workers: dict[int, WorkerPlace] = {}
+        self._workers: dict[int, WorkerHost] = {}
         """By number from 1, the lowest first: a node that has little to do uses the same ones again
         and again."""
-        self._leaving: list[WorkerPlace] = []
+        self._leaving: list[WorkerHost] = []
         self._idle_since: dict[int, float] = {}
         self._touched: set[int] = set()
         """Those to which something has happened since the last step. The others need no look before
         they are due: a step must not take longer the more workers there are."""
         self._due: dict[int, float] = {}
         self._soonest = math.inf
-        self._at: dict[str, int] = {}
-        """Number of the worker that each run was given to."""
-        self._asked: dict[str, int] = {}
-        """That of each call that a run made and that was not answered."""
         self._streams: dict[str, set[int]] = {}
         """Those that want to know where a stream is received."""
         self._commands: dict[str, _Gathered] = {}
@@ -122,18 +117,19 @@ class WorkerPool:
         number = next(n for n in range(1, self._most + 1) if n not in self._workers)
         hosting = replace(
             self._hosting,
-            changed=lambda: self._touch(number),
+            changed=lambda plain_ends: self._touch(number, plain_ends),
             wanted=lambda stream: self._want(number, stream),
         )
-        self._workers[number] = WorkerPlace(hosting)
+        self._workers[number] = WorkerHost(hosting)
         self._workers = dict(sorted(self._workers.items()))
         self._touched.add(number)
         self._workers[number].start()
         return number
 
-    def _touch(self, number: int) -> None:
+    def _touch(self, number: int, plain_ends: bool) -> None:
         self._touched.add(number)
-        self._hosting.changed()
+        # With more workers than are kept, one may have to retire now.
+        self._hosting.changed(plain_ends and len(self._workers) <= KEPT)
 
     def _idle(self) -> list[int]:
         """Workers without a run, the best first: ready ones, then those that start, then those that
@@ -143,7 +139,7 @@ class WorkerPool:
 
     def _rank(self, number: int) -> int:
         worker = self._workers[number]
-        return 0 if worker.ready else 1 if worker.stage is Stage.ACTIONS_START else 2
+        return 0 if worker.ready else 1 if worker.stage is HostStage.ACTIONS_START else 2
 
     def children(self) -> list[Child]:
         """Its processes, those included that were told to leave."""
@@ -157,34 +153,36 @@ class WorkerPool:
 
     def take(self, now: float, order: Order) -> None:
         """Take an order about a run."""
-        if isinstance(order, Begin):
+        if isinstance(order, Call):
             self._begin(now, order)
-        elif isinstance(order, Stop | Answered):
-            known = (
-                self._at.get(order.id)
-                if isinstance(order, Stop)
-                else self._asked.pop(order.id, None)
-            )
-            if known in self._workers:
-                self._touched.add(known)
-                self._workers[known].take(now, order)
+        elif isinstance(order, Cancel | Outcome):
+            # The id of a call that a run makes is that of the run, a slash and a number.
+            run = order.id if isinstance(order, Cancel) else order.id.rpartition("/")[0]
+            for number, worker in self._workers.items():
+                if run in worker.runs:
+                    self._touched.add(number)
+                    worker.take(now, order)
 
-    def _begin(self, now: float, begin: Begin) -> None:
+    def _begin(self, now: float, call: Call) -> None:
         number = self._choose()
         if number is None:
             self._reports.append(
-                Ended(begin.id, Status.ERROR, {}, "busy", self._full(), Executed.NO)
+                Outcome(call.id, Status.ERROR, {}, "busy", self._full(), Executed.NO)
             )
             return
-        self._at[begin.id] = number
         self._touched.add(number)
         if self._held:
-            self._workers[number].command(now, "", "hold")
-        self._workers[number].take(now, begin)
+            self._workers[number].command(now, HOLD)
+        self._workers[number].take(now, call)
         if len(self._workers) < self._most and all(
             worker.busy for worker in self._workers.values()
         ):
             self._add()
+
+    @property
+    def runs(self) -> list[str]:
+        """Ids of the runs that its workers have."""
+        return [run for worker in self._workers.values() for run in worker.runs]
 
     def _choose(self) -> int | None:
         """Number of the worker for the next run, started if need be; None at the limit."""
@@ -196,6 +194,11 @@ class WorkerPool:
         if (not idle or self._rank(idle[0]) == 2) and len(self._workers) < self._most:
             return self._add()
         return idle[0] if idle else None
+
+    @property
+    def news(self) -> bool:
+        """Whether it has something to report without a word of a process: that a run is refused."""
+        return bool(self._reports)
 
     idle = False
     """Its processes may say something at any time."""
@@ -259,16 +262,11 @@ class WorkerPool:
                     self._take_report(number, report)
 
     def _take_report(self, number: int, report: Report) -> None:
-        if isinstance(report, Told):
+        if isinstance(report, Answer):
             self._take_answer(number, report)
             return
-        if isinstance(report, Ended):
-            self._at.pop(report.id, None)
-            self._held = self._held and bool(self._at)  # a hold ends with the runs that it held
-        elif isinstance(report, Asked):
-            self._asked[report.id] = number
-        elif isinstance(report, Dropped):
-            self._asked.pop(report.id, None)
+        if isinstance(report, Outcome) and self._held:
+            self._held = bool(self.runs)  # a hold ends with the runs that it held
         self._reports.append(report)
 
     # --- streams ------------------------------------------------------------------------------
@@ -286,44 +284,43 @@ class WorkerPool:
 
     # --- operator -----------------------------------------------------------------------------
 
-    def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
+    def command(self, now: float, command: Command) -> None:
         """Carry out an operator's command in every worker that has a run. What only the node knows
         needs none of them: `status` is answered although all of them may be blocked by their
         actions."""
+        verb = command.verb
         if verb in ("hold", "release"):
             self._held = verb == "hold"
-        asked = set() if verb in ("status", PICTURE) else set(self._at.values())
-        if not asked:
+        asked = {number for number, worker in self._workers.items() if worker.busy}
+        if verb in ("status", PICTURE) or not asked:
             word, why = self.condition if verb == "status" else (DONE.get(verb, "stopped"), "")
-            self._tell(id, word, why)
+            self._tell(command.id, word, why)
             return
-        self._commands[id] = _Gathered(verb, asked)
+        self._commands[command.id] = _Gathered(verb, asked)
         self._touched |= asked
         for number in sorted(asked):
-            self._workers[number].command(now, id, verb)
+            self._workers[number].command(now, command)
 
-    def _take_answer(self, number: int, told: Told) -> None:
-        command = self._commands.get(told.id)
+    def _take_answer(self, number: int, answer: Answer) -> None:
+        command = self._commands.get(answer.id)
         if command is None or number not in command.missing:
             return
         command.missing.discard(number)
-        command.answers.append(told.answer)
+        command.answers.append(answer.data["answer"])
         if not command.missing:
-            del self._commands[told.id]
+            del self._commands[answer.id]
             good = DONE.get(command.verb, "stopped")
-            self._tell(
-                told.id, next((answer for answer in command.answers if answer != good), good)
-            )
+            self._tell(answer.id, next((word for word in command.answers if word != good), good))
 
     def _tell(self, id_: str, word: str, why: str = "") -> None:
         data = {
             "text": why,
-            "runs": list(self._at),
+            "runs": self.runs,
             "pids": self.pids(),
             "state": {},
             "workers": len(self._workers),
         }
-        self._reports.append(Told(id_, word, data))
+        self._reports.append(answer_of(id_, word, data))
 
     def close(self, now: float) -> None:
         """Let the processes end in good order."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from petrobot.services.action import Context
 from petrobot.services.comm.streams.image import Image
-from petrobot.services.device import Ports, refuse_unknown_keys
+from petrobot.services.device import Driver, Ports, refuse_unknown_keys
 from petrobot.services.vision.calibration_file import DEFAULT, parse_calibration
 from petrobot.services.vision.location import Background, BallDetector
 from petrobot.services.vision.prediction import Surface
@@ -48,7 +48,7 @@ class Mark:
     table: Any = ()
 
 
-class Camera:
+class Camera(Driver):
     """A device without cyclic work. Its keys in services.toml, all optional except those of its
     source:
 
@@ -56,8 +56,6 @@ class Camera:
     cell's data (default: the shipped one); `rate`: images/s (default: the cell's); `threads`: for
     OpenCV (default 1: other nodes share the cores).
     """
-
-    period: float | None = None
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         refuse_unknown_keys(config, KEYS)
@@ -145,13 +143,6 @@ class Camera:
 
     # For the node
 
-    def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Refuse: actions call the methods above instead."""
-        raise ValueError("the camera takes no commands; its actions read images")
-
-    def step(self, now: float) -> None:
-        """Do nothing: nothing is due between images."""
-
     def state(self) -> Mapping[str, Any]:
         """Return plain data for operator and report."""
         return {
@@ -218,13 +209,6 @@ class Camera:
     def stopped(self) -> bool:
         """Return whether no images are taken; a camera never moves."""
         return self._rate == 0.0
-
-    def hold(self, now: float) -> str:
-        """Refuse a pause while images are taken: a rolling ball does not wait."""
-        return "held" if self.stopped() else "cannot hold"
-
-    def release(self, now: float) -> None:
-        """Do nothing: nothing was held."""
 
     def close(self) -> None:
         """Stop the images and close the source."""

@@ -5,27 +5,33 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
-
-import numpy as np
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 from petrobot.services.action import Result, Status, Wait
 from petrobot.services.comm.calls.events import RunVerdict, mission_of, verdict_event
 from petrobot.services.comm.protocol.codec import NAME_LENGTH, ProtocolError, encode
-from petrobot.services.comm.protocol.messages import Call, Event, Feedback, Message, Outcome
+from petrobot.services.comm.protocol.messages import (
+    Answer,
+    Call,
+    Cancel,
+    Event,
+    Feedback,
+    Message,
+    Outcome,
+)
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.worker.callables import describe, words_of
-from petrobot.services.worker.outlets import Outlets
-from petrobot.services.worker.runs import (
-    Answered,
-    Asked,
-    Begin,
-    Dropped,
-    Judged,
-    Progressed,
-    Raised,
-    Report,
-)
+from petrobot.services.worker.outlets import Outlets, Sent
+
+Report = Outcome | Feedback | Event | Call | Cancel | Answer | Sent
+"""What a host of runs tells its node. Outcome: the result of a run. Feedback: its progress. Event:
+one of a run, a verdict on an earlier run, or an external one of the device. Call: a run (`parent`)
+calls a service. Cancel: a run no longer waits for a call that it made. Answer: that of a command,
+with a word as `answer` in its data. Sent: a set point leaves (in lock step only)."""
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 class CallFailed(Exception):  # noqa: N818 - what happened, not a class of errors
@@ -79,7 +85,7 @@ class RunContext:
 
     def __init__(
         self,
-        begin: Begin,
+        call: Call,
         device: Any,
         clock: Callable[[], float],
         outlets: Outlets,
@@ -87,7 +93,7 @@ class RunContext:
     ) -> None:
         self.held = 0.0
         """Seconds for which the operator has held the run."""
-        self._begin = begin
+        self._call = call
         self._device = device
         self._clock = clock
         self._outlets = outlets
@@ -105,7 +111,7 @@ class RunContext:
     @property
     def run(self) -> str:
         """This run's id."""
-        return self._begin.id
+        return self._call.id
 
     @property
     def device(self) -> Any:
@@ -131,9 +137,11 @@ class RunContext:
 
     def raise_event(self, name: str, **data: Any) -> None:
         """Raise a named internal event while the run goes on."""
-        raised = Raised(self.run, plain(name, "name"), plain(data, "data"))
-        checked(Event(raised.name, self._begin.action, 1, raised.data, self.run))
-        self._report(raised)
+        event = Event(
+            plain(name, "name"), self._call.service, 0, plain(data, "data"), self._call.id
+        )
+        checked(event)
+        self._report(event)
 
     def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
         """Judge an earlier run that had ended provisionally. Raises ValueError for what is no run's
@@ -141,16 +149,17 @@ class RunContext:
         said = RunVerdict(run, Status(status).value, str(cause), str(text))
         name = verdict_event(mission_of(run))
         checked(Outcome(run, said.status, cause=said.cause, text=said.text))
-        checked(Event(name, self._begin.action, 1, said.to_data()))
-        self._report(Judged(self.run, run, said.status, said.cause, said.text))
+        event = Event(name, self._call.service, 0, said.to_data())
+        checked(event)
+        self._report(event)
 
     def progress(self, fraction: float, **data: Any) -> None:
         """Tell how far the run is, 0 to 1 (clipped)."""
         if not math.isfinite(fraction):
             raise ValueError(f"progress is {fraction}; give a number from 0 to 1")
-        progressed = Progressed(self.run, min(1.0, max(0.0, float(fraction))), plain(data, "data"))
-        checked(Feedback(self.run, progressed.fraction, progressed.data))
-        self._report(progressed)
+        feedback = Feedback(self.run, min(1.0, max(0.0, float(fraction))), plain(data, "data"))
+        checked(feedback)
+        self._report(feedback)
 
     async def call(
         self, service: str, /, deadline: float | None = None, **arguments: Any
@@ -160,20 +169,17 @@ class RunContext:
         self._children += 1
         child = f"{self.run}/{self._children}"
         limit = None if deadline is None else float(deadline)
-        asked = Asked(
-            self.run,
+        asked = Call(
             child,
             plain(service, "service"),
             plain(arguments, "arguments"),
             limit,
-            self._begin.seed,
+            parent=self.run,
+            seed=self._call.seed,
         )
         # The node adds the boot of its peer: as long as any name of it, so that what passes here
         # passes there.
-        boot = "b" * NAME_LENGTH
-        checked(
-            Call(child, asked.service, asked.arguments, limit, 0, boot, self.run, self._begin.seed)
-        )
+        checked(replace(asked, boot="b" * NAME_LENGTH))
         self._report(asked)
         self._waiting.add(child)
         try:
@@ -181,7 +187,7 @@ class RunContext:
         finally:
             self._waiting.discard(child)
             if child not in self._answers:
-                self._report(Dropped(child))
+                self._report(Cancel(child, "its run no longer waits"))
         return self._answers.pop(child)
 
     async def get(self, name: str) -> Any:
@@ -209,16 +215,18 @@ class RunContext:
     def random(self, purpose: str) -> np.random.Generator:
         """A generator keyed by (seed, run, purpose); asking again goes on with the same one."""
         if purpose not in self._generators:
-            key = f"{self._begin.seed}\0{self.run}\0{purpose}".encode()
+            key = f"{self._call.seed}\0{self.run}\0{purpose}".encode()
+            import numpy as np  # here: most actions draw nothing, and importing it takes 0.1 s
+
             words = np.frombuffer(hashlib.sha256(key).digest(), dtype="<u4")
             self._generators[purpose] = np.random.default_rng([int(w) for w in words])
         return self._generators[purpose]
 
-    def answer(self, answered: Answered) -> bool:
-        """Take the end of a call; False when this run does not wait for it."""
-        if answered.id not in self._waiting:
+    def answer(self, outcome: Outcome) -> bool:
+        """Accept the result of a call that this run has made; False if it does not wait for it."""
+        if outcome.id not in self._waiting:
             return False
-        self._answers[answered.id] = Result(
-            Status(answered.status), answered.values, answered.cause, answered.text
+        self._answers[outcome.id] = Result(
+            Status(outcome.status), outcome.values, outcome.cause, outcome.text
         )
         return True

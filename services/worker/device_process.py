@@ -14,8 +14,9 @@ import math
 import os
 import socket
 import time
-from typing import Any
 
+from petrobot.services.comm.protocol.codec import ProtocolError
+from petrobot.services.comm.protocol.messages import Answer, Command, Event, Message
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import PICTURE, Driver, picture_of, stop_at_once
 from petrobot.services.node.emergency_stops import BEAT, Guard
@@ -31,7 +32,6 @@ from petrobot.services.worker.remote import (
     DeviceCommand,
 )
 from petrobot.services.worker.runner import STOP_LIMIT
-from petrobot.services.worker.runs import Told, flat
 
 LINKED = "linked"
 """What the node says when it has passed the link of a new worker."""
@@ -52,6 +52,19 @@ def take_priority() -> bool:
     except (PermissionError, OSError):
         return False
     return True
+
+
+def post_report(node: Pipe, report: Message) -> None:
+    """Send a report to the node. An answer that no message can carry says so instead: what a
+    driver tells of its device must not end its process."""
+    try:
+        node.post(report)
+    except ProtocolError as fault:
+        if not isinstance(report, Answer):
+            raise
+        _log.warning("the answer to a command cannot be sent: %s", fault)
+        word = report.data.get("answer")
+        node.post(Answer(report.id, True, {"answer": word, "text": fault.text}))
 
 
 class DeviceError(Exception):
@@ -156,10 +169,14 @@ class DeviceLoop:
 
     def _cycle(self, now: float) -> None:
         if not self._node.closed:
-            for items in self._node.read():
+            for item in self._node.read():
+                word = item[0] if isinstance(item, list) else ""
                 if self._guard is not None:
-                    self._guard.heard(now, items[0] == BEAT)
-                self._obey(now, items)
+                    self._guard.heard(now, word in (BEAT, LINKED))
+                if word == LINKED:
+                    self._attach()
+                elif isinstance(item, Command):
+                    self._obey(now, item.id, item.verb)
             if self._guard is not None and now >= self._guard.due:
                 self._watch(now, self._guard)
         self._take_commands(now)
@@ -182,7 +199,7 @@ class DeviceLoop:
                 del self._stopping[id_]
                 self._tell(id_, "stopped" if state.stopped else "moving")
         for name, data in self._ports.raised():
-            self._node.post(["raised", "", name, data])
+            self._node.post(Event(name, "", 0, data))
 
     def _watch(self, now: float, guard: Guard) -> None:
         """Stop the device without an order where nobody may be able to give one."""
@@ -211,34 +228,31 @@ class DeviceLoop:
             self._worker.socket.close()
             self._worker = None
 
-    def _obey(self, now: float, items: list[Any]) -> None:
-        if items[0] == BEAT:
-            return
-        if items[0] == LINKED:
-            self._attach()
-        elif items[0] == "command":
-            _, id_, verb = items
-            if verb == HALT:
-                self._driver.stop(now)
-                self._stopping[id_] = now + STOP_LIMIT
-            elif verb == "stop":
-                self._driver.stop(now)
-                self._tell(id_, "stopped" if self._driver.stopped() else "stopping")
-            elif verb == EMERGENCY_STOP:
-                self._cyclic.emergency_stop(now)
-                self._tell(id_, "stopped" if self._driver.stopped() else "stopping")
-            elif verb == CLEAR_EMERGENCY:
-                self._cyclic.clear_emergency()
-                self._tell(id_, "cleared")
-            elif verb == "hold":
-                self._tell(id_, self._driver.hold(now))
-            elif verb == "release":
-                self._driver.release(now)
-                self._tell(id_, "released")
-            elif verb == PICTURE:
-                self._node.post(flat(Told(id_, PICTURE, picture_of(self._driver))))
-            else:
-                self._tell(id_, "up")
+    def _obey(self, now: float, id_: str, verb: str) -> None:
+        """Carry out a command of the node, and answer it."""
+        if verb == HALT:
+            self._driver.stop(now)
+            self._stopping[id_] = now + STOP_LIMIT
+        elif verb == "stop":
+            self._driver.stop(now)
+            self._tell(id_, "stopped" if self._driver.stopped() else "stopping")
+        elif verb == EMERGENCY_STOP:
+            self._cyclic.emergency_stop(now)
+            self._tell(id_, "stopped" if self._driver.stopped() else "stopping")
+        elif verb == CLEAR_EMERGENCY:
+            self._cyclic.clear_emergency()
+            self._tell(id_, "cleared")
+        elif verb == "hold":
+            self._tell(id_, self._driver.hold(now))
+        elif verb == "release":
+            self._driver.release(now)
+            self._tell(id_, "released")
+        elif verb == PICTURE:
+            post_report(
+                self._node, Answer(id_, True, {"answer": PICTURE, **picture_of(self._driver)})
+            )
+        else:
+            self._tell(id_, "up")
 
     def _attach(self) -> None:
         """A new worker: take the end of its link."""
@@ -256,4 +270,4 @@ class DeviceLoop:
             "overruns": self._overruns,
             "refused": self._cyclic.refused,
         }
-        self._node.post(flat(Told(id_, answer, data)))
+        post_report(self._node, Answer(id_, True, {"answer": answer, **data}))

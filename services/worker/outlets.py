@@ -12,11 +12,21 @@ from petrobot.services.comm.protocol.codec import LIMITS
 from petrobot.services.comm.protocol.messages import SetPoint
 from petrobot.services.comm.streams.stream import StreamSender
 from petrobot.services.comm.tls.credentials import credentials
-from petrobot.services.worker.runs import Sent
 
 MOST = (LIMITS[SetPoint.KIND] - 64) // 9
 """Numbers of a set point: 9 bytes each in its message, and room for the rest of it."""
 SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """A set point that leaves: the newest value of a stream, and how long ago its action published
+    it (s)."""
+
+    run: str
+    stream: str
+    values: tuple[float, ...]
+    elapsed: float
 
 
 @dataclass
@@ -87,7 +97,8 @@ class Outlets:
         return min((outlet.next for outlet in self._open.values()), default=None)
 
 
-# All streams that a worker sends: finds the receivers through its node, keeps the connections, drops what cannot go now.
+# All streams that a worker sends: finds the receivers through its node, keeps the connections,
+# drops what cannot go now.
 
 ASK_AGAIN = 0.25
 """Seconds between questions for the address of a receiver that is not there."""

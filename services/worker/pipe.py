@@ -1,5 +1,9 @@
-"""Records between a node and its own processes: msgpack over a local socket pair, nothing
-blocks."""
+"""The pipe between a node and one of its own processes: messages of the node protocol over a local
+socket pair. Nothing blocks.
+
+A message is the same msgpack array as on the wire, `[kind, field, ...]`. What only concerns the
+process itself (that it is ready, that its node lives) is an array that begins with a word.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +18,14 @@ from typing import Any
 
 import msgpack
 
+from petrobot.services.comm.protocol.codec import ProtocolError, encode, read_fields
+from petrobot.services.comm.protocol.messages import Message
+
+Item = Message | list[Any]
+"""A message, or a list of plain data whose first item is a word."""
+MALFORMED = "malformed"
 LARGEST = 64 << 20
-"""Most bytes of one record, and of what waits to be read."""
+"""Most bytes of one item, and of what waits to be read."""
 CHUNK = 1 << 16
 """Bytes read at once."""
 _NUMBER = struct.Struct("=Q")
@@ -54,7 +64,7 @@ def _become_copy() -> None:
 
 
 class Pipe:
-    """One end. `post` takes a list and sends what fits; `read` gives whole lists. `closed` once the
+    """One end. `post` sends as much as fits; `read` returns whole items. `closed` is set once the
     other end is gone; what it has sent before can still be read."""
 
     def __init__(self, end: socket.socket) -> None:
@@ -77,19 +87,22 @@ class Pipe:
         """Whether something waits until the other end reads."""
         return bool(self._unsent)
 
-    def post(self, items: list[Any]) -> None:
-        """Send a list, or keep what does not fit for `flush`."""
+    def post(self, item: Item) -> None:
+        """Send an item, or keep what does not fit for `flush`. Raises ProtocolError for a message
+        that cannot be sent."""
         if _Copy.made:
             os._exit(0)
         if self.closed:
             return
-        data = self._packer.pack(items)
+        data = self._packer.pack(item) if type(item) is list else encode(item)  # type: ignore[arg-type]
         if not self._unsent:
-            with contextlib.suppress(OSError):  # met again, and dealt with, by `flush`
+            try:
                 sent = self.socket.send(data)
                 if sent == len(data):
                     return
                 data = data[sent:]
+            except OSError:
+                pass  # met again, and dealt with, by `flush`
         self._unsent += data
         self.flush()
 
@@ -105,41 +118,55 @@ class Pipe:
                     self.closed = True
                     self._unsent.clear()
 
-    def read(self) -> list[list[Any]]:
-        """All lists that have come. Raises ValueError for what is not msgpack: user code has
+    def read(self) -> list[Item]:
+        """Return all items that have come. Raises ValueError for what is not msgpack: user code has
         written into the pipe."""
         if _Copy.made:
             os._exit(0)
-        items: list[list[Any]] = []
-        with contextlib.suppress(BlockingIOError):
-            while not self._ended:
-                try:
-                    count = self.socket.recv_into(_BUFFER)
-                except BlockingIOError:
-                    raise
-                except OSError:
-                    count = 0
-                if not count:
-                    self.closed = self._ended = True
-                    break
-                self._feed(_BUFFER[:count])
-                # Taken out before more is read: several large records that came together are more
-                # than its buffer holds.
-                items += [item for item in self._unpacker if isinstance(item, list)]
-                if count < CHUNK and not self.closed:
-                    break  # all that has come; the end of the pipe wakes its reader once more
+        items: list[Item] = []
+        while not self._ended:
+            try:
+                count = self.socket.recv_into(_BUFFER)
+            except BlockingIOError:
+                break
+            except OSError:
+                count = 0
+            if not count:
+                self.closed = self._ended = True
+                break
+            self._feed(_BUFFER[:count])
+            # Taken out before more is read: several large items that came together are more than
+            # its buffer holds.
+            for unpacked in self._unpacker:
+                if (item := _item(unpacked)) is not None:
+                    items.append(item)
+            if count < CHUNK and not self.closed:
+                break  # all that has come; the end of the pipe wakes its reader once more
         return items
 
     def _feed(self, data: memoryview) -> None:
         try:
             self._unpacker.feed(data)
         except msgpack.BufferFull as fault:
-            raise ValueError(f"a record of more than {LARGEST} bytes") from fault
+            raise ValueError(f"an item of more than {LARGEST} bytes") from fault
 
     def close(self) -> None:
         """Let it go."""
         self.closed = self._ended = True
         self.socket.close()
+
+
+def _item(unpacked: Any) -> Item | None:
+    """Return a message, or a list that begins with a word. Anything but a list is dropped; a list
+    that is neither becomes the word MALFORMED, so that what came before it still counts."""
+    if not isinstance(unpacked, list) or not unpacked:
+        return None
+    if isinstance(unpacked[0], str):
+        return unpacked
+    try:
+        return read_fields(unpacked)
+    except ProtocolError as fault:
+        return [MALFORMED, str(fault)]
 
 
 class Counter:

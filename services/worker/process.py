@@ -23,23 +23,38 @@ from pathlib import Path
 from typing import Any
 
 from petrobot.services.comm.location_file import Directory, DirectoryError, parse
+from petrobot.services.comm.protocol.messages import (
+    Call,
+    Cancel,
+    Command,
+    Event,
+    Message,
+    Outcome,
+    Ping,
+    Pong,
+)
 from petrobot.services.device import Driver
+from petrobot.services.host.command_line import log_to_stderr
 from petrobot.services.host.emergency_latch import latch_of
 from petrobot.services.host.parent_death import STOP_ROUTINE, outlive
 from petrobot.services.node.drivers import make_driver
 from petrobot.services.node.emergency_stops import BEAT, Guard
-from petrobot.services.node.inline_host import InlinePlace
+from petrobot.services.node.inline_host import InlineHost
 from petrobot.services.node.ports import ProcessPorts
 from petrobot.services.scripted import load as load_script
-from petrobot.services.worker.device_process import DeviceError, DeviceLoop, take_priority
-from petrobot.services.worker.outlets import StreamOutlets
-from petrobot.services.worker.pipe import Counter, NewestLink, Pipe, keep_from_copies
+from petrobot.services.worker.device_process import (
+    DeviceError,
+    DeviceLoop,
+    post_report,
+    take_priority,
+)
+from petrobot.services.worker.outlets import Sent, StreamOutlets
+from petrobot.services.worker.pipe import Counter, Item, NewestLink, Pipe, keep_from_copies
 from petrobot.services.worker.remote import DeviceCommand, DeviceState, RemoteDriver
-from petrobot.services.worker.runs import Begin, Order, Raised, Sent, flat, record
 
 POLL = 0.002
 """Seconds between looks at what a run waits for, when it is more than time."""
-BORN, READY, FAILED, COMMAND, PING, PONG = "born", "ready", "failed", "command", "ping", "pong"
+SETUP, BORN, READY, FAILED = "setup", "born", "ready", "failed"
 WANTED, STREAM_AT = "wanted", "stream_at"
 LINK_LOST, NO_MEMORY = 90, 91
 """Exit codes: the driver's process is gone; not even the report of a run fits into the memory that
@@ -101,7 +116,7 @@ class Worker:
             if (a.node, a.device) == (setup.node, setup.device)
         }
         scripted = load_script(setup.mock) if setup.mock else {}
-        self._place = InlinePlace(
+        self._place = InlineHost(
             actions,
             clock=time.monotonic,
             driver=driver,
@@ -134,8 +149,8 @@ class Worker:
             if self._link is not None:
                 self._read_link(self._link)
             now = time.monotonic()
-            for items in self._node.read():
-                self._take(now, items)
+            for item in self._node.read():
+                self._take(now, item)
             if self._ports is not None:
                 self._ports.poll()
             now = time.monotonic()
@@ -173,34 +188,35 @@ class Worker:
             return POLL if pause is None else min(pause, POLL)
         return pause
 
-    def _take(self, now: float, items: list[Any]) -> None:
+    def _take(self, now: float, item: Item) -> None:
+        word = item[0] if isinstance(item, list) else ""
         if self._guard is not None:
-            self._guard.heard(now, items[0] == BEAT)
-        if items[0] == BEAT:
-            return
-        if items[0] == PING:
-            self._node.post([PONG, items[1]])
-        elif items[0] == COMMAND:
-            self._place.command(now, items[1], items[2])
-        elif items[0] == STREAM_AT:
-            _, stream, host, port, ticket = items
-            self._outlets.found(stream, host, port, ticket)
-        else:
-            order = record(items)
-            assert isinstance(order, Order)
-            if isinstance(order, Begin):
-                self._begun.count()  # before it: what is not counted was certainly not executed
-            self._place.take(now, order)
+            self._guard.heard(now, word == BEAT or isinstance(item, Call))
+        if not isinstance(item, list):
+            self._take_message(now, item)
+        elif word == STREAM_AT:
+            self._outlets.found(*item[1:])
+
+    def _take_message(self, now: float, message: Message) -> None:
+        if isinstance(message, Call):
+            self._begun.count()  # before it: what is not counted was certainly not executed
+            self._place.take(now, message)
+        elif isinstance(message, Cancel | Outcome):
+            self._place.take(now, message)
+        elif isinstance(message, Command):
+            self._place.command(now, message)
+        elif isinstance(message, Ping):
+            self._node.post(Pong(message.number))
 
     def _report(self, now: float) -> None:
         for report in self._place.reports():
             if not isinstance(report, Sent):
-                self._node.post(flat(report))
+                post_report(self._node, report)
             elif self._outlets.send(now, report):
                 self._node.post([WANTED, report.stream])
         self._connecting = self._place.runs != () and self._outlets.advance()
         for name, data in self._ports.raised() if self._ports else ():
-            self._node.post(flat(Raised("", name, data)))
+            self._node.post(Event(name, "", 0, data))
         if self._node.unsent:
             self._node.flush()
 
@@ -222,7 +238,8 @@ def _first(node: Pipe) -> Setup:
     while True:
         select.select([node], [], [])
         for items in node.read():
-            return Setup(**items[0])
+            if isinstance(items, list) and items[0] == SETUP:
+                return Setup(**items[1])
         if node.closed:
             sys.exit(0)
 
@@ -269,16 +286,6 @@ def serve(
     except (DirectoryError, DeviceError, OSError, ValueError) as fault:
         node.post([FAILED, str(fault)])
         sys.exit(1)
-
-
-def log_to_stderr(level: int = logging.INFO) -> None:
-    """Write log records of this level and above to the process's standard error, which is its
-    node's log."""
-    logging.basicConfig(
-        format="%(asctime)s %(levelname)s %(name)s, process %(process)d: %(message)s", level=level
-    )
-    # A compiler that a kernel needs: it logs each of its steps at DEBUG.
-    logging.getLogger("numba").setLevel(max(level, logging.INFO))
 
 
 def main(arguments: list[str]) -> None:

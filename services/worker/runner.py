@@ -3,15 +3,20 @@ and guards their device."""
 
 from __future__ import annotations
 
+import inspect
 import logging
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+import math
+import time
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import dataclass, replace
+from enum import Enum, auto
+from functools import partial
 from math import inf
 from typing import Any, Protocol
 
-from petrobot.services.action import Cancelled, Result, Status
+from petrobot.services.action import Cancelled, Result, Status, Wait
 from petrobot.services.comm.location_file import ActionEntry, resolve
-from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.comm.protocol.messages import Call, Cancel, Command, Executed, Outcome
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.worker.callables import (
     check_arguments,
@@ -19,11 +24,9 @@ from petrobot.services.worker.callables import (
     from_outside,
     log_fault,
 )
-from petrobot.services.worker.context import RunContext, checked_result
-from petrobot.services.worker.execution import Execution, Hung, Phase, Returned
+from petrobot.services.worker.context import Report, RunContext, checked_result, never
 from petrobot.services.worker.outlets import Outlets
 from petrobot.services.worker.remote import Refusing
-from petrobot.services.worker.runs import Answered, Begin, Ended, Hold, Order, Report, Stop
 
 _log = logging.getLogger(__name__)
 
@@ -36,7 +39,188 @@ the device stays fenced."""
 TAKEN_WITHIN = 1.0
 """Seconds that a driver has to take the commands of a run that has returned: until then nobody
 knows whether it refuses one."""
-_AFTER = (Phase.STOPPING, Phase.SETTLING)
+Order = Call | Cancel | Outcome | Command
+"""What a runner is told. Call: begin this run. Cancel: stop it, for the cause and with the text
+that `stop_reason` has put together. Outcome: the result of a call that a run has made. Command:
+`hold` or `release` all runs."""
+
+
+def stop_reason(cause: str, text: str) -> str:
+    """Return the reason of a CANCEL inside a node: the cause that the run ends with, and a text."""
+    return f"{cause}: {text}"
+
+
+STEPS = 10_000
+"""How often a coroutine may go on without time passing before it is taken for an endless loop."""
+
+
+class ActionPhase(Enum):
+    """Where a run is between its begin and its end."""
+
+    NEW = auto()
+    RUNNING = auto()
+    COMPUTED = auto()
+    """Its result waits for the declared computing time."""
+    TAKING = auto()
+    """Its result waits until the driver has taken all commands: one of them may be refused."""
+    STOPPING = auto()
+    """Its coroutine cleans up after a cancel."""
+    SETTLING = auto()
+    """Its coroutine is over; its device must come to a standstill."""
+
+
+class Hung(BaseException):
+    """Raised by the watchdog of lock step into code that has not come back for too long."""
+
+    def __str__(self) -> str:
+        return (
+            "did not come back in time; an action waits with ctx.wait or ctx.sleep, and "
+            "loops that do not end are faults"
+        )
+
+
+class Returned(Exception):  # noqa: N818 - not an error
+    """The action is over; `value` is what it returned."""
+
+    def __init__(self, value: Any) -> None:
+        super().__init__()
+        self.value = value
+
+
+@dataclass(eq=False)
+class Execution:
+    """State of one run; times in seconds on the cell's clock."""
+
+    call: Call
+    entry: ActionEntry
+    phase: ActionPhase = ActionPhase.NEW
+    context: RunContext | None = None
+    coroutine: Coroutine[Wait, bool | None, Any] | None = None
+    wait: Wait | None = None
+    started: float = 0.0
+    limit: float | None = None
+    """When the phase is over at the latest."""
+    ready_at: float = 0.0
+    """When its computed result is out, or is given up because the driver takes no commands."""
+    sent_before: int = 0
+    """Number of the last command that its device was sent before it began."""
+    cpu: float = 0.0
+    result: Result | None = None
+    cause: str = ""
+    text: str = ""
+    abandoned: bool = False
+    """The action could not bring its device to a safe state itself: standing still is not
+    enough."""
+    stop_called: bool = False
+
+    @property
+    def over(self) -> bool:
+        """Whether the action's own code has nothing more to do."""
+        return self.coroutine is None
+
+    @property
+    def polls(self) -> bool:
+        """Whether it waits for more than time."""
+        waits = self.wait is not None and self.wait.ready is not never
+        return waits or self.phase in (ActionPhase.SETTLING, ActionPhase.TAKING)
+
+    def due(self) -> float | None:
+        """When it is worth a look without anything coming in (s)."""
+        if self.phase is ActionPhase.NEW:
+            return -math.inf
+        times = [self.limit, self.wait.due if self.wait else None]
+        if self.phase in (ActionPhase.COMPUTED, ActionPhase.TAKING):
+            times.append(self.ready_at)
+        return min((t for t in times if t is not None), default=None)
+
+    def begin(self, function: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
+        """Call the action up to its first wait. Raises Returned when it is over, else whatever it
+        raised."""
+        returned = self._timed(lambda: function(self.context, **arguments))
+        if not inspect.iscoroutine(returned):
+            raise Returned(returned)
+        self.coroutine = returned
+        self.go_on(None)
+
+    def look(self, now: float) -> None:
+        """Continue if what it waits for is there or its time is over. Raises as `begin` does."""
+        if self.wait is None:
+            return
+        try:
+            ready = self.wait.ready()
+        except Exception as fault:
+            self.go_on(fault)
+            return
+        if ready or (self.wait.due is not None and now >= self.wait.due):
+            self.go_on(ready)
+
+    def go_on(self, verdict: bool | BaseException | None) -> None:
+        """Tell its wait the verdict (or raise it there), and run until it waits for something that
+        is not there yet.
+
+        Raises as `begin` does.
+        """
+        for _ in range(STEPS):
+            self.wait = self._resume(verdict)
+            if not self.wait.ready():
+                return
+            verdict = True
+        raise RuntimeError(f"went on {STEPS} times without time passing")
+
+    def _resume(self, verdict: bool | BaseException | None) -> Wait:
+        coroutine = self.coroutine
+        assert coroutine is not None
+        for _ in range(STEPS):
+            try:
+                if isinstance(verdict, BaseException):
+                    wait: Any = self._timed(partial(coroutine.throw, verdict))
+                else:
+                    wait = self._timed(partial(coroutine.send, verdict))
+            except StopIteration as returned:
+                self.coroutine = self.wait = None
+                raise Returned(returned.value) from None
+            if isinstance(wait, Wait):
+                return wait
+            verdict = TypeError(
+                f"awaits a {type(wait).__name__}; an action awaits only what its context gives it"
+            )
+        raise RuntimeError("awaits only what its context did not give it")
+
+    def close(self) -> str:
+        """End the coroutine for good; what it raised instead of ending, empty if it did not."""
+        coroutine, self.coroutine, self.wait = self.coroutine, None, None
+        try:
+            if coroutine is not None:
+                coroutine.close()
+        except BaseException as fault:
+            if from_outside(fault):
+                raise
+            return describe(fault)
+        return ""
+
+    def note(self, text: str) -> None:
+        """Add to the text of its end."""
+        self.text = f"{self.text}; {text}" if self.text else text
+
+    def postpone(self, pause: float) -> None:
+        """Move all its times by an operator's pause."""
+        self.started += pause
+        self.ready_at += pause
+        self.limit = None if self.limit is None else self.limit + pause
+        if self.context is not None:
+            self.context.held += pause
+        if self.wait is not None and self.wait.due is not None:
+            self.wait.due += pause
+
+    def _timed(self, function: Callable[[], Any]) -> Any:
+        before = time.process_time()
+        try:
+            return function()
+        finally:
+            self.cpu += time.process_time() - before
+
+
+_AFTER = (ActionPhase.STOPPING, ActionPhase.SETTLING)
 
 
 class DeviceControl(Protocol):
@@ -119,15 +303,16 @@ class Runner:
 
     def take(self, now: float, order: Order) -> None:
         """Take an order. A run begins at the next `advance`."""
-        if isinstance(order, Begin):
+        if isinstance(order, Call):
             self._begin(order)
-        elif isinstance(order, Stop):
+        elif isinstance(order, Cancel):
             if order.id in self._runs:
-                self._stop(now, self._runs[order.id], order.cause, order.text)
-        elif isinstance(order, Answered):
+                cause, _, text = order.reason.partition(": ")
+                self._stop(now, self._runs[order.id], cause or "cancelled", text)
+        elif isinstance(order, Outcome):
             any(run.context.answer(order) for run in self._runs.values() if run.context)
-        elif isinstance(order, Hold):
-            self._hold(now, order.frozen)
+        elif order.verb in ("hold", "release"):
+            self._hold(now, order.verb == "hold")
 
     def reports(self) -> list[Report]:
         """What happened since the last call, in order."""
@@ -159,9 +344,9 @@ class Runner:
         for run in list(self._runs.values()):
             if not held and run.phase not in _AFTER:
                 self._lead(now, run)
-            if run.phase is Phase.STOPPING:
+            if run.phase is ActionPhase.STOPPING:
                 self._clean_up(now, run)
-            if run.phase is Phase.SETTLING:
+            if run.phase is ActionPhase.SETTLING:
                 self._settle(now, run)
         if not held:
             self._reports += self._outlets.advance(now)
@@ -169,7 +354,7 @@ class Runner:
     def commands_taken(self, now: float) -> None:
         """The driver has just been stepped: end the runs that only waited for it to take their last
         commands."""
-        for run in [run for run in self._runs.values() if run.phase is Phase.TAKING]:
+        for run in [run for run in self._runs.values() if run.phase is ActionPhase.TAKING]:
             self._await_taking(now, run)
 
     def give_up_all(self, now: float, cause: str, text: str) -> list[Report]:
@@ -179,29 +364,29 @@ class Runner:
             if fault := run.close():
                 _log.warning("run %s did not let itself be closed: %s", identity, fault)
             self._outlets.close(identity)
-            executed = Executed.NO if run.phase is Phase.NEW else Executed.UNKNOWN
-            took = 0.0 if run.phase is Phase.NEW else now - run.started
-            ends.append(Ended(identity, Status.ERROR, {}, cause, text, executed, took, run.cpu))
+            executed = Executed.NO if run.phase is ActionPhase.NEW else Executed.UNKNOWN
+            took = 0.0 if run.phase is ActionPhase.NEW else now - run.started
+            ends.append(Outcome(identity, Status.ERROR, {}, cause, text, executed, took, run.cpu))
         self._runs.clear()
         return ends
 
     # --- begin --------------------------------------------------------------------------------
 
-    def _begin(self, begin: Begin) -> None:
-        entry = self._actions.get(begin.action)
+    def _begin(self, call: Call) -> None:
+        entry = self._actions.get(call.service)
         self._look_at_fence()
-        if begin.id in self._runs:
+        if call.id in self._runs:
             return
         if entry is None:
-            self._refuse(begin, "unknown_service", f"no action {begin.action!r} here")
+            self._refuse(call, "unknown_service", f"no action {call.service!r} here")
         elif self._fenced and not entry.at_once:
             self._refuse(
-                begin, "fenced", "the device is not known to stand still after an earlier run"
+                call, "fenced", "the device is not known to stand still after an earlier run"
             )
         elif busy := self._taken_by(entry):
-            self._refuse(begin, "busy", f"the device is taken by run {busy}")
+            self._refuse(call, "busy", f"the device is taken by run {busy}")
         else:
-            self._runs[begin.id] = Execution(begin, entry)
+            self._runs[call.id] = Execution(call, entry)
 
     def _taken_by(self, entry: ActionEntry) -> str:
         if self._device is None:
@@ -210,32 +395,31 @@ class Runner:
             (i for i, run in self._runs.items() if not (entry.at_once and run.phase in _AFTER)), ""
         )
 
-    def _refuse(self, begin: Begin, cause: str, text: str) -> None:
-        self._reports.append(Ended(begin.id, Status.ERROR, {}, cause, text, Executed.NO))
+    def _refuse(self, call: Call, cause: str, text: str) -> None:
+        self._reports.append(Outcome(call.id, Status.ERROR, {}, cause, text, Executed.NO))
 
     def _drop(self, run: Execution, cause: str, text: str) -> None:
-        del self._runs[run.begin.id]
-        self._refuse(run.begin, cause, text)
+        del self._runs[run.call.id]
+        self._refuse(run.call, cause, text)
 
     def _start(self, now: float, run: Execution) -> None:
-        begin, entry = run.begin, run.entry
+        call, entry = run.call, run.entry
         try:
-            function = self.load(begin.action)
-            arguments = plain({**entry.args, **begin.arguments}, "arguments")
+            function = self.load(call.service)
+            arguments = plain({**entry.args, **call.arguments}, "arguments")
             check_arguments(function, arguments)
         except ImportError as fault:
             log_fault(_log, fault, "%s cannot be imported", entry.run)
             self._drop(run, "import_failed", f"{entry.run}: {fault}")
             return
         except (TypeError, ValueError) as fault:
-            self._drop(run, "bad_arguments", f"{begin.action}: {fault}")
+            self._drop(run, "bad_arguments", f"{call.service}: {fault}")
             return
         handle = self._device.handle if self._device else None
-        run.context = RunContext(begin, handle, self._clock, self._outlets, self._report)
-        run.phase, run.started = Phase.RUNNING, now
+        run.context = RunContext(call, handle, self._clock, self._outlets, self._report)
+        run.phase, run.started = ActionPhase.RUNNING, now
         run.sent_before = self._refusing.sent if self._refusing is not None else 0
-        run.limit = None if begin.deadline is None else now + begin.deadline
-        self._in_action(now, run, lambda: run.call(function, arguments))
+        self._in_action(now, run, lambda: run.begin(function, arguments))
 
     # --- go on --------------------------------------------------------------------------------
 
@@ -244,13 +428,11 @@ class Runner:
             self._fenced = False
 
     def _lead(self, now: float, run: Execution) -> None:
-        if run.phase is Phase.NEW:
+        if run.phase is ActionPhase.NEW:
             self._start(now, run)
-        elif run.limit is not None and now >= run.limit:
-            self._stop(now, run, "deadline", f"not over after {run.begin.deadline:g} s")
-        elif run.phase is Phase.RUNNING:
+        elif run.phase is ActionPhase.RUNNING:
             self._in_action(now, run, lambda: run.look(now))
-        elif run.phase is Phase.TAKING:
+        elif run.phase is ActionPhase.TAKING:
             self._await_taking(now, run)
         elif run.result is not None and now >= run.ready_at - 1e-9:
             self._finish(now, run, run.result)
@@ -266,20 +448,20 @@ class Runner:
             if from_outside(fault):
                 raise
             run.close()
-            if run.phase is not Phase.STOPPING:
+            if run.phase is not ActionPhase.STOPPING:
                 cause = "hung" if isinstance(fault, Hung) else "exception"
                 if isinstance(fault, MemoryError):
                     cause = "out_of_memory"
                 self._give_up(now, run, cause, self._with_refusal(run, describe(fault)))
-                log_fault(_log, fault, "run %s of %s raised", run.begin.id, run.begin.action)
+                log_fault(_log, fault, "run %s of %s raised", run.call.id, run.call.service)
             elif not isinstance(fault, Cancelled):
-                log_fault(_log, fault, "run %s raised while it cleaned up", run.begin.id)
+                log_fault(_log, fault, "run %s raised while it cleaned up", run.call.id)
                 run.note(f"while it cleaned up: {describe(fault)}")
-        if run.phase is Phase.STOPPING and run.over:
-            run.phase = Phase.SETTLING
+        if run.phase is ActionPhase.STOPPING and run.over:
+            run.phase = ActionPhase.SETTLING
 
     def _returned(self, now: float, run: Execution, returned: Any) -> None:
-        if run.phase is Phase.STOPPING:
+        if run.phase is ActionPhase.STOPPING:
             return
         if not isinstance(returned, Result):
             name = type(returned).__name__
@@ -288,13 +470,13 @@ class Runner:
             )
             return
         try:
-            result = checked_result(run.begin.id, returned)
+            result = checked_result(run.call.id, returned)
         except ValueError as fault:
             self._give_up(now, run, "bad_result", self._with_refusal(run, str(fault)))
             return
         if self._virtual and run.entry.compute_time > 0:
             run.phase, run.result, run.ready_at = (
-                Phase.COMPUTED,
+                ActionPhase.COMPUTED,
                 result,
                 now + run.entry.compute_time,
             )
@@ -308,8 +490,8 @@ class Runner:
             text = self._with_refusal(run, result.text)
             self._end(now, run, replace(result, text=text))
             return
-        self._outlets.close(run.begin.id)
-        run.phase, run.result, run.ready_at = Phase.TAKING, result, now + TAKEN_WITHIN
+        self._outlets.close(run.call.id)
+        run.phase, run.result, run.ready_at = ActionPhase.TAKING, result, now + TAKEN_WITHIN
         self._await_taking(now, run)
 
     def _await_taking(self, now: float, run: Execution) -> None:
@@ -343,7 +525,7 @@ class Runner:
     def _give_up(now: float, run: Execution, cause: str, text: str) -> None:
         """The action broke: nobody leads its device any more, so the stop routine comes at once."""
         run.phase, run.cause, run.text, run.abandoned, run.limit = (
-            Phase.SETTLING,
+            ActionPhase.SETTLING,
             cause,
             text,
             True,
@@ -351,7 +533,7 @@ class Runner:
         )
 
     def _stop(self, now: float, run: Execution, cause: str, text: str) -> None:
-        if run.phase is Phase.NEW:
+        if run.phase is ActionPhase.NEW:
             self._drop(run, cause, text)
         elif run.phase not in _AFTER:
             text = self._with_refusal(run, text) if cause == "deadline" else text
@@ -359,8 +541,8 @@ class Runner:
             # A held device stands without having been stopped: released, it would go on without its
             # run.
             run.abandoned = self.held
-            self._outlets.close(run.begin.id)
-            run.phase = Phase.SETTLING if run.over else Phase.STOPPING
+            self._outlets.close(run.call.id)
+            run.phase = ActionPhase.SETTLING if run.over else ActionPhase.STOPPING
             if not run.over:
                 self._in_action(now, run, lambda: run.go_on(Cancelled(cause)))
 
@@ -369,7 +551,7 @@ class Runner:
         if now < run.limit:
             self._in_action(now, run, lambda: run.look(now))
             return
-        run.phase, run.abandoned = Phase.SETTLING, True
+        run.phase, run.abandoned = ActionPhase.SETTLING, True
         if fault := run.close():
             run.note(f"did not let itself be closed: {fault}")
 
@@ -377,7 +559,7 @@ class Runner:
         """End the run when its device stands still; call the stop routine when its grace is
         over."""
         assert run.limit is not None
-        self._outlets.close(run.begin.id)
+        self._outlets.close(run.call.id)
         failed = Result(Status.ERROR, {}, run.cause, run.text)
         if self._device is None or (
             self._device.stopped() and (run.stop_called or not run.abandoned)
@@ -394,11 +576,11 @@ class Runner:
             self._end(now, run, Result(Status.ERROR, {}, run.cause, run.text))
 
     def _end(self, now: float, run: Execution, result: Result) -> None:
-        identity = run.begin.id
+        identity = run.call.id
         self._outlets.close(identity)
         del self._runs[identity]
         said = (result.status, result.values, result.cause, result.text, Executed.YES)
-        self._reports.append(Ended(identity, *said, now - run.started, run.cpu, result.deferred))
+        self._reports.append(Outcome(identity, *said, now - run.started, run.cpu, result.deferred))
 
     def _hold(self, now: float, frozen: bool) -> None:
         """Freeze the runs, or let them go on with all their times moved by the pause."""
@@ -407,5 +589,5 @@ class Runner:
         elif self._held_since is not None:
             pause, self._held_since = now - self._held_since, None
             for run in self._runs.values():
-                if run.phase in (Phase.RUNNING, Phase.COMPUTED):
+                if run.phase in (ActionPhase.RUNNING, ActionPhase.COMPUTED):
                     run.postpone(pause)

@@ -11,7 +11,7 @@ Marlow, "The Physics of Pocket Billiards", 1995).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -126,6 +126,91 @@ class TableMotion:
             self.rests_after - self.rolls_after,
         )
         return self.rolls_after + rolling
+
+
+class UnevenMotion:
+    """Motion on a table with slopes, from a start state, as a function of the time since then: as
+    `TableMotion`, but integrated in steps of `_STEP`.
+
+    On a slope s the ball gains -g s of speed a second while it slides, and 1 / (1 + k) of that
+    while it rolls, since its spin must grow as well (k = I / (m r^2)). Height is not part of it.
+    """
+
+    def __init__(
+        self,
+        model: BallModel,
+        start: BallState,
+        rolling_resistance: float,
+        slope: Callable[[float, float], tuple[float, float]],
+    ) -> None:
+        """`slope` returns the rise of the table per m along x and y at a point (m)."""
+        self._z, self._spin_z = start.position[2], start.spin[2]
+        self._path = [start]
+        g, r, k = model.gravity, model.radius, model.inertia_factor
+        (x, y, _), (vx, vy, _), (wx, wy, _) = start
+        for _ in range(round(_LONGEST / _STEP)):
+            rise_x, rise_y = slope(x, y)
+            before_x, before_y = vx, vy
+            slip_x, slip_y = vx - r * wy, vy + r * wx
+            slip = math.sqrt(slip_x * slip_x + slip_y * slip_y)
+            rub = model.friction * g * _STEP
+            if slip > rub * (1.0 + 1.0 / k):
+                vx -= rub * slip_x / slip + g * rise_x * _STEP
+                vy -= rub * slip_y / slip + g * rise_y * _STEP
+                wx -= rub * slip_y / slip / (k * r)
+                wy += rub * slip_x / slip / (k * r)
+            else:
+                # What is left of the slip goes within this step: the momentum about the point of
+                # contact is kept.
+                vx, vy = (vx + k * r * wy) / (1.0 + k), (vy - k * r * wx) / (1.0 + k)
+                vx -= g * rise_x * _STEP / (1.0 + k)
+                vy -= g * rise_y * _STEP / (1.0 + k)
+                speed = math.sqrt(vx * vx + vy * vy)
+                left = max(0.0, 1.0 - rolling_resistance * g * _STEP / speed) if speed else 0.0
+                vx, vy = left * vx, left * vy
+                wx, wy, _ = model.spin_of_rolling(vx, vy)
+            x, y = x + 0.5 * (before_x + vx) * _STEP, y + 0.5 * (before_y + vy) * _STEP
+            self._path.append(BallState((x, y, self._z), (vx, vy, 0.0), (wx, wy, self._spin_z)))
+            steep = math.hypot(*slope(x, y)) > rolling_resistance * (1.0 + k)
+            if vx == vy == 0.0 and not steep:
+                break
+        self.rests_after = _STEP * (len(self._path) - 1)
+        """s until the ball lies still, or until the path is not known any further."""
+
+    def state(self, t: float) -> BallState:
+        """Return the state `t` >= 0 seconds after the start."""
+        at = t / _STEP
+        n = int(at)
+        if n >= len(self._path) - 1:
+            (x, y, z), _, _ = self._path[-1]
+            return BallState((x, y, z), (0.0, 0.0, 0.0), (0.0, 0.0, self._spin_z))
+        share, one, two = at - n, self._path[n], self._path[n + 1]
+        (ax, ay, az), (avx, avy, _), (awx, awy, awz) = one
+        (bx, by, _), (bvx, bvy, _), (bwx, bwy, _) = two
+        return BallState(
+            (ax + share * (bx - ax), ay + share * (by - ay), az),
+            (avx + share * (bvx - avx), avy + share * (bvy - avy), 0.0),
+            (awx + share * (bwx - awx), awy + share * (bwy - awy), awz),
+        )
+
+    def first_crossing(self, axis: int, value: float) -> float:
+        """Return the seconds until the centre's x (axis 0) or y (axis 1) first equals `value`; inf
+        if never."""
+        before = self._path[0].position[axis] - value
+        if before == 0.0:
+            return 0.0
+        for n, state in enumerate(self._path[1:]):
+            after = state.position[axis] - value
+            if before * after <= 0.0:
+                return _STEP * (n + before / (before - after))
+            before = after
+        return math.inf
+
+
+_STEP = 0.001
+"""s."""
+_LONGEST = 12.0
+"""s, more than a ball is left on the table."""
 
 
 def _first_root(c: float, b: float, a: float, until: float) -> float:

@@ -34,6 +34,9 @@ NOISE_SIZE = 1280
 LIGHT_DIRECTION = np.array([-0.25, 0.35, 0.90]) / np.linalg.norm([-0.25, 0.35, 0.90])
 """Direction to the lamp, base frame."""
 _TO_LAMP: Sequence[float] = LIGHT_DIRECTION.tolist()
+BRIDGE_HEIGHT = 0.15
+"""m above the table."""
+BRIDGE_GREY = 40.0
 LENS_STEPS = 6
 """Steps of the fixed-point inverse of the distortion."""
 
@@ -63,6 +66,8 @@ class CameraView:
     """Relative loss of light in the corners of the image."""
     noise: float | None = None
     """Grey levels, sigma."""
+    hidden: tuple[float, float] | None = None
+    """m, x from and to: a bridge over the table, `BRIDGE_HEIGHT` above it, hides what is below."""
 
     @classmethod
     def of(cls, truth: Mapping[str, Any]) -> CameraView:
@@ -227,11 +232,32 @@ class PinholeCamera:
         table = self._through(direction, np.array([0.0, 0.0, self.table.top]), up)
         floor = self._through(direction, np.zeros(3), up)
         on_table = self.table.contains(table[..., 0], table[..., 1])
-        return np.where(
+        grey = np.where(
             on_table,
             self.table.grey(table[..., 0], table[..., 1]),
             floor_grey(floor[..., 0], floor[..., 1]),
         )
+        if self.view.hidden is None:
+            return grey
+        return np.where(self._below_bridge(direction), BRIDGE_GREY, grey)
+
+    def _below_bridge(self, direction: Array) -> NDArray[np.bool_]:
+        """Return which base-frame directions (..., 3) from the optical centre meet the bridge."""
+        low, high = self.view.hidden or (0.0, 0.0)
+        above = np.array([0.0, 0.0, self.table.top + BRIDGE_HEIGHT])
+        point = self._through(direction, above, np.array([0.0, 0.0, 1.0]))
+        across = 0.5 * self.table.width + 0.1
+        met: NDArray[np.bool_] = (
+            (point[..., 0] >= low) & (point[..., 0] <= high) & (np.abs(point[..., 1]) <= across)
+        )
+        return met
+
+    @cached_property
+    def _bridge(self) -> NDArray[np.bool_] | None:
+        """Pixels (height, width) that see the bridge; None without one."""
+        if self.view.hidden is None:
+            return None
+        return self._below_bridge(self.rays(self._grid) @ self.rotation)
 
     @cached_property
     def background(self) -> Picture:
@@ -244,7 +270,7 @@ class PinholeCamera:
     def warm_up(self) -> None:
         """Make everything that is made once: in real time the first image must not take longer than
         the others."""
-        _ = self.background, self._canvas, self._to_lamp
+        _ = self.background, self._canvas, self._to_lamp, self._bridge
 
     def render(
         self,
@@ -254,8 +280,10 @@ class PinholeCamera:
         arm_radii: ArrayLike = (),
         cup_pose: ArrayLike | None = None,
         light: float = 1.0,
+        others: Sequence[tuple[ArrayLike, ArrayLike]] = (),
     ) -> Picture:
-        """Return one image (height, width) uint8.
+        """Return one image (height, width) uint8. `others`: centres and velocities of further
+        balls, away from arm and cup.
 
         ball: centre at mid-exposure (3,) m, None: no ball; ball_velocity (3,) m/s; arm_points (n,
         2, 3): both ends of each capsule of the arm, arm_radii (n,) m; cup_pose (4, 4): the cup's
@@ -271,6 +299,11 @@ class PinholeCamera:
         changed = [cover.box for cover in covers]
         glaring = [cover.box for cover in covers if not self._bears_noise(cover.grey)]
         picture = self._canvas
+        for other, speed in others:
+            box = self._paint_ball(picture, np.asarray(other, float), np.asarray(speed, float))
+            if box is not None:
+                changed.append(box)
+                glaring.append(box)
         if ball is None:
             fill(picture, covers)
         else:
@@ -285,6 +318,9 @@ class PinholeCamera:
                 changed.append(box)
                 glaring.append(box)
             fill(picture, above)
+        if self._bridge is not None:
+            for box in changed:
+                picture[box] = np.where(self._bridge[box], self.background[box], picture[box])
         image = self._expose(picture, light, glaring)
         for box in changed:
             picture[box] = self.background[box]

@@ -29,6 +29,8 @@ class ThrowCourse:
     throw: Throw
     released_at: float
     outcome: ThrowOutcome = ThrowOutcome.ROLLING
+    answered: bool = False
+    """Whether the arm moved while it was in play: it was seen."""
     exit_time: float = math.inf
     """When the centre left the near edge; inf if it did not."""
     exit_state: BallState | None = None

@@ -19,19 +19,23 @@ from petrobot.services.comm.lockstep.party import TICK
 from petrobot.sim.catching.camera import Picture, PinholeCamera
 from petrobot.sim.catching.drives import DriveBus
 from petrobot.sim.catching.oracle import Oracle
+from petrobot.sim.catching.physics import choose, version
 from petrobot.sim.catching.puma import ArmPlant
 from petrobot.sim.catching.puma_model import Frame3
 from petrobot.sim.catching.referee import CatchReferee
-from petrobot.sim.catching.site import CupMount, Site, site_of
-from petrobot.sim.catching.thrower import Thrower
-from petrobot.sim.catching.truth import Truth
-from petrobot.sim.catching.world import BallWorld
+from petrobot.sim.catching.site import CupMount, Site, laboratory_file, site_of
+from petrobot.sim.catching.thrower import Thrower, draw_throw
+from petrobot.sim.catching.truth import LaboratoryError, Truth, read_toml
+from petrobot.sim.catching.world import BallWorld, SecondBall
 from petrobot.sim.exposures import camera_of
 from petrobot.sim.faults import FaultPlan, InjectedFault, read_fault
 from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
 
-_NOISE, _FAULTS = 0x6361, 0x6661
-"""Keep the draws of camera noise and of faults separate from other draws of the same seed."""
+_NOISE, _FAULTS, _SCATTER, _SECOND = 0x6361, 0x6661, 0x7363, 0x7362
+"""Keep the draws of camera noise, of faults, of scatter and of second balls separate from other
+draws of the same seed."""
+_SECOND_AFTER = 0.6
+"""s; a second ball is released up to so long after the first."""
 
 
 class CatchingLaboratory(LaboratoryParty):
@@ -49,17 +53,24 @@ class CatchingLaboratory(LaboratoryParty):
         throws: int | None = None,
         boot: str = "laboratory",
         directory: str = "",
+        physics: str = "",
     ) -> None:
-        """Raises LaboratoryError for an unknown regime. `boot`, `directory`: as in
-        services.comm.calls.callee."""
+        """Raises LaboratoryError for an unknown regime or physics. `boot`, `directory`: as in
+        services.comm.calls.callee; `physics`: as for `physics.choose`."""
         super().__init__(name, where, boot, directory)
+        self._physics = choose(physics)
+        self.physics = version(self._physics)
         self._site = site
         truth = site.truth(regime)
         self._mount = CupMount(site.arm, truth)
         cup = site.cell["cup"]
         load = self._mount.load(truth.settings["cup"]["mass"], cup["radius"], cup["depth"])
         self.plant = ArmPlant(
-            site.arm, site.cell["ball"]["gravity"], site.arm.poses["home"].tolist(), load=load
+            site.arm,
+            site.cell["ball"]["gravity"],
+            site.arm.poses["home"].tolist(),
+            load=load,
+            physics=self._physics,
         )
         self._home: list[float] = site.arm.poses["home"].tolist()
         self.bus = DriveBus(self.plant, site.drives)
@@ -74,13 +85,17 @@ class CatchingLaboratory(LaboratoryParty):
         self.truth = truth
         self._mount = CupMount(self._site.arm, truth)
         self._arm_dt = float(truth.settings["step"]["arm"])
-        self._world = self.world = BallWorld(self._site.cell, truth)
+        self._world = self.world = BallWorld(self._site.cell, truth, self._physics)
         self.thrower = Thrower(self._site.cell, truth, seed, throws)
         self.referee = CatchReferee(
             seed, truth.regime, Oracle(self._site.arm, truth, self._site.cell), now
         )
         self._faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
         self._noise = np.random.default_rng((seed, _NOISE))
+        self._scatter = np.random.default_rng((seed, _SCATTER))
+        self._seed = seed
+        self._second: SecondBall | None = None
+        self._stood = self.plant.q
         self._camera: PinholeCamera | None = None
         self.bus.power(True)
         self.bus.slow_down(truth.arm_speed)
@@ -101,19 +116,33 @@ class CatchingLaboratory(LaboratoryParty):
 
     def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
         """Process frames of the master."""
-        self.bus.receive_cycle(now, self._faults.passed(frames))
+        self.bus.receive_cycle(now, self._passed(frames))
 
     def take_frames(self) -> Sequence[Frame]:
         """Return the frames of drives and inputs since the last call."""
-        return self._faults.passed(self.bus.drain())
+        return self._passed(self.bus.drain())
+
+    def _passed(self, frames: Sequence[Frame]) -> Sequence[Frame]:
+        """Return the frames that neither a fault nor the regime loses."""
+        share = self.truth.scatter.frames_lost
+        if share > 0.0 and frames:
+            kept = self._scatter.random(len(frames)) >= share
+            frames = [frame for frame, keep in zip(frames, kept, strict=True) if keep]
+        return self._faults.passed(frames)
 
     # Camera
 
     def _expose(self, now: float) -> None:
         if not self.exposures.due(now) or self._faults.image_lost():
             return
-        ready = now + self.truth.settings["camera"]["readout"] + self.truth.image_latency
-        self.exposures.put(now, ready, self._picture(now))
+        scatter, readout = self.truth.scatter, self.truth.settings["camera"]["readout"]
+        if scatter.images_lost > 0.0 and self._scatter.random() < scatter.images_lost:
+            return
+        ready, stated = now + readout + self.truth.image_latency, now
+        if scatter.image_time_error > 0.0:  # no image claims to come from the future
+            error = scatter.image_time_error * float(self._scatter.standard_normal())
+            stated += min(max(error, -readout), readout)
+        self.exposures.put(stated, ready, self._picture(now))
 
     def make_ready(self, arguments: Mapping[str, Any]) -> None:
         """Draw the static scene of a regime's camera before its first image, which takes seconds.
@@ -141,6 +170,7 @@ class CatchingLaboratory(LaboratoryParty):
             radii,
             pose,
             self.truth.light(now),
+            () if self._second is None else self._second.seen(now),
         )
 
     # World
@@ -150,6 +180,18 @@ class CatchingLaboratory(LaboratoryParty):
         if throw is not None:
             course = self.world.release(now, throw)
             self.referee.enter(course, self.plant.q)
+            self._stood = self.plant.q
+            self._second = self._throw_second(now, throw.n)
+
+    def _throw_second(self, now: float, n: int) -> SecondBall | None:
+        """Return the ball that rolls beside throw `n`, if the regime has one for it."""
+        rng = np.random.default_rng((self._seed, n, _SECOND))
+        if rng.random() >= self.truth.scatter.second_ball:
+            return None
+        throw = draw_throw(int(rng.integers(2**32)), n, self._site.cell, self.truth)
+        return SecondBall(
+            self.world.model, throw, self.truth, now + float(rng.uniform(0.0, _SECOND_AFTER))
+        )
 
     def _ready(self) -> bool:
         """Return whether images are taken, the last ball is gone, the cup is empty, and the arm
@@ -177,10 +219,20 @@ class CatchingLaboratory(LaboratoryParty):
             if fine and world.fine:
                 world.fine_step(now + (step + 1) * dt, self._cup_now())
         if world.ball is not None:
+            if world.course is not None and not world.course.answered:
+                world.course.answered = self._has_moved()
             world.end(now + TICK, self._cup_now)
         else:
             world.idle(now + TICK)
         bus.ball(world.barrier)
+
+    def _has_moved(self) -> bool:
+        """Return whether the arm has left the place where it stood at the last release."""
+        near = self.truth.settings["thrower"]["home_tolerance"]
+        return self.plant.q is not self._stood and any(
+            abs(angle - stood) > near
+            for angle, stood in zip(self.plant.q, self._stood, strict=True)
+        )
 
     def _cup_now(self) -> Frame3:
         """Return the cup's frame; the same object as long as the arm does not move."""
@@ -222,7 +274,8 @@ class CatchingLaboratory(LaboratoryParty):
         `CatchReferee.score`; laboratory_fault(kind, after=0, ...): see sim.faults.
         """
         if service == SCORE:
-            return self.referee.score(self.now, arguments.get("cycles", ()))
+            score = self.referee.score(self.now, arguments.get("cycles", ()))
+            return {**score, "physics": self.physics}
         if service == FAULT:
             rest = {key: value for key, value in arguments.items() if key != "kind"}
             self._faults.add(read_fault(self.now, str(arguments.get("kind", "")), rest))
@@ -235,7 +288,7 @@ class CatchingLaboratory(LaboratoryParty):
         return {}
 
     def close(self) -> None:
-        """Disconnect the physics clients."""
+        """Release what the back end of the mechanics holds."""
         self.world.close()
         self.plant.close()
 
@@ -243,7 +296,31 @@ class CatchingLaboratory(LaboratoryParty):
 def make_laboratory(directory: Directory, name: str) -> CatchingLaboratory:
     """Return the laboratory of the simulated node `name` of services.toml. Raises
     LaboratoryError."""
-    boot = f"{name} in lock step"
     return CatchingLaboratory(
-        name, site_of(directory), directory.party, boot=boot, directory=directory.hash
+        name,
+        site_of(directory),
+        directory.party,
+        boot=f"{name} in lock step",
+        directory=directory.hash,
+        physics=_wanted(directory, name),
     )
+
+
+def physics(directory: Directory, name: str) -> str:
+    """Return name and version of the back end of the simulated node `name` of services.toml, for
+    records. Raises LaboratoryError."""
+    return version(_wanted(directory, name))
+
+
+def _wanted(directory: Directory, name: str) -> str:
+    """Return the back end that services.toml names, else the one that the laboratory file names,
+    else the usual one of this computer."""
+    given = directory.nodes[name].physics
+    where = f"{directory.source}: [nodes.{name}]"
+    if not given:
+        file = laboratory_file(directory)
+        given, where = str(read_toml(file).get("physics", "")), f"{file}:"
+    try:
+        return choose(given)
+    except LaboratoryError as fault:
+        raise LaboratoryError(f"{where} {fault}") from fault

@@ -1,10 +1,12 @@
-"""Which balls could be caught at all: an oracle that knows the trajectory at release and moves at
-the joint limits.
+"""Which balls could be caught at all: an estimate, by an oracle that knows the trajectory at
+release and moves at the joint limits.
 
-A ball is *reachable* if there is a moment of its fall and a pose of the arm, within the joint
-limits, that holds the cup's mouth around the ball, turned towards it, clear of the table, and if
-every joint gets there from its angle at release before the ball does, from rest to rest with the
-greatest joint speed and acceleration of the arm file.
+It is not a bound: it tries some moments and tilts, and searches poses from a few guesses, so a ball
+that it calls unreachable may still be caught. A ball counts as *reachable* if there is a moment of
+its fall and a pose of the arm, within the joint limits, that holds the cup's mouth around the ball,
+turned towards it, clear of the table, and if every joint gets there from its angle at release
+before the ball does, from rest to rest with the greatest joint speed and acceleration of the arm
+file.
 
 Poses are found numerically for all moments and tilts at once, independently of the closed form that
 motion uses: Gauss-Newton on five equations (mouth centre, and two of its direction, since a round
@@ -21,10 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.sim.catching.ball import BallModel, TableMotion
+from petrobot.sim.catching.ball import BallModel
 from petrobot.sim.catching.puma_model import PumaModel
 from petrobot.sim.catching.thrower import Throw
 from petrobot.sim.catching.truth import Truth, Vector
+from petrobot.sim.catching.world import motion_on_table
 
 _ITERATIONS = 14
 _DAMPING = 1e-7
@@ -68,7 +71,7 @@ class Oracle:
     def judge(self, throw: Throw, q: Sequence[float]) -> OracleVerdict:
         """Return the verdict on a throw with the arm at encoder angles `q` (six, rad) at
         release."""
-        motion = TableMotion(self._ball, throw.start, throw.rolling_resistance)
+        motion = motion_on_table(self._ball, throw.start, throw.rolling_resistance, self._truth)
         table = self._truth.table
         leaves = motion.first_crossing(0, table.near_edge)
         sideways = min(

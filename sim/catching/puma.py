@@ -1,20 +1,17 @@
 """The arm as a body that torques move: rigid-body dynamics, rotors, friction, brakes, hard stops.
 
-Mass matrix and bias torques come from PyBullet with the published values; rotor inertia (up to 2.3
-kg m^2 at the joint, more than most links) is added here, since URDF cannot express it. The
+Mass matrix and bias torques come from the back end (sim/catching/physics.py) with the published
+values; rotor inertia (up to 2.3 kg m^2 at the joint, more than most links) is added here. The
 integration is semi-implicit Euler. An arm that stands still, held by friction or brakes, costs
 almost nothing.
 """
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pybullet
 
 from petrobot.services.host.numba_kernels import packed
 from petrobot.sim.catching.arm_motion import (
@@ -26,87 +23,8 @@ from petrobot.sim.catching.arm_motion import (
     stepped,
     stepped_packed,
 )
+from petrobot.sim.catching.physics import arm_dynamics, choose
 from petrobot.sim.catching.puma_model import JOINTS, PrincipalInertia, PumaModel
-from petrobot.sim.catching.truth import Vector
-
-# The arm as URDF: PyBullet computes its mass matrix and its gravity, Coriolis and centrifugal
-# torques from it.
-
-_LEAST_MASS = 1e-9
-_ZERO = (0.0, 0.0, 0.0)
-
-
-def urdf(model: PumaModel, flange_load: PrincipalInertia | None = None) -> str:
-    """Return the arm as URDF text: links base, link1 to link6; `flange_load`: what is bolted to
-    link 6, in frame 6."""
-    base = _inertial_text(PrincipalInertia(0.0, _ZERO, _ZERO), _ZERO, 0.0)
-    parts = [
-        '<robot name="arm">',
-        f'<link name="base">{base}</link>',
-    ]
-    for i, link in enumerate(model.links):
-        x, y, z = model.base if i == 0 else (model.a[i - 1], 0.0, model.d[i - 1])
-        roll = 0.0 if i == 0 else model.alpha[i - 1]
-        parent = "base" if i == 0 else f"link{i}"
-        parts.append(
-            f'<joint name="joint{i + 1}" type="revolute"><parent link="{parent}"/><child '
-            f'link="link{i + 1}"/>'
-            f'<origin xyz="{x!r} {y!r} {z!r}" rpy="{roll!r} 0 0"/><axis xyz="0 0 1"/>'
-            f'<limit lower="{model.lower[i]}" upper="{model.upper[i]}" effort="{model.torque[i]}" '
-            f'velocity="{model.speed[i]}"/></joint>'
-        )
-        parts.append(f'<link name="link{i + 1}">{_inertial(model, i, link)}</link>')
-    if flange_load is not None:
-        end = len(model.links) - 1
-        parts.append(
-            '<joint name="load" type="fixed"><parent link="link6"/><child link="load"/>'
-            f'<origin xyz="{model.a[end]!r} 0 {model.d[end]!r}" rpy="{model.alpha[end]!r} 0 '
-            '0"/></joint>'
-            f'<link name="load">{_inertial_text(flange_load, flange_load.centre, 0.0)}</link>'
-        )
-    parts.append("</robot>")
-    return "\n".join(parts)
-
-
-def _inertial(model: PumaModel, i: int, link: PrincipalInertia) -> str:
-    """Return the link's inertial element: its centre moved from DH frame i + 1 to the URDF link
-    frame, turned by the twist."""
-    c, s = model.twists[i]
-    x, y, z = link.centre
-    return _inertial_text(
-        link, (model.a[i] + x, c * y - s * z, model.d[i] + s * y + c * z), model.alpha[i]
-    )
-
-
-def _inertial_text(link: PrincipalInertia, centre: tuple[float, float, float], roll: float) -> str:
-    ixx, iyy, izz = _physical(link.inertia)
-    x, y, z = centre
-    return (
-        f'<inertial><origin xyz="{x!r} {y!r} {z!r}" rpy="{roll!r} 0 0"/><mass '
-        f'value="{max(link.mass, _LEAST_MASS)!r}"/>'
-        f'<inertia ixx="{ixx!r}" iyy="{iyy!r}" izz="{izz!r}" ixy="0" ixz="0" iyz="0"/></inertial>'
-    )
-
-
-def _physical(inertia: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return the tensor with its lesser moments raised just enough to belong to a real body
-    (triangle inequality of principal moments); the greatest is kept.
-
-    Where a lesser moment was left out because the link never turns about that axis (link 1),
-    raising it changes nothing. For link 3 it is 0.004 of 0.086 kg m^2, less than the publications
-    differ.
-    """
-    order = sorted(range(3), key=lambda k: inertia[k])
-    lack = inertia[order[2]] - inertia[order[0]] - inertia[order[1]]
-    if lack <= 0.0:
-        return inertia
-    # A little above equality: Bullet compares in rounded arithmetic.
-    share = 0.5 * lack * (1.0 + 1e-9) + 1e-12
-    mended = list(inertia)
-    mended[order[0]] += share
-    mended[order[1]] += share
-    return mended[0], mended[1], mended[2]
-
 
 _REFRESH = (0.01, 0.01, 0.1, 0.1)
 """rad, of joints 2 to 5; the mass matrix is computed again when a joint has moved so far, which
@@ -118,59 +36,6 @@ sliding fades."""
 _REST: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _BRAKE = 2.0
 """Torque of a joint's brake as a multiple of the motor's."""
-
-
-class RigidBody:
-    """Mass matrix and bias torques of the arm by PyBullet, without rotors and friction; a physics
-    client of its own."""
-
-    def __init__(
-        self, model: PumaModel, gravity: float, flange_load: PrincipalInertia | None = None
-    ) -> None:
-        self._client = pybullet.connect(pybullet.DIRECT)
-        pybullet.setGravity(0.0, 0.0, -gravity, physicsClientId=self._client)
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "arm.urdf"
-            file.write_text(urdf(model, flange_load), encoding="utf-8")
-            self._body = pybullet.loadURDF(
-                str(file),
-                useFixedBase=True,
-                flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
-                physicsClientId=self._client,
-            )
-        self._zero = [0.0] * JOINTS
-
-    def mass_matrix(self, q: Sequence[float]) -> Vector:
-        """Return the mass matrix (6, 6) kg m^2."""
-        return np.array(
-            pybullet.calculateMassMatrix(self._body, list(q), physicsClientId=self._client)
-        )
-
-    def bias(self, q: Sequence[float], qd: Sequence[float]) -> Six:
-        """Return six torques (N m) that hold the arm against gravity, Coriolis and centrifugal
-        forces."""
-        torques: Six = pybullet.calculateInverseDynamics(
-            self._body, q, qd, self._zero, physicsClientId=self._client
-        )
-        return torques
-
-    def link_frame(self, q: Sequence[float], link: int) -> tuple[Vector, Vector]:
-        """Return origin (3,) and rotation (3, 3) of a URDF link (0 to 5) as PyBullet places it; for
-        checks."""
-        for joint, angle in enumerate(q):
-            pybullet.resetJointState(self._body, joint, angle, physicsClientId=self._client)
-        state = pybullet.getLinkState(
-            self._body, link, computeForwardKinematics=1, physicsClientId=self._client
-        )
-        return np.array(state[4]), np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(
-            3, 3
-        )
-
-    def close(self) -> None:
-        """Disconnect the physics client."""
-        if self._client >= 0:
-            pybullet.disconnect(physicsClientId=self._client)
-            self._client = -1
 
 
 class ArmPlant:
@@ -188,9 +53,10 @@ class ArmPlant:
         start: Sequence[float],
         speed_factor: float = 1.0,
         load: PrincipalInertia | None = None,
+        physics: str = "",
     ) -> None:
         """`speed_factor`: share of its joint speeds that the arm reaches (a slow arm); `load`: what
-        the flange carries."""
+        the flange carries; `physics`: as for `physics.choose`."""
         self.model = model
         self.q: Six = _six(start)
         self.qd: Six = _REST
@@ -199,7 +65,7 @@ class ArmPlant:
         """Counts the steps in which the arm moved: unchanged means that the pose is unchanged."""
         self.still = True
         """Whether no joint moves."""
-        self._body = RigidBody(model, gravity, load)
+        self._body = arm_dynamics(choose(physics), model, gravity, load)
         self._rotors = np.diag(model.rotor)
         self._limit, self._viscous = _six(model.torque), _six(model.viscous)
         self._dry: list[float] = model.coulomb.tolist()
@@ -323,7 +189,7 @@ class ArmPlant:
         self._at = self.q
 
     def close(self) -> None:
-        """Disconnect the physics client."""
+        """Release what the back end holds."""
         self._body.close()
 
 

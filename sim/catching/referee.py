@@ -75,8 +75,11 @@ class CatchReferee:
         return self._entries[-1].verdict if self._entries else None
 
     def score(self, now: float, cycles: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
-        """Return all throws so far as plain data: `throws` (see `_row`) and, with more detail,
-        `courses` (see `_course`); counts are of finished throws.
+        """Return all throws so far as plain data: `throws` (see `_row`), with more detail
+        `courses` (see `_course`), and `balls`, counts for each of the caller's cycles.
+
+        Of all balls `thrown`, those `over` are `caught` or `missed`; of the missed ones, the arm
+        did not move for those `never_seen`. `reachable`: an estimate (sim/catching/oracle.py).
 
         `cycles` are the caller's cycles: `begun_ago`, `ended_ago` (s before `now`), `status` and
         `cause`. A throw takes the status of the cycle in which it was released, None if it was
@@ -84,6 +87,7 @@ class CatchReferee:
         """
         rows = [_row(entry) | _status(entry.course, now, cycles) for entry in self._entries]
         over = [row for row in rows if row["outcome"] != ThrowOutcome.ROLLING]
+        courses = [entry.course for entry in self._entries]
         return {
             "seed": self._seed,
             "regime": self._regime,
@@ -93,11 +97,36 @@ class CatchReferee:
                 for entry, status in zip(self._entries, rows, strict=True)
             ],
             "plots": PLOTS,
-            "over": len(over),
-            "caught": sum(row["caught"] for row in over),
+            "balls": _balls(courses, [row["run"] for row in rows]),
+            **_counts(courses),
             "reachable": sum(row["reachable"] for row in over),
             "reachable_caught": sum(row["reachable"] and row["caught"] for row in over),
         }
+
+
+def _counts(courses: Sequence[ThrowCourse]) -> dict[str, int]:
+    over = [course for course in courses if course.outcome is not ThrowOutcome.ROLLING]
+    missed = [course for course in over if course.outcome is not ThrowOutcome.CAUGHT]
+    return {
+        "thrown": len(courses),
+        "over": len(over),
+        "caught": len(over) - len(missed),
+        "missed": len(missed),
+        "never_seen": sum(not course.answered for course in missed),
+    }
+
+
+def _balls(courses: Sequence[ThrowCourse], runs: Sequence[int | None]) -> list[dict[str, Any]]:
+    """Return the counts of each of the caller's cycles; `runs`: that of each throw, None: it was
+    released in none."""
+    return [
+        {
+            "run": run,
+            "n": run,
+            **_counts([course for course, own in zip(courses, runs, strict=True) if own == run]),
+        }
+        for run in dict.fromkeys(runs)
+    ]
 
 
 def _status(course: ThrowCourse, now: float, cycles: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

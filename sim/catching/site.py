@@ -136,11 +136,13 @@ def site_of(directory: Directory) -> Site:
         raise LaboratoryError(
             f'{directory.source}: [parameters] cell is missing; write cell = "services/cell.toml"'
         )
-    laboratory = directory.parameters.get("laboratory")
-    return read_site(
-        directory.file(directory.parameters["cell"]),
-        directory.file(laboratory) if laboratory else LABORATORY_FILE,
-    )
+    return read_site(directory.file(directory.parameters["cell"]), laboratory_file(directory))
+
+
+def laboratory_file(directory: Directory) -> Path:
+    """Return the path of the laboratory file of services.toml."""
+    named = directory.parameters.get("laboratory")
+    return directory.file(named) if named else LABORATORY_FILE
 
 
 class CupMount:

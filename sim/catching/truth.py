@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +66,27 @@ class TableTruth:
 
 
 @dataclass(frozen=True, slots=True)
+class Scatter:
+    """What differs from image to image, frame to frame and ball to ball; the laboratory file
+    explains each ([nominal])."""
+
+    image_time_error: float = 0.0
+    images_lost: float = 0.0
+    frames_lost: float = 0.0
+    exposure_factor: float = 1.0
+    table_slope: tuple[float, float] = (0.0, 0.0)
+    wave_slope: float = 0.0
+    wave_length: float = 0.4
+    hidden: tuple[float, float] = (0.0, 0.0)
+    second_ball: float = 0.0
+
+    @property
+    def flat(self) -> bool:
+        """Whether the table is even."""
+        return self.table_slope == (0.0, 0.0) and self.wave_slope == 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Truth:
     """The simulated truth of one regime: everything that services must not know."""
 
@@ -88,6 +109,7 @@ class Truth:
     image_latency: float
     """s, in addition to the camera's own readout."""
     arm_speed: float
+    scatter: Scatter
     settings: Mapping[str, Any]
     """The whole laboratory file, for what is not an error: steps, thrower, friction."""
 
@@ -168,6 +190,7 @@ def read_truth(
             light_period=float(values["light_period"]),
             image_latency=float(values["image_latency"]),
             arm_speed=float(values["arm_speed"]),
+            scatter=_scatter(values),
             settings=settings,
         )
     except KeyError as fault:
@@ -227,10 +250,24 @@ def _cup(
     return CupTruth(
         mouth=mouth + np.asarray(values["cup_shift"], dtype=float),
         axis=axis / np.linalg.norm(axis),
-        radius=float(nominal["radius"]),
+        radius=float(values["cup_radius"])
+        if values.get("cup_radius", -1.0) > 0.0
+        else float(nominal["radius"]),
         depth=float(nominal["depth"]),
         restitution=restitution if restitution >= 0.0 else float(nominal["restitution"]),
     )
+
+
+def _scatter(values: Mapping[str, Any]) -> Scatter:
+    """Return what scatters; a laboratory file that is older than these keys has none of it."""
+    found: dict[str, Any] = {
+        one.name: values[one.name] for one in fields(Scatter) if one.name in values
+    }
+    given: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else float(value)
+        for key, value in found.items()
+    }
+    return Scatter(**given)
 
 
 def _table(

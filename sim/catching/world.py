@@ -2,22 +2,22 @@
 exact there.
 
 On the flat table and in free flight the ball follows closed forms (sim/catching/ball.py), one
-evaluation per tick. Only where it may touch the cup, an edge or anything else from above does the
-contact space (sim/catching/contact.py) take over at 1 kHz; a ball that lies still in a standing cup
+evaluation per tick. Only where it may touch the cup, an edge or anything else from above do the
+contacts (sim/catching/physics.py) take over at 1 kHz; a ball that lies still in a standing cup
 costs nothing. The light barrier and the closest approach to the cup are also computed here.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from typing import Any
 
 from petrobot.services.comm.lockstep.party import TICK
-from petrobot.sim.catching.ball import BallModel, BallState, TableMotion, fly
-from petrobot.sim.catching.contact import ContactSpace
+from petrobot.sim.catching.ball import BallModel, BallState, TableMotion, UnevenMotion, fly
 from petrobot.sim.catching.course import LightBarrier, ThrowCourse, ThrowOutcome
+from petrobot.sim.catching.physics import ball_contact, choose
 from petrobot.sim.catching.puma_model import Frame3
 from petrobot.sim.catching.thrower import Throw
 from petrobot.sim.catching.truth import Truth
@@ -60,13 +60,16 @@ class BallWorld:
     be near it: a pose costs more than they do. The same object means the same pose.
     """
 
-    def __init__(self, cell: Mapping[str, Any], truth: Truth) -> None:
+    def __init__(self, cell: Mapping[str, Any], truth: Truth, physics: str = "") -> None:
+        """`physics`: as for `physics.choose`."""
         settings = truth.settings
         self._truth = truth
         self.model = BallModel.of(cell["ball"], settings["ball"]["friction"])
         self._settings = settings
         self._cup_wall = float(cell["cup"]["wall"])
-        self._space = ContactSpace(self.model, truth.table, truth.cup, self._cup_wall, settings)
+        self._space = ball_contact(
+            choose(physics), self.model, truth.table, truth.cup, self._cup_wall, settings
+        )
         self._barrier = LightBarrier(float(settings["cup"]["barrier_delay"]))
         self.where = Where.ABSENT
         self.ball: BallState | None = None
@@ -78,7 +81,7 @@ class BallWorld:
         self._last = (0.0, 0.0)
         self._start_at = 0.0
         self._start: BallState | None = None
-        self._motion: TableMotion | None = None
+        self._motion: TableMotion | UnevenMotion | None = None
         self._leaves = (math.inf, 0)
         """Seconds after `_start_at` when the ball rolls over an edge, and 0 if that is the near
         one."""
@@ -202,7 +205,7 @@ class BallWorld:
 
     def _roll(self, now: float, start: BallState) -> None:
         resistance = self.course.throw.rolling_resistance if self.course else 0.0
-        self._motion = motion = TableMotion(self.model, start, resistance)
+        self._motion = motion = motion_on_table(self.model, start, resistance, self._truth)
         table = self._truth.table
         self._leaves = min(
             (motion.first_crossing(0, table.near_edge), 0),
@@ -373,8 +376,55 @@ class BallWorld:
         return gap < r + self._way_within_tick(ball)
 
     def close(self) -> None:
-        """Disconnect the physics client."""
+        """Release what the back end holds."""
         self._space.close()
+
+
+class SecondBall:
+    """A ball that rolls beside the one that counts: the camera sees it; it touches nothing but the
+    table, and is gone once it has fallen below the cup."""
+
+    def __init__(self, model: BallModel, throw: Throw, truth: Truth, released_at: float) -> None:
+        self._released_at, self._gravity = released_at, model.gravity
+        self._motion = motion_on_table(model, throw.start, throw.rolling_resistance, truth)
+        table = truth.table
+        self._leaves = min(
+            self._motion.first_crossing(0, table.near_edge),
+            self._motion.first_crossing(1, table.half_width),
+            self._motion.first_crossing(1, -table.half_width),
+        )
+
+    def seen(
+        self, now: float
+    ) -> Sequence[tuple[tuple[float, float, float], tuple[float, float, float]]]:
+        """Return its centre and velocity at `now` (s), if it is there."""
+        t = now - self._released_at
+        if not 0.0 <= t < self._leaves + _FALLS:
+            return ()
+        state = self._motion.state(min(t, self._leaves))
+        if t > self._leaves:
+            state = fly(state, t - self._leaves, self._gravity)
+        return ((state.position, state.velocity),)
+
+
+_FALLS = 0.25
+"""s in which a ball falls from the table to well below the cup."""
+
+
+def motion_on_table(
+    model: BallModel, start: BallState, rolling_resistance: float, truth: Truth
+) -> TableMotion | UnevenMotion:
+    """Return a ball's motion on the table as it really is."""
+    scatter = truth.scatter
+    if scatter.flat:
+        return TableMotion(model, start, rolling_resistance)
+    (along, across), wave = scatter.table_slope, scatter.wave_slope
+    number = 2.0 * math.pi / scatter.wave_length
+
+    def slope(x: float, y: float) -> tuple[float, float]:
+        return along + wave * math.sin(number * x), across + wave * math.sin(number * (y + 0.3 * x))
+
+    return UnevenMotion(model, start, rolling_resistance, slope)
 
 
 def _clears_edge(state: BallState, model: BallModel) -> bool:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
         provisional,
         success,
     )
-    from petrobot.services.device import Driver, Ports, Remote, Setpoint
+    from petrobot.services.device import Driver, Ports, Remote, Setpoint, key
     from petrobot.services.rehearsal import Rehearsal, rehearse
 
 __all__ = [
@@ -36,13 +36,14 @@ __all__ = [
     "Status",
     "error",
     "failure",
+    "key",
     "provisional",
     "rehearse",
     "success",
 ]
 
 _HOMES = {
-    **dict.fromkeys(("Driver", "Ports", "Remote", "Setpoint"), "petrobot.services.device"),
+    **dict.fromkeys(("Driver", "Ports", "Remote", "Setpoint", "key"), "petrobot.services.device"),
     **dict.fromkeys(("Rehearsal", "rehearse"), "petrobot.services.rehearsal"),
 }
 

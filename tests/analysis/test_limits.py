@@ -15,12 +15,18 @@ from typing import Any
 
 import pytest
 
+from petrobot.coordinator.analysis.commands import analyse_command
 from petrobot.coordinator.analysis.formats.netfile import NetFile
 from petrobot.coordinator.analysis.formats.pnml import write_pnml
+from petrobot.coordinator.analysis.net.space import SearchLimits
+from petrobot.coordinator.analysis.time.gspn import Gspn
+from petrobot.coordinator.cli import loading
+from petrobot.coordinator.task.file import load
 from petrobot.coordinator.task.net import Net
-from tests.analysis.generators import kanban, philosophers
+from tests.analysis.generators import KANBAN_RATES, kanban, philosophers
 from tests.waiting import Limit
 
+CATCH = Path(loading.__file__).parents[1] / "tasks" / "catch_ball.toml"
 pytestmark = pytest.mark.processes
 
 ROOM = 3 << 30
@@ -88,6 +94,99 @@ def test_a_huge_net_ends_with_a_partial_result(net: Net, deadlock: bool, tmp_pat
     assert data["throughput"] is None and data["mean_tokens"] is None and data["residual"] is None
     assert any("simulate instead" in note for note in data["notes"])
     assert data["deadlock"] is deadlock and data["live"] is (False if deadlock else None)
+
+
+class Steps:
+    """A clock on which every look takes a second, so a limit in seconds is a number of looks."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        self.now += 1.0
+        return self.now
+
+
+def many_siphons(places: int) -> Net:
+    """Return a net with few markings, but with far more siphons than can be listed."""
+    names = [f"p{i}" for i in range(places)]
+    arcs = {f"t{i}": ({names[i]: 1}, {names[(i + 1) % places]: 1}) for i in range(places)}
+    for i in range(places):
+        some = {names[i]: 1, names[i * 7 % places]: 1, names[i * 3 % places]: 1}
+        arcs[f"u{i}"] = (some, {names[(i * 11 + 3) % places]: 1})
+    return Net.build(dict.fromkeys(names, 0) | {"p0": 1}, arcs)
+
+
+def test_structure_stops_with_the_time_of_the_analysis(tmp_path: Path) -> None:
+    path = tmp_path / "net.pnml"
+    path.write_text(write_pnml(NetFile(many_siphons(60))), encoding="utf-8")
+    clock = Steps()
+    limits = SearchLimits(seconds=300.0, clock=clock)
+    found = analyse_command(path, load, limits=limits)
+    assert found.data["complete"] is True and found.data["states"] == 60
+    structure = found.data["structure"]
+    assert structure["siphons_complete"] is False and structure["siphons_controlled"] is not True
+    assert any(
+        "siphons" in note and "unknown within the limit" in note for note in found.data["notes"]
+    )
+    assert clock.now < 400.0
+
+
+def test_all_parts_of_an_analysis_share_its_time(tmp_path: Path) -> None:
+    """Searches, verdicts and numbers of both analyses of a what-if end within one limit."""
+    gspn = Gspn.of(kanban(3), KANBAN_RATES)
+    path = tmp_path / "net.pnml"
+    path.write_text(write_pnml(NetFile(gspn.net, gspn=gspn)), encoding="utf-8")
+    for seconds in (2.0, 20.0, 60.0, 200.0):
+        clock = Steps()
+        limits = SearchLimits(seconds=seconds, clock=clock)
+        found = analyse_command(path, load, limits=limits, changes=["tin1.rate=2"])
+        assert clock.now < seconds + 100.0  # one look for each block, sweep or branch
+        assert found.data["complete"] or "time limit" in found.data["reason"]
+        assert found.data["throughput"] is not None or any(
+            "time limit" in note for note in found.data["notes"]
+        )
+
+
+@pytest.mark.parametrize("seconds", [3.0, 30.0, 100.0, 300.0, 600.0, 1000.0])
+def test_the_forecast_of_a_task_ends_in_time(seconds: float) -> None:
+    """Wherever the time ends, there is a result that says what is unknown."""
+    clock = Steps()
+    limits = SearchLimits(seconds=seconds, clock=clock)
+    found = analyse_command(CATCH, load, view="gspn", limits=limits, changes=["runs=1"])
+    assert clock.now < seconds + 100.0
+    assert "states" in found.data or "time limit" in found.text
+    said = " ".join(found.data.get("notes", ())) + found.text
+    assert "forecast" in found.data or "limit" in said
+
+
+PEAK = """
+import resource, subprocess, sys
+code = subprocess.call(sys.argv[1:], stdout=subprocess.DEVNULL)
+print(code, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+"""
+"""Run a command from a small process: Linux counts what the parent held at the fork as the child's
+peak (getrusage(2)), and that of a test process is large."""
+
+
+def test_an_analysis_holds_no_more_memory_than_it_may(tmp_path: Path) -> None:
+    """The whole command: interpreter, search, verdicts, chain."""
+    gspn = Gspn.of(kanban(4), KANBAN_RATES)
+    path = tmp_path / "net.pnml"
+    path.write_text(write_pnml(NetFile(gspn.net, gspn=gspn)), encoding="utf-8")
+    arguments = ["analyse", str(path), "--memory", "300", "--json", str(tmp_path / "found.json")]
+    process = subprocess.run(
+        [sys.executable, "-c", PEAK, sys.executable, "-m", "petrobot.coordinator", *arguments],
+        capture_output=True,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        text=True,
+        timeout=120,
+    )
+    code, peak = map(int, process.stdout.split())
+    assert code in (0, 1)
+    assert peak <= 300 << 10  # KiB
+    data = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
+    assert data["throughput"] is not None or any("memory" in note for note in data["notes"])
 
 
 def test_what_cannot_be_solved_can_be_simulated(tmp_path: Path) -> None:

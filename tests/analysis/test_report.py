@@ -27,7 +27,7 @@ from petrobot.coordinator.analysis.formats.netfile import (
 from petrobot.coordinator.analysis.formats.pnml import write_pnml
 from petrobot.coordinator.analysis.net.picture import graph_svg
 from petrobot.coordinator.analysis.net.space import SearchLimits, explore
-from petrobot.coordinator.analysis.report import analyse, heat
+from petrobot.coordinator.analysis.report import analyse, heat, missing
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
@@ -128,7 +128,7 @@ def test_the_catching_task_in_one_analysis() -> None:
         and data["sound"]
         and data["deadlock"] is False
     )
-    assert data["judged_on_closed_net"] and {
+    assert data["execution"]["complete"] and {
         v["holds"] for k, v in data["verdicts"].items() if k != "safe"
     } == {True}
     text = found.text()
@@ -139,6 +139,16 @@ def test_the_catching_task_in_one_analysis() -> None:
         and "P_complete" in text
     )
     assert 0 < max(heat(found).values()) <= 1
+    assert found.forecast is not None
+    rest = missing(found.forecast)
+    assert sum(share for share, _, _ in rest) == pytest.approx(
+        1 - found.forecast.completion_probability, rel=0.02
+    )
+    assert all(path[-1] == "give_up" for _, _, path in rest)
+    assert (
+        "sound, but P_complete is 6.31e-07 short of 1" in text
+        and "live           if mended" in text
+    )
 
 
 def test_the_forecast_of_a_task_is_consistent() -> None:

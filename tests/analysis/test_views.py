@@ -4,6 +4,7 @@ tasks."""
 from __future__ import annotations
 
 from dataclasses import replace
+from math import exp, log
 from pathlib import Path
 from typing import Any
 
@@ -12,29 +13,31 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.analysis.net.booleans import boolean_view
+from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.qualitative import examine
-from petrobot.coordinator.analysis.net.robot import judge
 from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.analysis.time.completion import Completion, completion
 from petrobot.coordinator.analysis.time.gspn import Chain
 from petrobot.coordinator.analysis.time.markov import visits_before
+from petrobot.coordinator.analysis.time.measures import read_measure, value_of
 from petrobot.coordinator.analysis.time.stochastic import (
     Measured,
     NoEstimate,
     StochasticView,
     stochastic_view,
 )
+from petrobot.coordinator.analysis.time.task_forecast import forecast
+from petrobot.coordinator.analysis.time.whatif import change_task, read_change
 from petrobot.coordinator.task import (
     Counts,
     End,
     Estimate,
     Event,
+    EventMemory,
     Inhibitor,
     Input,
     Kind,
-    Memory,
     Output,
     Place,
     PrimitiveTask,
@@ -42,8 +45,6 @@ from petrobot.coordinator.task import (
     Status,
     Task,
     Transition,
-    Variable,
-    VariableType,
 )
 from petrobot.coordinator.task.conditions import parse
 from petrobot.coordinator.task.file import load
@@ -120,6 +121,68 @@ def test_preselection_gives_the_mean_of_the_mixture() -> None:
     assert any("estimates declared in the task file" in text for text in view.assumptions)
 
 
+def test_every_rate_says_where_it_comes_from() -> None:
+    task = one_step(alternatives=("slow", "fast"))
+    runs = {("act", "slow"): {Status.SUCCESS: Estimate(1.0, 4.0, 0.5)}}
+    said = {("act", "slow"): "measured in 7 runs"}
+    view = stochastic_view(task, Measured(runs, sources=said))
+    timed = [t for t, r in zip(view.gspn.net.transitions, view.gspn.rate, strict=True) if r]
+    assert set(timed) <= set(view.sources)
+    assert view.sources["act.slow.success"] == "measured in 7 runs"
+    assert view.numbers["measured in 7 runs"] == ("act.slow",)
+    assert view.numbers["declared in the task file"] == ("act.fast",)
+    assert view.sources["act.slow"] == "assumed equally likely"
+
+
+def test_a_change_counts_before_what_was_measured() -> None:
+    """Measurements are kept by place, changes are written by primitive task or action."""
+    task = one_step()
+    runs = {("act", "a"): {Status.SUCCESS: Estimate(0.5, 4.0), Status.ERROR: Estimate(0.3, 1.0)}}
+    changed, measured = change_task(task, Measured(runs), [read_change("act.error.share=0.2")])
+    shares = {s: e.share for s, e in measured.runs["act", "a"].items()}
+    assert shares == pytest.approx({Status.SUCCESS: 0.6, Status.ERROR: 0.2})
+    assert stochastic_view(changed, measured).numbers["what if act.error.share=0.2"] == ("act.a",)
+    with pytest.raises(NetFileError, match=r"only a share of 0\.8"):
+        change_task(task, Measured(runs), [read_change("act.error.share=0.9")])
+
+
+def test_errors_of_fits_are_reported_if_they_matter() -> None:
+    """A constant duration needs many phases; one that is never waited for needs none."""
+    fixed = {Status.SUCCESS: Estimate(1.0, 2.0, 0.0)}
+    found = forecast(stochastic_view(one_step(estimates=fixed), stages=2))
+    assert [text.partition(":")[0] for text in found.approximations] == ["act.a.success"]
+    rare = {Status.SUCCESS: Estimate(0.999, 2.0, 1.0), Status.ERROR: Estimate(0.001, 2.0, 0.0)}
+    assert forecast(stochastic_view(one_step(estimates=rare), stages=2)).approximations == []
+
+
+def test_measures_of_the_user() -> None:
+    """One run of 2 s, exponential; it ends in SUCCESS."""
+    plain = {Status.SUCCESS: Estimate(1.0, 2.0, 1.0)}
+    found = forecast(stochastic_view(one_step(estimates=plain)))
+    for text, value in {
+        "time(0.95)": -2 * log(0.05),
+        "late=late(4)": exp(-2.0),
+        "rate(ok) / rate(go)": 1.0,
+        "1 - P_complete": 0.0,
+        "mean*2": 4.0,
+        "marked(act)": 1.0,
+        "(tokens(act)+tokens(done))*2": 2.0,
+    }.items():
+        assert value_of(read_measure(text), found) == pytest.approx(value, abs=1e-9), text
+    assert read_measure("late=late(4)").name == "late"
+    for text, said in {
+        "rate(nope)": "no transition 'nope'; transitions: go",
+        "time(1.5)": "out of range",
+        "late(soon)": "expected a number",
+        "best(1)": "unknown measure best",
+        "1/0": "division|zero|Fraction",
+        "mean +": "ends too early",
+        "R_goal": "not defined here",
+    }.items():
+        with pytest.raises(NetFileError, match=said):
+            value_of(read_measure(text), found)
+
+
 def test_measured_runs_choices_and_no_declared_estimates() -> None:
     task = one_step(estimates={}, alternatives=("slow", "fast"))
     with pytest.raises(NoEstimate, match="duration of slow is unknown"):
@@ -145,7 +208,7 @@ def test_a_preempting_event_races_with_the_run() -> None:
     task = replace(
         task,
         transitions={**task.transitions, "caught": caught},
-        events={"hit": Event("hit", Scope.EXTERNAL, Memory.LATCHED, mean_wait=3.0)},
+        events={"hit": Event("hit", Scope.EXTERNAL, EventMemory.LATCHED, mean_wait=3.0)},
         goal_transitions=("caught",),
     )
     view, done = completed(task)
@@ -326,7 +389,6 @@ def test_operator_transitions_are_added_on_request() -> None:
     task = replace(task, places={**task.places, "idle": replace(task.places["idle"], capacity=2)})
     view = OrdinaryView(task, operator=True)
     assert view.net.transitions[-2:] == ("put.idle", "take.idle")
-    assert view.controllable == {"put.idle", "take.idle", "go"}
     space = explore(view.net, limits=SearchLimits(states=100))
     assert space.bounds[view.net.place_index["idle"]] == 2
     assert space.number((0,) * len(view.net.places)) is not None
@@ -335,33 +397,8 @@ def test_operator_transitions_are_added_on_request() -> None:
 # The shipped tasks.
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda p: p.stem)
-def test_shipped_tasks_are_bounded_live_proper_and_recoverable(path: Path) -> None:
-    view = OrdinaryView(load(path))
-    space = explore(view.net)
-    open_net = examine(space, final=view.is_end)
-    assert open_net.bounded.holds and open_net.deadlock_free.holds
-    assert open_net.sound is not None and open_net.sound.holds
-    closed = explore(view.closed(space))
-    closed_net = examine(closed)
-    assert closed_net.live.holds and closed_net.reversible.holds and closed_net.deadlock_free.holds
-    robot = judge(closed, view.roles(closed.net), space)
-    assert robot.stable.holds and robot.controllable.holds
-    assert {r.error_exit for r in robot.recoveries} == view.error_exits
-    assert all(r.almost_sure.holds and r.possible.holds for r in robot.recoveries)
-
-
 def catching() -> Task:
     return load(next(p for p in SHIPPED if p.stem == "catch_ball"))
-
-
-def test_the_catching_task_survives_three_further_errors() -> None:
-    view = OrdinaryView(catching())
-    space = explore(view.net)
-    closed = explore(view.closed(space))
-    kappa = {r.error_exit: r.kappa for r in judge(closed, view.roles(closed.net), space).recoveries}
-    assert kappa["move_failed"] == kappa["catch_failed"] == kappa["home_failed"] == 3
-    assert kappa["not_located"] is None and kappa["give_up"] == -1
 
 
 def test_broken_variants_are_caught_with_witnesses() -> None:
@@ -409,70 +446,3 @@ def test_broken_variants_are_caught_with_witnesses() -> None:
     assert list(view.net.replay(space.path(int(np.argmax(both)))))[-1] == space.marking(
         int(np.argmax(both))
     )
-
-
-def with_variable(initial: bool | None) -> Task:
-    """A run of `look` writes `seen`, its normal exits read it; a second look needs `not seen`."""
-    task = task_of(
-        [action("look", out={"seen": "seen"})],
-        [
-            Place("idle", Kind.CONTROL, 1),
-            Place("found", Kind.CONTROL),
-            Place("missed", Kind.CONTROL),
-        ],
-        [
-            Transition("go", (Input("idle"),), (Output("look"),)),
-            Transition("hit", (taken("look", End.NORMAL),), (Output("found"),), when=parse("seen")),
-            Transition(
-                "miss", (taken("look", End.NORMAL),), (Output("missed"),), when=parse("not seen")
-            ),
-            Transition("wrong", (Input("missed"),), (Output("found"),), when=parse("seen")),
-        ],
-        "found == 1 or missed == 1",
-    )
-    return replace(task, variables={"seen": Variable("seen", VariableType.BOOL, initial)})
-
-
-@pytest.mark.parametrize("initial", [True, False, None])
-def test_boolean_variables_are_kept_as_complementary_places(initial: bool | None) -> None:
-    task = with_variable(initial)
-    view = boolean_view(task)
-    space = explore(view.net)
-    names = [
-        t for t, level in zip(view.net.transitions, examine(space).levels, strict=True) if level
-    ]
-    fired = {view.origin[name] for name in names if name in view.origin}
-    assert (
-        fired == {"go", "hit", "miss"} and "wrong" not in fired
-    )  # seen stays false behind `miss`: nothing writes it
-    values = [i for i, p in enumerate(view.net.places) if p.startswith("seen=")]
-    assert all(sum(space.marking(i)[p] for p in values) == 1 for i in range(len(space)))
-    width = len(task.net.places)
-    for i, t, j in zip(
-        space.source.tolist(), space.label.tolist(), space.target.tolist(), strict=True
-    ):
-        before, after = space.marking(i)[:width], space.marking(j)[:width]
-        name = view.origin.get(view.net.transitions[t])
-        assert (
-            before == after
-            if name is None
-            else task.net.fire(before, task.net.transition_index[name]) == after
-        )
-    assert examine(explore(task.net)).dead_transitions == ()
-
-
-def test_other_conditions_are_dropped_and_too_many_variables_refused() -> None:
-    task = with_variable(False)
-    hit = replace(task.transitions["hit"], when=parse('seen and look.status == "success"'))
-    view = boolean_view(replace(task, transitions={**task.transitions, "hit": hit}))
-    assert "hit" in view.net.transitions
-    many = {f"v{i}": Variable(f"v{i}", VariableType.BOOL, False) for i in range(9)}
-    wide = replace(task.transitions["hit"], when=parse(" and ".join(many)))
-    with pytest.raises(ValueError, match="got 9"):
-        boolean_view(
-            replace(
-                task,
-                variables={**task.variables, **many},
-                transitions={**task.transitions, "hit": wide},
-            )
-        )

@@ -10,8 +10,8 @@ from typing import Any
 
 from petrobot.services.action import Context, Result, success
 from petrobot.services.comm.location_file import Directory, parse
-from petrobot.services.device import Ports
-from petrobot.services.node.inline_host import InlinePlace
+from petrobot.services.device import Driver, Ports
+from petrobot.services.node.inline_host import InlineHost
 from petrobot.services.node.node import Node
 from tests.in_loop import NodeInLoop
 from tests.ports import free_ports
@@ -100,7 +100,7 @@ out = ["out_of_order"]
 """
 
 
-class Arm:
+class Arm(Driver):
     """A driver that reaches when an action has told it to and the test lets it."""
 
     newest: Arm
@@ -149,7 +149,7 @@ class Arm:
         self.quick_stops.append(now)
 
     def stopped(self) -> bool:
-        """Whether it stands."""
+        """Whether it stands still."""
         return not self.moving
 
     def hold(self, now: float) -> str:
@@ -185,7 +185,7 @@ class RobotNode(NodeInLoop):
         self.directory = directory
         self.arm = Arm({}, None)
         clock = asyncio.get_running_loop().time
-        place = InlinePlace(directory.actions, clock=clock, driver=self.arm)
+        place = InlineHost(directory.actions, clock=clock, driver=self.arm)
         node = Node(directory, "robot", boot="b1", clock=clock, places={"arm": place})
         super().__init__(node, directory.address("robot"))
 

@@ -1,4 +1,4 @@
-"""A mission run that goes on over a node in this process, and the command line in front of it."""
+"""An active mission run over a node in this process, and the command line that steers it."""
 
 from __future__ import annotations
 

@@ -48,8 +48,8 @@ async def test_a_node_that_is_away(tmp_path: Path, capsys: pytest.CaptureFixture
 async def test_a_node_with_an_older_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A node that was started with another services.toml refuses whoever has this one, and the
-    check says so."""
+    """A node that was started with another services.toml refuses callers that have this one, and
+    the check reports it."""
     directory = directory_in(tmp_path)
     robot = RobotNode(directory)
     await robot.start()

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from petrobot.coordinator.analysis.formats import read_net
+from petrobot.coordinator.analysis.net.space import explore
 from petrobot.coordinator.cli import COMMANDS, main
 from tests.ports import free_ports
 
@@ -42,7 +44,7 @@ def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> Non
     shown = capsys.readouterr().out
     assert all(f"  {command.name} " in shown for command in COMMANDS)
     assert main(["fly"]) == 2
-    assert "no command 'fly'" in capsys.readouterr().err
+    assert "unknown command 'fly'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -50,7 +52,7 @@ def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> Non
     [
         (["run", "no_such_task"], "no task 'no_such_task'"),
         (["run", "catch_ball", "--set", "speed=3"], "no parameter 'speed'"),
-        (["run", "catch_ball", "--use", "track_ball=teleport"], "choose among"),
+        (["run", "catch_ball", "--use", "track_ball=teleport"], "choose from"),
         (["run", "catch_ball", "--mode", "lockstep", "--regime", "Z9", "--quiet"], "Z9"),
         (["run", "catch_ball", "--services", "nowhere.toml"], "nowhere.toml"),
         (["check", "services.toml"], "services.toml"),
@@ -102,7 +104,7 @@ def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> Non
             "--target: 7 is not a number of more than 0 and at most 1",
         ),
         (["learned", "show", "x.db", "--rho", "-1"], "--rho: -1 is not a number of at least 0"),
-        (["token", "runs", "two"], "two changes nothing: write how many tokens"),
+        (["token", "runs", "two"], "such as +1 or -1, got two"),
         (["run", "catch_ball", "--runs", "abc"], "--runs: abc is not a whole number of at least 1"),
         (["run", "catch_ball", "--keep", "0"], "--keep: 0 is not a whole number of at least 1"),
         (
@@ -305,6 +307,46 @@ def test_show_draws_svg(capsys: pytest.CaptureFixture[str]) -> None:
     assert "recover_arm" in whole
 
 
+def test_show_draws_the_stochastic_view(capsys: pytest.CaptureFixture[str]) -> None:
+    """Timed transitions are boxes with their rates; every number says where it comes from."""
+    assert main(["show", "catch_ball", "--view", "gspn"]) == 0
+    drawn = capsys.readouterr().out
+    assert "transition timed" in drawn and "transition immediate" in drawn
+    assert "declared in the task file" in drawn and "/s" in drawn
+    assert "declared: after 10 s" in drawn and "assumed equally likely" in drawn
+    for wrong in (["--view", "gspn", "--errors"], ["--estimates", "learned.db"]):
+        assert main(["show", "catch_ball", *wrong]) == 2
+    assert "leave out --view gspn" in capsys.readouterr().err
+
+
+def test_convert_writes_the_stochastic_view(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """GreatSPN projects, PNML and Storm's chain hold the same GSPN."""
+    found = []
+    for ending, more in ((".pnpro", []), (".pnml", ["--view", "gspn"])):
+        target = tmp_path / f"catch{ending}"
+        assert main(["convert", "catch_ball", str(target), *more]) == 0
+        said = capsys.readouterr().out
+        assert "assumed: catch_ball: estimates declared" in said
+        gspn = read_net(target).gspn
+        assert gspn is not None
+        found.append((sorted(filter(None, gspn.rate)), len(explore(gspn.net))))
+    assert found[0] == found[1]
+    assert main(["convert", "catch_ball", str(tmp_path / "catch.drn")]) == 0
+    assert main(["convert", str(tmp_path / "catch.pnml"), str(tmp_path / "x.net")]) == 0
+    assert "not kept: rates and weights" in capsys.readouterr().out
+
+
+def test_analyse_reports_measures_of_the_user(capsys: pytest.CaptureFixture[str]) -> None:
+    measures = ["--measure", "p95=time(0.95)", "--measure", "late(20)"]
+    main(["analyse", "catch_ball", "--view", "gspn", *measures, "--json", "-"])
+    told = json.loads(capsys.readouterr().out)["measures"]
+    assert 15 < told["p95"] < 30 and 0 < told["late(20)"] < 1
+    assert main(["analyse", "catch_ball", *measures]) == 2
+    assert "give --view gspn" in capsys.readouterr().err
+
+
 @pytest.mark.processes
 def test_new_writes_what_works(tmp_path: Path) -> None:
     """The skeletons' own tests pass as they are written."""
@@ -332,7 +374,8 @@ def test_new_writes_what_works(tmp_path: Path) -> None:
 
 @pytest.mark.processes
 def test_lockstep_run_writes_the_promised_file(tmp_path: Path) -> None:
-    """The keys that scripts rely on; the same seed gives the same file but for wall_s."""
+    """It has the keys that scripts rely on. The same seed gives the same file, except for
+    wall_s."""
     results = []
     for number in range(2):
         path = tmp_path / f"{number}.json"
@@ -451,8 +494,8 @@ def test_a_task_may_name_its_own_location_file(
 
 
 def test_a_task_may_draw_its_own_pictures() -> None:
-    """`pictures` of the task file names a function that draws a result for the report; a name that
-    leads nowhere is told."""
+    """`pictures` of the task file names a function that draws a result for the report. A function
+    that does not exist is an error."""
     from dataclasses import replace
 
     from petrobot.coordinator.cli import CommandError

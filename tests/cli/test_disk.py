@@ -72,9 +72,13 @@ def test_a_disk_that_cannot_be_written_is_told_in_one_line(disk: str, tmp_path: 
     ]
     given = ["unshare", "-rm", "bash", "-c", " && ".join(steps)]
     done = subprocess.run(
-        given, env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin:/usr/sbin:/sbin"}, capture_output=True, text=True,
-        timeout=LIMIT, check=False,
-    )  # fmt: skip
+        given,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin:/usr/sbin:/sbin"},
+        capture_output=True,
+        text=True,
+        timeout=LIMIT,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr[-2_000:]
     found = json.loads(done.stdout.splitlines()[-1])
     for (command, name), outcome in zip(COMMANDS.items(), found, strict=True):

@@ -3,15 +3,16 @@ never an exception's name."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from petrobot.coordinator.analysis.may_run import Budget
 from petrobot.coordinator.cli import COMMANDS, main
 from petrobot.coordinator.cli.new import TASK
 
-SHIPPED = str(Path(__file__).parents[2] / "services.toml")
 WORK = TASK.replace("{name}", "work")
 CELL = """\
 schema = 1
@@ -72,7 +73,7 @@ def petrobot(
         ("check astray.toml --live", NO_CELL),
         ("run astray.toml", NO_CELL),
         ("campaign astray.toml", NO_CELL),
-        ("check folder.toml", "folder.toml:5: task.services: . is no file"),
+        ("check folder.toml", "folder.toml:5: task.services: . is not a file"),
         (
             "analyse work.toml --rates nope.toml",
             "--rates: nope.toml: work is a task; rates are for net files; leave it out",
@@ -84,9 +85,10 @@ def petrobot(
         ("convert binary.toml x.pnml", "petrobot convert: binary.toml:2: file: is not UTF-8"),
         (
             "convert work.toml x.foo",
-            "x.foo: file: no writer for the ending .foo; end its name in .pnml, .net, .dot, .drn",
+            "x.foo: file: no writer for the ending .foo; end its name in .pnml, .net, .pnpro, "
+            ".dot, .drn",
         ),
-        ("new action class", "'class' is a word of Python itself (a keyword)"),
+        ("new action class", "'class' is a keyword of Python"),
         ("new action Fast", "use small letters, digits and _"),
         (
             "run work.toml --mode lockstep --mock mock.toml",
@@ -138,17 +140,29 @@ def test_bad_input_names_file_key_and_remedy(command: str, said: str, petrobot: 
 
 
 def test_a_cell_that_was_not_given_is_named(petrobot: Petrobot) -> None:
-    """Without services.toml here the shipped one is judged by, and said to be."""
+    """The location file beside the task, one folder above it, or here; no other cell's."""
     assert petrobot("check", "work.toml")[0] == 0
+    cell = Path("services.toml").read_text(encoding="utf-8")
+    folder = Path("lab/tasks")
+    folder.mkdir(parents=True)
+    shutil.move("work.toml", folder)
+    wrong = cell.replace("[actions.work]", "[actions.wrok]")
+    for number, path in enumerate((folder / "services.toml", Path("lab/services.toml"))):
+        path.write_text(wrong, encoding="utf-8")
+        code, out, _ = petrobot("check", "lab/tasks/work.toml")
+        assert code == 2 and f"add [actions.work] to {path}, or drop it here" in out, number
+        path.unlink()
+    assert petrobot("check", "lab/tasks/work.toml")[0] == 0, "the one here"
     Path("services.toml").unlink()
-    code, out, _ = petrobot("check", "work.toml")
-    assert code == 2
-    assert f"add [actions.work] to {SHIPPED}, or drop it here" in out
-    assert f"services.toml: there is none here, so {SHIPPED} was used" in out
+    code, out, _ = petrobot("check", "lab/tasks/work.toml")
+    assert code == 0
+    assert "there is no services.toml beside the task" in out and "was not checked" in out
+    code, _, err = petrobot("run", "lab/tasks/work.toml")
+    assert code == 2 and "there is no services.toml beside the task" in err
 
 
 def test_an_action_that_translates_another_task_is_told(petrobot: Petrobot) -> None:
-    """It may run all the same."""
+    """This is a warning; the task may still run."""
     Path("services.toml").write_text(
         CELL.replace('task = "work"', 'task = "wrok"'), encoding="utf-8"
     )
@@ -162,7 +176,7 @@ def test_an_action_that_translates_another_task_is_told(petrobot: Petrobot) -> N
 
 
 def test_check_does_not_promise_what_analyse_does_not_do(petrobot: Petrobot) -> None:
-    """Neither goes on when the net has no end; where only the limit is near, `analyse` does."""
+    """`analyse` searches longer than `check`, but not when the net is unbounded."""
     endless = WORK.replace('out = ["robot_free"]', 'out = ["robot_free", "runs*2"]', 1)
     Path("work.toml").write_text(endless, encoding="utf-8")
     code, out, _ = petrobot("check", "work.toml")
@@ -174,16 +188,16 @@ def test_a_search_that_was_cut_short_may_go_on(
     petrobot: Petrobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where a limit ended it, `analyse` has a larger one."""
-    monkeypatch.setattr("petrobot.coordinator.cli.check.MOST_STATES", 4)
+    monkeypatch.setattr("petrobot.coordinator.analysis.may_run.BUDGET", Budget(4))
     out = petrobot("check", "work.toml")[1]
-    assert "petrobot analyse goes on longer" in out
+    assert "petrobot analyse continues longer" in out
 
 
 @pytest.mark.parametrize("name", [command.name for command in COMMANDS])
 def test_help_says_which_location_file(name: str, petrobot: Petrobot) -> None:
     """The task's own comes first."""
     out = " ".join(petrobot(name, "--help")[1].split())
-    assert "--services FILE the" not in out or "the one that the task names in `services`" in out
+    assert "--services FILE the" not in out or "the one that the task names in its key" in out
 
 
 def test_exit_codes_are_told(petrobot: Petrobot) -> None:
@@ -193,5 +207,5 @@ def test_exit_codes_are_told(petrobot: Petrobot) -> None:
     told = out.partition("exit codes:")[2]
     assert all(
         word in told
-        for word in ("analyse refuses", "forecast disagrees", "operator's command", "3 a node")
+        for word in ("analyse refutes", "forecast or replay", "operator's command", "3  a node")
     )

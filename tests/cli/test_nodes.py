@@ -14,7 +14,7 @@ import pytest_asyncio
 
 from petrobot.coordinator.cli import main
 from petrobot.services.comm.location_file import Directory
-from petrobot.services.node.inline_host import InlinePlace
+from petrobot.services.node.inline_host import InlineHost
 from petrobot.services.node.node import GENERAL, Node
 from tests.cli.cell import Arm, directory_in
 from tests.in_loop import NodeInLoop
@@ -28,8 +28,8 @@ async def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIte
     monkeypatch.setenv("COLUMNS", "200")
     directory = directory_in(tmp_path)
     clock = asyncio.get_running_loop().time
-    arm = InlinePlace(directory.actions, clock=clock, driver=Arm({}, None))
-    places = {"arm": arm, GENERAL: InlinePlace(directory.actions, clock=clock)}
+    arm = InlineHost(directory.actions, clock=clock, driver=Arm({}, None))
+    places = {"arm": arm, GENERAL: InlineHost(directory.actions, clock=clock)}
     node = NodeInLoop(
         Node(directory, "robot", boot="b1", clock=clock, places=places), directory.address("robot")
     )

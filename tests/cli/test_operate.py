@@ -1,5 +1,5 @@
-"""The operator's commands against a mission run that goes on: what they change, what they answer,
-and whom they refuse."""
+"""The operator's commands and an active mission run: what they change, what they answer, and whom
+they refuse."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ async def test_pause_reaches_the_devices_and_continue_releases_them(petrobot: Te
     assert (said.code, said.json["nodes"]) == (0, {"robot": "held"})
     assert petrobot.arm.held and petrobot.mission.executor.state.mode is Mode.PAUSED
     said = await petrobot("continue")
-    assert said.code == 0 and "goes on" in said.out
+    assert said.code == 0 and "continues" in said.out
     await petrobot.until(lambda: not petrobot.arm.held)
 
 
@@ -132,8 +132,8 @@ async def test_abort_ends_the_run_in_error(petrobot: Terminal) -> None:
 
 
 async def test_emergency_stop_stops_latches_and_ends_the_run(petrobot: Terminal) -> None:
-    """The arm stops at once and obeys nobody until it is cleared, not even the task's own
-    recovery."""
+    """The arm stops at once and accepts no command until the stop is cleared, not even from the
+    task's own recovery."""
     await petrobot.working()
     said = await petrobot("estop", "--json", "-")
     assert said.code == 0, said.err
@@ -153,13 +153,14 @@ async def test_emergency_stop_stops_latches_and_ends_the_run(petrobot: Terminal)
 
 
 async def test_an_emergency_stop_needs_no_controls(petrobot: Terminal) -> None:
-    """Whoever holds them."""
+    """Any operator may give it, whoever holds the controls."""
     assert (await petrobot("pause", "--as", "ana")).code == 0
     assert (await petrobot("estop", "--json", "-")).code == 0
 
 
 async def test_one_operator_holds_the_controls(petrobot: Terminal) -> None:
-    """A second one is told who; after a handover he may."""
+    """A second operator is refused and told the name of the holder. After a handover he may give
+    commands."""
     assert (await petrobot("pause", "--as", "ana")).code == 0
     refused = await petrobot("continue", "--as", "bob")
     assert refused.code == 1 and "ana" in refused.err and "holds the controls" in refused.err
@@ -170,7 +171,7 @@ async def test_one_operator_holds_the_controls(petrobot: Terminal) -> None:
 
 
 async def test_controls_are_asked_for_and_handed_over(petrobot: Terminal) -> None:
-    """`--take` waits until the holder releases them to whoever asks."""
+    """`--take` waits until the holder hands them over."""
     from petrobot.coordinator.cli.operate.hand import connect
 
     async with connect(find_door(folder=petrobot.runs), "ana") as ana:
@@ -223,12 +224,12 @@ async def test_watch_tells_what_happens_until_the_end(petrobot: Terminal) -> Non
     ("arguments", "says"),
     [
         (("raise", "part_their"), "did you mean 'part_there'"),
-        (("force", "work", "start"), "no way out of work is named 'start'"),
+        (("force", "work", "start"), "no outgoing transition of work is named 'start'"),
         (("force", "jobs", "done"), "no action place is named 'jobs'"),
         (("break", "nowhere"), "no place or transition is named 'nowhere'"),
-        (("token", "jobs", "0"), "0 changes nothing"),
+        (("token", "jobs", "0"), "such as +1 or -1, got 0"),
         (("token", "job", "+1"), "did you mean 'jobs'"),
-        (("override", "work"), "or say --free"),
+        (("override", "work"), "or give --free"),
         (("override", "work", "fly"), "no alternative is named 'fly'"),
         (("pause", "--run", "nowhere"), "no run 'nowhere'"),
     ],
@@ -259,7 +260,7 @@ def test_without_a_run_every_command_says_so(
 
 
 async def test_a_coordinator_that_is_gone_is_exit_code_3(petrobot: Terminal) -> None:
-    """The process lives, but nobody listens there any more."""
+    """Its process lives, but no server listens at its address any more."""
     await petrobot.page.close()
     said = await petrobot("pause")
     assert said.code == 3 and "cannot be reached" in said.err
@@ -281,7 +282,8 @@ def test_the_door_is_its_owners_alone_and_gone_with_its_run(tmp_path: Path) -> N
 
 
 def test_the_door_of_a_killed_coordinator_is_no_door(tmp_path: Path) -> None:
-    """Its process is no more; the next one at this run replaces it."""
+    """The door of a process that has ended does not count. The next coordinator of this run
+    replaces it."""
     (tmp_path / "r").mkdir()
     dead = {"run": "r", "url": "http://127.0.0.1:1", "token": "t", "process": 2**22 + 1}
     (tmp_path / "r" / DOOR).write_text(json.dumps(dead))

@@ -1,11 +1,12 @@
-"""What operators see beside the net: pictures, devices and set points of nodes, only while somebody
-looks."""
+"""What operators see beside the net: pictures, devices and set points of nodes, and only while an
+operator looks."""
 
 from __future__ import annotations
 
 from base64 import b64decode
 from typing import Any
 
+from petrobot.services.comm.protocol.messages import Command
 from tests.cli.conftest import Terminal
 
 
@@ -15,9 +16,9 @@ def verbs(terminal: Terminal) -> list[str]:
     place: Any = terminal.robot.node.places["arm"]
     carry_out = place.command
 
-    def command(now: float, id: str, verb: str) -> None:  # noqa: A002
-        asked.append(verb)
-        carry_out(now, id, verb)
+    def command(now: float, command: Command) -> None:
+        asked.append(command.verb)
+        carry_out(now, command)
 
     place.command = command
     return asked
@@ -48,7 +49,7 @@ async def test_pictures_and_states_come_while_somebody_looks(petrobot: Terminal)
 
 
 async def test_nobody_looks_nothing_is_asked(petrobot: Terminal) -> None:
-    """A node hears of no operator while there is none, and again once one looks."""
+    """Without operators a node gets no question; it gets some again as soon as one looks."""
     asked = verbs(petrobot)
     feed = petrobot.operation.feed
     polled: list[dict[str, Any]] = []
@@ -61,8 +62,8 @@ async def test_nobody_looks_nothing_is_asked(petrobot: Terminal) -> None:
 
 
 async def test_old_set_points_are_none(petrobot: Terminal) -> None:
-    """A stream that nobody sends is not shown as one that grows older and older; a device that sees
-    nothing shows nothing."""
+    """A stream without a sender does not show a set point that grows older for ever. A device that
+    sees nothing shows nothing."""
     petrobot.arm.setpoint_age = 3.0
     stop = petrobot.operation.subscribe(lambda change: None)
     feed = petrobot.operation.feed

@@ -21,8 +21,9 @@ from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
 
-from petrobot.services.comm.calls.callee import Callee, CancelOrder, Offer, Order
+from petrobot.services.comm.calls.callee import Callee, Offer, Order
 from petrobot.services.comm.calls.server import Server
+from petrobot.services.comm.protocol.messages import Cancel, Outcome
 from petrobot.services.comm.streams.stream import StreamSender
 
 HOST = "127.0.0.1"
@@ -132,8 +133,10 @@ async def be_node(port: int, boot: str) -> None:
 
     def obey(now: float, orders: list[Order]) -> None:
         for order in orders:
-            if isinstance(order, CancelOrder):
-                callee.finish(now, order.id, "error", cause="cancelled", text="it was told to stop")
+            if isinstance(order, Cancel):
+                callee.finish(
+                    now, Outcome(order.id, "error", cause="cancelled", text="it was told to stop")
+                )
 
     callee = Callee("motion", boot, {"move": Offer()})
     server = Server(callee, on_orders=obey)

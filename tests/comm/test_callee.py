@@ -9,13 +9,10 @@ from hypothesis import strategies as st
 
 from petrobot.services.comm.calls.callee import (
     Callee,
-    CancelOrder,
-    CommandOrder,
+    FinishedIds,
     Offer,
     Retention,
-    StartOrder,
 )
-from petrobot.services.comm.calls.runs import FinishedIds
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.messages import Executed
 
@@ -56,9 +53,11 @@ def test_a_run_from_call_to_acknowledged_result() -> None:
     callee = _callee()
     call = m.Call("1", "move", {"to": 1}, 5.0, 3, "n1")
     callee.receive(0.0, "coord", call)
-    assert callee.orders() == [StartOrder(call, "coord")] and callee.orders() == []
+    assert callee.orders() == [call] and callee.orders() == []
     callee.feedback(0.1, "1", 1.5, {"n": (1,)})
-    outcome = callee.finish(0.5, "1", "success", {"p": (1, 2)}, cpu_seconds=0.1)
+    outcome = callee.finish(
+        0.5, m.Outcome("1", "success", {"p": (1, 2)}, seconds=0.5, cpu_seconds=0.1)
+    )
     assert outcome == m.Outcome("1", "success", {"p": [1, 2]}, "", "", Executed.YES, 0.5, 0.1)
     assert _said(callee) == [m.Accept("1"), m.Feedback("1", 1.0, {"n": [1]}), outcome]
     callee.receive(1.0, "coord", call)
@@ -107,7 +106,7 @@ def test_a_refused_call_stays_refused() -> None:
     callee = _callee(COORD, m.Hello(2, 2, "coordinator", "other", "o1"))
     callee.receive(0.0, "coord", m.Call("1", "move", epoch=3))
     callee.receive(0.1, "other", m.Call("2", "move"))
-    callee.finish(1.0, "1", "success")
+    callee.finish(1.0, m.Outcome("1", "success"))
     callee.link_down(1.0, "coord", leaves=True)
     _said(callee)
     callee.receive(2.0, "other", m.Call("2", "move"))
@@ -119,7 +118,7 @@ def test_a_refused_call_stays_refused() -> None:
 def test_busy_is_said_by_the_runner() -> None:
     callee = _callee()
     callee.receive(0.0, "coord", m.Call("1", "move", epoch=3))
-    callee.finish(0.0, "1", "error", cause="busy", executed=Executed.NO)
+    callee.finish(0.0, m.Outcome("1", "error", cause="busy", executed=Executed.NO))
     assert _outcome(callee) == ("error", "busy", Executed.NO)
 
 
@@ -133,7 +132,7 @@ def test_a_device_takes_orders_from_the_holder_of_its_lease_alone() -> None:
     callee.link_down(1.0, "coord")
     callee.receive(9.0, "other", m.Call("3", "move"))
     assert _outcome(callee)[1] == "device_leased", "its run still goes on"
-    callee.finish(9.1, "1", "error", cause="cancelled")
+    callee.finish(9.1, m.Outcome("1", "error", cause="cancelled"))
     callee.receive(9.2, "other", m.Call("4", "move"))
     assert _said(callee) == [m.Accept("4")]
 
@@ -141,7 +140,7 @@ def test_a_device_takes_orders_from_the_holder_of_its_lease_alone() -> None:
 def test_a_lease_outlives_a_short_break_of_the_link() -> None:
     callee = _callee(COORD, m.Hello(2, 2, "coordinator", "other", "o1"))
     callee.receive(0.0, "coord", m.Call("1", "move", epoch=3))
-    callee.finish(0.5, "1", "success")
+    callee.finish(0.5, m.Outcome("1", "success"))
     callee.link_down(1.0, "coord")
     _said(callee)
     callee.receive(2.9, "other", m.Call("2", "move"))
@@ -176,8 +175,8 @@ def test_the_deadline_is_enforced_whatever_the_action_says(limited_by: str) -> N
     assert callee.orders() == []
     callee.advance(3.0)
     callee.advance(4.0)
-    assert callee.orders() == [CancelOrder("1", "deadline")]
-    callee.finish(4.1, "1", "success", {"p": 1})
+    assert callee.orders() == [m.Cancel("1", "deadline")]
+    callee.finish(4.1, m.Outcome("1", "success", {"p": 1}))
     assert _outcome(callee) == ("error", "deadline", Executed.YES)
 
 
@@ -195,8 +194,8 @@ def test_an_orphan_is_stopped_after_its_time_unless_its_caller_comes_back() -> N
     callee.advance(3.9)
     assert callee.orders() == []
     callee.advance(4.0)
-    assert callee.orders() == [CancelOrder("1", "orphan")], "track has no orphan time and goes on"
-    callee.finish(4.1, "1", "error", cause="cancelled")
+    assert callee.orders() == [m.Cancel("1", "orphan")], "track has no orphan time and goes on"
+    callee.finish(4.1, m.Outcome("1", "error", cause="cancelled"))
     _said(callee)
     welcome = callee.link_up(5.0, "coord", COORD)
     assert isinstance(welcome, m.Welcome) and set(welcome.runs) == {"1", "2"}
@@ -210,14 +209,14 @@ def test_cancel_against_completion() -> None:
         callee.receive(0.0, "coord", m.Call(id_, "track", epoch=3))
         callee.receive(0.1, "coord", m.Cancel(id_, "not wanted"))
         callee.receive(0.1, "coord", m.Cancel(id_, "again"))
-    assert [order for order in callee.orders() if isinstance(order, CancelOrder)] == [
-        CancelOrder("1", "not wanted"),
-        CancelOrder("2", "not wanted"),
+    assert [order for order in callee.orders() if isinstance(order, m.Cancel)] == [
+        m.Cancel("1", "not wanted"),
+        m.Cancel("2", "not wanted"),
     ]
     _said(callee)
-    callee.finish(0.2, "1", "success", {"p": 1})
+    callee.finish(0.2, m.Outcome("1", "success", {"p": 1}))
     assert _outcome(callee) == ("success", "", Executed.YES), "it had ended before"
-    callee.finish(0.2, "2", "error", cause="cancelled")
+    callee.finish(0.2, m.Outcome("2", "error", cause="cancelled"))
     assert _outcome(callee) == ("error", "cancelled", Executed.YES)
     callee.receive(0.3, "coord", m.Cancel("2", "again"))
     assert _outcome(callee) == ("error", "cancelled", Executed.YES), (
@@ -362,7 +361,7 @@ def test_ids_in_groups_are_the_ids(ids: list[tuple[str, int]]) -> None:
 def test_what_cannot_be_sent_is_an_error_of_the_action() -> None:
     callee = _callee()
     callee.receive(0.0, "coord", m.Call("1", "track", epoch=3))
-    outcome = callee.finish(1.0, "1", "success", {"image": object()})
+    outcome = callee.finish(1.0, m.Outcome("1", "success", {"image": object()}))
     assert (outcome.status, outcome.cause, outcome.executed) == (
         "error",
         "bad_result",
@@ -375,7 +374,7 @@ def test_commands_go_to_the_node_and_their_answers_back() -> None:
     callee = _callee()
     command = m.Command("k1", "hold", "arm")
     callee.receive(0.0, "coord", command)
-    assert callee.orders() == [CommandOrder(command, "coord")]
+    assert callee.orders() == [command]
     callee.answer(0.1, "k1", True, {"arm": "held"})
     assert callee.messages() == [("coord", m.Answer("k1", True, {"arm": "held"}))]
 
@@ -393,13 +392,13 @@ def test_a_restarted_caller_counts_its_commands_anew() -> None:
     )
     callee.messages()
     callee.receive(2.1, "coord", command)
-    assert callee.orders() == [CommandOrder(command, "coord")] and callee.messages() == []
+    assert callee.orders() == [command] and callee.messages() == []
 
 
 def test_reports_about_what_does_not_go_on_are_the_nodes_own_fault() -> None:
     callee = _callee()
     with pytest.raises(ValueError, match="no active run"):
-        callee.finish(0.0, "1", "success")
+        callee.finish(0.0, m.Outcome("1", "success"))
     with pytest.raises(ValueError, match="no active run"):
         callee.feedback(0.0, "1", 0.5)
     with pytest.raises(ValueError, match="no active run"):
@@ -448,12 +447,12 @@ def test_the_deadline_of_a_held_run_stands_still(target: str) -> None:
     callee.orders()
     callee.advance(4.9)
     callee.receive(5.0, "coord", m.Command("r", "release", target))
-    assert [type(order) for order in callee.orders()] == [CommandOrder]
+    assert [type(order) for order in callee.orders()] == [m.Command]
     assert callee.due() == 6.0
     callee.advance(5.99)
     assert callee.orders() == []
     callee.advance(6.0)
-    assert callee.orders() == [CancelOrder("1", "deadline")]
+    assert callee.orders() == [m.Cancel("1", "deadline")]
 
 
 @pytest.mark.parametrize(
@@ -467,7 +466,7 @@ def test_the_deadline_of_a_run_that_goes_on_is_kept_during_a_pause(answers: dict
     callee.answer(1.0, "h", False, {"answers": answers})
     callee.orders()
     callee.advance(2.0)
-    assert callee.orders() == [CancelOrder("1", "deadline")]
+    assert callee.orders() == [m.Cancel("1", "deadline")]
 
 
 def test_a_held_run_is_still_an_orphan_without_its_caller() -> None:
@@ -479,7 +478,7 @@ def test_a_held_run_is_still_an_orphan_without_its_caller() -> None:
     callee.orders()
     callee.link_down(1.0, "coord")
     callee.advance(2.0)
-    assert callee.orders() == [CancelOrder("1", "orphan")]
+    assert callee.orders() == [m.Cancel("1", "orphan")]
 
 
 def test_a_repeated_command_is_not_carried_out_again() -> None:
@@ -492,7 +491,7 @@ def test_a_repeated_command_is_not_carried_out_again() -> None:
     stop = m.Command("k1", "stop", "arm")
     for _ in range(3):
         callee.receive(0.0, "coord", stop)
-    assert callee.orders() == [CommandOrder(stop, "coord")] and callee.messages() == []
+    assert callee.orders() == [stop] and callee.messages() == []
     callee.receive(0.1, "other", stop)
     [(peer, answer)] = callee.messages()
     assert peer == "other" and isinstance(answer, m.Answer) and answer.data["cause"] == "id_taken"
@@ -501,7 +500,7 @@ def test_a_repeated_command_is_not_carried_out_again() -> None:
     callee.receive(0.2, "coord", stop)
     assert callee.orders() == [] and callee.messages() == [said]
     callee.receive(0.3, "other", stop)
-    assert callee.orders() == [CommandOrder(stop, "other")] and callee.messages() == []
+    assert callee.orders() == [stop] and callee.messages() == []
     callee.answer(0.4, "k1", True)
     for number in range(1_000):
         callee.receive(1.0, "coord", m.Command(f"more {number}", "status"))

@@ -6,21 +6,16 @@ from dataclasses import replace
 
 import pytest
 
-from petrobot.services.comm.calls.caller import (
-    CallAccepted,
-    CallEnded,
-    Caller,
-    CallProgress,
-    CommandAnswered,
-    EventArrived,
-    LateResult,
-    Notice,
-    PeerBack,
-    PeerLost,
-)
+from petrobot.services.comm.calls.caller import Caller, LateResult, Notice, PeerLost
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.codec import LIMITS, encode
-from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.comm.protocol.messages import (
+    Accept,
+    Answer,
+    Executed,
+    Feedback,
+    Outcome,
+)
 from petrobot.services.comm.protocol.plain import NotPlainError
 
 
@@ -56,9 +51,9 @@ def _caller(*, up: bool = True, auto_ack: bool = False) -> Caller:
 
 def _ends(notices: list[Notice]) -> list[tuple[str, str, Executed]]:
     return [
-        (notice.outcome.id, notice.outcome.cause, notice.outcome.executed)
+        (notice.id, notice.cause, notice.executed)
         for notice in notices
-        if isinstance(notice, CallEnded)
+        if isinstance(notice, Outcome)
     ]
 
 
@@ -76,9 +71,9 @@ def test_a_run_from_accept_to_acknowledged_result() -> None:
     for message in (m.Accept("1"), m.Accept("1"), m.Feedback("1", 0.5, {"n": 1}), result, result):
         caller.receive(0.1, message)
     assert caller.notices() == [
-        CallAccepted("1"),
-        CallProgress("1", 0.5, {"n": 1}),
-        CallEnded(result),
+        Accept("1"),
+        Feedback("1", 0.5, {"n": 1}),
+        result,
     ]
     caller.messages(0.1)
     assert caller.due() is None, "a result that is not safe yet is not acknowledged"
@@ -206,7 +201,7 @@ def test_the_same_boot_is_sent_the_call_again_under_its_id_with_its_cancel() -> 
     caller.link_up(1.5, _welcome(runs=("1",)))
     again = [replace(call, again=True) for call in sent if isinstance(call, m.Call)]
     assert caller.messages(1.5) == [m.Subscribe(("tick",)), *again, m.Cancel("2", "not wanted")]
-    assert caller.notices()[1:] == [PeerBack("motion", "n1", True, ("move",), ("1",))]
+    assert caller.notices()[1:] == [_welcome(runs=("1",))]
 
 
 def test_another_boot_is_never_sent_what_the_first_was() -> None:
@@ -280,7 +275,7 @@ def test_who_waits_no_more_is_told_nothing_and_the_result_is_acknowledged_all_th
         caller.take_outcomes(0.1, [m.Outcome("1", "success")])
         assert m.ResultAck("1") in caller.messages(1.0)
     assert waiter.told == [] and caller.calls == 0
-    assert not any(isinstance(notice, CallEnded) for notice in caller.notices())
+    assert not any(isinstance(notice, Outcome) for notice in caller.notices())
 
 
 def test_very_many_results_at_once_are_acknowledged_in_messages_that_may_be_sent() -> None:
@@ -342,9 +337,7 @@ def test_a_call_cancelled_before_it_leaves_ends_at_once() -> None:
     assert caller.messages(0.2) == []
 
 
-def test_a_call_of_before_a_restart_is_cancelled_on_the_node_although_it_was_not_sent_again_yet() -> (
-    None
-):
+def test_a_call_of_before_a_restart_is_cancelled_before_it_is_sent_again() -> None:
     caller = _caller(up=False)
     caller.connecting(0.0)
     caller.call(0.0, m.Call("1", "move", boot="n1"))
@@ -395,16 +388,14 @@ def test_commands_are_answered_come_what_may() -> None:
         caller.command(0.0, m.Command(id_, "hold"))
     caller.receive(0.1, m.Answer("a", True, {"arm": "held"}))
     caller.receive(0.1, m.Answer("a", True, {"arm": "held"}))
-    assert caller.notices() == [CommandAnswered(m.Answer("a", True, {"arm": "held"}))]
+    assert caller.notices() == [m.Answer("a", True, {"arm": "held"})]
     assert caller.due() == 2.0
     caller.advance(2.0)
-    assert caller.notices() == [
-        CommandAnswered(m.Answer(id_, False, {"cause": "no_answer"})) for id_ in "bc"
-    ]
+    assert caller.notices() == [m.Answer(id_, False, {"cause": "no_answer"}) for id_ in "bc"]
     caller.command(3.0, m.Command("d", "hold"))
     caller.link_down(3.1, "cut")
     caller.command(3.2, m.Command("e", "hold"))
-    answers = [notice.answer for notice in caller.notices() if isinstance(notice, CommandAnswered)]
+    answers = [notice for notice in caller.notices() if isinstance(notice, Answer)]
     assert answers == [
         m.Answer("d", False, {"cause": "lost"}),
         m.Answer("e", False, {"cause": "unreachable"}),
@@ -419,7 +410,7 @@ def test_each_event_of_a_source_arrives_once_and_is_acknowledged_when_it_is_safe
     events = [m.Event("caught", "barrier", n) for n in (1, 2, 2, 1)]
     for event in events:
         caller.receive(0.0, event)
-    assert caller.notices() == [EventArrived(event) for event in events[:2]]
+    assert caller.notices() == events[:2]
     if not auto_ack:
         assert caller.messages() == []
         caller.acknowledge_event(0.1, events[1])
@@ -433,7 +424,7 @@ def test_each_event_of_a_source_arrives_once_and_is_acknowledged_when_it_is_safe
     caller.link_up(1.0, _welcome("n2"))
     caller.notices()
     caller.receive(1.0, events[0])
-    assert caller.notices() == [EventArrived(events[0])], "another boot counts anew"
+    assert caller.notices() == [events[0]], "another boot counts anew"
 
 
 def test_a_pulse_is_told_each_time() -> None:
@@ -441,7 +432,7 @@ def test_a_pulse_is_told_each_time() -> None:
     pulse = m.Event("tick", "timer", 0)
     caller.receive(0.0, pulse)
     caller.receive(0.0, pulse)
-    assert caller.notices() == [EventArrived(pulse)] * 2 and caller.messages() == []
+    assert caller.notices() == [pulse] * 2 and caller.messages() == []
 
 
 def test_lock_step_says_hello_by_itself() -> None:

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.comm.calls.callee import Callee, CancelOrder, Offer, Retention, StartOrder
-from petrobot.services.comm.calls.caller import CallEnded, Caller, LateResult, PeerBack
+from petrobot.services.comm.calls.callee import Callee, Offer, Retention
+from petrobot.services.comm.calls.caller import Caller, LateResult
 from petrobot.services.comm.protocol import messages as m
-from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.comm.protocol.messages import Executed, Outcome, Welcome
 
 COORD = "coord"
 DEVICES = 2
@@ -159,13 +159,13 @@ class World:
             self._orders()
             self._exchange(delay)
         for notice in self.caller.notices():
-            if isinstance(notice, CallEnded):
-                assert notice.outcome.id not in self.ended, "a call ended twice"
-                self.ended[notice.outcome.id] = notice.outcome
-                self.caller.acknowledge(self.now, notice.outcome.id)
+            if isinstance(notice, Outcome):
+                assert notice.id not in self.ended, "a call ended twice"
+                self.ended[notice.id] = notice
+                self.caller.acknowledge(self.now, notice.id)
             elif isinstance(notice, LateResult):
                 self.late.append(notice.outcome)
-            elif isinstance(notice, PeerBack):
+            elif isinstance(notice, Welcome):
                 self.known_boot = notice.boot
                 self._settle(notice.runs)
 
@@ -183,22 +183,24 @@ class World:
                 del self.runs[id_]
                 self.finished.add(id_)
                 self.callee.finish(
-                    self.now, id_, "success", {"seconds": run.call.arguments["seconds"]}
+                    self.now, m.Outcome(id_, "success", {"seconds": run.call.arguments["seconds"]})
                 )
 
     def _orders(self) -> None:
         for order in self.callee.orders():
-            if isinstance(order, StartOrder):
-                self._start(order.call)
-            elif isinstance(order, CancelOrder) and order.id in self.runs:
+            if isinstance(order, m.Call):
+                self._start(order)
+            elif isinstance(order, m.Cancel) and order.id in self.runs:
                 del self.runs[order.id]
                 self.callee.finish(
-                    self.now, order.id, "error", cause="cancelled", text=order.reason
+                    self.now, m.Outcome(order.id, "error", cause="cancelled", text=order.reason)
                 )
 
     def _start(self, call: m.Call) -> None:
         if any(run.call.service == call.service for run in self.runs.values()):
-            self.callee.finish(self.now, call.id, "error", cause="busy", executed=Executed.NO)
+            self.callee.finish(
+                self.now, m.Outcome(call.id, "error", cause="busy", executed=Executed.NO)
+            )
             return
         self.started[call.id] += 1
         self.runs[call.id] = ModelRun(self.now + call.arguments["seconds"], call)

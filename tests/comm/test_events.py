@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from petrobot.services.comm.calls.callee import Callee, Offer
-from petrobot.services.comm.calls.caller import Caller, EventArrived
+from petrobot.services.comm.calls.caller import Caller
 from petrobot.services.comm.calls.events import KEPT, EventBoard
 from petrobot.services.comm.protocol import messages as m
 
@@ -79,7 +79,7 @@ def test_an_event_of_a_run_goes_to_its_caller_and_is_gone_with_the_run() -> None
     assert event == m.Event("ball_lost", "motion", 1, {"at": 1}, "1")
     assert [to for to, message in callee.messages() if message == event] == ["coord"]
     callee.link_down(0.2, "coord")
-    callee.finish(0.3, "1", "success")
+    callee.finish(0.3, m.Outcome("1", "success"))
     callee.link_up(0.4, "coord", m.Hello(2, 2, "coordinator", "coord", "b"))
     assert _heard(callee, "coord") == [("ball_lost", 1)]
     callee.receive(0.5, "coord", m.ResultAck("1"))
@@ -146,9 +146,7 @@ def test_every_latched_event_arrives_once_and_in_order_of_its_source(
             caller.link_down(0.0, "cut")
 
     def take() -> None:
-        arrived.extend(
-            notice.event for notice in caller.notices() if isinstance(notice, EventArrived)
-        )
+        arrived.extend(notice for notice in caller.notices() if isinstance(notice, m.Event))
 
     for step in [*steps, "connect", "carry", "ack"]:
         if step.startswith("raise"):

@@ -16,19 +16,10 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm.calls.caller import (
-    CallAccepted,
-    CallEnded,
-    Caller,
-    LateResult,
-    Notice,
-    PeerBack,
-    PeerLost,
-)
+from petrobot.services.comm.calls.caller import Caller, LateResult, Notice, Patience, PeerLost
 from petrobot.services.comm.calls.client import Client
-from petrobot.services.comm.calls.pending import Patience
 from petrobot.services.comm.protocol import messages as m
-from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.comm.protocol.messages import Accept, Executed, Outcome, Welcome
 from petrobot.services.comm.streams.stream import Incoming, StreamReceiver
 from tests.comm.fault_parts import HOST, STREAM, Cable, LinkFault, first_line, inflict, part
 
@@ -67,7 +58,7 @@ class Told:
         assert await self.client.connected(LIMIT)
         self.caller.call(self.client.now(), m.Call("1", "move"))
         self.client.flush()
-        await self.until(CallAccepted)
+        await self.until(Accept)
 
 
 @pytest.mark.parametrize(
@@ -89,9 +80,9 @@ async def test_a_node_that_is_lost_is_named_and_its_run_ends_once_with_unknown(
         inflict(fault, process, cable)
         lost = await told.until(PeerLost)
         assert any(one in lost.reason for one in says), lost.reason
-        ended = (await told.until(CallEnded)).outcome
+        ended = await told.until(Outcome)
         assert (ended.status, ended.cause, ended.executed) == ("error", "lost", Executed.UNKNOWN)
-        assert told.order() == ["PeerBack", "CallAccepted", "PeerLost", "CallEnded"]
+        assert told.order() == ["Welcome", "Accept", "PeerLost", "Outcome"]
         await told.client.close()
         cable.close()
 
@@ -106,25 +97,25 @@ async def test_the_run_of_a_killed_node_ends_as_soon_as_its_port_refuses() -> No
         # Far longer than anything waits here: only the refusing port can end the run.
         told.caller._patience = told.caller._absence._patience = Patience(reconnect=2 * LIMIT)
         process.kill()
-        ended = (await told.until(CallEnded)).outcome
+        ended = await told.until(Outcome)
     assert (ended.cause, ended.executed) == (
         "lost",
         Executed.UNKNOWN,
     ) and "nothing listens" in ended.text
-    assert told.order() == ["PeerBack", "CallAccepted", "PeerLost", "CallEnded"]
+    assert told.order() == ["Welcome", "Accept", "PeerLost", "Outcome"]
     told.caller.call(told.client.now(), m.Call("2", "move"))
     told.client.flush()
-    late = (await told.until(CallEnded, 2)).outcome
+    late = await told.until(Outcome, 2)
     assert (late.cause, late.executed) == ("unreachable", Executed.NO)
     with part("node", str(port), "n2") as again:
         await asyncio.to_thread(first_line, again)
-        back = await told.until(PeerBack, 2)
-        assert not back.same_boot and back.runs == (), "nothing was sent to it"
+        back = await told.until(Welcome, 2)
+        assert back.boot == "n2" and back.runs == (), "nothing was sent to it"
         told.caller.call(told.client.now(), m.Call("3", "move"))
         told.client.flush()
-        await told.until(CallAccepted, 2)
+        await told.until(Accept, 2)
         await told.client.close()
-    assert told.order().count("CallEnded") >= 2, (
+    assert told.order().count("Outcome") >= 2, (
         "the first two once each; the third goes on until its caller leaves"
     )
 
@@ -138,9 +129,9 @@ async def test_a_broken_link_to_a_node_that_lives_keeps_its_run() -> None:
         for number in range(2, 12):
             assert told.client._link is not None
             told.client._link.cut("a fault")
-            back = await told.until(PeerBack, number)
-            assert back.same_boot and back.runs == ("1",)
-        assert "CallEnded" not in told.order()
+            back = await told.until(Welcome, number)
+            assert back.boot == (await told.until(Welcome)).boot and back.runs == ("1",)
+        assert "Outcome" not in told.order()
         await told.client.close()
 
 
@@ -149,15 +140,17 @@ async def test_a_node_that_thaws_is_back_and_stops_the_run_that_was_given_up() -
         told = Told(int(await asyncio.to_thread(first_line, process)))
         await told.begin()
         process.send_signal(signal.SIGSTOP)
-        await told.until(CallEnded)
+        await told.until(Outcome)
         process.send_signal(signal.SIGCONT)
-        back = await told.until(PeerBack, 2)
-        assert back.same_boot and back.runs == ("1",), "it never noticed, and the run goes on"
+        back = await told.until(Welcome, 2)
+        assert back.boot == (await told.until(Welcome)).boot and back.runs == ("1",), (
+            "it never noticed, and the run goes on"
+        )
         late = (await told.until(LateResult)).outcome
         assert (late.id, late.cause, late.executed) == ("1", "cancelled", Executed.YES), (
             "recorded, and moves nothing"
         )
-        assert told.order().count("CallEnded") == 1
+        assert told.order().count("Outcome") == 1
         await told.client.close()
 
 

@@ -185,8 +185,9 @@ def test_an_action_accept_result_and_at_most_once(hub: Hub) -> None:
     client = hub.coordinator()
     id_ = f"once {hub.count}"
     client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 5.0, 1)
-    assert client.hear() == [f.ACCEPT, id_]
     first = client.hear()
+    if first == [f.ACCEPT, id_]:  # left out when the result comes within 2 ms
+        first = client.hear()
     assert first[:4] == [f.RESULT, id_, "success", {"sum": 5}]
     client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 5.0, 1)
     assert client.hear() == first, "the same result, the seconds that it took included"

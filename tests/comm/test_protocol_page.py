@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from petrobot.services.comm.calls.callee import Retention
+from petrobot.services.comm.calls.caller import Patience
 from petrobot.services.comm.calls.link import LinkTiming
-from petrobot.services.comm.calls.pending import Patience
-from petrobot.services.comm.calls.runs import Retention
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.codec import LIMITS
 from tests.comm.conftest import KINDS

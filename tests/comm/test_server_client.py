@@ -7,10 +7,9 @@ import asyncio
 
 import pytest
 
-from petrobot.services.comm.calls.callee import CancelOrder, StartOrder
-from petrobot.services.comm.calls.caller import CallEnded, CommandAnswered, PeerBack, PeerLost
+from petrobot.services.comm.calls.caller import PeerLost
 from petrobot.services.comm.protocol import messages as m
-from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.comm.protocol.messages import Answer, Executed, Outcome, Welcome
 from petrobot.services.comm.protocol.security import KeyNeededError
 from tests.comm.ends import Coordinator, Node, until
 
@@ -23,13 +22,13 @@ async def test_a_service_and_an_action(node: Node, key: bytes | None) -> None:
     many = await asyncio.gather(*(coordinator.client.call("echo", {"n": n}) for n in range(200)))
     assert [one.values["n"] for one in many] == list(range(200))
     coordinator.call("1", "move", to=1)
-    start = await node.order(StartOrder)
-    assert start.call.id == "1"
+    start = await node.order(m.Call)
+    assert start.id == "1"
     callee = node.server.callee
     callee.feedback(node.server.now(), "1", 0.5)
-    callee.finish(node.server.now(), "1", "success", {"p": 1})
+    callee.finish(node.server.now(), m.Outcome("1", "success", {"p": 1}))
     node.server.flush()
-    assert (await coordinator.notice(CallEnded)).outcome.values == {"p": 1}
+    assert (await coordinator.notice(Outcome)).values == {"p": 1}
     coordinator.caller.acknowledge(coordinator.client.now(), "1")
     coordinator.client.flush()
     await until(lambda: not callee._results.of("coord"))
@@ -42,11 +41,11 @@ async def test_calls_of_several_clients_of_a_process_have_ids_of_their_own(open_
     await other.server.start("127.0.0.1", 0)
     first, second = open_node.client(), other.client()
     calls = [asyncio.ensure_future(one.client.call("move")) for one in (first, second)]
-    ids = {(await node.order(StartOrder)).call.id for node in (open_node, other)}
+    ids = {(await node.order(m.Call)).id for node in (open_node, other)}
     assert len(ids) == 2, "one of them is the parent or the key of something else"
     for call, node, told in zip(calls, (open_node, other), (first, second), strict=True):
         callee = node.server.callee
-        callee.finish(node.server.now(), next(iter(callee.running())), "success")
+        callee.finish(node.server.now(), Outcome(next(iter(callee.running())), "success"))
         node.server.flush()
         assert (await call).status == "success"
         await told.client.close()
@@ -61,7 +60,7 @@ async def test_a_command_and_an_event(open_node: Node) -> None:
     await open_node.order(object)
     open_node.server.callee.answer(open_node.server.now(), "k1", True, {"arm": "held"})
     open_node.server.flush()
-    assert (await coordinator.notice(CommandAnswered)).answer.data == {"arm": "held"}
+    assert (await coordinator.notice(Answer)).data == {"arm": "held"}
     await coordinator.client.close()
 
 
@@ -69,11 +68,11 @@ async def test_cancelling_the_future_cancels_the_call(open_node: Node) -> None:
     coordinator = open_node.client()
     assert await coordinator.client.connected(60.0)
     task = asyncio.ensure_future(coordinator.client.call("move"))
-    await open_node.order(StartOrder)
+    await open_node.order(m.Call)
     task.cancel()
-    cancel = await open_node.order(CancelOrder)
+    cancel = await open_node.order(m.Cancel)
     callee = open_node.server.callee
-    callee.finish(open_node.server.now(), cancel.id, "error", cause="cancelled")
+    callee.finish(open_node.server.now(), m.Outcome(cancel.id, "error", cause="cancelled"))
     open_node.server.flush()
     await until(lambda: not coordinator.caller.under_way())
     await until(lambda: not callee._results.of("coord"))
@@ -103,11 +102,11 @@ async def test_the_heart_keeps_an_idle_link_up_and_a_broken_one_comes_back(open_
     await until(lambda: link._pings + coordinator.client._link._pings >= 6)  # type: ignore[union-attr]
     assert not any(isinstance(notice, PeerLost) for notice in coordinator.notices)
     coordinator.call("1", "move")
-    await open_node.order(StartOrder)
+    await open_node.order(m.Call)
     link.cut("a fault")
-    back = await coordinator.notice(PeerBack, 2)
-    assert back.same_boot and back.runs == ("1",)
-    assert not any(isinstance(order, CancelOrder) for order in open_node.orders)
+    back = await coordinator.notice(Welcome, 2)
+    assert back.boot == (await coordinator.notice(Welcome)).boot and back.runs == ("1",)
+    assert not any(isinstance(order, m.Cancel) for order in open_node.orders)
     await coordinator.client.close()
 
 
@@ -115,9 +114,9 @@ async def test_a_run_whose_caller_is_gone_is_stopped(open_node: Node) -> None:
     coordinator = open_node.client()
     assert await coordinator.client.connected(60.0)
     coordinator.call("1", "move")
-    await open_node.order(StartOrder)
+    await open_node.order(m.Call)
     await coordinator.client.close()
-    assert (await open_node.order(CancelOrder)).reason == "orphan"
+    assert (await open_node.order(m.Cancel)).reason == "orphan"
 
 
 async def test_nobody_listens(open_node: Node) -> None:
@@ -128,7 +127,7 @@ async def test_nobody_listens(open_node: Node) -> None:
     coordinator.caller.call(coordinator.client.now(), m.Call("1", "echo"))
     coordinator.caller.advance(coordinator.client.now() + 2.0)
     coordinator.client.flush()
-    outcome = (await coordinator.notice(CallEnded)).outcome
+    outcome = await coordinator.notice(Outcome)
     assert (outcome.cause, outcome.executed) == ("unreachable", Executed.NO)
     await coordinator.client.close()
 

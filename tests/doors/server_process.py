@@ -56,7 +56,8 @@ def about(server: Server, deep: bool) -> dict[str, Any]:
     links = [one for one in gc.get_objects() if type(one).__name__ == "_ServerLink"] if deep else []
     fds = len(list(Path("/proc/self/fd").iterdir()))
     return {
-        "faults": server.faults, "links": len(links), "all": len(server._all), "opening": len(server._opening),
+        "faults": server.faults, "links": len(links), "all": len(server._all),
+        "opening": len(server._opening),
         "tasks": len(asyncio.all_tasks()), "connected": server.connected, "fds": fds,
     }  # fmt: skip
 

@@ -513,10 +513,20 @@ def beginnings() -> list[bytes]:
     """Good conversations to begin from: HELLO, then one message of each kind that a client may
     send."""
     said: list[m.Message] = [
-        m.Call("m/1", "echo", {"x": [1, 2.5, {"y": b"z"}]}, 2.0), m.ResultAck("m/1", ("m/2",)), m.Cancel("m/1", "why"),
-        m.EventAck("s", 3), m.Subscribe(("a", "b")), m.Command("c", "hold", "arm", {"run": "r"}), m.Ping(1), m.Tick(0),
-        m.StreamOpen("points", 0.02, "t"), m.SetPoint(1, (1.0, 2.0)), m.Withdraw(), m.Bye("x"), m.Refuse("c", "t"),
-    ]  # fmt: skip
+        m.Call("m/1", "echo", {"x": [1, 2.5, {"y": b"z"}]}, 2.0),
+        m.ResultAck("m/1", ("m/2",)),
+        m.Cancel("m/1", "why"),
+        m.EventAck("s", 3),
+        m.Subscribe(("a", "b")),
+        m.Command("c", "hold", "arm", {"run": "r"}),
+        m.Ping(1),
+        m.Tick(0),
+        m.StreamOpen("points", 0.02, "t"),
+        m.SetPoint(1, (1.0, 2.0)),
+        m.Withdraw(),
+        m.Bye("x"),
+        m.Refuse("c", "t"),
+    ]
     back: list[m.Message] = [
         m.Welcome(2, "v", "b", ("echo",)),
         m.Challenge(bytes(32)),

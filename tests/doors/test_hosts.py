@@ -79,13 +79,14 @@ from petrobot.services.comm.calls.client import Client
 
 async def main():
     hello = m.Hello(2, 2, "coordinator", "far", "f1", 1)
-    client = Client(sys.argv[1], int(sys.argv[2]), Caller("vision", hello, auto_ack=True), key=bytes.fromhex(sys.argv[3]))
+    caller, key = Caller("vision", hello, auto_ack=True), bytes.fromhex(sys.argv[3])
+    client = Client(sys.argv[1], int(sys.argv[2]), caller, key=key)
     client.start()
     async with asyncio.timeout(60):
         assert await client.connected(60)
         echo, tune = await client.call("echo", {"n": 1}), await client.call("tune", {"n": 1})
-    told = {"offers": client.caller.offers, "echo": echo.status, "tune": [tune.status, tune.cause, tune.executed]}
-    print(json.dumps(told))
+    tuned = [tune.status, tune.cause, tune.executed]
+    print(json.dumps({"offers": client.caller.offers, "echo": echo.status, "tune": tuned}))
     await client.close()
 
 asyncio.run(main())
@@ -135,8 +136,12 @@ def test_a_local_service_is_out_of_reach_for_another_host(
     ]
     far = subprocess.run(
         ["ip", "netns", "exec", namespace, *command],
-        env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False, timeout=120,
-    )  # fmt: skip
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
     assert far.returncode == 0, far.stderr
     told = json.loads(far.stdout)
     assert told == {

@@ -10,9 +10,9 @@ import pytest
 
 from petrobot.services.action import Status, success
 from petrobot.services.comm.location_file import ActionEntry
-from petrobot.services.comm.protocol.messages import Executed
-from petrobot.services.device import stop_at_once
-from petrobot.services.worker.process import COMMAND
+from petrobot.services.comm.protocol.messages import Call, Cancel, Command, Executed, Outcome
+from petrobot.services.device import Driver, stop_at_once
+from petrobot.services.node.inline_host import HOLD, RELEASE, answer_of
 from petrobot.services.worker.remote import (
     CLEAR_EMERGENCY,
     EMERGENCY_STOP,
@@ -21,15 +21,14 @@ from petrobot.services.worker.remote import (
     DeviceCommand,
 )
 from petrobot.services.worker.runner import GRACE, Runner
-from petrobot.services.worker.runs import Begin, Ended, Hold, Stop, Told, flat
 from tests.node.conftest import Clock, Device
 from tests.node.test_worker_place import Bench
 
 
-class Stopping:
+class Stopping(Driver):
     """A driver that counts its stops; `quick` gives it a quick stop of its own."""
 
-    period: float | None = 0.004
+    period = 0.004
 
     def __init__(self) -> None:
         self.did: list[str] = []
@@ -38,30 +37,9 @@ class Stopping:
         """Take any."""
         self.did.append(str(body["do"]))
 
-    def step(self, now: float) -> None:
-        """Nothing."""
-
-    def state(self) -> Mapping[str, Any]:
-        """Nothing."""
-        return {}
-
     def stop(self, now: float) -> None:
         """The stop routine."""
         self.did.append("stop")
-
-    def stopped(self) -> bool:
-        """Always."""
-        return True
-
-    def hold(self, now: float) -> str:
-        """Hold."""
-        return "held"
-
-    def release(self, now: float) -> None:
-        """Go on."""
-
-    def close(self) -> None:
-        """Nothing."""
 
 
 class QuickStopping(Stopping):
@@ -96,7 +74,7 @@ def test_a_stopped_driver_takes_no_command_until_it_is_cleared() -> None:
 
 def orders_to(child: Any) -> list[str]:
     """Verbs of the operator that a process was told."""
-    return [items[2] for items in child.got if items[0] == COMMAND]
+    return [item.verb for item in child.commands()]
 
 
 def test_the_driver_is_told_before_its_actions_are_stopped() -> None:
@@ -105,10 +83,10 @@ def test_the_driver_is_told_before_its_actions_are_stopped() -> None:
     driver, worker = bench.cyclic()
     bench.begin("r")
     bench.run(0.0)
-    bench.place.command(bench.clock.now, "e1", EMERGENCY_STOP)
+    bench.place.command(bench.clock.now, Command("e1", EMERGENCY_STOP))
     assert orders_to(driver) == [EMERGENCY_STOP]
-    (stop,) = [order for order in worker.orders() if isinstance(order, Stop)]
-    assert (stop.id, stop.cause) == ("r", EMERGENCY_STOP)
+    (stop,) = [order for order in worker.orders() if isinstance(order, Cancel)]
+    assert stop == Cancel("r", f"{EMERGENCY_STOP}: by command")
 
 
 def test_a_driver_that_dies_comes_back_stopped() -> None:
@@ -116,7 +94,7 @@ def test_a_driver_that_dies_comes_back_stopped() -> None:
     is not."""
     bench = Bench()
     driver, _ = bench.cyclic()
-    bench.place.command(bench.clock.now, "e1", EMERGENCY_STOP)
+    bench.place.command(bench.clock.now, Command("e1", EMERGENCY_STOP))
     driver.die()
     bench.run(20.0)
     again = bench.children[-1]
@@ -124,7 +102,7 @@ def test_a_driver_that_dies_comes_back_stopped() -> None:
     again.ready(0.004)
     assert orders_to(again) == [EMERGENCY_STOP]
     bench.children[-1].ready()
-    bench.place.command(bench.clock.now, "e2", CLEAR_EMERGENCY)
+    bench.place.command(bench.clock.now, Command("e2", CLEAR_EMERGENCY))
     again.die()
     bench.run(20.0)
     third = bench.children[-1]
@@ -137,28 +115,28 @@ def test_a_hold_ends_with_the_runs_that_it_held() -> None:
     unspent."""
     bench = Bench()
     driver, worker = bench.cyclic()
-    bench.begin("one", deadline=1.0)
+    bench.begin("one")
     bench.run(0.0)
-    bench.place.command(bench.clock.now, "h1", "hold")
-    driver.say(flat(Told("h1", "held", {})))
-    assert Hold(True) in worker.orders()
+    bench.place.command(bench.clock.now, Command("h1", "hold"))
+    driver.say(answer_of("h1", "held", {}))
+    assert HOLD in worker.orders()
     bench.run(5.0)
-    worker.say(flat(Ended("one", Status.ERROR, {}, "cancelled", "", Executed.YES, 5.0)))
+    worker.say(Outcome("one", Status.ERROR, {}, "cancelled", "", Executed.YES, 5.0))
     assert orders_to(driver) == ["hold", "release"]
-    assert worker.orders()[-1] == Hold(False)
-    bench.begin("two", deadline=1.0)
-    assert not [r for r in bench.run(0.9) if isinstance(r, Ended) and r.id == "two"]
+    assert worker.orders()[-1] == RELEASE
+    bench.begin("two")
+    assert not [r for r in bench.run(0.9) if isinstance(r, Outcome) and r.id == "two"]
 
 
 def test_a_hold_without_runs_stays_until_it_is_released() -> None:
     """Nothing ended, so nothing lets it go."""
     bench = Bench()
     driver, _ = bench.cyclic()
-    bench.place.command(bench.clock.now, "h1", "hold")
-    driver.say(flat(Told("h1", "held", {})))
+    bench.place.command(bench.clock.now, Command("h1", "hold"))
+    driver.say(answer_of("h1", "held", {}))
     bench.run(5.0)
     assert orders_to(driver) == ["hold"]
-    bench.place.command(bench.clock.now, "r1", "release")
+    bench.place.command(bench.clock.now, Command("r1", "release"))
     assert orders_to(driver) == ["hold", "release"]
 
 
@@ -177,16 +155,16 @@ def test_a_cancelled_run_of_a_held_device_calls_its_stop_routine() -> None:
             entries, clock=clock, device=device, substitutes={"move": move}, virtual=True
         )
         device.stops.clear()
-        runner.take(clock.now, Begin("r", "move", {}, None, 1))
+        runner.take(clock.now, Call("r", "move", {}, None, seed=1))
         runner.advance(clock.now)
         if held:
-            runner.take(clock.now, Hold(True))
-        runner.take(clock.now, Stop("r", "cancelled", "enough"))
+            runner.take(clock.now, HOLD)
+        runner.take(clock.now, Cancel("r", "cancelled: enough"))
         clock.now += GRACE + 0.01
         runner.advance(clock.now)
         runner.advance(clock.now)
         assert len(device.stops) == stops
-        (end,) = [report for report in runner.reports() if isinstance(report, Ended)]
+        (end,) = [report for report in runner.reports() if isinstance(report, Outcome)]
         assert end.cause == "cancelled"
 
 
@@ -205,7 +183,7 @@ def test_a_held_run_does_not_grow_older() -> None:
 
     entries = {"patient": ActionEntry("patient", "tests:none", "task", "here")}
     runner = Runner(entries, clock=clock, substitutes={"patient": patient}, virtual=True)
-    runner.take(clock.now, Begin("r", "patient", {}, 2.0, 1))
+    runner.take(clock.now, Call("r", "patient", {}, 2.0, seed=1))
 
     def go_on(seconds: float) -> list[Any]:
         until, told = clock.now + seconds, []
@@ -216,9 +194,9 @@ def test_a_held_run_does_not_grow_older() -> None:
         return told
 
     assert go_on(0.55) == []
-    runner.take(clock.now, Hold(True))
+    runner.take(clock.now, HOLD)
     assert go_on(30.0) == []
-    runner.take(clock.now, Hold(False))
+    runner.take(clock.now, RELEASE)
     (end,) = go_on(0.7)
-    assert isinstance(end, Ended) and end.status is Status.SUCCESS
+    assert isinstance(end, Outcome) and end.status is Status.SUCCESS
     assert end.seconds == pytest.approx(1.0, abs=0.15) and seen[-1] < 1.2

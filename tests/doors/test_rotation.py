@@ -22,10 +22,12 @@ pytestmark = pytest.mark.processes
 PASSES = {
     "shared key": ['file = "old"', 'file = "new"\nalso = "old"', 'file = "new"'],
     "certificates": [
-        'certificates = "old"', 'certificates = "old"\nalso = "new"', 'certificates = "new"\nalso = "old"',
+        'certificates = "old"',
+        'certificates = "old"\nalso = "new"',
+        'certificates = "new"\nalso = "old"',
         'certificates = "new"',
     ],
-}  # fmt: skip
+}
 """What stands under [keys], pass by pass; each host goes on to the next when all have done the one
 before."""
 

@@ -22,11 +22,11 @@ from petrobot.coordinator.engine import (
     Stimulus,
 )
 from petrobot.coordinator.task import (
-    Early,
+    EarlyEvent,
     Event,
+    EventMemory,
     Input,
     Kind,
-    Memory,
     Place,
     PrimitiveTask,
     Scope,
@@ -101,9 +101,12 @@ def _event(word: str) -> Event:
     if "<" in word:
         name, _, by = word.partition("<")
         return Event(name, Scope.INTERNAL, by=by)
-    memory = Memory.PULSE if word.isidentifier() else Memory.LATCHED
+    memory = EventMemory.PULSE if word.isidentifier() else EventMemory.LATCHED
     return Event(
-        word.rstrip("*+"), Scope.EXTERNAL, memory, Early.KEEP if word.endswith("+") else Early.DROP
+        word.rstrip("*+"),
+        Scope.EXTERNAL,
+        memory,
+        EarlyEvent.KEEP if word.endswith("+") else EarlyEvent.DROP,
     )
 
 

@@ -48,7 +48,7 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
         ),
         (
             "unsettled-conflict",
-            E,
+            W,
             "transitions.t",
             lambda t: t(
                 "x=1 y",
@@ -58,13 +58,13 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
         ),
         (
             "unsettled-conflict",
-            E,
+            W,
             "transitions.n",
             lambda t: t("a!=1 y", {**A, "m": {"in": "a:normal", "event": "e"}}, "e*"),
         ),
         (
             "unsettled-conflict",
-            E,
+            W,
             "transitions.t",
             lambda t: t(
                 "x=1 w=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "w", "event": "e"}}, "e*"
@@ -72,7 +72,7 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
         ),
         (
             "unsettled-conflict",
-            E,
+            W,
             "transitions.t",
             lambda t: t(
                 "x=1 w=1 y/1",
@@ -82,7 +82,7 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
         ),
         (
             "unsettled-conflict",
-            E,
+            W,
             "transitions.t",
             lambda t: t(
                 "x=1 w=1 y z", {"t": {"in": "x !z", "out": "y"}, "u": {"in": "w !y", "out": "z"}}
@@ -90,13 +90,13 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
         ),
         (
             "unsettled-conflict",
-            E,
+            W,
             "transitions.t",
             lambda t: t("a!2=2 x=1", {"t": {"in": "a:normal x"}, "u": {"in": "a:error x"}}),
         ),
         (
             "unsettled-conflict",
-            E,
+            W,
             "transitions.t",
             lambda t: t("x=1 y=2", {"t": {"in": "x !y*3"}, "u": {"in": "x y"}}),
         ),
@@ -110,7 +110,7 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
         ),
         (
             "unsettled-conflict",
-            E,
+            W,
             "transitions.t",
             lambda t: t(
                 "x=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "x", "event": "f"}}, "e+ f+"

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from petrobot.coordinator.task.conditions import (
-    Answer,
+    Certainty,
     ConditionError,
     ConditionFault,
     Domain,
@@ -68,7 +68,7 @@ def test_value(text: str, expected: bool) -> None:
         ("(a or b", 1, "not closed"),
         ("a)", 2, "not expected"),
         ("s == 'line", 6, "string is not closed"),
-        ("and a", 1, "no value"),
+        ("and a", 1, "neither a value nor a name"),
         ("n > 1e999", 5, "too large"),
         ("n > " + "9" * 50, 5, "more than 40"),
         ("a ;", 3, "no meaning"),
@@ -159,9 +159,9 @@ def test_kinds_that_fit(text: str) -> None:
 )
 def test_exclusive_and_covering(texts: list[str], apart: bool, cover: bool) -> None:
     conditions = [parse(t) for t in texts]
-    assert (exclusive(conditions, DOMAINS).answer is Answer.PROVED) is apart
+    assert (exclusive(conditions, DOMAINS).answer is Certainty.PROVED) is apart
     verdict = covering(conditions, DOMAINS)
-    assert (verdict.answer is Answer.PROVED) is cover
+    assert (verdict.answer is Certainty.PROVED) is cover
     if not cover:
         assert verdict.witness is not None
         assert not any(c.holds(verdict.witness) for c in conditions)
@@ -171,12 +171,12 @@ def test_too_many_regions_are_unknown() -> None:
     names = [f"x{i}" for i in range(9)]
     text = " and ".join(f"{n} > {i} and {n} < {i + 9}" for i, n in enumerate(names))
     domains = {n: Domain("float") for n in names}
-    assert exclusive([parse(text), parse(f"not ({text})")], domains).answer is Answer.UNKNOWN
+    assert exclusive([parse(text), parse(f"not ({text})")], domains).answer is Certainty.UNKNOWN
 
 
 def test_always_true_is_never_exclusive() -> None:
-    assert exclusive([None, parse("a")], DOMAINS).answer is Answer.REFUTED
-    assert covering([None], DOMAINS).answer is Answer.PROVED
+    assert exclusive([None, parse("a")], DOMAINS).answer is Certainty.REFUTED
+    assert covering([None], DOMAINS).answer is Certainty.PROVED
 
 
 @st.composite
@@ -218,8 +218,8 @@ def test_regions_agree_with_brute_force(texts: list[str]) -> None:
     compared."""
     parsed = [parse(t) for t in texts]
     truths: list[list[Any]] = [[c.holds(values) for c in parsed] for values in BRUTE]
-    assert (exclusive(parsed, SMALL).answer is Answer.PROVED) is all(sum(t) < 2 for t in truths)
-    assert (covering(parsed, SMALL).answer is Answer.PROVED) is all(any(t) for t in truths)
+    assert (exclusive(parsed, SMALL).answer is Certainty.PROVED) is all(sum(t) < 2 for t in truths)
+    assert (covering(parsed, SMALL).answer is Certainty.PROVED) is all(any(t) for t in truths)
 
 
 @settings(max_examples=300, deadline=None)

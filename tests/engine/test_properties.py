@@ -59,14 +59,14 @@ from petrobot.coordinator.engine import (
 from petrobot.coordinator.engine.state import ACTIVE
 from petrobot.coordinator.task import (
     Counts,
-    Early,
+    EarlyEvent,
     End,
     Event,
+    EventMemory,
     Executed,
     Inhibitor,
     Input,
     Kind,
-    Memory,
     Output,
     Place,
     PrimitiveTask,
@@ -96,9 +96,9 @@ CONDITIONS = (
 )
 DEVICES = {"x": "arm", "y": "camera", "z": "arm"}
 EVENTS = {
-    "tick": Event("tick", Scope.EXTERNAL, Memory.PULSE),
-    "flag": Event("flag", Scope.EXTERNAL, Memory.LATCHED),
-    "kept": Event("kept", Scope.EXTERNAL, Memory.LATCHED, Early.KEEP),
+    "tick": Event("tick", Scope.EXTERNAL, EventMemory.PULSE),
+    "flag": Event("flag", Scope.EXTERNAL, EventMemory.LATCHED),
+    "kept": Event("kept", Scope.EXTERNAL, EventMemory.LATCHED, EarlyEvent.KEEP),
     "seen": Event("seen", Scope.INTERNAL, by="p0"),
 }
 VARIABLES = {"b": Variable("b", VariableType.BOOL, False), "n": Variable("n", VariableType.INT, 0)}

@@ -279,6 +279,27 @@ def test_timer_starts_anew_after_its_own_firing(play: Plays) -> None:
     assert p.fired == ["late", "late"]
 
 
+def test_timer_starts_anew_when_a_firing_takes_its_token_and_gives_it_back(play: Plays) -> None:
+    """Between taking and giving the transition is not enabled, however short that is."""
+    net = {
+        "t": {"in": "x", "out": "x", "event": "e"},
+        "late": {"in": "x", "out": "z", "after": 9.0},
+        "other": {"in": "y", "out": "z", "after": 9.0},
+    }
+    p = play("x=1 y=1 z", net, events="e")
+    late, other = p.of(ArmTimer)
+    p(EventOccurred("e"))
+    assert p.fired == ["t"] and [d.key for d in p.of(DisarmTimer)] == [late.key]
+    again = p.of(ArmTimer)[2]
+    assert again.transition == "late" and again.key != late.key
+    p(TimerFired(late.key))
+    assert p.fired == ["t"], "the timer of the former token counts no more"
+    p(TimerFired(other.key))
+    assert p.fired == ["t", "other"], "a timer whose token was not touched runs on"
+    p(TimerFired(again.key))
+    assert p.fired == ["t", "other", "late"]
+
+
 def test_timer_belongs_to_the_run_that_it_would_take(play: Plays) -> None:
     net = {"t": {"in": "a:normal"}, "long": {"in": "a:preempt=failure", "out": "z", "after": 9.0}}
     p = play("a!2=2 z", net)

@@ -15,11 +15,11 @@ import pytest
 from petrobot.coordinator.run.folder import JOURNAL
 from petrobot.coordinator.run.journal import MAGIC, PREFIX, read_journal
 from petrobot.coordinator.task import Executed, Status
-from petrobot.services.comm.calls.caller import CallEnded, Caller, Notice
+from petrobot.services.comm.calls.callee import Retention
+from petrobot.services.comm.calls.caller import Caller, Notice
 from petrobot.services.comm.calls.client import Client
-from petrobot.services.comm.calls.runs import Retention
 from petrobot.services.comm.location_file import load
-from petrobot.services.comm.protocol.messages import Call, Hello
+from petrobot.services.comm.protocol.messages import Call, Hello, Outcome
 from tests.chaos.shuttle_cell import TASK, moves, shuttle_services
 from tests.integration.test_resume_processes import (
     NEVER_BEGUN,
@@ -44,7 +44,7 @@ async def _flood(node: str, port: int, ids: Callable[[int], str], calls: int) ->
 
     def count(_: float, notices: list[Notice]) -> None:
         nonlocal left
-        left -= sum(isinstance(notice, CallEnded) for notice in notices)
+        left -= sum(isinstance(notice, Outcome) for notice in notices)
         if left <= 0:
             over.set()
 

@@ -19,9 +19,8 @@ from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.run.realtime import RealtimeMission
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.coordinator.task import Executed, Status
-from petrobot.services.comm.calls.caller import CallProgress
 from petrobot.services.comm.location_file import load
-from petrobot.services.comm.protocol.messages import Command
+from petrobot.services.comm.protocol.messages import Command, Feedback
 from tests.integration.cell_files import services_file
 
 pytestmark = pytest.mark.processes
@@ -46,7 +45,7 @@ class When:
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Nothing to do."""
 
-    def progress(self, now: float, run: str, notice: CallProgress) -> None:
+    def progress(self, now: float, run: str, notice: Feedback) -> None:
         """Nothing to do."""
 
     def settled(self, now: float, state: State) -> None:

@@ -432,13 +432,16 @@ def test_what_actions_are_judged_by_is_kept(tmp_path: Path) -> None:
 
 SCHEMA_1 = """
 CREATE TABLE about(name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE tally(origin TEXT, primitive_task TEXT, action TEXT, context TEXT, version INTEGER NOT NULL, body TEXT NOT NULL,
+CREATE TABLE tally(origin TEXT, primitive_task TEXT, action TEXT, context TEXT,
+  version INTEGER NOT NULL, body TEXT NOT NULL,
   PRIMARY KEY(origin, primitive_task, action, context)) WITHOUT ROWID;
-CREATE TABLE flow(origin TEXT, task TEXT, transition_name TEXT, context TEXT, version INTEGER NOT NULL, body TEXT NOT NULL,
+CREATE TABLE flow(origin TEXT, task TEXT, transition_name TEXT, context TEXT,
+  version INTEGER NOT NULL, body TEXT NOT NULL,
   PRIMARY KEY(origin, task, transition_name, context)) WITHOUT ROWID;
 CREATE TABLE selector(primitive_task TEXT, name TEXT, trials REAL NOT NULL, state TEXT NOT NULL,
   PRIMARY KEY(primitive_task, name)) WITHOUT ROWID;
-CREATE TABLE forgotten(origin TEXT, primitive_task TEXT, PRIMARY KEY(origin, primitive_task)) WITHOUT ROWID;
+CREATE TABLE forgotten(origin TEXT, primitive_task TEXT,
+  PRIMARY KEY(origin, primitive_task)) WITHOUT ROWID;
 CREATE TABLE mission(id TEXT PRIMARY KEY, records INTEGER NOT NULL) WITHOUT ROWID;
 PRAGMA application_id = 1885697138;
 PRAGMA user_version = 1;

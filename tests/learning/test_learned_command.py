@@ -92,6 +92,29 @@ def petrobot(*more: str, runs: int = 6) -> tuple[int, dict[str, Any]]:
     return code, result
 
 
+def _uses_the_measurements(file: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Check that analyse, simulate, show and convert compute with a file instead of the task's own
+    estimates, and say so."""
+    capsys.readouterr()
+    task, more = str(TASK_FILE), ["--estimates", file]
+    main(["analyse", task, "--view", "gspn", "--json", "-"])
+    assert "forecast" not in json.loads(capsys.readouterr().out)  # the task declares no estimates
+    main(["analyse", task, "--view", "gspn", *more, "--json", "-"])
+    sources = json.loads(capsys.readouterr().out)["forecast"]["sources"]
+    assert any(text.startswith("measured in") and "in missions" in text for text in sources)
+    for command in (
+        ["simulate", task, *more, "--replicas", "20", "--json", "-"],
+        ["show", task, *more, "--heat"],
+        ["show", task, *more, "--view", "gspn"],
+        ["convert", task, "learned.pnpro", *more],
+    ):
+        assert main(command) in (0, 1)
+        said = capsys.readouterr().out
+        assert "measured in" in said or "--view" not in command
+    assert main(["analyse", "catch_ball", *more]) == 2
+    assert "nothing was measured of catch_ball" in capsys.readouterr().err
+
+
 def test_learning_goes_on_where_it_stood(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two runs in a row add up; a fresh file and the same seed give the same again."""
     learn = ("--learn", "learned.db", "--selector", "nikolic_fu_fast")
@@ -104,6 +127,7 @@ def test_learning_goes_on_where_it_stood(cell: Path, capsys: pytest.CaptureFixtu
     assert sum(t.runs + t.censored for t in kept.estimates.tallies.values()) == runs > 12
     assert kept.generation == 2
     assert kept.states("nikolic_fu_fast")["pick"]["learners"]["regime=A"]["k"] == 12
+    _uses_the_measurements("learned.db", capsys)
     _, again = petrobot("--learn", "other.db", "--selector", "nikolic_fu_fast")
     again["learned"]["file"] = first["learned"]["file"]
     assert again == first
@@ -412,7 +436,22 @@ def test_what_the_actions_come_to_in_the_task(
     assert 0 < found["R_goal"] < found["R_conj"], "a jam counts none, yet nothing is placed"
     assert found["P_complete"] == pytest.approx(1.0)
     assert found["cost"] is None, "seconds and tries do not add"
-    assert "every run a success" in capsys.readouterr().out
+    assert found["R_conj_interval"][0] < found["R_conj"] < found["R_conj_interval"][1]
+    told = capsys.readouterr().out
+    assert "every run a success" in told and "do not add: give --cost" in told
+    one = ["learned", "task", "learned.db", str(TASK_FILE), "--json", "task.json"]
+    assert main([*one, "--cost", "wall", "--rho", "0.25"]) == 0
+    same = json.loads(Path("task.json").read_text(encoding="utf-8"))
+    assert same["rho"] == 0.25 and same["cost_interval"][0] < same["cost"]
+    assert same["J"] == pytest.approx(1 - same["R_conj"] + 0.25 * same["cost"])
+    assert main(["learned", "show", "learned.db", "--cost", "wall", "--json", "shown.json"]) == 0
+    shown = json.loads(Path("shown.json").read_text(encoding="utf-8"))["primitive_tasks"]
+    mixed = {p["primitive_task"]: p["C"] for p in same["primitive_tasks"]}
+    costs = [a["C"] for a in shown["place"]["actions"]]
+    assert min(costs) <= mixed["place"] <= max(costs), "the same costs in both commands"
+    assert main([*one, "--cost", "value:nothing"]) == 2
+    assert main([*one, "--budget", "3"]) == 2
+    capsys.readouterr()
     assert main(["learned", "task", "learned.db"]) == 2
     assert main(["learned", "task", "learned.db", "no_such_task"]) == 2
     assert "which task?" in capsys.readouterr().err

@@ -265,3 +265,17 @@ def test_a_node_that_is_away_is_away_in_all_scenarios() -> None:
     found = compare({"act": {"calm": runs(9, 1), "storm": runs(0, 0, missing=10)}}, Question())
     assert found.of("act").availability == 0.5
     assert found.scenarios == ("calm",)
+
+
+def test_declared_costs_count_until_measurements_replace_them() -> None:
+    """They set rho and J from the first run on, and stand beside what was measured later."""
+    question = Question("value:energy", declared=(("a", 4.0), ("b", 1.0)))
+    ran = Tally().adding(Observation(Status.SUCCESS, 1.0))
+    found = compare({"a": {"": ran}, "b": {"": ran}, "c": {"": ran}}, question)
+    assert found.rho == 0.25 and found.best == "c"
+    assert [f.j for f in found.figures] == pytest.approx([1.0, 0.25, 0.0])
+    assert found.uncosted == ("c",)
+    measured = ran.adding(Observation(Status.SUCCESS, 1.0, values={"energy": 2.0}))
+    now = compare({"a": {"": measured}, "b": {"": ran}}, question)
+    assert (now.of("a").cost, now.of("a").declared_cost) == (2.0, 4.0)
+    assert now.of("b").cost == 1.0

@@ -4,7 +4,7 @@ cause, and the sorting task."""
 from __future__ import annotations
 
 from dataclasses import replace
-from math import exp
+from math import exp, hypot
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ from petrobot.coordinator.launch import with_runs
 from petrobot.coordinator.learning.estimate import Observation, Tally, TallyKey
 from petrobot.coordinator.learning.learner import LearningSelector
 from petrobot.coordinator.learning.learning import Estimates, Learning
+from petrobot.coordinator.learning.objective import Question, compare
 from petrobot.coordinator.learning.propagation import incidences, measured_from, propagate
 from petrobot.coordinator.task import Estimate, Executed, Status, Task
 from petrobot.coordinator.task.file import loads
@@ -103,7 +104,7 @@ def test_a_series_comes_to_the_conjunctive_product(
     found = propagate(task, estimates, choice=choice)
     assert found.conjunctive == pytest.approx(expected_r, abs=1e-9)
     assert found.product == pytest.approx(expected_r, abs=1e-9)
-    assert found.cost == pytest.approx(expected_c, rel=1e-9)
+    assert found.cost.value == pytest.approx(expected_c, rel=1e-9)
     assert found.forecast.mission_time == pytest.approx(expected_c, rel=1e-6)
 
 
@@ -132,8 +133,64 @@ out = ["a"]
     assert found.conjunctive == pytest.approx(0.75)
     assert found.complete == pytest.approx(1.0)
     assert found.parts["a"].runs == pytest.approx(4 / 3)
-    assert found.cost == pytest.approx(2.0 * 4 / 3)
+    assert found.cost.value == pytest.approx(2.0 * 4 / 3)
     assert found.forecast.mission_time == pytest.approx(2.0 * 4 / 3, rel=1e-6)
+
+
+def test_intervals_of_the_task_come_from_those_of_its_actions() -> None:
+    """A series of two: each R moves the product by the other one; costs have the error of means."""
+    rng = np.random.default_rng(5)
+    known = []
+    for good, bad in ((60, 20), (45, 5)):
+        one = Tally()
+        for i in range(good + bad):
+            status = Status.SUCCESS if i < good else Status.ERROR
+            one = one.adding(Observation(status, float(rng.uniform(1.0, 3.0))))
+        known.append(one)
+    estimates = Estimates({TallyKey(n, f"do_{n}"): t for n, t in zip("ab", known, strict=True)})
+    found = propagate(series(2), estimates)
+    (r1, r2), ((l1, u1), (l2, u2)) = (
+        [t.reliability for t in known],
+        [t.interval(0.95) for t in known],
+    )
+    assert found.reliability.value == pytest.approx(r1 * r2)
+    assert found.reliability.lower == pytest.approx(
+        r1 * r2 - hypot(r2 * (r1 - l1), r1 * (r2 - l2)), abs=1e-6
+    )
+    assert found.reliability.upper == pytest.approx(
+        r1 * r2 + hypot(r2 * (u1 - r1), r1 * (u2 - r2)), abs=1e-6
+    )
+    c1, c2 = (t.cost("wall") for t in known)
+    assert found.cost.value == pytest.approx(c1.mean + r1 * c2.mean)
+    own = 1.959964 * hypot(c1.deviation / 80**0.5, r1 * c2.deviation / 50**0.5)
+    more = c2.mean * (u1 - r1)  # the second action runs more often if the first is more reliable
+    assert found.cost.upper == pytest.approx(found.cost.value + hypot(own, more), rel=1e-5)
+    assert found.rho == pytest.approx(1 / found.cost.value)
+    assert found.j.value == pytest.approx(2 - r1 * r2)
+    assert found.j.lower < found.j.value < found.j.upper
+    cheap = propagate(series(2), estimates, rho=0.0)
+    assert cheap.j.value == pytest.approx(1 - r1 * r2)
+    assert cheap.j.upper == pytest.approx(1 - cheap.reliability.lower, abs=1e-6)
+
+
+def test_the_task_is_judged_in_its_hardest_scenario() -> None:
+    """R and C of a primitive task are those of `learned show`: the worst scenario, not the share of
+    all runs."""
+    estimates = Estimates(
+        {
+            TallyKey("a", "do_a", "calm"): tally(90, 0, 10, 1.0),
+            TallyKey("a", "do_a", "windy"): tally(5, 0, 5, 3.0),
+        }
+    )
+    question = Question("wall", rho=0.1)
+    found = propagate(series(1), estimates, questions={"a": question})
+    shown = compare(estimates.of("a"), question)
+    assert found.scenario == "windy" and found.conjunctive == pytest.approx(0.5)
+    assert found.parts["a"].reliability.value == shown.of("do_a").reliability == 0.5
+    assert found.parts["a"].cost.value == shown.of("do_a").cost == pytest.approx(3.0)
+    assert found.parts["a"].j == pytest.approx(shown.of("do_a").j) == pytest.approx(0.8)
+    calm = propagate(series(1), estimates, "calm")
+    assert calm.conjunctive == pytest.approx(0.9) and calm.cost.value == pytest.approx(1.0)
 
 
 def test_what_never_executed_takes_the_error_branch() -> None:
@@ -289,7 +346,7 @@ def test_the_forecast_of_a_learned_task_meets_its_runs() -> None:
     selector = LearningSelector(Learning(task, "round_robin"), seed=1)
     mission = run(task, selector, runs=n, seed=1)
     one, _ = with_runs(task, 1)
-    found = propagate(one, selector.learning.estimates, "regime=A", measure="wall")
+    found = propagate(one, selector.learning.estimates, "regime=A")
     fired = {k.transition: f.fired / n for k, f in selector.learning.estimates.flows.items()}
     for transition, share in fired.items():
         assert found.forecast.firings[transition] == pytest.approx(share, abs=0.02), transition

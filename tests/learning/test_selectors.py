@@ -452,3 +452,18 @@ def test_probabilities_of_what_is_offered() -> None:
     p = np.array([[0.5, 0.5, 0.0]])
     assert restricted(p, np.array([[True, False, True]])).tolist() == [[1.0, 0.0, 0.0]]
     assert restricted(p, np.array([[False, False, True]])).tolist() == [[0.0, 0.0, 1.0]]
+
+
+def test_declared_costs_count_from_the_first_trial() -> None:
+    """Of two actions that both succeed, the selector orders the one first that is declared cheaper;
+    a measured cost replaces the declared one, also after the state was saved and restored."""
+    question = Question("value:energy", declared=(("a", 4.0), ("b", 1.0)))
+    selector = RuleSelector(RULES["nikolic_fu"](), ("a", "b"), question)
+    for action in ("a", "b"):
+        selector.update("", action, Observation(Status.SUCCESS, 1.0))
+    assert selector.learner("").objective()[0].tolist() == [1.0, 0.25]
+    selector.update("", "a", Observation(Status.SUCCESS, 1.0, values={"energy": 0.5}))
+    again = RuleSelector(RULES["nikolic_fu"](), ("a", "b"), question)
+    again.restore(selector.state())
+    for one in (selector, again):
+        assert one.learner("").mean_cost()[0].tolist() == [0.5, 1.0]

@@ -1,4 +1,4 @@
-"""Interruption and T are told apart, and nothing is called an end that is none."""
+"""Interruptions and the T are told apart, and no other place is taken for an end."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Echoes become reflectors: through misses and false returns, wherever the rover is when it hears
-them."""
+"""Echoes become reflectors, in spite of missing and false returns, wherever the rover is when they
+arrive."""
 
 from __future__ import annotations
 

@@ -172,8 +172,8 @@ def blindly_on(yard: Yard, end: Odo, ahead: float) -> None:
 
 
 def test_a_rover_that_stands_beyond_the_gap_drives_on_and_not_back() -> None:
-    """It stands where a first attempt has ended: nearer to where the track resumes than where a
-    search goes to look."""
+    """It is where a first attempt has ended: nearer to the point where the track resumes than a
+    search would look."""
     yard, followed = gap_yard("s", reflector=False)
     line_end = Odo(*followed.values["line_end"])
     blindly_on(yard, line_end, 1.3)

@@ -70,7 +70,7 @@ class YardPorts:
         return self.receiver
 
     def raise_event(self, name: str, **data: Any) -> None:
-        """Nobody listens."""
+        """Ignore the event: no task waits for it."""
 
     def file(self, path: str) -> bytes:
         """The rover's numbers."""

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pybullet
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -67,6 +66,7 @@ def _urdf() -> str:
 
 
 def test_forward_agrees_with_pybullet(tmp_path: Path) -> None:
+    pybullet = pytest.importorskip("pybullet", exc_type=ImportError)
     file = tmp_path / "puma.urdf"
     file.write_text(_urdf(), encoding="utf-8")
     client = pybullet.connect(pybullet.DIRECT)

@@ -13,8 +13,9 @@ import pytest
 
 from petrobot.services.comm.location_file import ActionEntry
 from petrobot.services.comm.lockstep.party import TICK
-from petrobot.services.worker.runner import Runner
-from petrobot.services.worker.runs import Answered, Begin, Ended, Order, Report
+from petrobot.services.comm.protocol.messages import Call, Cancel, Outcome
+from petrobot.services.worker.context import Report
+from petrobot.services.worker.runner import Order, Runner
 
 OUTSIDE = Path(__file__).parent / "outside"
 """Stands for the folder of a laboratory's own packages."""
@@ -68,26 +69,34 @@ class Bench:
     runner: Runner
     seen: list[Report] = field(default_factory=list)
     begun: int = 0
+    deadlines: dict[str, float] = field(default_factory=dict)
+    """When each run is over its deadline, which its node watches and the bench stands for (s)."""
 
     def begin(
         self, action: str, deadline: float | None = None, seed: int = 1, **arguments: Any
     ) -> str:
         self.begun += 1
         identity = f"run{self.begun}"
-        self.runner.take(self.clock.now, Begin(identity, action, arguments, deadline, seed))
+        if deadline is not None:
+            self.deadlines[identity] = self.clock.now + deadline
+        self.runner.take(self.clock.now, Call(identity, action, arguments, deadline, seed=seed))
         return identity
 
     def take(self, order: Order) -> None:
         self.runner.take(self.clock.now, order)
 
     def answer(self, child: str, status: str = "success", **values: Any) -> None:
-        self.take(Answered(child, status, values))
+        self.take(Outcome(child, status, values))
 
     def tick(self, seconds: float = 0.0) -> list[Report]:
         """Advance now, then tick by tick for so many seconds; gives what was reported."""
         fresh: list[Report] = []
         until = self.clock.now + seconds
         while True:
+            for run, due in list(self.deadlines.items()):
+                if self.clock.now >= due - 1e-9:
+                    del self.deadlines[run]
+                    self.take(Cancel(run, "deadline: late"))
             self.runner.advance(self.clock.now)
             fresh += self.runner.reports()
             if self.clock.now >= until - 1e-9:
@@ -96,9 +105,9 @@ class Bench:
         self.seen += fresh
         return fresh
 
-    def ended(self, identity: str) -> Ended:
+    def ended(self, identity: str) -> Outcome:
         """How a run ended; it must have ended once."""
-        (end,) = [r for r in self.seen if isinstance(r, Ended) and r.id == identity]
+        (end,) = [r for r in self.seen if isinstance(r, Outcome) and r.id == identity]
         return end
 
 

@@ -166,7 +166,7 @@ FAULTS = [
         "[actions.beat]",
         "timers.beat: the name is taken by actions.beat; rename one of them",
     ),
-    ('task = "sum"\n', "", "actions.add.task: is missing; write the name of the primitive task"),
+    ('task = "sum"\n', "task = 3\n", "actions.add.task: is 3; write the name of the primitive"),
     (
         "deadline = 5",
         "deadline = 0",
@@ -255,11 +255,12 @@ def test_an_unreadable_file_raises_what_the_system_says(tmp_path: Path) -> None:
         ("json:JSONDecode", "'json' has no callable 'JSONDecode'; did you mean 'JSONDecoder'?"),
         (
             "jsonn:loads",
-            "cannot import 'jsonn' (No module named 'jsonn'); install its package on this host",
+            "cannot import 'jsonn' (No module named 'jsonn'); put it beside the location file",
         ),
         (
             "broken_driver:Driver",
-            "importing 'broken_driver' raises ZeroDivisionError: division by zero; correct the module",
+            "importing 'broken_driver' raises ZeroDivisionError: division by zero; correct the "
+            "module",
         ),
     ],
 )

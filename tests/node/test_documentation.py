@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.services.comm.calls.caller import CallEnded
 from petrobot.services.comm.location_file import load, verify_imports
 from petrobot.services.comm.lockstep.cell import LockStepCell
+from petrobot.services.comm.protocol.messages import Outcome
 from petrobot.services.node.lockstep import LockstepNode
 from petrobot.services.scripted import load as load_script
 from tests.node.test_lockstep import Coordinator
@@ -27,7 +27,7 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with all files of the pages."""
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
     blocks = re.findall(r"```(?:python|toml)\n# file: (\S+)\n(.*?)```", text, re.DOTALL)
-    assert len(blocks) == 6
+    assert len(blocks) == 7
     for name, text in blocks:
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
@@ -59,7 +59,7 @@ def test_the_pages_node_runs_its_action(files: Path, mocked: bool) -> None:
     coordinator = Coordinator(directory, [(2, "grip", {}), (400, "grip", {})])
     cell = LockStepCell([node, coordinator])
     cell.run(lambda: False, 800)
-    ends = [n.outcome for _, n in coordinator.heard if isinstance(n, CallEnded)]
+    ends = [n for _, n in coordinator.heard if isinstance(n, Outcome)]
     assert [(e.status, e.cause) for e in ends] == [
         ("failure", "empty") if mocked else ("success", ""),
         ("success", ""),

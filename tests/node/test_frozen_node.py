@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.cli import main
+from petrobot.services.comm.protocol.messages import Command
 from petrobot.services.host.emergency_latch import ALL, Latch, latch_of
 from petrobot.services.node.emergency_stops import AGAIN, BEAT, GUARD_LOOK, SILENCE, Guard
 from petrobot.services.worker.device_process import DeviceLoop
@@ -316,8 +317,20 @@ def test_a_driver_heeds_the_latch_while_its_node_beats(latch: Latch) -> None:
     link.send([1, "command", {"go": 1}])
     assert "emergency stop" in process.beat_until(link, lambda s: s[0] == 1)[1]
     latch.clear(["base"], ["base"])
-    process.node.post(["command", "c", "clear_emergency"])
+    process.node.post(Command("c", "clear_emergency"))
     process.beat_until(link, lambda s: s[5] == "")
+    link.close()
+    process.end()
+
+
+def test_a_driver_stops_when_its_node_is_frozen_before_its_first_beat(latch: Latch) -> None:
+    """A worker was attached, so the device can move: from then on the node's silence counts."""
+    driver = Moving()
+    process = Watched(driver, latch)
+    link = process.link()
+    link.send([1, "command", {"go": 1}])
+    stopped = states(link, lambda s: s[5] == NODE_SILENT and s[2])
+    assert stopped[0] == 1 and "stop" in driver.log
     link.close()
     process.end()
 

@@ -16,9 +16,8 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.cli import main
-from petrobot.services.comm.calls.caller import CallAccepted
 from petrobot.services.comm.location_file import Directory, parse
-from petrobot.services.comm.protocol.messages import Call
+from petrobot.services.comm.protocol.messages import Accept, Call
 from tests.node.conftest import OUTSIDE
 from tests.node.test_processes import PATIENCE, ROOT, Operator, operator_of
 from tests.ports import free_ports
@@ -155,7 +154,7 @@ async def test_a_stop_routine_that_raises_beside_its_action(
         {"send": [{"break": True}, {"go": True}], "seconds": 15.0},
     )
     running = asyncio.create_task(client.call("plain_stop", call.arguments))
-    await operator.heard(CallAccepted)
+    await operator.heard(Accept)
     await asyncio.sleep(0.3)
     await operator.command("only", "stop", "the_plain_stop")
     end = await asyncio.wait_for(running, PATIENCE)
@@ -170,7 +169,7 @@ async def test_a_hold_that_raises_ends_the_run(node: OneNode, operator: Operator
     running = asyncio.create_task(
         operator.call("hold", None, send=[{"go": True}, {"break": True}], seconds=15.0)
     )
-    await operator.heard(CallAccepted)
+    await operator.heard(Accept)
     await asyncio.sleep(0.3)
     await operator.command("only", "hold", "the_hold")
     end = await running
@@ -185,7 +184,7 @@ async def test_a_picture_that_raises_stops_nothing(node: OneNode, operator: Oper
     running = asyncio.create_task(
         operator.call("picture", None, send=[{"break": True}], seconds=1.0)
     )
-    await operator.heard(CallAccepted)
+    await operator.heard(Accept)
     await asyncio.sleep(0.3)
     answer = await operator.command("only", "picture", "the_picture")
     assert answer.data["devices"]["the_picture"].get("mime") is None
@@ -251,7 +250,7 @@ async def test_a_driver_that_blocks_is_named_at_the_deadline(
     node: OneNode, operator: Operator, capsys: pytest.CaptureFixture[str]
 ) -> None:
     running = asyncio.create_task(operator.call("good", 2.5, send=[{"block": 5.0}], seconds=60.0))
-    await operator.heard(CallAccepted)
+    await operator.heard(Accept)
     await asyncio.sleep(0.5)
     await asyncio.to_thread(main, ["nodes", "--services", str(node.file)])
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())

@@ -3,29 +3,21 @@ good."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import pytest
 
 from petrobot.services.comm.location_file import ServiceEntry
-from petrobot.services.comm.protocol.messages import Call, Executed
+from petrobot.services.comm.protocol.messages import Call, Event, Executed
 from petrobot.services.node.node import inline_service
-from petrobot.services.worker.runs import Judged
 
-EVENTS: list[tuple[str, str, Mapping[str, Any]]] = []
-VERDICTS: list[tuple[str, Judged]] = []
+EVENTS: list[Event] = []
 
 
 def _call(function: str, **arguments: Any) -> Any:
     EVENTS.clear()
-    VERDICTS.clear()
     entry = ServiceEntry("it", "here", f"toy_cell.actions:{function}")
-    answer = inline_service(
-        entry,
-        lambda service, name, data: EVENTS.append((service, name, data)),
-        lambda service, judged: VERDICTS.append((service, judged)),
-    )
+    answer = inline_service(entry, EVENTS.append)
     return answer(1.5, Call("c1", "it", arguments))
 
 
@@ -37,15 +29,16 @@ def test_its_values_are_plain_and_its_events_are_told() -> None:
         Executed.YES,
     )
     assert type(outcome.values["numbers"]) is list, "as its caller would see it over the wire"
-    assert EVENTS == [("it", "doubled", {"count": 2})]
+    assert [Event("doubled", "it", 0, {"count": 2})] == EVENTS
 
 
 def test_its_verdicts_are_told() -> None:
     """A service may judge as an action may: it is on nobody's device, and sees what all of them
     did."""
     assert _call("judge", run="m/pick#1").status == "success"
-    assert [("it", Judged("c1", "m/pick#1", "failure", "crooked"))] == VERDICTS
-    assert _call("judge", run="pick").cause == "exception" and VERDICTS == []
+    judged = {"run": "m/pick#1", "status": "failure", "cause": "crooked", "text": ""}
+    assert [Event("verdict:m", "it", 0, judged)] == EVENTS
+    assert _call("judge", run="pick").cause == "exception" and EVENTS == []
 
 
 @pytest.mark.parametrize(

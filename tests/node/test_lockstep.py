@@ -13,15 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.comm.calls.caller import (
-    CallAccepted,
-    CallEnded,
-    Caller,
-    CallProgress,
-    CommandAnswered,
-    EventArrived,
-    Notice,
-)
+from petrobot.services.comm.calls.caller import Caller, Notice
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.location_file import Directory, DirectoryError, parse
 from petrobot.services.comm.lockstep.cell import Delays, LockStepCell
@@ -32,7 +24,16 @@ from petrobot.services.comm.lockstep.channels import (
     read_images_wanted,
 )
 from petrobot.services.comm.lockstep.party import TICK, Envelope
-from petrobot.services.comm.protocol.messages import Call, Command, Hello
+from petrobot.services.comm.protocol.messages import (
+    Accept,
+    Answer,
+    Call,
+    Command,
+    Event,
+    Feedback,
+    Hello,
+    Outcome,
+)
 from petrobot.services.node.lockstep import LockstepNode
 
 CELL = """\
@@ -80,7 +81,11 @@ follow = { run = "toy_cell.actions:follow", task = "move", device = "slide" }
 look = { run = "toy_cell.actions:look", task = "see", device = "eye" }
 lead = { run = "toy_cell.actions:lead", task = "see", device = "eye" }
 add = { run = "toy_cell.actions:add", task = "sum", node = "NODE", compute_time = 0.1 }
-nap = { run = "toy_cell.actions:nap", task = "sum", node = "NODE", deadline = 1.0, orphan_time = 0.2 }
+nap.run = "toy_cell.actions:nap"
+nap.task = "sum"
+nap.node = "NODE"
+nap.deadline = 1.0
+nap.orphan_time = 0.2
 relay = { run = "toy_cell.actions:relay", task = "sum", node = "NODE" }
 swap = { run = "toy_cell.actions:swap", task = "sum", node = "NODE" }
 delegate = { run = "toy_cell.actions:delegate", task = "sum", node = "NODE" }
@@ -181,11 +186,7 @@ class Coordinator:
         ]
 
     def ended(self, identity: str) -> Any:
-        (end,) = [
-            n.outcome
-            for _, n in self.heard
-            if isinstance(n, CallEnded) and n.outcome.id == identity
-        ]
+        (end,) = [n for _, n in self.heard if isinstance(n, Outcome) and n.id == identity]
         return end
 
 
@@ -224,6 +225,27 @@ def test_an_action_on_a_cyclic_device() -> None:
     assert [f.id for f in bench.world.frames[:3]] == [0x181] * 3 and len(bench.world.frames) >= 490
 
 
+def test_a_stopped_device_starts_no_run_before_it_is_cleared() -> None:
+    """The run is refused before it begins, so nothing of it was executed. Devices of other nodes
+    work as before."""
+    bench = Bench(directory())
+    assert bench.call("go", 1.0, to=0.1).status == "success"
+    coordinator = bench.coordinator
+
+    def order(number: int, verb: str) -> None:
+        now = coordinator.tick * TICK
+        coordinator.callers["left"].command(now, Command(f"c/{number}", verb, "slide"))
+        bench.run(0.5)
+
+    order(1, "emergency_stop")
+    refused = bench.call("go", to=0.5)
+    assert (refused.status, refused.cause, refused.executed) == ("error", "emergency_stop", "no")
+    assert bench.call("look", images=1).status == "success"
+    order(2, "clear_emergency")
+    moved = bench.call("go", to=0.3)
+    assert (moved.status, moved.values["position"]) == ("success", pytest.approx(0.3))
+
+
 def test_images_come_from_the_laboratory_with_their_age() -> None:
     bench = Bench(directory())
     end = bench.call("look", images=3)
@@ -242,7 +264,7 @@ def test_set_points_go_from_one_device_to_another() -> None:
     end = bench.coordinator.ended("c2")
     assert end.values["count"] == 31 and 0.27 < end.values["position"] < 0.3
     assert bench.coordinator.ended("c1").status == "success"
-    (event,) = [n.event for _, n in bench.coordinator.heard if isinstance(n, EventArrived)]
+    (event,) = [n for _, n in bench.coordinator.heard if isinstance(n, Event)]
     assert (event.name, event.source, event.run, event.data) == (
         "led",
         "lead",
@@ -274,7 +296,7 @@ def test_watched_variables_are_told() -> None:
     bench = Bench(directory())
     bench.coordinator.callers["right"].subscribe(0.0, ["memory:sum"])
     bench.call("relay", a=4)
-    events = [n.event for _, n in bench.coordinator.heard if isinstance(n, EventArrived)]
+    events = [n for _, n in bench.coordinator.heard if isinstance(n, Event)]
     assert [(e.name, e.data) for e in events] == [
         ("memory:sum", {"name": "sum", "value": 6, "version": 1})
     ]
@@ -284,12 +306,12 @@ def test_watched_variables_are_told() -> None:
 def test_timers_pulse_for_those_who_listen() -> None:
     bench = Bench(directory())
     bench.run(0.5)
-    assert not [n for _, n in bench.coordinator.heard if isinstance(n, EventArrived)]
+    assert not [n for _, n in bench.coordinator.heard if isinstance(n, Event)]
     bench.coordinator.callers["right"].subscribe(0.5, ["beat"])
     bench.run(0.5)
-    ticks = [t for t, n in bench.coordinator.heard if isinstance(n, EventArrived)]
+    ticks = [t for t, n in bench.coordinator.heard if isinstance(n, Event)]
     assert 11 <= len(ticks) <= 13 and set(np.diff(ticks)) == {10}
-    numbers = {n.event.number for _, n in bench.coordinator.heard if isinstance(n, EventArrived)}
+    numbers = {n.number for _, n in bench.coordinator.heard if isinstance(n, Event)}
     assert numbers == {0}, "a pulse needs no acknowledgement"
 
 
@@ -346,12 +368,8 @@ def test_one_run_a_device_and_cancel() -> None:
 def test_feedback_and_events_reach_the_caller() -> None:
     bench = Bench(directory())
     end = bench.call("tell", name="hello")
-    kinds = [type(n) for _, n in bench.coordinator.heard if not isinstance(n, CallEnded)]
-    assert (
-        kinds.count(CallAccepted) == 1
-        and kinds.count(CallProgress) == 1
-        and kinds.count(EventArrived) == 1
-    )
+    kinds = [type(n) for _, n in bench.coordinator.heard if not isinstance(n, Outcome)]
+    assert kinds.count(Accept) == 1 and kinds.count(Feedback) == 1 and kinds.count(Event) == 1
     assert end.values["draw"] == Bench(directory("right")).call("tell", name="x").values["draw"]
 
 
@@ -362,9 +380,7 @@ def test_hold_stops_the_arm_and_its_run_but_not_the_eye() -> None:
     for peer, caller in bench.coordinator.callers.items():
         caller.command(bench.cell.now, Command(f"hold {peer}", "hold"))
     bench.run(3.0)
-    answers = {
-        n.answer.id: n.answer for _, n in bench.coordinator.heard if isinstance(n, CommandAnswered)
-    }
+    answers = {n.id: n for _, n in bench.coordinator.heard if isinstance(n, Answer)}
     assert answers["hold left"].ok and answers["hold left"].data["answers"] == {
         "slide": "held",
         "left": "held",
@@ -375,11 +391,7 @@ def test_hold_stops_the_arm_and_its_run_but_not_the_eye() -> None:
     )
     bench.coordinator.callers["left"].command(bench.cell.now, Command("s", "status", "slide"))
     bench.run(0.1)
-    status = next(
-        n.answer
-        for _, n in bench.coordinator.heard
-        if isinstance(n, CommandAnswered) and n.answer.id == "s"
-    )
+    status = next(n for _, n in bench.coordinator.heard if isinstance(n, Answer) and n.id == "s")
     assert status.data["devices"]["slide"]["runs"] == [first]
     assert 0.15 < status.data["devices"]["slide"]["state"]["position"] < 0.25
     bench.coordinator.callers["left"].command(bench.cell.now, Command("r", "release"))
@@ -398,7 +410,7 @@ def test_commands_that_mean_nothing(verb: str, target: str, cause: str) -> None:
     bench.run(0.05)
     bench.coordinator.callers["left"].command(bench.cell.now, Command("x", verb, target))
     bench.run(0.05)
-    (answer,) = [n.answer for _, n in bench.coordinator.heard if isinstance(n, CommandAnswered)]
+    (answer,) = [n for _, n in bench.coordinator.heard if isinstance(n, Answer)]
     assert not answer.ok and answer.data["cause"] == cause
 
 
@@ -467,23 +479,23 @@ def trace_of(coordinator: Coordinator) -> list[tuple[Any, ...]]:
     """All that a coordinator heard, with the tick, but for what belongs to a process."""
     rows: list[tuple[Any, ...]] = []
     for tick, notice in coordinator.heard:
-        if isinstance(notice, CallEnded):
-            o = notice.outcome
+        if isinstance(notice, Outcome):
+            o = notice
             values = {k: v for k, v in o.values.items() if k != "pid"}
             rows.append(
                 (tick, o.id, o.status, repr(values), o.cause, o.executed, round(o.seconds, 9))
             )
-        elif isinstance(notice, EventArrived):
+        elif isinstance(notice, Event):
             rows.append(
                 (
                     tick,
-                    notice.event.source,
-                    notice.event.name,
-                    notice.event.number,
-                    repr(notice.event.data),
+                    notice.source,
+                    notice.name,
+                    notice.number,
+                    repr(notice.data),
                 )
             )
-        elif isinstance(notice, CallAccepted | CallProgress):
+        elif isinstance(notice, Accept | Feedback):
             rows.append((tick, notice.id, type(notice).__name__))
     return sorted(rows, key=repr)
 

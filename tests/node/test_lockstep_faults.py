@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 
 from petrobot.services.comm.location_file import ActionEntry
+from petrobot.services.comm.protocol.messages import Answer, Call, Command, Outcome
 from petrobot.services.node import watchdog
-from petrobot.services.node.inline_host import InlinePlace
+from petrobot.services.node.inline_host import InlineHost
 from petrobot.services.node.watchdog import Watchdog
-from petrobot.services.worker.runs import Begin, Ended, Told
 from tests.node.conftest import OUTSIDE, Clock
 from tests.node.test_heard import FAULTS
 from tests.node.test_processes import PATIENCE, ROOT
@@ -47,26 +47,26 @@ class Inline:
         self.clock = Clock()
         self.driver = drivers.Broken({"breaks": breaks, "period": TICK}, Ports())
         entry = ActionEntry("order", "tests:none", "task", "here", "it")
-        self.place = InlinePlace(
+        self.place = InlineHost(
             {"order": entry},
             clock=self.clock,
             driver=self.driver,
             substitutes={"order": getattr(actions, action)},
             virtual=True,
         )
-        self.ends: list[Ended] = []
-        self.told: list[Told] = []
+        self.ends: list[Outcome] = []
+        self.told: list[Answer] = []
         self._begun = 0
 
-    def run(self, **arguments: Any) -> Ended:
+    def run(self, **arguments: Any) -> Outcome:
         """Begin a run, and give its end."""
         self._begun += 1
         identity = f"run{self._begun}"
-        self.place.take(self.clock.now, Begin(identity, "order", arguments, 5.0))
+        self.place.take(self.clock.now, Call(identity, "order", arguments, 5.0))
         for _ in range(2_000):
             self.place.advance(self.clock.now)
             for report in self.place.reports():
-                (self.ends if isinstance(report, Ended) else self.told).append(report)  # type: ignore[arg-type]
+                (self.ends if isinstance(report, Outcome) else self.told).append(report)  # type: ignore[arg-type]
             if self.ends and self.ends[-1].id == identity:
                 return self.ends[-1]
             self.clock.now += TICK
@@ -87,9 +87,9 @@ def test_what_a_driver_raises_is_its_runs_error(
     )
     again = inline.run(send=[], seconds=0.1)
     assert (again.cause, again.executed) == ("not_ready", "no") and FAULTS[breaks] in again.text
-    inline.place.command(inline.clock.now, "c", "status")
-    told = [report for report in inline.place.reports() if isinstance(report, Told)]
-    assert told[0].answer == "not ready" and FAULTS[breaks] in told[0].data["text"]
+    inline.place.command(inline.clock.now, Command("c", "status"))
+    told = [report for report in inline.place.reports() if isinstance(report, Answer)]
+    assert told[0].data["answer"] == "not ready" and FAULTS[breaks] in told[0].data["text"]
     inline.place.close(inline.clock.now)
 
 
@@ -97,13 +97,15 @@ def test_what_a_driver_raises_is_its_runs_error(
 def test_an_order_that_the_driver_fails_on(verb: str) -> None:
     inline = Inline(verb)
     inline.place.take(
-        0.0, Begin("r", "order", {"send": [{"go": True}, {"break": True}], "seconds": 3.0}, 5.0)
+        0.0, Call("r", "order", {"send": [{"go": True}, {"break": True}], "seconds": 3.0}, 5.0)
     )
     inline.place.advance(0.0)
-    inline.place.command(0.0, "c", verb)
+    inline.place.command(0.0, Command("c", verb))
     reports = inline.place.reports()
     assert [
-        (r.cause, f"nothing is right in {verb}" in r.text) for r in reports if isinstance(r, Ended)
+        (r.cause, f"nothing is right in {verb}" in r.text)
+        for r in reports
+        if isinstance(r, Outcome)
     ] == [("device_died", True)]
 
 
@@ -161,8 +163,10 @@ RUN = textwrap.dedent("""\
     from pathlib import Path
     file = Path(sys.argv[1])
     node = LockstepNode(parse(file.read_text(), file), "only")
-    node.receive(0.0, Envelope("only", "coordinator", "only", "call", Hello(2, 2, "coordinator", "coordinator", "b", 1)))
-    node.receive(0.0, Envelope("only", "coordinator", "spin", "call", Call("m/p#1", "spin", epoch=1)))
+    hello = Hello(2, 2, "coordinator", "coordinator", "b", 1)
+    node.receive(0.0, Envelope("only", "coordinator", "only", "call", hello))
+    call = Call("m/p#1", "spin", epoch=1)
+    node.receive(0.0, Envelope("only", "coordinator", "spin", "call", call))
     for tick in range(100):
         node.advance(tick * 0.004)
         for envelope in node.drain():
@@ -230,7 +234,7 @@ def test_ctrl_c_of_a_person_is_not_taken_for_the_actions(by: str) -> None:
         raise KeyboardInterrupt
 
     inline = Inline("")
-    inline.place = InlinePlace(
+    inline.place = InlineHost(
         {"order": ActionEntry("order", "tests:none", "task", "here", "")},
         clock=inline.clock,
         substitutes={"order": act},

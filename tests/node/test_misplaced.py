@@ -11,7 +11,8 @@ import pytest
 
 from petrobot.coordinator.cli import main
 from petrobot.services.comm.location_file import DirectoryError, load, parse
-from petrobot.services.comm.location_file.host_checks import is_loopback, misplaced
+from petrobot.services.comm.location_file.host_checks import misplaced
+from petrobot.services.comm.protocol.security import is_loopback
 
 SHIPPED = Path(__file__).parents[2] / "services.toml"
 VISION = 'host = "127.0.0.1"\nport = 7301'

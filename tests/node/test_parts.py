@@ -23,28 +23,33 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from petrobot.services.action import Context, Result, Status, failure, provisional, success
 from petrobot.services.comm.location_file import ActionEntry
+from petrobot.services.comm.protocol.messages import (
+    Answer,
+    Call,
+    Cancel,
+    Command,
+    Executed,
+    Outcome,
+)
+from petrobot.services.device import Driver
 from petrobot.services.host.parent_death import until_ended
 from petrobot.services.node import memory as memory_module
-from petrobot.services.node.inline_host import InlinePlace
-from petrobot.services.node.memory import Memory, event_name
-from petrobot.services.node.node import Timers
+from petrobot.services.node.inline_host import HOLD, InlineHost, answer_of
+from petrobot.services.node.memory import GlobalMemory, event_name
+from petrobot.services.node.node import EventTimers
 from petrobot.services.rehearsal import StillRunningError, rehearse
 from petrobot.services.scripted import ScriptError, load
 from petrobot.services.worker.device_process import LINKED, DeviceLoop
-from petrobot.services.worker.outlets import Outlets
-from petrobot.services.worker.pipe import Counter, NewestLink, Pipe, counter_memory, link_pair
-from petrobot.services.worker.remote import CyclicDriver, DeviceCommand, RemoteDriver
-from petrobot.services.worker.runs import (
-    Answered,
-    Begin,
-    Ended,
-    Hold,
-    Sent,
-    Stop,
-    Told,
-    flat,
-    record,
+from petrobot.services.worker.outlets import Outlets, Sent
+from petrobot.services.worker.pipe import (
+    MALFORMED,
+    Counter,
+    NewestLink,
+    Pipe,
+    counter_memory,
+    link_pair,
 )
+from petrobot.services.worker.remote import CyclicDriver, DeviceCommand, RemoteDriver
 from petrobot.services.worker.setpoints import SetpointReceiver
 from tests.node.conftest import Clock
 from tests.waiting import Limit
@@ -70,7 +75,9 @@ class MemoryMachine(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.told: list[tuple[str, Any, int]] = []
-        self.memory = Memory(lambda name, value, version: self.told.append((name, value, version)))
+        self.memory = GlobalMemory(
+            lambda name, value, version: self.told.append((name, value, version))
+        )
         self.model: dict[str, tuple[Any, int]] = {}
         self.writes = 0
 
@@ -135,14 +142,14 @@ TestMemory.settings = settings(max_examples=25, stateful_step_count=25, deadline
     ],
 )
 def test_the_memory_refuses(service: str, arguments: dict[str, Any], cause: str, says: str) -> None:
-    result = Memory(lambda *_: None).call(service, arguments)
+    result = GlobalMemory(lambda *_: None).call(service, arguments)
     assert (result.status, result.cause) == (Status.ERROR, cause) and says in result.text
 
 
 def test_the_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory_module, "VARIABLES", 3)
     monkeypatch.setattr(memory_module, "TOTAL_BYTES", 1000)
-    memory = Memory(lambda *_: None)
+    memory = GlobalMemory(lambda *_: None)
     for name in "abc":
         assert (
             memory.call("memory.put", {"name": name, "value": bytes(300)}).status is Status.SUCCESS
@@ -161,7 +168,7 @@ def test_the_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     steps=st.lists(st.floats(0.001, 0.5), min_size=1, max_size=60),
 )
 def test_timers_lie_on_an_absolute_grid(period: float, steps: list[float]) -> None:
-    timers, now, fired = Timers({"beat": period}), 10.0, 0
+    timers, now, fired = EventTimers({"beat": period}), 10.0, 0
     timers.advance(now)
     for step in steps:
         now += step
@@ -179,7 +186,7 @@ def test_timers_lie_on_an_absolute_grid(period: float, steps: list[float]) -> No
 
 
 def test_timers_that_there_are_none_of() -> None:
-    timers = Timers({})
+    timers = EventTimers({})
     assert timers.advance(1.0) == [] and timers.due() is None
 
 
@@ -238,7 +245,7 @@ def test_a_set_point_ages_and_goes_stale() -> None:
 # --- remote driver ----------------------------------------------------------------------------
 
 
-class Stub:
+class Stub(Driver):
     """A driver that writes down what it is told."""
 
     period: float | None = 0.004
@@ -303,45 +310,51 @@ def test_commands_are_numbered_taken_in_order_and_answered_for() -> None:
 @pytest.mark.parametrize(
     "what",
     [
-        Begin("r", "act", {"a": [1, {"b": b"x"}]}, 1.5, 3),
-        Stop("r", "deadline", "late"),
-        Answered("r/1", "success", {"x": 1}),
-        Hold(True),
-        Ended("r", "error", {}, "lost", "text", "no", 0.5, 0.1),
-        Told("c", "held", {"q": [0.0]}),
+        Call("r", "act", {"a": [1, {"b": b"x"}]}, 1.5, seed=3),
+        Cancel("r", "deadline: late"),
+        Outcome("r/1", "success", {"x": 1}),
+        HOLD,
+        Outcome("r", "error", {}, "lost", "text", Executed.NO, 0.5, 0.1),
+        answer_of("c", "held", {"q": [0.0]}),
     ],
 )
-def test_records_cross_a_socket(what: Any) -> None:
+def test_messages_cross_a_socket(what: Any) -> None:
     near, far = socket.socketpair()
     a, b = Pipe(near), Pipe(far)
-    a.post(flat(what))
-    assert [record(items) for items in b.read()] == [what]
+    a.post(what)
+    assert b.read() == [what]
     a.close()
     assert b.read() == [] and b.closed
     b.close()
 
 
-@pytest.mark.parametrize("items", [[], ["nothing"], ["begin", 1], ["stop", 1, 2, 3, 4]])
-def test_what_is_no_record_is_refused(items: list[Any]) -> None:
-    with pytest.raises(ValueError, match="not a record"):
-        record(items)
+@pytest.mark.parametrize("items", [[4, 1], [999, "x"], [True], [7, "r", "success", {}, "", "", 1]])
+def test_a_list_that_is_no_message_becomes_a_word_after_what_came_before(items: list[Any]) -> None:
+    near, far = socket.socketpair()
+    a, b = Pipe(near), Pipe(far)
+    a.post(["before"])
+    a.post(items)
+    first, word = b.read()
+    assert first == ["before"] and isinstance(word, list) and word[0] == MALFORMED
+    a.close()
+    b.close()
 
 
 def test_a_pipe_keeps_what_does_not_fit() -> None:
     near, far = socket.socketpair()
     a, b = Pipe(near), Pipe(far)
     for n in range(40):
-        a.post([n, bytes(100_000)])
+        a.post(["n", n, bytes(100_000)])
     assert bool(a.unsent)
     got: list[int] = []
     limit = Limit("40 items")
     while len(got) < 40 and limit.left():
-        got += [items[0] for items in b.read()]
+        got += [items[1] for items in b.read() if isinstance(items, list)]
         a.flush()
     assert (got, a.unsent) == (list(range(40)), False)
     b.close()
-    a.post([1])
-    a.post([2])
+    a.post(["1"])
+    a.post(["2"])
     assert a.closed
     a.close()
 
@@ -351,7 +364,7 @@ def test_last_words_are_read_although_the_other_end_takes_nothing_more() -> None
     a, b = Pipe(near), Pipe(far)
     b.post(["last", "words"])
     b.close()
-    a.post([1])
+    a.post(["1"])
     assert a.closed and a.read() == [["last", "words"]]
     a.close()
 
@@ -403,16 +416,16 @@ async def test_the_end_of_a_process_is_noticed_whoever_holds_its_pipe(
 def test_a_hold_ends_with_runs_that_were_stopped_before_they_began(by: str) -> None:
     clock = Clock()
     entry = ActionEntry("act", "tests:none", "task", "here")
-    place = InlinePlace({"act": entry}, clock=clock, substitutes={"act": lambda ctx: success()})
-    place.command(0.0, "h", "hold")
-    place.take(0.0, Begin("held", "act"))
+    place = InlineHost({"act": entry}, clock=clock, substitutes={"act": lambda ctx: success()})
+    place.command(0.0, Command("h", "hold"))
+    place.take(0.0, Call("held", "act"))
     if by == "order":
-        place.take(0.0, Stop("held"))
+        place.take(0.0, Cancel("held"))
     else:
-        place.command(0.0, "s", "stop")
-    place.take(0.0, Begin("next", "act"))
+        place.command(0.0, Command("s", "stop"))
+    place.take(0.0, Call("next", "act"))
     place.advance(0.0)
-    ends = {report.id: report.status for report in place.reports() if isinstance(report, Ended)}
+    ends = {report.id: report.status for report in place.reports() if isinstance(report, Outcome)}
     assert ends == {"held": "error", "next": "success"}
 
 
@@ -615,13 +628,14 @@ class Process:
         self.node.post([LINKED])
         return NewestLink(near)
 
-    def told(self) -> list[Any]:
+    def told(self) -> Answer:
         """The next that the loop says to its node."""
         limit = Limit("a word of the loop")
         while True:
             limit.left()
             select.select([self.node], [], [], 10.0)
             if items := self.node.read():
+                assert isinstance(items[0], Answer)
                 return items[0]
 
     def end(self) -> None:
@@ -652,8 +666,9 @@ def test_the_driver_is_stopped_when_its_worker_dies() -> None:
     link.send([1, "command", {"go": 1}])
     assert states(link, lambda s: s[0] == 1)[2] is False, "it does not say that it moves"
     link.close()
-    process.node.post(["command", "h", "halt"])
-    assert process.told()[:3] == ["told", "h", "stopped"]
+    process.node.post(Command("h", "halt"))
+    told = process.told()
+    assert (told.id, told.data["answer"]) == ("h", "stopped")
     second = process.link()
     assert states(second, lambda s: True)[0] == 0, "the new worker's commands are counted from 1"
     second.close()
@@ -676,7 +691,7 @@ def test_the_driver_is_stopped_before_the_process_leaves_a_dead_node() -> None:
 )
 def test_the_node_commands_the_driver_itself(verb: str, answer: str) -> None:
     process = Process(Moving())
-    process.node.post(["command", "c", verb])
+    process.node.post(Command("c", verb))
     told = process.told()
-    assert told[:3] == ["told", "c", answer] and told[3]["state"] == {"n": 0}
+    assert (told.id, told.data["answer"], told.data["state"]) == ("c", answer, {"n": 0})
     process.end()

@@ -24,7 +24,6 @@ from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.codec import ProtocolError, decode, encode
 from petrobot.services.worker.context import checked, checked_result
 from petrobot.services.worker.pipe import Pipe
-from petrobot.services.worker.runs import Ended, flat, record
 from tests.node.conftest import Bench
 from tests.node.test_heard import OneNode
 from tests.node.test_processes import Operator, operator_of
@@ -128,15 +127,15 @@ def test_many_large_records_at_once() -> None:
     worker, node = Pipe(near), Pipe(far)
     large = bytes(15 << 20)
     for number in range(6):
-        worker.post([number, large])
+        worker.post(["large", number, large])
     writing = threading.Thread(target=lambda: flush_all(worker))
     writing.start()
     got: list[list[Any]] = []
     until = time.monotonic() + 60.0
     while len(got) < 6 and time.monotonic() < until:
-        got += node.read()
+        got += [item for item in node.read() if isinstance(item, list)]
     writing.join(60.0)
-    assert [(number, data == large) for number, data in got] == [
+    assert [(number, data == large) for _, number, data in got] == [
         (number, True) for number in range(6)
     ]
     worker.close()
@@ -247,11 +246,11 @@ def test_a_result_crosses_unchanged_or_is_refused_where_it_is_made(
         return
     near, far = socket.socketpair()
     worker, node = Pipe(near), Pipe(far)
-    worker.post(flat(Ended("m/p#1", made.status, made.values, made.cause, made.text)))
-    (ended,) = [record(items) for items in node.read()]
+    worker.post(m.Outcome("m/p#1", made.status, made.values, made.cause, made.text))
+    (ended,) = node.read()
     worker.close()
     node.close()
-    assert isinstance(ended, Ended)
+    assert isinstance(ended, m.Outcome)
     sent = m.Outcome(ended.id, ended.status, ended.values, ended.cause, ended.text)
     got = decode(encode(sent))
     assert isinstance(got, m.Outcome)

@@ -13,19 +13,11 @@ from hypothesis import strategies as st
 
 from petrobot.services.action import Cancelled, Context, Result, error, failure, success
 from petrobot.services.comm.lockstep.party import TICK
+from petrobot.services.comm.protocol.messages import Call, Cancel, Event, Feedback, Outcome
+from petrobot.services.node.inline_host import HOLD, RELEASE
 from petrobot.services.worker.context import CallFailed
+from petrobot.services.worker.outlets import Sent
 from petrobot.services.worker.runner import GRACE, STOP_LIMIT, Runner
-from petrobot.services.worker.runs import (
-    Asked,
-    Begin,
-    Dropped,
-    Ended,
-    Hold,
-    Progressed,
-    Raised,
-    Sent,
-    Stop,
-)
 from tests.node.conftest import Bench, Clock, Device
 
 Make = Callable[..., Bench]
@@ -222,7 +214,7 @@ def test_a_cancelled_action_cleans_up_and_its_device_comes_to_rest(bench: Make, 
     run = b.begin("act", 0.2 if why == "deadline" else None)
     b.tick(0.2)
     if why == "cancelled":
-        b.take(Stop(run))
+        b.take(Cancel(run))
     b.tick(1.0)
     end = b.ended(run)
     assert (end.status, end.cause, end.executed, log) == ("error", why, "yes", ["brake"])
@@ -245,7 +237,7 @@ def test_an_action_that_does_not_let_go_has_its_device_stopped(
     b = bench(act=stubborn, other=doubled, device=Device(Clock(), halting))
     run = b.begin("act")
     b.tick(0.1)
-    b.take(Stop(run, "cancelled", "operator"))
+    b.take(Cancel(run, "cancelled: operator"))
     b.tick(GRACE / 2)
     assert b.device is not None and b.device.stops == [] and b.runner.runs == (run,)
     refused = b.begin("other")
@@ -267,7 +259,7 @@ def test_an_action_that_does_not_let_go_has_its_device_stopped(
 def test_a_run_cancelled_before_it_began_was_not_executed(bench: Make) -> None:
     b = bench(act=doubled)
     run = b.begin("act")
-    b.take(Stop(run))
+    b.take(Cancel(run))
     b.tick(1.0)
     assert (b.ended(run).cause, b.ended(run).executed) == ("cancelled", "no")
 
@@ -283,7 +275,7 @@ def test_a_result_after_the_cancel_does_not_count(bench: Make) -> None:
     b = bench(act=finishes)
     run = b.begin("act")
     b.tick(0.1)
-    b.take(Stop(run))
+    b.take(Cancel(run))
     b.tick()
     assert (b.ended(run).status, b.ended(run).cause, b.ended(run).values) == (
         "error",
@@ -311,7 +303,7 @@ def test_what_starts_at_once_does_not_wait_for_a_stopping_run(bench: Make) -> No
     run, early = b.begin("act"), b.begin("hold")
     b.tick(0.1)
     assert b.ended(early).cause == "busy"
-    b.take(Stop(run))
+    b.take(Cancel(run))
     hold = b.begin("hold")
     b.tick()
     assert b.ended(hold).status == "success" and b.runner.runs == (run,)
@@ -366,15 +358,17 @@ def test_never_two_runs_on_a_device_and_each_ends_once(
         clock.now = tick * TICK
         for n, (at, kind) in enumerate(begins):
             if at == tick:
-                runner.take(clock.now, Begin(f"run{n}", kind, {}, 0.3))
+                runner.take(clock.now, Call(f"run{n}", kind))
+            elif tick == at + round(0.3 / TICK):  # its deadline, which its node watches
+                runner.take(clock.now, Cancel(f"run{n}", "deadline: late"))
         for at, n in cancels:
             if at == tick:
-                runner.take(clock.now, Stop(f"run{n}"))
+                runner.take(clock.now, Cancel(f"run{n}"))
         runner.advance(clock.now)
-        ended += [r.id for r in runner.reports() if isinstance(r, Ended)]
+        ended += [r.id for r in runner.reports() if isinstance(r, Outcome)]
     runner.advance(clock.now + GRACE + STOP_LIMIT)
     runner.advance(clock.now + 2 * (GRACE + STOP_LIMIT))
-    ended += [r.id for r in runner.reports() if isinstance(r, Ended)]
+    ended += [r.id for r in runner.reports() if isinstance(r, Outcome)]
     assert sorted(ended) == sorted(f"run{n}" for n in range(len(begins)))
     assert active == []
 
@@ -403,14 +397,14 @@ def test_cancel_at_any_wait_is_thrown_there_once(at: int, steps: int) -> None:
 
     clock = Clock()
     runner = Runner({"walk": _entry("walk")}, clock=clock, substitutes={"walk": walk}, virtual=True)
-    runner.take(0.0, Begin("r", "walk"))
-    ends: list[Ended] = []
+    runner.take(0.0, Call("r", "walk"))
+    ends: list[Outcome] = []
     for tick in range(40):
         clock.now = tick * TICK
         if tick == at:
-            runner.take(clock.now, Stop("r"))
+            runner.take(clock.now, Cancel("r"))
         runner.advance(clock.now)
-        ends += [r for r in runner.reports() if isinstance(r, Ended)]
+        ends += [r for r in runner.reports() if isinstance(r, Outcome)]
     (end,) = ends
     if end.status == "success":
         assert thrown == [] and len(reached) == steps and at > 4 * steps
@@ -430,10 +424,10 @@ def test_calls_go_out_with_child_ids_and_come_back(bench: Make) -> None:
     b = bench(act=calls)
     run = b.begin("act", seed=7)
     (asked,) = b.tick()
-    assert asked == Asked(run, f"{run}/1", "add", {"a": 1}, 2.0, 7)
+    assert asked == Call(f"{run}/1", "add", {"a": 1}, 2.0, parent=run, seed=7)
     b.answer(f"{run}/1", sum=2)
     (asked,) = b.tick()
-    assert asked == Asked(run, f"{run}/2", "add", {"a": 2}, None, 7)
+    assert asked == Call(f"{run}/2", "add", {"a": 2}, parent=run, seed=7)
     b.answer(f"{run}/2", sum=3)
     b.tick()
     assert b.ended(run).values == {"sum": 3}
@@ -446,8 +440,8 @@ def test_open_calls_are_dropped_with_their_run(bench: Make) -> None:
     b = bench(act=calls)
     run = b.begin("act")
     b.tick(0.1)
-    b.take(Stop(run))
-    assert Dropped(f"{run}/1") in b.tick()
+    b.take(Cancel(run))
+    assert Cancel(f"{run}/1", "its run no longer waits") in b.tick()
     b.answer(f"{run}/1")
     assert b.tick(0.1) == [] and b.ended(run).cause == "cancelled"
 
@@ -545,7 +539,10 @@ def test_events_and_progress(bench: Make) -> None:
 
     b = bench(act=tells)
     run = b.begin("act")
-    assert b.tick() == [Raised(run, "contact", {"force": 2.0}), Progressed(run, 1.0, {"seen": 3})]
+    assert b.tick() == [
+        Event("contact", "act", 0, {"force": 2.0}, run),
+        Feedback(run, 1.0, {"seen": 3}),
+    ]
 
 
 def test_random_draws_are_keyed_by_seed_run_and_purpose(bench: Make) -> None:
@@ -578,13 +575,13 @@ def test_a_held_run_stands_still_and_its_times_move(bench: Make) -> None:
         return success()
 
     b = bench(act=walks)
-    run = b.begin("act", 1.2)
+    run = b.begin("act")
     b.tick(0.5)
-    b.take(Hold(True))
+    b.take(HOLD)
     before = len(steps)
     b.tick(5.0)
     assert len(steps) == before and b.runner.due() is None
-    b.take(Hold(False))
+    b.take(RELEASE)
     b.tick(1.0)
     assert b.ended(run).status == "success" and b.ended(run).seconds == pytest.approx(1.0, abs=0.05)
 
@@ -593,7 +590,7 @@ def test_a_held_run_can_be_cancelled(bench: Make) -> None:
     b = bench(act=forever)
     run = b.begin("act")
     b.tick(0.1)
-    b.take(Hold(True))
-    b.take(Stop(run))
+    b.take(HOLD)
+    b.take(Cancel(run))
     b.tick()
     assert b.ended(run).cause == "cancelled"

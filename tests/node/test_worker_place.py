@@ -3,6 +3,7 @@ run ends once."""
 
 from __future__ import annotations
 
+import math
 import socket
 from collections.abc import Callable
 from itertools import pairwise, product
@@ -12,6 +13,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from petrobot.services.comm.protocol.messages import (
+    Answer,
+    Call,
+    Cancel,
+    Command,
+    Event,
+    Outcome,
+    Ping,
+    Pong,
+)
+from petrobot.services.node.inline_host import HOLD, RELEASE, answer_of
 from petrobot.services.node.worker_host import (
     MARGIN,
     NEXT,
@@ -21,36 +33,21 @@ from petrobot.services.node.worker_host import (
     START_LIMIT,
     Happening,
     Hosting,
-    Stage,
-    WorkerPlace,
+    HostStage,
+    WorkerHost,
 )
 from petrobot.services.node.worker_pool import WorkerPool
-from petrobot.services.worker.pipe import NewestLink
+from petrobot.services.worker.pipe import Item, NewestLink
 from petrobot.services.worker.process import (
-    COMMAND,
     FAILED,
     LINK_LOST,
-    PING,
-    PONG,
     READY,
     STREAM_AT,
     WANTED,
     Setup,
 )
 from petrobot.services.worker.remote import EMERGENCY_STOP
-from petrobot.services.worker.runner import GRACE, STOP_LIMIT
-from petrobot.services.worker.runs import (
-    Answered,
-    Begin,
-    Ended,
-    Hold,
-    Order,
-    Raised,
-    Stop,
-    Told,
-    flat,
-    record,
-)
+from petrobot.services.worker.runner import GRACE, STOP_LIMIT, Order
 from tests.node.conftest import Clock
 from tests.waiting import Limit
 
@@ -61,7 +58,7 @@ class FakeChild:
     def __init__(
         self,
         setup: Setup,
-        heard: Callable[[Any, list[list[Any]]], None],
+        heard: Callable[[Any, list[Item]], None],
         ended: Callable[[Any], None],
         link: Any,
     ) -> None:
@@ -76,15 +73,23 @@ class FakeChild:
         self.linked = link is not None
         self._drop(link)
         self.pid = id(self) % 10_000
-        self.got: list[list[Any]] = []
+        self.got: list[Any] = []
         self.passed: list[socket.socket] = []
         self.killed = self.left = False
 
-    def say(self, items: list[Any]) -> None:
-        self._heard(self, [items])
+    def say(self, item: Item) -> None:
+        self._heard(self, [item])
 
-    def post(self, items: list[Any]) -> None:
-        self.got.append(items)
+    def post(self, item: Item) -> None:
+        self.got.append(item)
+
+    def words(self) -> list[Any]:
+        """Return what it was told beside the node's messages."""
+        return [item for item in self.got if isinstance(item, list)]
+
+    def commands(self) -> list[Command]:
+        """Return the commands that it was told."""
+        return [item for item in self.got if isinstance(item, Command)]
 
     def _drop(self, end: socket.socket | None) -> None:
         if end is not None:
@@ -112,8 +117,9 @@ class FakeChild:
         self.say([READY, {"period": period, "streams": streams, "fifo": False}])
 
     def orders(self) -> list[Order]:
-        kinds = {"begin", "stop", "answered", "hold"}
-        return [record(items) for items in self.got if items[0] in kinds]  # type: ignore[misc]
+        """Return what it was told about runs."""
+        orders = (Call, Cancel, Outcome)
+        return [item for item in self.got if isinstance(item, orders) or item in (HOLD, RELEASE)]
 
 
 class KeepingChild(FakeChild):
@@ -125,7 +131,7 @@ class KeepingChild(FakeChild):
 class HostBench:
     """A host of runs whose processes are fake, on a clock of its own."""
 
-    place: WorkerPlace | WorkerPool
+    place: WorkerHost | WorkerPool
 
     def __init__(self, device: str, child: type[FakeChild] = FakeChild) -> None:
         self.child = child
@@ -133,9 +139,12 @@ class HostBench:
         self.children: list[FakeChild] = []
         self.wanted: list[str] = []
         self.reports: list[Any] = []
+        self.deadlines: dict[str, float] = {}
+        """When each run is over its deadline, which its node watches and the bench stands for
+        (s)."""
         setup = Setup("services.toml", "", "node", device)
         self.hosting = Hosting(
-            setup, self.clock, lambda: None, self.wanted.append, spawn=self._spawn
+            setup, self.clock, lambda plain_ends: None, self.wanted.append, spawn=self._spawn
         )
 
     def _spawn(self, *arguments: Any) -> Any:
@@ -143,17 +152,26 @@ class HostBench:
         return self.children[-1]
 
     def begin(self, identity: str = "r", deadline: float | None = None) -> None:
-        self.place.take(self.clock.now, Begin(identity, "act", {}, deadline))
+        if deadline is not None:
+            self.deadlines[identity] = self.clock.now + deadline
+        self.place.take(self.clock.now, Call(identity, "act", {}, deadline))
+
+    def _stop_late(self) -> None:
+        for run, due in list(self.deadlines.items()):
+            if self.clock.now >= due:
+                del self.deadlines[run]
+                self.place.take(self.clock.now, Cancel(run, "deadline: late"))
 
     def run(self, seconds: float = 0.0) -> list[Any]:
         """Advance exactly when it says that it is due, as the shell does."""
         until, fresh = self.clock.now + seconds, []
         limit = Limit("nothing more to be due", steps=100_000)
         while limit.left():
+            self._stop_late()
             self.place.advance(self.clock.now)
             fresh += self.place.reports()
-            due = self.place.due()
-            if due is None or due > until:
+            due = min([self.place.due() or math.inf, *self.deadlines.values()])
+            if due > until:
                 break
             self.clock.now = max(due, self.clock.now + 1e-6)
         self.clock.now = max(until, self.clock.now)
@@ -164,11 +182,11 @@ class HostBench:
 class Bench(HostBench):
     """A place of one device whose processes are fake."""
 
-    place: WorkerPlace
+    place: WorkerHost
 
     def __init__(self, device: str = "arm", child: type[FakeChild] = FakeChild) -> None:
         super().__init__(device, child)
-        self.place = WorkerPlace(self.hosting)
+        self.place = WorkerHost(self.hosting)
         self.place.start()
 
     def cyclic(self) -> tuple[FakeChild, FakeChild]:
@@ -177,8 +195,8 @@ class Bench(HostBench):
         self.children[-1].ready()
         return self.children[-2], self.children[-1]
 
-    def ended(self, identity: str = "r") -> Ended:
-        (end,) = [r for r in self.reports if isinstance(r, Ended) and r.id == identity]
+    def ended(self, identity: str = "r") -> Outcome:
+        (end,) = [r for r in self.reports if isinstance(r, Outcome) and r.id == identity]
         return end
 
 
@@ -189,8 +207,8 @@ def test_a_device_without_cycle_has_one_process() -> None:
     bench.begin()
     assert child.orders() == []
     child.ready()
-    assert bench.place.ready and child.orders() == [Begin("r", "act", {}, None)]
-    child.say(flat(Ended("r", "success", {"x": 1})))
+    assert bench.place.ready and child.orders() == [Call("r", "act", {}, None)]
+    child.say(Outcome("r", "success", {"x": 1}))
     bench.run(0.0)
     assert bench.ended().values == {"x": 1} and bench.place.pids() == {"actions": child.pid}
 
@@ -212,12 +230,12 @@ def test_what_comes_up_passes_through() -> None:
     bench = Bench("")
     (child,) = bench.children
     child.ready()
-    child.say(flat(Raised("r", "seen", {})))
+    child.say(Event("seen", "act", 0, {}, "r"))
     child.say([WANTED, "points"])
-    bench.place.take(0.0, Answered("r/1", "success"))
+    bench.place.take(0.0, Outcome("r/1", "success"))
     bench.place.stream_at("points", "h", 1, "t")
-    assert bench.run(0.0) == [Raised("r", "seen", {})] and bench.wanted == ["points"]
-    assert child.got[-2:] == [flat(Answered("r/1", "success")), [STREAM_AT, "points", "h", 1, "t"]]
+    assert bench.run(0.0) == [Event("seen", "act", 0, {}, "r")] and bench.wanted == ["points"]
+    assert child.got[-2:] == [Outcome("r/1", "success"), [STREAM_AT, "points", "h", 1, "t"]]
 
 
 @pytest.mark.parametrize("answers", [False, True])
@@ -227,23 +245,20 @@ def test_a_run_that_does_not_end_at_its_deadline(answers: bool) -> None:
     begun = bench.clock.now
     bench.begin(deadline=1.0)
     bench.run(1.0)
-    assert (
-        actions.orders()[-1] == Stop("r", "deadline", "not over after 1 s")
-        and actions.got[-1][0] == PING
-    )
+    assert actions.orders()[-1] == Cancel("r", "deadline: late") and type(actions.got[-1]) is Ping
     if answers:
-        actions.say([PONG, 1])
+        actions.say(Pong(1))
     bench.run(SILENT + 0.01)
-    assert ([COMMAND, "halt", "halt"] in driver.got) == (not answers), "the device is stopped first"
+    assert (Command("halt", "halt") in driver.got) == (not answers), "the device is stopped first"
     patience = GRACE + STOP_LIMIT + MARGIN if answers else GRACE
     bench.run(patience - SILENT - 0.03)
     assert not actions.killed
     bench.run(0.05)
     assert bool(actions.killed)
     actions.die()
-    assert [c for c in driver.got if c[0] == COMMAND][-1][2] == "halt"
+    assert driver.commands()[-1].verb == "halt"
     assert bench.run(0.0) == [], "a run ends when its device stands still, not before"
-    driver.say(flat(Told("halt1", "stopped")))
+    driver.say(answer_of("halt1", "stopped", {}))
     bench.run(0.0)
     end = bench.ended()
     assert (end.cause, end.executed) == ("deadline", "yes") and "its process was killed" in end.text
@@ -257,7 +272,7 @@ def test_a_dead_worker(stops: bool) -> None:
     bench.begin()
     actions.die()
     if stops:
-        driver.say(flat(Told("halt1", "stopped")))
+        driver.say(answer_of("halt1", "stopped", {}))
     bench.run(STOP_LIMIT + MARGIN + 0.01)
     end = bench.ended()
     assert (end.cause, end.executed) == ("worker_died", "unknown") and "SIGTEST" in end.text
@@ -267,7 +282,7 @@ def test_a_dead_worker(stops: bool) -> None:
     )
     bench.children[-1].ready()
     bench.begin("next")
-    assert bench.children[-1].orders() == [Begin("next", "act", {}, None)]
+    assert bench.children[-1].orders() == [Call("next", "act", {}, None)]
 
 
 def test_a_dead_driver_takes_the_actions_with_it() -> None:
@@ -312,40 +327,36 @@ def test_a_call_waits_for_a_starting_process_but_not_for_ever() -> None:
     assert "no bus" in bench.ended("long").text
 
 
-def test_hold_reaches_device_and_runs_and_moves_deadlines() -> None:
+def test_hold_reaches_device_and_runs() -> None:
     bench = Bench()
     driver, actions = bench.cyclic()
-    bench.begin(deadline=1.0)
-    bench.place.command(bench.clock.now, "h", "hold")
-    assert driver.got[-1] == [COMMAND, "h", "hold"]
-    driver.say(flat(Told("h", "held")))
-    assert actions.orders()[-1] == Hold(True)
-    assert [type(r) for r in bench.run(10.0)] == [Told], (
-        "the deadline does not pass while it is held"
-    )
-    bench.place.command(bench.clock.now, "r", "release")
-    assert actions.orders()[-1] == Hold(False)
-    bench.run(0.9)
-    assert not [o for o in actions.orders() if isinstance(o, Stop)]
-    bench.run(0.2)
-    assert [o.cause for o in actions.orders() if isinstance(o, Stop)] == ["deadline"]
+    bench.begin()
+    bench.place.command(bench.clock.now, Command("h", "hold"))
+    assert driver.got[-1] == Command("h", "hold")
+    driver.say(answer_of("h", "held", {}))
+    assert actions.orders()[-1] == HOLD
+    assert [type(r) for r in bench.run(10.0)] == [Answer]
+    bench.place.command(bench.clock.now, Command("r", "release"))
+    assert actions.orders()[-1] == RELEASE
+    bench.run(2.0)
+    assert not [o for o in actions.orders() if isinstance(o, Cancel)]
 
 
 def test_a_device_that_cannot_hold_goes_on() -> None:
     bench = Bench()
     driver, actions = bench.cyclic()
-    bench.place.command(bench.clock.now, "h", "hold")
-    driver.say(flat(Told("h", "cannot hold")))
-    assert not [o for o in actions.orders() if isinstance(o, Hold)]
+    bench.place.command(bench.clock.now, Command("h", "hold"))
+    driver.say(answer_of("h", "cannot hold", {}))
+    assert not [o for o in actions.orders() if o == HOLD]
 
 
 def test_stop_by_command() -> None:
     bench = Bench()
     driver, actions = bench.cyclic()
     bench.begin()
-    bench.place.command(bench.clock.now, "s", "stop")
-    assert driver.got[-1] == [COMMAND, "s", "stop"]
-    assert actions.orders()[-1] == Stop("r", "stopped", "by command")
+    bench.place.command(bench.clock.now, Command("s", "stop"))
+    assert driver.got[-1] == Command("s", "stop")
+    assert actions.orders()[-1] == Cancel("r", "stopped: by command")
 
 
 def test_closing_lets_all_children_go() -> None:
@@ -397,16 +408,16 @@ class Storm:
         elif act == "link lost" and workers:
             workers[-1].die(LINK_LOST)
         elif act == "end" and workers:
-            had = [o.id for o in workers[-1].orders() if isinstance(o, Begin)]
+            had = [o.id for o in workers[-1].orders() if isinstance(o, Call)]
             if newest in had:
-                workers[-1].say(flat(Ended(newest, "success")))
+                workers[-1].say(Outcome(newest, "success"))
         elif act == "no memory" and workers:
-            workers[-1].say(flat(Ended(newest, "error", {}, "out_of_memory")))
+            workers[-1].say(Outcome(newest, "error", {}, "out_of_memory"))
         elif act == "late words":
             for child in dead:
                 child.ready(0.004)
                 child.ready()
-                child.say(flat(Ended(newest, "success")))
+                child.say(Outcome(newest, "success"))
                 child.say([FAILED, "long ago"])
         elif act == "garbage" and living:
             living[-1].say(["nothing", 1])
@@ -415,14 +426,14 @@ class Storm:
             living[-1].say([FAILED, "no bus"])
             living[-1].die(0)
         elif act == "stop":
-            bench.place.take(now, Stop(newest))
+            bench.place.take(now, Cancel(newest))
         elif act in ("hold", "release", "status", EMERGENCY_STOP):
-            bench.place.command(now, act, act)
+            bench.place.command(now, Command(act, act))
             for child in living:
-                if [COMMAND, act, act] in child.got:
-                    child.say(flat(Told(act, "held" if act == "hold" else "done")))
+                if Command(act, act) in child.got:
+                    child.say(answer_of(act, "held" if act == "hold" else "done", {}))
         elif act == "halted" and drivers:
-            drivers[-1].say(flat(Told("halt1", "stopped")))
+            drivers[-1].say(answer_of("halt1", "stopped", {}))
         elif act == "wait":
             bench.run(1.5)
         bench.run(0.0)
@@ -434,7 +445,7 @@ class Storm:
 
     def settle(self) -> None:
         """Time passes: what was killed dies, what was started becomes ready, and devices answer."""
-        self.bench.place.command(self.bench.clock.now, "end of hold", "release")
+        self.bench.place.command(self.bench.clock.now, Command("end of hold", "release"))
         for _ in range(20):
             self.kill_the_killed()
             for child in self.living():
@@ -450,10 +461,10 @@ class Storm:
         assert set(place.pids()) == wanted and len(self.living()) == len(wanted)
         self.bench.begin("last", 1.0)
         worker = self.living()[-1]
-        assert Begin("last", "act", {}, 1.0) in worker.orders()
-        worker.say(flat(Ended("last", "success")))
+        assert Call("last", "act", {}, 1.0) in worker.orders()
+        worker.say(Outcome("last", "success"))
         self.bench.run(30.0)
-        ends = [report.id for report in self.bench.reports if isinstance(report, Ended)]
+        ends = [report.id for report in self.bench.reports if isinstance(report, Outcome)]
         assert sorted(ends) == sorted([*self.begun, "last"])
 
 
@@ -510,12 +521,17 @@ def test_every_order_of_deaths_and_starts_ends_well(kind: str) -> None:
 
 
 def test_every_stage_can_be_reached_and_left_by_the_table() -> None:
-    reached = {Stage.DOWN, *NEXT.values()}
-    assert reached == set(Stage)
-    for stage in set(Stage) - {Stage.CLOSED}:
+    reached = {HostStage.DOWN, *NEXT.values()}
+    assert reached == set(HostStage)
+    for stage in set(HostStage) - {HostStage.CLOSED}:
         assert {happening for at, happening in NEXT if at is stage} > {Happening.CLOSE}, stage
-    waiting = {Stage.DRIVER_STARTS, Stage.ACTIONS_START, Stage.ACTIONS_DOWN, Stage.READY}
-    assert all(NEXT[stage, Happening.ALL_ENDED] is Stage.DOWN for stage in waiting)
+    waiting = {
+        HostStage.DRIVER_STARTS,
+        HostStage.ACTIONS_START,
+        HostStage.ACTIONS_DOWN,
+        HostStage.READY,
+    }
+    assert all(NEXT[stage, Happening.ALL_ENDED] is HostStage.DOWN for stage in waiting)
 
 
 @pytest.mark.parametrize("stopped", [False, True])
@@ -525,16 +541,16 @@ def test_a_run_that_a_dead_process_had_not_begun_waits_for_the_next_one(stopped:
     bench.begin("begun")
     bench.begin("not begun")
     if stopped:
-        bench.place.take(bench.clock.now, Stop("not begun"))
+        bench.place.take(bench.clock.now, Cancel("not begun"))
     bench.children[0].begun = 1
     bench.children[0].die()
-    ends = {r.id: (r.cause, r.executed) for r in bench.run(1.0) if isinstance(r, Ended)}
+    ends = {r.id: (r.cause, r.executed) for r in bench.run(1.0) if isinstance(r, Outcome)}
     assert ends == {"begun": ("worker_died", "unknown")} | (
         {"not begun": ("cancelled", "no")} if stopped else {}
     )
     bench.children[1].ready()
     bench.run(0.0)
-    begins = [order.id for order in bench.children[1].orders() if isinstance(order, Begin)]
+    begins = [order.id for order in bench.children[1].orders() if isinstance(order, Call)]
     assert begins == ([] if stopped else ["not begun"])
 
 
@@ -553,29 +569,29 @@ def test_the_end_of_a_former_process_does_not_touch_the_present_one() -> None:
 
 
 def test_status_says_what_the_place_is_doing() -> None:
-    def status() -> Told:
-        bench.place.command(bench.clock.now, "s", "status")
+    def status() -> Answer:
+        bench.place.command(bench.clock.now, Command("s", "status"))
         for child in bench.children:
-            if not child.dead and [COMMAND, "s", "status"] in child.got:
+            if not child.dead and Command("s", "status") in child.got:
                 child.got.clear()
-                child.say(flat(Told("s", "up")))
-        (told,) = [r for r in bench.run(0.0) if isinstance(r, Told)]
+                child.say(answer_of("s", "up", {}))
+        (told,) = [r for r in bench.run(0.0) if isinstance(r, Answer)]
         return told
 
     bench = Bench()
-    assert status().answer == "starting"
+    assert status().data["answer"] == "starting"
     driver, actions = bench.cyclic()
-    assert status().answer == "up"
+    assert status().data["answer"] == "up"
     actions.die()
-    assert (status().answer, "SIGTEST" in status().data["text"]) == ("restarting", True)
+    assert (status().data["answer"], "SIGTEST" in status().data["text"]) == ("restarting", True)
     bench.children[-1].ready()
-    assert status().answer == "up"
+    assert status().data["answer"] == "up"
     driver.die()
-    assert (status().answer, "driver" in status().data["text"]) == ("restarting", True)
+    assert (status().data["answer"], "driver" in status().data["text"]) == ("restarting", True)
     bench.run(PAUSES[1])
     bench.children[-1].say([FAILED, "no bus"])
     bench.children[-1].die(0)
-    assert (status().answer, status().data["text"]) == ("failed", "no bus")
+    assert (status().data["answer"], status().data["text"]) == ("failed", "no bus")
 
 
 def test_a_process_that_never_becomes_ready_is_killed_and_started_again() -> None:
@@ -592,6 +608,8 @@ def test_a_process_that_never_becomes_ready_is_killed_and_started_again() -> Non
 def test_a_command_is_answered_although_its_process_dies() -> None:
     bench = Bench()
     bench.cyclic()
-    bench.place.command(bench.clock.now, "p", "picture")
+    bench.place.command(bench.clock.now, Command("p", "picture"))
     bench.children[0].die()
-    assert [(r.id, r.answer) for r in bench.run(0.0) if isinstance(r, Told)] == [("p", "not ready")]
+    assert [(r.id, r.data["answer"]) for r in bench.run(0.0) if isinstance(r, Answer)] == [
+        ("p", "not ready")
+    ]

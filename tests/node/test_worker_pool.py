@@ -6,9 +6,10 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from petrobot.services.comm.protocol.messages import Answer, Call, Cancel, Command, Outcome
+from petrobot.services.node.inline_host import HOLD, answer_of
 from petrobot.services.node.worker_pool import IDLE_LIMIT, KEPT, WorkerPool
-from petrobot.services.worker.process import COMMAND, STREAM_AT, WANTED
-from petrobot.services.worker.runs import Answered, Asked, Begin, Ended, Hold, Stop, Told, flat
+from petrobot.services.worker.process import STREAM_AT, WANTED
 from tests.node.test_worker_place import FakeChild, HostBench
 
 
@@ -34,13 +35,13 @@ class Pool(HostBench):
         (child,) = [
             c
             for c in self.children
-            if identity in {o.id for o in c.orders() if isinstance(o, Begin)}
+            if identity in {o.id for o in c.orders() if isinstance(o, Call)}
         ]
         return child
 
-    def answer(self, verb: str) -> Told | None:
-        self.place.command(self.clock.now, verb, verb)
-        return next((report for report in self.run() if isinstance(report, Told)), None)
+    def answer(self, verb: str) -> Answer | None:
+        self.place.command(self.clock.now, Command(verb, verb))
+        return next((report for report in self.run() if isinstance(report, Answer)), None)
 
 
 def test_runs_have_a_worker_each_and_one_more_waits() -> None:
@@ -51,7 +52,7 @@ def test_runs_have_a_worker_each_and_one_more_waits() -> None:
     bench.make_ready()
     bench.begin("b")
     assert bench.of("a") is bench.children[0] and bench.of("b") is bench.children[1]
-    bench.of("a").say(flat(Ended("a", "success")))
+    bench.of("a").say(Outcome("a", "success"))
     bench.run()
     bench.begin("c")
     assert bench.of("c") is bench.children[0], "the first worker is used again"
@@ -65,7 +66,7 @@ def test_the_death_of_one_worker_ends_its_run_alone() -> None:
     bench.begin("b")
     bench.of("a").die(-11)
     assert [(r.id, r.cause) for r in bench.run()] == [("a", "worker_died")]
-    bench.of("b").say(flat(Ended("b", "success")))
+    bench.of("b").say(Outcome("b", "success"))
     assert [(r.id, r.status) for r in bench.run()] == [("b", "success")]
 
 
@@ -76,7 +77,7 @@ def test_beyond_the_limit_a_run_is_busy() -> None:
         bench.begin(identity)
     assert [(r.id, r.cause, r.executed) for r in bench.run()] == [("c", "busy", "no")]
     told = bench.answer("status")
-    assert told is not None and told.answer == "busy" and len(bench.children) == 2
+    assert told is not None and told.data["answer"] == "busy" and len(bench.children) == 2
 
 
 def test_idle_workers_retire_but_a_few() -> None:
@@ -85,7 +86,7 @@ def test_idle_workers_retire_but_a_few() -> None:
         bench.begin(identity)
     bench.make_ready()
     for identity in "abcd":
-        bench.of(identity).say(flat(Ended(identity, "success")))
+        bench.of(identity).say(Outcome(identity, "success"))
     bench.run(IDLE_LIMIT - 1.0)
     assert not any(child.left for child in bench.children)
     bench.run(2.0)
@@ -105,14 +106,15 @@ def test_answers_and_addresses_go_to_the_worker_that_asked() -> None:
     bench.make_ready()
     bench.begin("b")
     a, b = bench.of("a"), bench.of("b")
-    b.say(flat(Asked("b", "b/1", "service")))
+    b.say(Call("b/1", "service", parent="b"))
     b.say([WANTED, "points"])
     bench.run()
-    bench.place.take(0.0, Answered("b/1", "success"))
+    bench.place.take(0.0, Outcome("b/1", "success"))
     bench.place.stream_at("points", "h", 1, "t")
     assert bench.wanted == ["points"]
-    assert b.got[-2:] == [flat(Answered("b/1", "success")), [STREAM_AT, "points", "h", 1, "t"]]
-    assert not [items for items in a.got if items[0] in (STREAM_AT, "answered")]
+    assert b.got[-2:] == [Outcome("b/1", "success"), [STREAM_AT, "points", "h", 1, "t"]]
+    assert not [item for item in a.words() if item[0] == STREAM_AT]
+    assert not [item for item in a.got if isinstance(item, Outcome)]
 
 
 def test_a_command_is_answered_once_by_all_that_run() -> None:
@@ -123,18 +125,21 @@ def test_a_command_is_answered_once_by_all_that_run() -> None:
     bench.make_ready()
     bench.begin("b")
     assert bench.answer("hold") is None
-    bench.of("a").say(flat(Told("hold", "held")))
-    assert not [r for r in bench.run() if isinstance(r, Told)]
-    bench.of("b").say(flat(Told("hold", "held")))
-    assert [(r.id, r.answer) for r in bench.run() if isinstance(r, Told)] == [("hold", "held")]
+    bench.of("a").say(answer_of("hold", "held", {}))
+    assert not [r for r in bench.run() if isinstance(r, Answer)]
+    bench.of("b").say(answer_of("hold", "held", {}))
+    assert [(r.id, r.data["answer"]) for r in bench.run() if isinstance(r, Answer)] == [
+        ("hold", "held")
+    ]
     bench.make_ready()
     bench.begin("late")
-    got = [items for items in bench.of("late").got if items[0] in (COMMAND, "begin", "hold")]
-    assert got[0][:3] in ([COMMAND, "", "hold"], flat(Hold(True))) and got[1][0] == "begin", (
-        "it begins held"
-    )
+    got = [item for item in bench.of("late").got if isinstance(item, Call | Command)]
+    assert got[0] == HOLD and isinstance(got[1], Call), "it begins held"
     told = bench.answer("status")
-    assert told is not None and (told.answer, set(told.data["runs"])) == ("up", {"a", "b", "late"})
+    assert told is not None and (told.data["answer"], set(told.data["runs"])) == (
+        "up",
+        {"a", "b", "late"},
+    )
 
 
 @settings(max_examples=300, deadline=None)
@@ -159,32 +164,32 @@ def test_every_run_ends_once_and_the_pool_takes_runs_again(acts: list[tuple[str,
             begun.append(f"r{len(begun)}")
             bench.begin(begun[-1], 5.0)
         elif act == "stop" and begun:
-            bench.place.take(bench.clock.now, Stop(begun[number % len(begun)]))
+            bench.place.take(bench.clock.now, Cancel(begun[number % len(begun)]))
         elif act == "end" and child:
             for order in child.orders():
-                if isinstance(order, Begin):
-                    child.say(flat(Ended(order.id, "success")))
+                if isinstance(order, Call):
+                    child.say(Outcome(order.id, "success"))
         elif act == "die" and child:
             child.die()
         elif act == "ready":
             bench.make_ready()
         elif act in ("hold", "release", "stop all"):
             verb = act.partition(" ")[0]
-            bench.place.command(bench.clock.now, verb, verb)
+            bench.place.command(bench.clock.now, Command(verb, verb))
             for each in living:
-                if [COMMAND, verb, verb] in each.got:
-                    each.say(flat(Told(verb, "held" if verb == "hold" else "done")))
+                if Command(verb, verb) in each.got:
+                    each.say(answer_of(verb, "held" if verb == "hold" else "done", {}))
         elif act == "wait":
             bench.run(1.0)
         bench.run()
-    bench.place.command(bench.clock.now, "last release", "release")
+    bench.place.command(bench.clock.now, Command("last release", "release"))
     for _ in range(30):
         for each in bench.living():
             if each.killed or each.left:
                 each.die()
         bench.make_ready()
         bench.run(2.0)
-    ends = [report.id for report in bench.reports if isinstance(report, Ended)]
+    ends = [report.id for report in bench.reports if isinstance(report, Outcome)]
     assert sorted(ends) == sorted(begun)
     assert bench.place.ready and bench.place.condition == ("up", "")
     bench.begin("last")

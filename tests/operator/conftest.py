@@ -12,7 +12,7 @@ import pytest_asyncio
 from petrobot.coordinator.operator.station import Station
 from petrobot.coordinator.page.task_store import TaskStore
 from petrobot.services.comm.location_file import Directory, parse
-from petrobot.services.node.inline_host import InlinePlace
+from petrobot.services.node.inline_host import InlineHost
 from petrobot.services.node.node import GENERAL, Node
 from petrobot.services.scripted import load
 from tests.in_loop import NodeInLoop
@@ -115,7 +115,7 @@ def toy_node(
 ) -> NodeInLoop:
     """A node, in this loop."""
     clock = asyncio.get_running_loop().time
-    place = InlinePlace(directory.actions, clock=clock, substitutes=script)
+    place = InlineHost(directory.actions, clock=clock, substitutes=script)
     node = Node(directory, name, boot=f"{name} 1", clock=clock, places={GENERAL: place})
     return NodeInLoop(node, directory.address(name))
 

@@ -351,7 +351,6 @@ async def test_a_run_in_lock_step_learns(cell: Simulated, tmp_path: Path) -> Non
 
 
 # ---- from a point
-# -----------------------------------------------------------------------------------------------------
 
 
 async def test_a_run_from_a_point_is_shown_live_and_says_where_it_comes_from(

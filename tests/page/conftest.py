@@ -57,6 +57,13 @@ WHERE = {
 }
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run all tests of the page in one event loop: that of the browser, which they share."""
+    for item in items:
+        if item.path.parent == HERE and pytest_asyncio.is_async_test(item):
+            item.add_marker(pytest.mark.asyncio(loop_scope="session"), append=False)
+
+
 @pytest.fixture
 def tasks(tmp_path: Path) -> Path:
     """A folder with the shipped test task."""
@@ -86,14 +93,14 @@ async def served(stage: Stage, tasks: Path, runs: Path) -> AsyncIterator[Page]:
     await made.close()
 
 
-@pytest_asyncio.fixture
+@pytest_asyncio.fixture(loop_scope="session")
 async def stage(tasks: Path, tmp_path: Path) -> AsyncIterator[Stage]:
     """A mission for one test."""
     async with staged(tasks, tmp_path / "runs") as made:
         yield made
 
 
-@pytest_asyncio.fixture
+@pytest_asyncio.fixture(loop_scope="session")
 async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
     """Its page."""
     async with served(stage, tasks, tmp_path / "runs") as made:
@@ -101,7 +108,7 @@ async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]
 
 
 def browser_missing() -> str:
-    """Why there is no browser to test with; empty if there is one."""
+    """Return why there is no browser to test with; empty if there is one."""
     if not BROWSER.exists():
         return f"no browser at {BROWSER}: install chromium or set PETROBOT_BROWSER"
     if find_spec("playwright") is None:
@@ -146,14 +153,15 @@ async def until(holds: Callable[[], bool]) -> None:
 
 NOTE_TOASTS = """() => {
   window.toasted = [...document.querySelectorAll(".toast")].map((toast) => toast.title);
-  const note = (changes) => changes.forEach(({ addedNodes }) => addedNodes.forEach((toast) => window.toasted.push(toast.title)));
+  const keep = (toast) => window.toasted.push(toast.title);
+  const note = (changes) => changes.forEach(({ addedNodes }) => addedNodes.forEach(keep));
   new MutationObserver(note).observe(document.querySelector(".toasts"), { childList: true });
 }"""
 
 
 async def note_toasts(tab: Tab) -> None:
-    """Keep what the page says for a few seconds only: whoever looks once a second may be too
-    late."""
+    """Keep the messages that the page shows for a few seconds only: a test that looks once a second
+    may miss one."""
     await tab.evaluate(NOTE_TOASTS)
 
 
@@ -189,9 +197,9 @@ def nobody_listens(port: int) -> Iterator[None]:
         yield
 
 
-@pytest_asyncio.fixture(scope="module", loop_scope="module")
+@pytest_asyncio.fixture(scope="session", loop_scope="session")
 async def browser() -> AsyncIterator[Browser]:
-    """Chromium without a window, one for all tests of a file."""
+    """Chromium without a window, one for all tests; each test closes its windows."""
     if browser_missing():
         pytest.fail(browser_missing())
     from playwright.async_api import async_playwright
@@ -202,9 +210,9 @@ async def browser() -> AsyncIterator[Browser]:
         await launched.close()
 
 
-@pytest_asyncio.fixture(loop_scope="module")
+@pytest_asyncio.fixture(loop_scope="session")
 async def _windows_are_closed(browser: Browser) -> AsyncIterator[None]:
-    """No window of one test goes on painting during the next."""
+    """Close all windows, so that none of them paints during the next test."""
     yield
     for context in browser.contexts:
         await context.close()

@@ -49,7 +49,7 @@ from petrobot.coordinator.run.journal import JournalWriter
 from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task import Executed, Status, Task
 from petrobot.coordinator.task.file import TaskFileError, loads
-from petrobot.services.comm.calls.caller import CallProgress
+from petrobot.services.comm.protocol.messages import Feedback
 
 FREE = frozenset({"estop", "take_controls", "ask_controls", "release_controls"})
 BEAT_S = 0.02
@@ -88,12 +88,10 @@ class Controls:
 
 
 class Stage:
-    """A mission port (coordinator.operator.port.MissionPort) that plays tasks of a folder.
-
-    `script` gives the parts of each action, the last repeating; `where` the node of each action.
-    Time goes on in steps of `BEAT_S`, driven by the loop's clock, so that a pause really stops
-    every run.
-    """
+    """A mission port (coordinator.operator.port.MissionPort) that plays tasks of a folder. `script`
+    gives the parts of each action, of which the last one repeats; `where` gives the node of each
+    action. Time advances in steps of `BEAT_S`, driven by the loop's clock, so a pause really stops
+    every run."""
 
     def __init__(
         self,
@@ -398,7 +396,7 @@ class Stage:
             if playing.start.action in self.kept:
                 fraction = min(fraction, 0.9)
             if fraction < 1.0:
-                self.narrator.progress(self.clock, run, CallProgress(run, fraction, {}))
+                self.narrator.progress(self.clock, run, Feedback(run, fraction, {}))
                 continue
             del self._playing[run]
             part = playing.part

@@ -40,8 +40,8 @@ async def settled(tab: Tab) -> None:
 
 
 async def checked(tab: Tab, said: str = "May run") -> None:
-    """The server has checked what is drawn now, and says so; before, the list says what was found
-    in what was drawn then."""
+    """Wait until the server's findings are those of the net that is drawn now; before, the page
+    shows findings of an earlier drawing."""
     findings = tab.get_by_role("region", name="Findings")
     await expect(findings).not_to_have_attribute("aria-busy", "true")
     await expect(findings).to_contain_text(said)

@@ -1,5 +1,5 @@
-"""Further attacks: names that climb, bodies and frames that are no text, replays, secrets in
-headers, and what nobody may say."""
+"""Further attacks: names that climb out of their folder, bodies and frames that are not text,
+replays, secrets in headers, and messages that no client may send."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ async def raw(page: Page, head: str, body: bytes = b"") -> bytes:
     return answer
 
 
-@pytest_asyncio.fixture
+@pytest_asyncio.fixture(loop_scope="session")
 async def cell(tmp_path: Path) -> AsyncIterator[tuple[Simulated, Page]]:
     """A station that can be started, and its page."""
     made = Simulated(tmp_path)
@@ -137,7 +137,8 @@ STRANGE: list[dict[str, Any]] = [
 async def test_strange_orders_are_answered_briefly(
     cell: tuple[Simulated, Page], data: dict[str, Any]
 ) -> None:
-    """What is no order is refused in a few words, whatever it holds, and leaves nothing behind."""
+    """A message that is not a command is refused in a few words, whatever it holds, and leaves
+    nothing behind."""
     made, page = cell
     await ask(
         page,
@@ -160,7 +161,7 @@ async def test_strange_orders_are_answered_briefly(
 
 @pytest.mark.parametrize("depth", [10, 900, 5_000, 100_000])
 async def test_deep_data_is_refused_or_ignored(page: Page, depth: int) -> None:
-    """Nesting beyond what can be read ends in a refusal; the server goes on."""
+    """Data that is nested too deep to be read is refused; the server continues."""
     deep = "[" * depth + "]" * depth
     headers = {**bearer(page), "Content-Type": "application/json"}
     body = io.BytesIO(f'{{"verb": "pause", "name": "x", "data": {{"deep": {deep}}}}}'.encode())
@@ -199,7 +200,7 @@ NO_TEXT = [b"\x00\x01", b"{}", b"\xff" * 1_000, b""]
 
 @pytest.mark.parametrize("frame", NO_TEXT)
 async def test_binary_frames_end_their_connection_alone(page: Page, frame: bytes) -> None:
-    """The protocol is text; whoever sends bytes is closed with a reason."""
+    """The protocol is text. A client that sends bytes is closed, with a reason."""
     async with joined(page) as good, joined(page, "bad", "2") as bad:
         await good.until(lambda s: True)
         await bad.until(lambda s: True)
@@ -268,7 +269,8 @@ async def test_a_replayed_command_is_carried_out_once(page: Page, stage: Stage) 
 
 
 async def test_a_name_alone_is_nobody(page: Page, stage: Stage) -> None:
-    """Whoever calls himself like the holder, without the secret of his tab, holds nothing."""
+    """A client with the holder's name, but without the secret of the holder's tab, does not hold
+    the controls."""
     async with joined(page) as ana, joined(page, "ana", "guessed") as thief:
         await ana.command("take_controls")
         assert (await thief.command("start"))["code"] == "not_holder"

@@ -6,12 +6,11 @@ from __future__ import annotations
 import asyncio
 import os
 import re
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
-import pytest_asyncio
 from hypothesis import Phase, given, settings
 from tools.bench.hmi import SyntheticMission, ticking
 
@@ -25,7 +24,6 @@ from tests.page.conftest import (
     browser_missing,
     nobody_listens,
     served,
-    staged,
     toasted,
     until,
 )
@@ -52,24 +50,7 @@ from tests.page.steps import (
     take_controls,
 )
 
-pytestmark = [
-    pytest.mark.asyncio(loop_scope="module"),
-    pytest.mark.usefixtures("_windows_are_closed"),
-]
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def stage(tasks: Path, tmp_path: Path) -> AsyncIterator[Stage]:
-    """A mission for one test."""
-    async with staged(tasks, tmp_path / "runs") as made:
-        yield made
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
-    """Its page."""
-    async with served(stage, tasks, tmp_path / "runs") as made:
-        yield made
+pytestmark = pytest.mark.usefixtures("_windows_are_closed")
 
 
 async def test_a_new_user_draws_runs_and_understands(
@@ -155,8 +136,8 @@ async def test_two_operators(browser: Browser, page: Page, stage: Stage) -> None
 
 
 async def test_operators_hand_on_the_net(browser: Browser, page: Page, stage: Stage) -> None:
-    """Raise an event, stop at a breakpoint set beforehand, choose the alternative, force a way out,
-    abort."""
+    """Raise an event, stop at a breakpoint that was set before, choose an action, force an outgoing
+    transition, abort."""
     stage.script["pick"].clear()
     stage.script["pick"].append(Part(0.3))
     stage.kept.update({"look__template", "pick", "put"})
@@ -184,8 +165,14 @@ async def test_operators_hand_on_the_net(browser: Browser, page: Page, stage: St
     await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Aborted")
     verbs = [verb for _, verb, _ in stage.commands]
     assert verbs == [
-        "take_controls", "breakpoint", "override_selector", "start", "raise_event", "force_exit", "abort",
-    ]  # fmt: skip
+        "take_controls",
+        "breakpoint",
+        "override_selector",
+        "start",
+        "raise_event",
+        "force_exit",
+        "abort",
+    ]
 
 
 async def test_who_chooses_an_alternative_while_a_run_learns_goes_on_choosing(
@@ -290,8 +277,8 @@ async def test_script_in_names_and_reasons_is_text(
 async def test_a_lost_connection_is_plain_to_see(
     browser: Browser, stage: Stage, tasks: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """When the coordinator goes away without a word the page says so at once, and it catches up
-    when it is back."""
+    """When the coordinator disappears without a message, the page shows it at once. It catches up
+    when the coordinator is back."""
 
     async def vanish(session: Session) -> None:
         """Say no goodbye."""
@@ -338,7 +325,10 @@ async def test_details(
     tab = await opened(browser, page, "dark")
     complaints = faults(tab)
     await start_mission(tab)
-    pixel = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNkYPhfDwAChwGA60e6kgAAAABJRU5ErkJggg=="
+    pixel = (
+        "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNkYPhfDwAChwGA60e6kgAAAABJRU5Er"
+        "kJggg=="
+    )
     seen = [
         {"kind": "circle", "x": 300, "y": 200, "r": 20, "label": "part"},
         {"kind": "path", "points": [[0, 0], [9, 9]]},
@@ -392,7 +382,7 @@ async def test_details(
 
 
 def mission_of(stage: Stage) -> tuple[str, str]:
-    """Which mission there is, and how it stands."""
+    """Return which mission there is, and its state."""
     mission = stage.feed.state["mission"]
     return mission["id"], mission["state"]
 

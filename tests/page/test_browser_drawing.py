@@ -5,15 +5,13 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-import pytest_asyncio
 
 from petrobot.coordinator.page.server import Page
 from petrobot.coordinator.task.file import load
-from tests.page.conftest import browser_missing, served, staged, toasted
+from tests.page.conftest import browser_missing, toasted
 from tests.page.stage import Stage
 
 if browser_missing() and os.environ.get("CI") != "true":
@@ -33,24 +31,7 @@ from tests.page.steps import (
     settled,
 )
 
-pytestmark = [
-    pytest.mark.asyncio(loop_scope="module"),
-    pytest.mark.usefixtures("_windows_are_closed"),
-]
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def stage(tasks: Path, tmp_path: Path) -> AsyncIterator[Stage]:
-    """A mission for one test."""
-    async with staged(tasks, tmp_path / "runs") as made:
-        yield made
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
-    """Its page."""
-    async with served(stage, tasks, tmp_path / "runs") as made:
-        yield made
+pytestmark = pytest.mark.usefixtures("_windows_are_closed")
 
 
 async def test_drawing_by_keyboard_alone(browser: Browser, page: Page, faults: Watch) -> None:
@@ -140,8 +121,7 @@ async def test_a_late_answer_takes_nothing_away(browser: Browser, page: Page, ta
 
 
 async def test_what_is_typed_while_the_page_loads_stays(browser: Browser, page: Page) -> None:
-    """Offers that come in late do not draw the form anew under the hands of whoever types
-    already."""
+    """Offers of nodes that arrive late do not rebuild a form in which the user types already."""
     tab = await opened(browser, page)
     offers = await late(tab, "**/api/offers", "GET")
     await tab.get_by_role("tab", name="Design").click()
@@ -287,8 +267,8 @@ async def test_macro_places_open_in_both_views(
 async def test_verdicts_stand_beside_the_drawing(
     browser: Browser, page: Page, shots: Path, faults: Watch
 ) -> None:
-    """A task that may stop short of its end is told by itself; a press shows the marking and the
-    firings that lead there."""
+    """The page says by itself that a task may stop before its end. A click shows the marking and
+    the firings that lead there."""
     tab = await designer(browser, page)
     complaints = faults(tab)
     analysis = tab.get_by_role("region", name="Analysis")
@@ -296,7 +276,7 @@ async def test_verdicts_stand_beside_the_drawing(
     field = tab.get_by_label("Ends when")
     await field.fill("parts == 0 and look == 1")
     await field.press("Enter")
-    await expect(analysis.get_by_role("status")).to_contain_text("6 problems found")
+    await expect(analysis.get_by_role("status")).to_contain_text("10 problems found")
     refused = analysis.get_by_role(
         "button", name=re.compile("^Never stuck before its end: does not hold")
     )

@@ -13,7 +13,7 @@ import pytest_asyncio
 
 from petrobot.coordinator.page.server import Page, start_page
 from tests.operator.test_starting import Simulated
-from tests.page.conftest import browser_missing, served, staged, toasted
+from tests.page.conftest import browser_missing, toasted
 from tests.page.stage import Stage
 
 if browser_missing() and os.environ.get("CI") != "true":
@@ -24,10 +24,7 @@ from playwright.async_api import Page as Tab
 
 from tests.page.steps import checked, designer, element, hold_controls, opened, settled
 
-pytestmark = [
-    pytest.mark.asyncio(loop_scope="module"),
-    pytest.mark.usefixtures("_windows_are_closed"),
-]
+pytestmark = pytest.mark.usefixtures("_windows_are_closed")
 
 CORNERS = """\
 schema = 1
@@ -46,22 +43,14 @@ t3 = { x = 500, y = 300 }
 NAMES = ("p1", "p2", "p3", "t1", "t2", "t3")
 
 
-@pytest_asyncio.fixture(loop_scope="module")
-async def stage(tasks: Path, tmp_path: Path) -> AsyncIterator[Stage]:
-    """A mission for one test."""
+@pytest.fixture
+def tasks(tasks: Path) -> Path:
+    """The folder with one more task."""
     (tasks / "corners.toml").write_text(CORNERS, encoding="utf-8")
-    async with staged(tasks, tmp_path / "runs") as made:
-        yield made
+    return tasks
 
 
-@pytest_asyncio.fixture(loop_scope="module")
-async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
-    """Its page."""
-    async with served(stage, tasks, tmp_path / "runs") as made:
-        yield made
-
-
-@pytest_asyncio.fixture(loop_scope="module")
+@pytest_asyncio.fixture(loop_scope="session")
 async def cell(tmp_path: Path) -> AsyncIterator[Simulated]:
     """A station that simulates."""
     made = Simulated(tmp_path)
@@ -69,7 +58,7 @@ async def cell(tmp_path: Path) -> AsyncIterator[Simulated]:
     await made.station.close()
 
 
-@pytest_asyncio.fixture(loop_scope="module")
+@pytest_asyncio.fixture(loop_scope="session")
 async def own_page(cell: Simulated) -> AsyncIterator[Page]:
     """Its page."""
     made = await start_page(
@@ -90,7 +79,6 @@ async def on_the_desk(browser: Browser, page: Page, task: str) -> Tab:
 
 
 # ---- run
-# ----------------------------------------------------------------------------------------------------------------
 
 
 async def test_run_this_task_takes_free_controls(
@@ -135,7 +123,6 @@ async def test_run_this_task_says_who_holds_the_controls(
 
 
 # ---- arcs
-# ---------------------------------------------------------------------------------------------------------------
 
 
 async def centre(tab: Tab, name: str) -> tuple[float, float]:
@@ -199,11 +186,12 @@ async def test_arcs_by_choosing_one_after_the_other_go_on_as_ever(
 
 
 # ---- fields
-# -------------------------------------------------------------------------------------------------------------
 
 
 FOCUSED = """() => { const at = document.activeElement;
-  return at.getAttribute("aria-label") ?? at.closest("label")?.firstChild.textContent ?? at.tagName; }"""
+  return at.getAttribute("aria-label")
+    ?? at.closest("label")?.firstChild.textContent
+    ?? at.tagName; }"""
 
 
 async def test_tab_goes_on_to_the_next_field_after_a_change(browser: Browser, page: Page) -> None:
@@ -238,7 +226,7 @@ async def test_tab_goes_on_to_the_next_field_after_a_change(browser: Browser, pa
 
 
 async def test_a_choice_keeps_the_focus(browser: Browser, page: Page) -> None:
-    """Another kind draws another form; who chose it by keyboard goes on from there."""
+    """Another kind of place has another form. A user who chose it by keyboard keeps the focus."""
     tab = await designer(browser, page)
     await element(tab, "^Control place parts").click()
     kind = tab.get_by_role("complementary", name="Properties").get_by_label("Kind")
@@ -249,7 +237,6 @@ async def test_a_choice_keeps_the_focus(browser: Browser, page: Page) -> None:
 
 
 # ---- questions
-# ----------------------------------------------------------------------------------------------------------
 
 
 async def test_the_safe_answer_has_the_focus(browser: Browser, page: Page, tasks: Path) -> None:

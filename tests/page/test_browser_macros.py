@@ -5,15 +5,13 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-import pytest_asyncio
 
 from petrobot.coordinator.page.server import Page
 from petrobot.coordinator.task.file import load
-from tests.page.conftest import browser_missing, served, staged
+from tests.page.conftest import browser_missing
 from tests.page.stage import Stage
 
 if browser_missing() and os.environ.get("CI") != "true":
@@ -24,26 +22,9 @@ from playwright.async_api import Page as Tab
 
 from tests.page.steps import element, hold_controls, opened
 
-pytestmark = [
-    pytest.mark.asyncio(loop_scope="module"),
-    pytest.mark.usefixtures("_windows_are_closed"),
-]
+pytestmark = pytest.mark.usefixtures("_windows_are_closed")
 NET = "Task net"
 BRANCH = ("pick_failed", "put_failed", "cleared", "stuck")
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def stage(tasks: Path, tmp_path: Path) -> AsyncIterator[Stage]:
-    """A mission for one test."""
-    async with staged(tasks, tmp_path / "runs") as made:
-        yield made
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
-    """Its page."""
-    async with served(stage, tasks, tmp_path / "runs") as made:
-        yield made
 
 
 def grouped(text: str, macros: dict[str, tuple[str, ...]]) -> str:
@@ -109,7 +90,8 @@ async def test_an_error_that_leaves_a_closed_macro_place(
 async def test_an_error_that_stays_in_a_closed_macro_place(
     browser: Browser, page: Page, stage: Stage, shots: Path, deep: bool
 ) -> None:
-    """The branch lies inside: the closed place says so, and so does each place around it."""
+    """The error branch lies inside: the closed macro place shows it, and so does each macro place
+    around it."""
     inside = ("pick", "put", "clear", "picked", "pick_failed", "put_failed")
     macros: dict[str, tuple[str, ...]] = (
         {"handling": inside} if not deep else {"inner": inside, "handling": ("inner",)}

@@ -5,15 +5,14 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from math import inf, nan
 from pathlib import Path
 
 import pytest
-import pytest_asyncio
 
 from petrobot.coordinator.page.server import Page, start_page
-from tests.page.conftest import browser_missing, nobody_listens, served, staged, until
+from tests.page.conftest import browser_missing, nobody_listens, served, until
 from tests.page.stage import Stage
 
 if browser_missing() and os.environ.get("CI") != "true":
@@ -24,25 +23,8 @@ from playwright.async_api import Page as Tab
 
 from tests.page.steps import SIZE, Watch, element, opened, start_mission
 
-pytestmark = [
-    pytest.mark.asyncio(loop_scope="module"),
-    pytest.mark.usefixtures("_windows_are_closed"),
-]
+pytestmark = pytest.mark.usefixtures("_windows_are_closed")
 Mangle = Callable[[str], str | bytes]
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def stage(tasks: Path, tmp_path: Path) -> AsyncIterator[Stage]:
-    """A mission for one test."""
-    async with staged(tasks, tmp_path / "runs") as made:
-        yield made
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
-    """Its page."""
-    async with served(stage, tasks, tmp_path / "runs") as made:
-        yield made
 
 
 DETAILS = ("Camera", "Devices", "Set points", "Learning", "Variables", "Events", "Timeline")
@@ -53,8 +35,12 @@ def emit_everything(stage: Stage, bad: float) -> None:
     stand."""
     feed = stage.feed
     values = {"setpoint_age": bad, "load": 0.25, "list": [bad, {"deep": [bad]}]}
-    feed.emit("device", name="arm", device={"state": "on", "joints": [0.1, bad], "limits": [[bad, 1.0]], "age": bad}
-              | {"values": values})  # fmt: skip
+    feed.emit(
+        "device",
+        name="arm",
+        device={"state": "on", "joints": [0.1, bad], "limits": [[bad, 1.0]], "age": bad}
+        | {"values": values},
+    )
     feed.emit("variable", name="distance", value={"near": bad, "all": [1, [bad]]})
     feed.emit("variable", name="plain", value=bad)
     feed.emit("setpoint", stream="point", samples=[[0.1, 0.01], [0.2, bad], [0.3, 0.02]])
@@ -103,8 +89,8 @@ def emit_everything(stage: Stage, bad: float) -> None:
 async def test_numbers_that_are_not_finite_leave_the_page_alive(
     browser: Browser, page: Page, stage: Stage, faults: Watch, bad: float
 ) -> None:
-    """As deltas to one that looks, and in the snapshot of one that comes later: no value is shown,
-    and all else goes on."""
+    """They come as deltas to an open page and in the snapshot of a new one. No value is shown, and
+    everything else works."""
     tab = await opened(browser, page)
     complaints = faults(tab)
     emit_everything(stage, bad)
@@ -186,8 +172,8 @@ ALTERED: dict[str, Callable[[str], str | bytes]] = {
 async def test_a_message_that_cannot_be_read_is_a_lost_connection(
     browser: Browser, page: Page, stage: Stage, how: str
 ) -> None:
-    """The bar says so, and the page comes back with a fresh snapshot: what the message said is not
-    missing."""
+    """The bar shows it, and the page continues with a fresh snapshot, so the content of the message
+    is not missing."""
     tab, passed = await through_a_proxy(browser, page, once(ALTERED[how]))
     await tab.evaluate(NOTE_BAR)
     stage.feed.emit("marking", marking={"parts": 5})
@@ -205,7 +191,8 @@ NOTE_BAR = """() => {
   const bar = document.querySelector(".lost");
   window.barSaid = [];
   const note = () => window.barSaid.push(bar.hidden ? "" : bar.textContent);
-  new MutationObserver(note).observe(bar, { subtree: true, childList: true, characterData: true, attributes: true });
+  const all = { subtree: true, childList: true, characterData: true, attributes: true };
+  new MutationObserver(note).observe(bar, all);
 }"""
 
 
@@ -230,8 +217,8 @@ async def test_a_page_that_receives_only_what_it_cannot_read_says_so_and_keeps_t
 async def test_a_fault_of_the_page_itself_is_said_and_mended(
     browser: Browser, page: Page, stage: Stage
 ) -> None:
-    """A handler of the page that throws does not leave a picture that stands still: it says so and
-    begins again."""
+    """After an exception in a handler the page does not show an old picture: it reports the fault
+    and connects again."""
     tab = await opened(browser, page)
     await start_mission(tab)
     await tab.evaluate(NOTE_BAR)
@@ -289,8 +276,8 @@ async def test_a_page_whose_script_does_not_arrive_says_so(browser: Browser, pag
 async def test_after_a_restart_with_another_key_old_windows_say_what_to_do(
     browser: Browser, stage: Stage, tasks: Path, tmp_path: Path
 ) -> None:
-    """The key is drawn at each start. An old window says so, and follows again once the new address
-    was opened."""
+    """The key is drawn at each start. An old window says which address to open, and works again
+    once that was opened."""
     async with served(stage, tasks, tmp_path / "runs") as first:
         tab = await opened(browser, first)
         port = int(first.url.rpartition(":")[2].partition("/")[0])

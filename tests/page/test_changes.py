@@ -33,8 +33,7 @@ NAMED = {
 
 @st.composite
 def changes(draw: st.DrawFn) -> list[dict[str, Any]]:
-    """A run of numbered changes as a mission would emit them: a run begins before it goes on and
-    ends."""
+    """Return numbered changes as a mission would emit them: a run starts, is active, and ends."""
     made: list[dict[str, Any]] = []
     going: list[str] = []
     for number in range(1, draw(st.integers(1, 40)) + 1):
@@ -143,7 +142,7 @@ def test_a_verdict_changes_the_run_that_had_ended_and_no_other() -> None:
 
 
 def test_what_waits_for_a_slow_client_is_bounded() -> None:
-    """Ten thousand firings that nobody fetches leave no backlog: the client gets a snapshot
+    """Ten thousand firings that the client does not fetch leave no backlog: it gets a snapshot
     instead."""
     pending = Pending()
     for number in range(1, 10_001):
@@ -175,7 +174,7 @@ def test_values_that_only_have_a_newest_take_no_room() -> None:
 
 
 def test_reset_makes_every_client_start_anew() -> None:
-    """Another mission is no delta."""
+    """Another mission is sent as a snapshot, not as a delta."""
     feed = Feed()
     pending = Pending()
     feed.subscribe(pending.add)

@@ -8,12 +8,11 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import pytest_asyncio
 
 from petrobot.coordinator.drawing.layout import lay_out
 from petrobot.coordinator.page.edits import edited, parse, plain
@@ -25,8 +24,6 @@ from tests.page.conftest import (
     browser_missing,
     is_fault,
     note_toasts,
-    served,
-    staged,
     toasted,
     until,
 )
@@ -40,27 +37,10 @@ from playwright.async_api import Page as Tab
 
 from tests.page.steps import element, settled
 
-pytestmark = [
-    pytest.mark.asyncio(loop_scope="module"),
-    pytest.mark.usefixtures("_windows_are_closed"),
-]
+pytestmark = pytest.mark.usefixtures("_windows_are_closed")
 DRAWING = "Drawing of the task"
 SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks" / "catch_ball.toml"
 expect.set_options(timeout=PATIENCE_MS)
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def stage(tasks: Path, tmp_path: Path) -> AsyncIterator[Stage]:
-    """A mission for one test."""
-    async with staged(tasks, tmp_path / "runs") as made:
-        yield made
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
-    """Its page."""
-    async with served(stage, tasks, tmp_path / "runs") as made:
-        yield made
 
 
 async def designing(
@@ -125,7 +105,6 @@ async def save(tab: Tab) -> None:
 
 
 # ---- arranging
-# --------------------------------------------------------------------------------------------------------
 
 
 async def test_a_task_that_is_opened_is_seen_whole(
@@ -139,7 +118,8 @@ async def test_a_task_that_is_opened_is_seen_whole(
       const all = drawing.getBoundingClientRect();
       return [...drawing.querySelectorAll("[data-name], [data-name] text, path")].filter((one) => {
         const box = one.getBoundingClientRect();
-        return box.width && (box.left < all.left || box.right > all.right || box.top < all.top || box.bottom > all.bottom);
+        const beside = box.left < all.left || box.right > all.right;
+        return box.width && (beside || box.top < all.top || box.bottom > all.bottom);
       }).map((one) => one.dataset.name ?? one.textContent);
     }"""
     drawing = tab.get_by_role("application", name=DRAWING)
@@ -223,7 +203,6 @@ async def test_a_dragged_element_lands_on_the_grid(
 
 
 # ---- macro places
-# -----------------------------------------------------------------------------------------------------
 
 
 async def test_a_part_of_the_net_becomes_a_macro_place(
@@ -441,8 +420,7 @@ async def test_an_odd_file_keeps_every_byte_but_the_edited(
 
 
 async def test_a_broken_file_leaves_what_is_open(browser: Browser, page: Page, tasks: Path) -> None:
-    """A file that is no TOML is refused with its line; the task on the desk and its unsaved edit
-    stay."""
+    """A file that is not TOML is refused with its line. The open task and its unsaved edit stay."""
     (tasks / "broken.toml").write_text('[task]\nname = "x\n')
     tab, _ = await designing(browser, page)
     await tab.get_by_label("Task", exact=True).select_option("broken")
@@ -478,7 +456,8 @@ async def test_a_hundred_and_twenty_places_without_positions(
     await expect(element(tab, "^Action place ")).to_have_count(118)
     overlaps = """() => {
       const all = [...petrobot.tabs.Design.view.elements.values()];
-      return all.filter((a, i) => all.some((b, j) => j > i && Math.abs(a.x - b.x) < 44 && Math.abs(a.y - b.y) < 44)).length;
+      const near = (a, b) => Math.abs(a.x - b.x) < 44 && Math.abs(a.y - b.y) < 44;
+      return all.filter((a, i) => all.some((b, j) => j > i && near(a, b))).length;
     }"""
     assert await tab.evaluate(overlaps) == 0
     await tab.get_by_role("button", name="Zoom in").first.click(click_count=6)
@@ -686,27 +665,37 @@ async def test_everything_can_be_undone_and_done_again(
 # ---- other tools' nets
 # ------------------------------------------------------------------------------------------------
 
-PIPE = """<?xml version="1.0" encoding="ISO-8859-1"?><pnml><net id="Net-One" type="P/T net"><token id="Default" red="0"/>
+PIPE = """<?xml version="1.0" encoding="ISO-8859-1"?><pnml><net id="Net-One" type="P/T net">
+<token id="Default" red="0"/>
 <place id="P0"><graphics><position x="105.0" y="90.0"/></graphics><name><value>P0</value></name>
-<initialMarking><value>Default,2</value></initialMarking><capacity><value>0</value></capacity></place>
+<initialMarking><value>Default,2</value></initialMarking><capacity><value>0</value></capacity>
+</place>
 <place id="P1"><graphics><position x="330.0" y="90.0"/></graphics><name><value>P1</value></name>
-<initialMarking><value>Default,0</value></initialMarking><capacity><value>3</value></capacity></place>
-<transition id="T0"><graphics><position x="210.0" y="90.0"/></graphics><name><value>T0</value></name>
+<initialMarking><value>Default,0</value></initialMarking><capacity><value>3</value></capacity>
+</place>
+<transition id="T0"><graphics><position x="210.0" y="90.0"/></graphics><name><value>T0</value>
+</name>
 <rate><value>1.0</value></rate><priority><value>1</value></priority></transition>
-<arc id="a" source="P0" target="T0"><inscription><value>Default,1</value></inscription><type value="normal"/></arc>
-<arc id="b" source="T0" target="P1"><inscription><value>Default,2</value></inscription><type value="normal"/></arc>
-<arc id="c" source="P1" target="T0"><inscription><value>Default,1</value></inscription><type value="inhibitor"/></arc>
+<arc id="a" source="P0" target="T0"><inscription><value>Default,1</value></inscription>
+<type value="normal"/></arc>
+<arc id="b" source="T0" target="P1"><inscription><value>Default,2</value></inscription>
+<type value="normal"/></arc>
+<arc id="c" source="P1" target="T0"><inscription><value>Default,1</value></inscription>
+<type value="inhibitor"/></arc>
 </net></pnml>"""
 PM4PY = """<?xml version='1.0' encoding='UTF-8'?><pnml>
-<net id="imdf" type="http://www.pnml.org/version-2009/grammar/pnmlcoremodel"><name><text>im df "zoo"</text></name><page id="n0">
-<place id="source"><name><text>source</text></name><initialMarking><text>1</text></initialMarking></place>
+<net id="imdf" type="http://www.pnml.org/version-2009/grammar/pnmlcoremodel"><name>
+<text>im df "zoo"</text></name><page id="n0">
+<place id="source"><name><text>source</text></name><initialMarking><text>1</text></initialMarking>
+</place>
 <place id="sink"><name><text>sink</text></name></place>
 <transition id="4b1c-77"><name><text>register request</text></name></transition>
 <transition id="8c-1"><name><text>8c-1</text></name>
 <toolspecific tool="ProM" version="6.4" activity="$invisible$"/></transition>
 <arc id="140" source="source" target="4b1c-77"/><arc id="141" source="4b1c-77" target="sink"/>
 <arc id="142" source="sink" target="8c-1"/></page>
-<finalmarkings><marking><place idref="sink"><text>1</text></place></marking></finalmarkings></net></pnml>"""
+<finalmarkings><marking><place idref="sink"><text>1</text></place></marking></finalmarkings></net>
+</pnml>"""
 
 
 @pytest.mark.parametrize(

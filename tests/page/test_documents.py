@@ -35,7 +35,7 @@ FORBIDDEN = (
     (store, "parse"),
     (verdicts, "parse"),
     (verdicts, "loads"),
-    (verdicts, "check"),
+    (verdicts, "may_run"),
     (verdicts, "parse_pnml"),
     (journals, "read_journal"),
     (journals, "replay"),
@@ -44,7 +44,7 @@ FORBIDDEN = (
 """What takes longer than a turn of the loop may for a large net or a long journal."""
 
 
-@pytest_asyncio.fixture
+@pytest_asyncio.fixture(loop_scope="session")
 async def http(page: Page) -> AsyncIterator[aiohttp.ClientSession]:
     """A script with the token."""
     address = page.url.partition("/?")[0]
@@ -137,7 +137,8 @@ async def test_faults_name_the_element(http: aiohttp.ClientSession) -> None:
 async def test_editing_does_not_touch_the_running_net(
     http: aiohttp.ClientSession, stage: Stage
 ) -> None:
-    """A save during a run alters the file; the mission goes on with what it was started with."""
+    """A save during a run changes the file; the active mission keeps the task that it was started
+    with."""
     await stage.command("ana", "take_controls", {})
     assert (await stage.command("ana", "start", {}))["ok"]
     running = stage.snapshot()["task"]
@@ -151,7 +152,7 @@ async def test_editing_does_not_touch_the_running_net(
 
 
 async def test_a_broken_file_says_what_is_wrong(http: aiohttp.ClientSession, tasks: Path) -> None:
-    """A file that somebody broke by hand is named with its fault; the others can be opened."""
+    """A file that was broken by hand is listed with its fault; the others can be opened."""
     (tasks / "broken.toml").write_text("[places\n")
     async with http.get("/api/tasks/broken") as answer:
         assert answer.status == 422 and "broken.toml" in await answer.text()
@@ -208,7 +209,7 @@ BAD_PNML = (
 
 @pytest.mark.parametrize("text", BAD_PNML)
 async def test_bad_pnml_is_refused(http: aiohttp.ClientSession, text: str) -> None:
-    """What is no place/transition net, or tries to define entities, is refused with a reason."""
+    """A file that is not a place/transition net, or defines entities, is refused with a reason."""
     async with http.post("/api/import", json={"form": "pnml", "text": text}) as answer:
         assert answer.status == 400 and "PNML" in await answer.text()
 
@@ -312,3 +313,20 @@ async def test_nothing_that_takes_long_is_done_in_the_coordinator(
     async with http.get(f"/api/runs/{run['id']}") as answer:
         assert answer.status == 200 and (await answer.json())["records"]
         assert answer.headers.keys() >= HEADERS.keys()
+
+
+async def test_an_older_drawing_is_answered_without_an_error(http: aiohttp.ClientSession) -> None:
+    """A browser logs each 4xx answer as an error, and drawing on is none."""
+    document = (await opened(http))["document"]
+    document["places"]["parts"] |= {"tokens": 100_000, "capacity": 100_000}  # a long analysis
+    drawn = {"name": TASK, "document": document, "desk": "mine"}
+
+    async def post(path: str) -> tuple[int, Any]:
+        async with http.post(path, json=drawn) as answer:
+            return answer.status, await answer.json()
+
+    older = asyncio.create_task(post("/api/analyse"))
+    async with asyncio.timeout(60):
+        while not older.done():
+            assert (await post("/api/check"))[0] == 200
+    assert await older == (200, {"superseded": True})

@@ -154,7 +154,7 @@ async def test_other_sites_get_nothing(page: Page, site: str, path: str) -> None
     "kind", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data; boundary=x"]
 )
 async def test_forms_are_refused(page: Page, stage: Stage, kind: str) -> None:
-    """What a plain form of another site could send is no JSON, so it is not even read."""
+    """What a form on another site could send is not JSON, so it is not even read."""
     headers = {**bearer(page), "Content-Type": kind}
     response = await ask(page, "/api/command", "POST", headers=headers, data=b'{"verb": "estop"}')
     assert response.status == 415
@@ -191,7 +191,8 @@ async def test_task_names_do_not_climb(page: Page, name: str) -> None:
 
 @pytest.mark.parametrize("body", ["{", "[]", "3", '"text"', "[" * 100_000, "{}" * 2_000_000])
 async def test_bad_bodies_are_refused(page: Page, body: str) -> None:
-    """What is no JSON object, too deep or too large ends in one clear refusal."""
+    """A body that is not a JSON object, nested too deep or too large is refused with one clear
+    answer."""
     headers = {**bearer(page), "Content-Type": "application/json"}
     assert (
         await ask(page, "/api/check", "POST", headers=headers, data=io.BytesIO(body.encode()))
@@ -328,7 +329,7 @@ async def test_without_the_page_only_the_protocol_is_served(
 
 @pytest.mark.parametrize("size", [LARGEST_MESSAGE + 1, 8 * LARGEST_MESSAGE])
 async def test_an_oversized_message_ends_its_connection_alone(page: Page, size: int) -> None:
-    """It is not even taken in whole; another client goes on."""
+    """The server does not even read all of it; another client is not affected."""
     hello = {"type": "hello", "protocol": PROTOCOL, "name": "ana", "tab": "1"}
     async with (
         aiohttp.ClientSession(headers=bearer(page)) as http,
@@ -354,7 +355,8 @@ async def test_an_oversized_message_ends_its_connection_alone(page: Page, size: 
 
 
 async def test_clients_are_bounded_and_commands_still_come_in(page: Page) -> None:
-    """One more than there is room for is told so; a script's emergency stop needs no seat."""
+    """One client more than allowed is refused with a reason. The emergency stop of a script still
+    works."""
     hello = {"type": "hello", "protocol": PROTOCOL, "name": "ana", "tab": "1"}
     async with aiohttp.ClientSession(
         headers=bearer(page), connector=aiohttp.TCPConnector(limit=0)

@@ -136,7 +136,7 @@ def test_other_lines_outlive_a_new_and_a_deleted_element(text: str, data: st.Dat
 
 
 def test_a_renamed_element_keeps_its_place_and_comments() -> None:
-    """The header is renamed where it stands; what is below it stays."""
+    """The header is renamed where it is in the file; the lines below it stay."""
     text = TEXTS["pick_and_place"]
     document = plain(parse(text))
     document["places"] = {("grab" if n == "pick" else n): p for n, p in document["places"].items()}
@@ -145,7 +145,8 @@ def test_a_renamed_element_keeps_its_place_and_comments() -> None:
 
 
 def test_a_rename_that_cannot_be_done_in_place_is_written_anew() -> None:
-    """Inline tables have no header to rename; the document is right all the same."""
+    """Inline tables have no header to rename; the element is written again, and the document is
+    right."""
     text = "schema = 1\n[places]\na = {kind = 'control'} # first\n"
     result = edited(
         text, {"schema": 1, "places": {"b": {"kind": "control"}}}, [Rename(("places",), "a", "b")]

@@ -24,7 +24,6 @@ from playwright.async_api import Page as Tab
 
 from tests.page.steps import Watch
 
-pytestmark = pytest.mark.asyncio(loop_scope="module")
 LONG = ("a_name_that_somebody_wrote_down_without_any_thought_of_screens_or_of_readers_" * 2)[:80]
 OTHER = "Überprüfung_der_Zange_für_日本語_und_العربية"
 MARKUP = "<img src=x onerror=\"document.title='owned'\"><b>bold</b> &amp; &lt;"
@@ -37,7 +36,7 @@ SIZES = [
 ]
 
 
-@pytest_asyncio.fixture(loop_scope="module")
+@pytest_asyncio.fixture(loop_scope="session")
 async def page(tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
     """A mission of extremes."""
     async with (

@@ -106,7 +106,7 @@ def task_files(draw: st.DrawFn) -> str:
 
 
 def document_of(text: str) -> dict[str, Any]:
-    """What the page gets; texts that are no TOML are passed over."""
+    """Return what the page gets; texts that are not TOML are skipped."""
     try:
         return plain(parse(text))
     except ValueError:

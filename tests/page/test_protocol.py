@@ -78,7 +78,7 @@ async def joined(page: Page, name: str = "ana", tab: str = "1") -> AsyncIterator
 
 
 async def test_late_joiners_see_the_same(page: Page, stage: Stage) -> None:
-    """Whoever comes when ends with the state that the server has; nobody misses a number."""
+    """A client that connects at any time ends with the server's state and misses no change."""
     async with joined(page) as first:
         await first.command("take_controls")
         assert (await first.command("start"))["ok"]
@@ -166,7 +166,7 @@ async def test_controls_go_free_when_their_holder_is_gone(
 
 
 async def test_commands_go_on_when_their_client_leaves(page: Page, stage: Stage) -> None:
-    """What was asked for is carried out although nobody waits for the answer any more."""
+    """A command is carried out although its client no longer waits for the answer."""
     begun, go = asyncio.Event(), asyncio.Event()
     done: list[str] = []
 
@@ -186,8 +186,8 @@ async def test_commands_go_on_when_their_client_leaves(page: Page, stage: Stage)
 
 
 async def test_the_command_that_ends_the_run_is_answered(page: Page, stage: Stage) -> None:
-    """The coordinator closes while it is still being carried out: whoever gave it hears that it
-    was."""
+    """The coordinator closes while the command is still being carried out; its client still gets
+    the answer."""
     begun, closing = asyncio.Event(), asyncio.Event()
 
     async def last(who: str, data: Any) -> dict[str, Any]:
@@ -228,7 +228,8 @@ NONSENSE = (
 
 @pytest.mark.parametrize("text", NONSENSE)
 async def test_nonsense_ends_the_connection_with_a_reason(page: Page, text: str) -> None:
-    """A client that does not speak the protocol is told so and closed; the others go on."""
+    """A client that does not speak the protocol gets a reason and is closed; the others are not
+    affected."""
     async with joined(page) as good, joined(page, "bad", "2") as bad:
         await good.until(lambda s: True)
         await bad.until(lambda s: True)
@@ -253,7 +254,8 @@ async def test_who_floods_is_closed(page: Page) -> None:
 
 
 async def test_hello_comes_first(page: Page) -> None:
-    """Nobody is served before saying who they are, in the protocol that the server speaks."""
+    """A client is served only after it has given its name, in the version that the server
+    speaks."""
     address = page.url.partition("?")[0] + "api/live"
     headers = {"Authorization": f"Bearer {page.token}"}
     for first in ({"type": "command", "id": 1, "verb": "estop"}, {"type": "hello", "protocol": 99}):

@@ -27,7 +27,6 @@ from playwright.async_api import Page as Tab
 from tests.page.steps import SIZE, Watch, checked, draw_the_task, element, hold_controls, settled
 from tests.ports import free_ports
 
-pytestmark = pytest.mark.asyncio(loop_scope="module")
 ROOT = Path(__file__).parents[2]
 SERVICES = """\
 schema = 1
@@ -111,7 +110,7 @@ async def serving(folder: Path) -> AsyncIterator[Served]:
         await served.end()
 
 
-@pytest_asyncio.fixture(loop_scope="module")
+@pytest_asyncio.fixture(loop_scope="session")
 async def served(tmp_path: Path) -> AsyncIterator[Served]:
     """A cell with two nodes that wait for a task."""
     async with serving(tmp_path) as made:

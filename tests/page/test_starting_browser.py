@@ -27,11 +27,10 @@ from playwright.async_api import Page as Tab
 
 from tests.page.steps import Watch, element, hold_controls, opened
 
-pytestmark = pytest.mark.asyncio(loop_scope="module")
 expect.set_options(timeout=PATIENCE_MS)
 
 
-@pytest_asyncio.fixture(loop_scope="module")
+@pytest_asyncio.fixture(loop_scope="session")
 async def cell(tmp_path: Path) -> AsyncIterator[Simulated]:
     """A station that simulates."""
     made = Simulated(tmp_path)
@@ -40,7 +39,7 @@ async def cell(tmp_path: Path) -> AsyncIterator[Simulated]:
     await made.station.close()
 
 
-@pytest_asyncio.fixture(loop_scope="module")
+@pytest_asyncio.fixture(loop_scope="session")
 async def page(cell: Simulated) -> AsyncIterator[Page]:
     """Its page."""
     history, offers, form = JournalHistory(cell.runs), cell.station.offers, cell.station.form
@@ -74,8 +73,8 @@ async def chosen(tab: Tab, task: str) -> Locator:
 async def test_everything_that_the_command_line_takes(
     browser: Browser, page: Page, cell: Simulated, shots: Path, faults: Watch
 ) -> None:
-    """Mode, runs, seed, parameters of each type and learning; what is wrong is told in the form,
-    which stays open."""
+    """Mode, runs, seed, parameters of each type, and learning. Wrong input is explained in the
+    form, which stays open."""
     tab = await opened(browser, page)
     complaints = faults(tab)
     await expect(mission(tab)).to_contain_text("Idle")
@@ -183,6 +182,7 @@ async def test_the_selector_is_overridden_and_frozen_from_the_page(
     await expect(selected).to_be_visible()
     reasons = {run["why"] for run in cell.state["ended"] if run["place"] == "look"}
     assert "chosen by the operator" in reasons
+    await cell.until(lambda: cell.state["result"] is not None)  # it comes after the status
     assert cell.state["result"]["learned"]["runs_counted"] == 0
 
 
@@ -199,8 +199,8 @@ async def again(tab: Tab, task: str) -> Locator:
 async def test_a_run_sets_out_from_a_point_of_another(
     browser: Browser, page: Page, cell: Simulated, shots: Path, faults: Watch
 ) -> None:
-    """Scrub to a moment, say what becomes of what went on, simulate, and see it live; its journal
-    says where it comes from."""
+    """Move to a moment of a recorded run, choose how its active actions continue, simulate, and
+    watch it live. Its journal names the recorded run."""
     await cell.say("take_controls")
     first, _ = await cell.simulate(runs=3)
     await cell.say("release_controls")
@@ -252,8 +252,8 @@ async def test_a_run_sets_out_from_a_point_of_another(
 async def test_the_emergency_stop_is_cleared_by_who_holds_the_controls(
     browser: Browser, page: Page, cell: Simulated, shots: Path, faults: Watch
 ) -> None:
-    """It stands until then, whatever the run came to; nothing starts; clearing asks once more;
-    keyboard alone."""
+    """The stop stays until it is cleared, however the run ended, and nothing starts. Clearing asks
+    for a confirmation; all by keyboard."""
     cell.tasks.save_text(
         "long", None, TASK.replace("[transitions.begin]", "[transitions.begin]\nafter = 3600.0")
     )

@@ -14,8 +14,8 @@ from petrobot.coordinator.learning.learning import Learning
 from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.task import Status, Task
 from petrobot.coordinator.task.file import load
-from petrobot.services.comm.calls.caller import CallProgress
 from petrobot.services.comm.location_file import Directory, parse
+from petrobot.services.comm.protocol.messages import Feedback
 
 FOLDER = Path(__file__).parent / "judged"
 sys.path.append(str(FOLDER))
@@ -62,7 +62,7 @@ class Heard:
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Nothing to keep."""
 
-    def progress(self, now: float, run: str, notice: CallProgress) -> None:
+    def progress(self, now: float, run: str, notice: Feedback) -> None:
         """Nothing to keep."""
 
     def settled(self, now: float, state: State) -> None:

@@ -11,7 +11,7 @@ from petrobot.coordinator.run.node_status import ask_all
 from petrobot.services.comm.calls.callee import Callee
 from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.location_file import parse
-from petrobot.services.node.inline_host import InlinePlace
+from petrobot.services.node.inline_host import InlineHost
 from petrobot.services.node.node import GENERAL, Node
 from tests.in_loop import NodeInLoop
 from tests.ports import free_ports
@@ -31,7 +31,7 @@ port = {1}
 async def test_one_that_does_not_answer_hides_no_other(tmp_path: Path, mute_is_up: bool) -> None:
     directory = parse(PLACES.format(*free_ports(2)), tmp_path / "services.toml")
     clock = asyncio.get_running_loop().time
-    place = InlinePlace(directory.actions, clock=clock)
+    place = InlineHost(directory.actions, clock=clock)
     node = Node(directory, "well", boot="well 1", clock=clock, places={GENERAL: place})
     well = NodeInLoop(node, directory.address("well"))
     mute = Server(

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.engine import Begin, Hold, Pause, Phase, Resume, RunEnded, StartRun
-from petrobot.coordinator.run.calls import ESCALATION, Dispatch
-from petrobot.coordinator.run.fences import STOP_MARGIN
+from petrobot.coordinator.run.calls import ESCALATION, STOP_MARGIN, Dispatch
 from petrobot.coordinator.run.journal import JournalError, JournalWriter
 from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task import Executed, Status

@@ -3,6 +3,7 @@ by marking."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -64,3 +65,19 @@ def test_a_changed_task_is_noticed_at_the_record_where_it_matters() -> None:
     seen: list[State] = []
     with pytest.raises(ReplayError, match=r"record \d+ \(RunEnded\): marking was"):
         seen.extend(step.state for step in replay(found.journal, Engine(task)))
+
+
+def test_another_instruction_with_the_same_markings_is_noticed() -> None:
+    """With another deadline all markings are the same; the first run that starts with it is
+    named."""
+    from petrobot.coordinator.launch import with_runs
+    from petrobot.coordinator.task.file import loads
+
+    found = recorded(str(GOLDEN / "catch_ball-undisturbed.journal"))
+    text = found.journal.header["task"]
+    changed = re.sub(r"(?m)^deadline = .*$", "deadline = 123.25", text, count=1)
+    assert changed != text
+    task, _ = with_runs(loads(changed, "changed"), found.journal.header["runs"])
+    differs = r"record \d+ .*: the instructions differ .* StartRun .*123\.25"
+    with pytest.raises(ReplayError, match=differs):
+        list(replay(found.journal, Engine(task)))

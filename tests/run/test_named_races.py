@@ -10,8 +10,7 @@ from __future__ import annotations
 import pytest
 
 from petrobot.coordinator.engine import Abort, Begin, CancelRun, RunRecorded
-from petrobot.coordinator.run.calls import ESCALATION
-from petrobot.coordinator.run.fences import STOP_MARGIN
+from petrobot.coordinator.run.calls import ESCALATION, STOP_MARGIN
 from petrobot.coordinator.task import Executed, Status
 from petrobot.services.comm.protocol import messages as m
 from tests.run.toy_arm import TIDY, WORK, Bench
@@ -104,9 +103,7 @@ def test_yasmin_102_a_second_cancel_stops_what_came_after_the_first() -> None:
     assert [r.run for r in bench.records] == ["work#1", "tidy#1"]
 
 
-def test_plansys2_399_a_performer_that_took_the_action_and_never_answers_does_not_block_the_task() -> (
-    None
-):
+def test_plansys2_399_a_performer_that_never_answers_does_not_block_the_task() -> None:
     """There the executor stayed in RUNNING for ever. Here the deadline and 5 s for the stop routine
     end the wait, honestly."""
     bench = Bench().begin()

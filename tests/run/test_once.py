@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from petrobot.coordinator.engine import Begin, RunRecorded
-from petrobot.coordinator.run.fences import STOP_MARGIN
-from petrobot.coordinator.run.recording import Step
+from petrobot.coordinator.run.calls import STOP_MARGIN
+from petrobot.coordinator.run.recording import RecordedStep
 from petrobot.coordinator.task import Executed, Status
-from petrobot.services.comm.calls.callee import Callee, CancelOrder, Offer, Retention, StartOrder
+from petrobot.services.comm.calls.callee import Callee, Offer, Retention
 from petrobot.services.comm.protocol import messages as m
 from tests.run.toy_arm import TIDY, WORK, Bench
 
@@ -33,7 +33,7 @@ class World:
         self.keeping = keeping
         self.started: Counter[str] = Counter()
         self.active: list[str] = []
-        self.journal: list[Step] = []
+        self.journal: list[RecordedStep] = []
         self.callee = self._callee()
         first = Bench()
         self.bench: Bench | None = first
@@ -114,7 +114,7 @@ class World:
     def finish(self) -> None:
         """The oldest run that is active ends."""
         if self.active:
-            self.callee.finish(self.now, self.active.pop(0), "success")
+            self.callee.finish(self.now, m.Outcome(self.active.pop(0), "success"))
 
     def ring(self) -> None:
         """The bell preempts work."""
@@ -143,12 +143,12 @@ class World:
 
     def _obey(self) -> None:
         for order in self.callee.orders():
-            if isinstance(order, StartOrder):
-                self.started[order.call.id] += 1
-                self.active.append(order.call.id)
-            elif isinstance(order, CancelOrder) and order.id in self.active:
+            if isinstance(order, m.Call):
+                self.started[order.id] += 1
+                self.active.append(order.id)
+            elif isinstance(order, m.Cancel) and order.id in self.active:
                 self.active.remove(order.id)
-                self.callee.finish(self.now, order.id, "error", cause="cancelled")
+                self.callee.finish(self.now, m.Outcome(order.id, "error", cause="cancelled"))
 
     # --- what must be -------------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ from petrobot.coordinator.engine.stimuli import EventOccurred
 from petrobot.coordinator.launch import make_mission, with_runs
 from petrobot.coordinator.run.journal import JournalWriter, read_journal
 from petrobot.coordinator.run.mission import Mission
-from petrobot.coordinator.run.recording import JournalStore, Step, replay
+from petrobot.coordinator.run.recording import JournalStore, RecordedStep, replay
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import loads
 from petrobot.services.comm.calls.caller import Caller
@@ -29,7 +29,7 @@ from tests.run.toy_arm import TASK, TIDY, WORK, Bench, directory
 JOURNAL = "run/run.journal"
 
 
-def left(disk: Disk, folder: Path, engine: Engine, torn: float = 0.0) -> list[Step]:
+def left(disk: Disk, folder: Path, engine: Engine, torn: float = 0.0) -> list[RecordedStep]:
     """The steps that can be derived after a power cut."""
     image = disk.left(torn)
     if JOURNAL not in image:
@@ -39,7 +39,7 @@ def left(disk: Disk, folder: Path, engine: Engine, torn: float = 0.0) -> list[St
     return list(replay(read_journal(copy), engine))
 
 
-def ordered(steps: Iterable[Step], kind: type) -> set[str]:
+def ordered(steps: Iterable[RecordedStep], kind: type) -> set[str]:
     """Runs that orders of this kind are for."""
     return {
         i.run
@@ -49,7 +49,7 @@ def ordered(steps: Iterable[Step], kind: type) -> set[str]:
     }
 
 
-def ended(steps: Iterable[Step]) -> set[str]:
+def ended(steps: Iterable[RecordedStep]) -> set[str]:
     """Runs whose end is kept."""
     return {step.stimulus.run for step in steps if isinstance(step.stimulus, RunEnded)}
 
@@ -84,7 +84,7 @@ def test_a_device_is_moved_and_a_result_acknowledged_only_when_the_cause_is_on_t
             loads(TASK, "toy"), {a.name: a.device for a in places.actions.values() if a.device}
         )
 
-        def steps() -> list[Step]:
+        def steps() -> list[RecordedStep]:
             return left(disk, tmp_path, engine)
 
         def called(call: m.Call) -> None:

@@ -15,7 +15,7 @@ from petrobot.coordinator.engine import (
     SetBreakpoints,
     Step,
 )
-from petrobot.coordinator.run.fences import STOP_MARGIN
+from petrobot.coordinator.run.calls import STOP_MARGIN
 from petrobot.coordinator.task import Executed, Status
 from petrobot.services.comm.protocol import messages as m
 from tests.run.toy_arm import TIDY, WORK, Bench

@@ -103,7 +103,7 @@ def test_resume_of_a_run_that_had_ended_says_how(
     (run / JOURNAL).write_bytes(golden.read_bytes())
     (run / RESULT).write_text(json.dumps({"status": status, "runs": 4}))
     assert main(["resume", str(run), "--json", str(tmp_path / "out.json")]) == code
-    assert f"the run had ended, {status}" in capsys.readouterr().err
+    assert f"ended already, with status {status}" in capsys.readouterr().err
     assert json.loads((tmp_path / "out.json").read_text()) == {"status": status, "runs": 4}
     (run / JOURNAL).write_bytes(golden.read_bytes()[:100] + b"damaged" + golden.read_bytes()[107:])
     assert main(["resume", str(run)]) == 2

@@ -234,7 +234,7 @@ class Judges(Bench):
         self, now: float, run: str, status: str, *, deferred: bool = False, cause: str = ""
     ) -> None:
         """A run has ended."""
-        self.node.finish(now, run, status, cause=cause, deferred=deferred)
+        self.node.finish(now, m.Outcome(run, status, cause=cause, deferred=deferred))
         self.carry(now)
 
     def judge(

@@ -16,8 +16,8 @@ from petrobot.coordinator.launch import Setting, local_programs, realtime_missio
 from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.run.realtime import RealtimeMission
 from petrobot.coordinator.run.supervisor import Supervisor
-from petrobot.services.comm.calls.caller import CallProgress
 from petrobot.services.comm.location_file import Directory, load
+from petrobot.services.comm.protocol.messages import Feedback
 from tests.ports import free_ports
 from tests.run.judged_parts import (
     FOLDER,
@@ -49,7 +49,7 @@ class AtEnd:
     def instruction(self, now: float, instruction: Instruction) -> None:
         """Nothing to do."""
 
-    def progress(self, now: float, run: str, notice: CallProgress) -> None:
+    def progress(self, now: float, run: str, notice: Feedback) -> None:
         """Nothing to do."""
 
     def settled(self, now: float, state: State) -> None:

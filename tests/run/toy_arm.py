@@ -18,12 +18,12 @@ from petrobot.coordinator.engine import (
 )
 from petrobot.coordinator.run.executor import Executor
 from petrobot.coordinator.run.interfaces import Forgetful, Store
-from petrobot.coordinator.run.recording import Step
+from petrobot.coordinator.run.recording import RecordedStep
 from petrobot.coordinator.task.file import loads
-from petrobot.services.comm.calls.caller import Caller, CallProgress
+from petrobot.services.comm.calls.caller import Caller
 from petrobot.services.comm.location_file import Directory, parse
 from petrobot.services.comm.protocol import messages as m
-from petrobot.services.comm.protocol.messages import Event, Message
+from petrobot.services.comm.protocol.messages import Event, Feedback, Message
 
 TASK = """
 schema = 1
@@ -129,7 +129,7 @@ class Bench:
         self.fired: list[str] = []
         self.records: list[RunRecorded] = []
         self.reports: list[str] = []
-        self.steps: list[Step] = []
+        self.steps: list[RecordedStep] = []
         self._stimulus: tuple[Stimulus, list[Instruction]] | None = None
         self.boot = ""
         self.now = 0.0
@@ -150,7 +150,7 @@ class Bench:
         elif isinstance(instruction, Report):
             self.reports.append(instruction.key)
 
-    def progress(self, now: float, run: str, notice: CallProgress) -> None:
+    def progress(self, now: float, run: str, notice: Feedback) -> None:
         """Not kept."""
 
     def settled(self, now: float, state: State) -> None:
@@ -158,7 +158,7 @@ class Bench:
         stimulus, instructions = self._stimulus
         boots = {"motion": self.boot}
         self.steps.append(
-            Step(len(self.steps) + 1, now, stimulus, tuple(instructions), state, boots)
+            RecordedStep(len(self.steps) + 1, now, stimulus, tuple(instructions), state, boots)
         )
 
     # --- the node -----------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from petrobot.services.comm.canopen.cia402 import (
     to_units,
 )
 from petrobot.sim.catching.laboratory import CatchingLaboratory
+from petrobot.sim.catching.physics import BULLET, PORTABLE
 from petrobot.sim.catching.puma_model import PumaModel
 from petrobot.sim.catching.site import Site, read_site
 from tests.sim.laboratory_bench import LaboratoryBench
@@ -38,6 +40,20 @@ from tests.sim.laboratory_bench import LaboratoryBench
 REPOSITORY = Path(__file__).parents[2]
 PARTIES = {"arm": "motion", "camera": "vision"}
 CELL_FILE = REPOSITORY / "services" / "cell.toml"
+
+
+needs_bullet = pytest.mark.skipif(
+    find_spec("pybullet") is None, reason="PyBullet is not installed: the portable back end alone"
+)
+
+
+@pytest.fixture(
+    scope="session", params=[pytest.param(BULLET, marks=needs_bullet), pytest.param(PORTABLE)]
+)
+def physics(request: pytest.FixtureRequest) -> str:
+    """Each back end of the laboratory's mechanics: the same tests for both."""
+    name: str = request.param
+    return name
 
 
 @pytest.fixture(scope="session")
@@ -204,12 +220,12 @@ class CatchingBench(LaboratoryBench):
 
 
 @pytest.fixture
-def bench(site: Site) -> Iterator[Callable[..., CatchingBench]]:
+def bench(site: Site, physics: str) -> Iterator[Callable[..., CatchingBench]]:
     """Makes benches; options as for Laboratory."""
     made: list[CatchingBench] = []
 
     def make(**options: Any) -> CatchingBench:
-        made.append(CatchingBench(site, **options))
+        made.append(CatchingBench(site, **{"physics": physics, **options}))
         return made[-1]
 
     yield make
@@ -223,12 +239,13 @@ def cell_master(site: Site) -> Callable[[], Master]:
     return lambda: Master(site.arm, site.arm.poses["home"].tolist())
 
 
-def run_digests(seed: int, regime: str, prepared_before: bool = False) -> list[str]:
+def run_digests(seed: int, regime: str, physics: str, prepared_before: bool = False) -> list[str]:
     """Digests of the score, of all images and of the arm's end position after a throw."""
     made = CatchingBench(
         read_site(CELL_FILE),
         seed=77 if prepared_before else seed,
         regime="A" if prepared_before else regime,
+        physics=physics,
     )
     made.call("laboratory_prepare", seed=seed, regime=regime)
     made.enable()
@@ -254,4 +271,4 @@ def digests() -> Callable[..., list[str]]:
 
 
 if __name__ == "__main__":  # a fresh process, to compare with
-    print("\n".join(run_digests(int(sys.argv[1]), sys.argv[2])))
+    print("\n".join(run_digests(int(sys.argv[1]), sys.argv[2], sys.argv[3])))

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from petrobot.sim.catching.ball import BallModel, BallState, TableMotion, fly
+from petrobot.sim.catching.ball import BallModel, BallState, TableMotion, UnevenMotion, fly
 
 MODEL = BallModel(radius=0.02, mass=0.0027, inertia_factor=2.0 / 3.0, gravity=9.81, friction=0.2)
 RESISTANCE = 0.006
@@ -100,6 +100,37 @@ def test_the_first_crossing_is_one_and_is_the_first(
         assert side * (motion.state(0.98 * until * k / 50).position[axis] - aim) > -1e-9
     if crossing < math.inf:
         assert motion.state(crossing).position[axis] == pytest.approx(aim, abs=1e-6)
+
+
+def even(x: float, y: float) -> tuple[float, float]:
+    return 0.0, 0.0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.7, 1.0, 1.3])
+def test_an_uneven_motion_on_an_even_table_is_the_closed_form(share: float) -> None:
+    start = BallState((2.1, 0.1, 0.62), (-1.2, 0.3, 0.0), MODEL.spin_of_rolling(-1.2, 0.3, share))
+    exact, found = (
+        TableMotion(MODEL, start, RESISTANCE),
+        UnevenMotion(MODEL, start, RESISTANCE, even),
+    )
+    for t in (0.0, 0.0123, 0.3, 1.1):
+        assert found.state(t).position == pytest.approx(exact.state(t).position, abs=1e-3)
+        assert found.state(t).velocity == pytest.approx(exact.state(t).velocity, abs=3e-3)
+    for axis, value in ((0, 0.62), (1, 0.3), (0, 9.0)):
+        assert found.first_crossing(axis, value) == pytest.approx(
+            exact.first_crossing(axis, value), abs=2e-3
+        )
+
+
+@pytest.mark.parametrize("along", [-1.0, 0.5])
+def test_a_slope_drives_a_rolling_ball_as_its_inertia_says(along: float) -> None:
+    """Rolling loses nothing here: s g / (1 + k) downhill, k = 2/3."""
+    start = BallState((2.0, 0.0, 0.62), (along, 0.0, 0.0), MODEL.spin_of_rolling(along, 0.0))
+    motion = UnevenMotion(MODEL, start, 0.0, lambda x, y: (0.0, 0.003))
+    state = motion.state(1.0)
+    down = 0.003 * 9.81 / (1.0 + 2.0 / 3.0)
+    assert state.velocity == pytest.approx((along, -down, 0.0), abs=1e-4)
+    assert state.position == pytest.approx((2.0 + along, -0.5 * down, 0.62), abs=1e-4)
 
 
 def test_it_comes_to_rest_and_stays() -> None:

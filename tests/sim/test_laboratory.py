@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,11 @@ import pytest
 from petrobot.services.comm.lockstep.channels import images_wanted
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.host.numba_kernels import SWITCH
 from petrobot.sim.catching.course import ThrowOutcome
 from petrobot.sim.catching.site import Site
 from petrobot.sim.catching.thrower import draw_throw
+from petrobot.sim.catching.truth import Scatter
 from petrobot.sim.exposures import Exposures
 
 REPOSITORY = Path(__file__).parents[2]
@@ -101,6 +104,76 @@ def test_latency_delays_images_and_they_say_so(bench: Benches, regime: str, age:
     here.wait(0.6)
     assert here.images[0][0] == pytest.approx(age, abs=TICK + 1e-9)
     assert [body["age"] for _, body in here.images] == pytest.approx([age] * len(here.images))
+
+
+def test_stated_ages_scatter_in_the_regime_that_says_so(bench: Benches) -> None:
+    here = bench(seed=1, regime="A+jitter")
+    here.want_images(50.0)
+    here.wait(4.0)
+    errors = np.array([body["age"] - 0.008 for _, body in here.images])
+    assert errors.std() == pytest.approx(0.003, rel=0.2) and abs(errors.mean()) < 0.001
+    assert errors.min() >= -0.008 - 1e-9
+
+
+def test_images_are_lost_in_the_regime_that_says_so(bench: Benches) -> None:
+    here = bench(seed=1, regime="A+dropped_images")
+    here.want_images(50.0)
+    here.wait(4.0)
+    assert len(here.images) == pytest.approx(140, abs=25)
+
+
+def test_frames_are_lost_in_the_regime_that_says_so(bench: Benches) -> None:
+    here = bench(seed=1, regime="A")
+    here.enable()
+    here.lab.truth = replace(here.lab.truth, scatter=Scatter(frames_lost=0.3))
+    begun = here.master.heard()
+    here.wait(4.0)
+    # an answer needs the SYNC (0.7) and its own way back (0.7)
+    assert (here.master.heard() - begun) / (1000 * 6) == pytest.approx(0.49, abs=0.04)
+
+
+def brightening(here: Bench, ball: tuple[float, float, float], velocity: Any) -> Any:
+    """By how much (grey levels) a ball changes the image around its middle."""
+    camera = here.lab.camera()
+    u, v, _ = (round(x) for x in camera.pixel(ball))
+    window = slice(v - 30, v + 30), slice(u - 30, u + 30)
+    return (camera.render(ball, velocity).astype(int) - camera.background)[window]
+
+
+def test_a_bridge_hides_the_ball(bench: Benches) -> None:
+    here = bench(seed=3, regime="B+occluded")
+    seen = [
+        (brightening(here, (x, 0.05, 0.62), (-1.0, 0.0, 0.0)) > 25).sum() for x in (1.6, 1.27, 0.9)
+    ]
+    assert seen[0] > 60 and seen[1] == 0 and seen[2] > 60
+
+
+def test_a_blurred_ball_is_longer(bench: Benches) -> None:
+    """3 m/s for 16 ms instead of 4: 48 mm and 12 mm, beside the ball's own 40 mm."""
+    lengths = []
+    for regime in ("B", "B+blur"):
+        change = brightening(bench(seed=3, regime=regime), (1.5, 0.0, 0.62), (-3.0, 0.0, 0.0))
+        rows, columns = np.nonzero(change > 20)
+        lengths.append(max(rows.std(), columns.std()))
+    assert 1.3 < lengths[1] / lengths[0] < 2.0
+
+
+def test_a_second_ball_rolls_beside_half_of_the_others(bench: Benches) -> None:
+    here = bench(seed=3, regime="B+two_balls")
+    seconds = [here.lab._throw_second(0.0, n) for n in range(1, 201)]
+    assert sum(one is not None for one in seconds) == pytest.approx(100, abs=25)
+    one = next(second for second in seconds if second is not None)
+    times = [t for t in np.arange(0.0, 3.0, 0.02) if one.seen(float(t))]
+    assert 0.7 < times[-1] - times[0] < 1.6  # 1.5 m at 1.5 to 2 m/s, and a fall
+    (ball, velocity), *_ = one.seen(float(times[5]))
+    image = here.lab.camera().render(None, others=[(ball, velocity)]).astype(int)
+    u, v, _ = (round(x) for x in here.lab.camera().pixel(ball))
+    assert image[v, u] - int(here.lab.camera().background[v, u]) > 25
+
+
+def test_a_cup_of_another_size_is_seen_and_touched(bench: Benches) -> None:
+    here = bench(seed=1, regime="A+cup50")
+    assert here.lab.camera().cup_radius == here.lab.truth.cup.radius == 0.025
 
 
 def test_a_new_wish_drops_what_was_exposed_for_the_old_one(bench: Benches) -> None:
@@ -256,6 +329,35 @@ def test_prepare_begins_a_new_experiment(bench: Benches) -> None:
     assert abs(course["exit_y"]) < 0.31 and 1.5 < course["exit_speed"] < 2.5
 
 
+def test_every_ball_is_counted(bench: Benches) -> None:
+    """One that is caught, one for which the arm does not move; one is still rolling."""
+    here = bench(seed=1)
+    here.enable()
+    here.want_images(0.001)
+    row = here.catch_one()
+    assert row["caught"]
+    assert here.run(lambda: here.lab.world.course is not None, 3.0)
+    assert here.run(lambda: here.lab.world.course is None, 8.0)
+    assert here.run(lambda: here.lab.world.course is not None, 3.0)
+    first, second, third = here.lab.referee.score(here.now)["courses"]
+    cycles = [
+        {
+            "n": n,
+            "begun_ago": here.now - course["released_after"] + 0.1,
+            "ended_ago": here.now - course["released_after"] - 0.1,
+            "status": "success",
+        }
+        for n, course in ((1, first), (2, second), (2, third))
+    ]
+    score = here.call("laboratory_score", cycles=cycles).values
+    counts = {"thrown": 3, "over": 2, "caught": 1, "missed": 1, "never_seen": 1}
+    assert {name: score[name] for name in counts} == counts
+    assert score["balls"] == [
+        {"run": 1, "n": 1, "thrown": 1, "over": 1, "caught": 1, "missed": 0, "never_seen": 0},
+        {"run": 2, "n": 2, "thrown": 2, "over": 1, "caught": 0, "missed": 1, "never_seen": 1},
+    ]
+
+
 def test_a_throw_takes_the_status_of_its_cycle(bench: Benches) -> None:
     here = bench(seed=1)
     here.enable()
@@ -291,18 +393,30 @@ def test_a_preparation_that_cannot_be_is_refused(
 
 
 @pytest.mark.processes
-def test_the_same_seed_gives_the_same_bits_here_and_in_a_fresh_process(digests: Digests) -> None:
-    """Frames, pixels and score; also when the laboratory had been prepared for another run
-    before."""
-    here = digests(3, "B+drift")
-    program = [sys.executable, str(Path(__file__).with_name("conftest.py")), "3", "B+drift"]
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "PYTHONHASHSEED": "4711"}
-    there = subprocess.run(
-        program, capture_output=True, text=True, check=True, timeout=120, env=environment
-    )
-    assert there.stdout.split()[-3:] == here
-    assert digests(3, "B+drift", prepared_before=True) == here
-    assert digests(4, "B+drift") != here
+def test_the_same_seed_gives_the_same_bits_here_and_in_fresh_processes(
+    digests: Digests, physics: str
+) -> None:
+    """Frames, pixels and score; also when the laboratory had been prepared for another run before,
+    and with and without numba."""
+    here = digests(3, "B+drift", physics)
+    file = str(Path(__file__).with_name("conftest.py"))
+    for compiled in ("0", "1"):
+        there = subprocess.run(
+            [sys.executable, file, "3", "B+drift", physics],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=120,
+            env={
+                **os.environ,
+                "PYTHONPATH": str(REPOSITORY),
+                "PYTHONHASHSEED": "4711",
+                SWITCH: compiled,
+            },
+        )
+        assert there.stdout.split()[-2:] == here
+    assert digests(3, "B+drift", physics, prepared_before=True) == here
+    assert digests(4, "B+drift", physics) != here
 
 
 def test_outcomes_are_plain_words() -> None:

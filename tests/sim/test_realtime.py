@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import signal
 import socket
 from collections.abc import AsyncIterator, Callable
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from petrobot.services.comm.calls.caller import Caller, CommandAnswered, Notice
+from petrobot.services.comm.calls.caller import Caller, Notice
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.canopen.ports import StreamPort
 from petrobot.services.comm.location_file import load
@@ -134,7 +135,11 @@ async def test_images_come_with_their_age_and_stop_when_asked(shell: LaboratoryS
     camera.close()
 
 
-async def test_services_are_answered(shell: LaboratoryShell) -> None:
+async def test_services_are_answered(
+    shell: LaboratoryShell, caplog: pytest.LogCaptureFixture
+) -> None:
+    """And logged: each preparation, and each call that is refused."""
+    caplog.set_level(logging.INFO, "petrobot.sim")
     assert (
         await ask(shell, "laboratory_prepare", seed=7, regime="B+miscalibrated", runs=3)
     ).status == "success"
@@ -147,6 +152,9 @@ async def test_services_are_answered(shell: LaboratoryShell) -> None:
     assert (await ask(shell, "laboratory_fault", kind="slow_arm", factor=0.5)).status == "success"
     refused = await ask(shell, "laboratory_prepare", regime="Q")
     assert refused.status == "error" and "must begin with" in refused.text
+    logged = [record.getMessage() for record in caplog.records if record.name == "petrobot.sim"]
+    assert len(logged) == 2 and logged[0].endswith("of laboratory_prepare ended: success")
+    assert "of laboratory_prepare ended: error" in logged[1] and refused.text in logged[1]
 
 
 async def test_it_says_how_it_is(shell: LaboratoryShell) -> None:
@@ -154,7 +162,7 @@ async def test_it_says_how_it_is(shell: LaboratoryShell) -> None:
     answered: list[Answer] = []
 
     def hear(_: float, notices: list[Notice]) -> None:
-        answered.extend(notice.answer for notice in notices if isinstance(notice, CommandAnswered))
+        answered.extend(notice for notice in notices if isinstance(notice, Answer))
 
     caller = Caller("laboratory", Hello(2, 2, "client", "asking", "a1"))
     client = Client(*shell.server.address, caller, on_notices=hear)
@@ -169,7 +177,9 @@ async def test_it_says_how_it_is(shell: LaboratoryShell) -> None:
     ]
 
 
-async def test_a_fault_of_the_world_ends_the_shell(tmp_path: Path) -> None:
+async def test_a_fault_of_the_world_ends_the_shell(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     failing = LaboratoryShell(load(services_file(tmp_path)), "laboratory")
 
     def fails(now: float) -> None:
@@ -181,6 +191,7 @@ async def test_a_fault_of_the_world_ends_the_shell(tmp_path: Path) -> None:
         await failing.over.wait()
     with pytest.raises(RuntimeError, match="came to its end"):
         await failing.close()
+    assert "RuntimeError: the world came to its end" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,8 @@ def changed(one: Truth, other: Truth) -> set[str]:
         ("A + arm50", {"arm_speed"}),
         ("A+arm30", {"arm_speed"}),
         ("A+bouncy", {"cup.restitution"}),
+        ("A+cup50", {"cup.radius"}),
+        ("A+jitter+blur+two_balls", {"scatter"}),
         ("A+dim+arm50+bouncy", {"light_level", "arm_speed", "cup.restitution"}),
         ("C", {"speed"}),
     ],
@@ -61,7 +63,7 @@ def test_every_disturbance_of_the_file_is_tried_here(site: Site) -> None:
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("D", "must begin with one of A, B, C"),
+        ("Q", "must begin with one of A, B, C, D, E, F"),
         ("dim", "must begin with"),
         ("A+fog", "unknown disturbance 'fog'"),
         ("A+latency200+latency400", "latency200 and latency400 both set image_latency"),

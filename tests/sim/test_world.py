@@ -30,9 +30,9 @@ def leaned(angle: float, origin: tuple[float, float, float]) -> Frame3:
 class WorldByHand:
     """A world stepped by hand."""
 
-    def __init__(self, site: Site, regime: str) -> None:
-        self.site, self.truth = site, site.truth(regime)
-        self.world = BallWorld(site.cell, self.truth)
+    def __init__(self, site: Site, regime: str, physics: str) -> None:
+        self.site, self.truth, self.physics = site, site.truth(regime), physics
+        self.world = BallWorld(site.cell, self.truth, physics)
         self.tick = 0
 
     @property
@@ -84,11 +84,11 @@ def _free(world: BallWorld) -> bool:
 
 
 @pytest.fixture
-def hand(site: Site) -> Iterator[Callable[[str], WorldByHand]]:
+def hand(site: Site, physics: str) -> Iterator[Callable[[str], WorldByHand]]:
     hands: list[WorldByHand] = []
 
     def make(regime: str) -> WorldByHand:
-        hands.append(WorldByHand(site, regime))
+        hands.append(WorldByHand(site, regime, physics))
         return hands[-1]
 
     yield make
@@ -150,7 +150,9 @@ def test_restitution_decides_whether_fast_balls_stay_in(
     here = hand("C")
     here.world.close()
     here.world = BallWorld(
-        here.site.cell, replace(here.truth, cup=replace(here.truth.cup, restitution=restitution))
+        here.site.cell,
+        replace(here.truth, cup=replace(here.truth.cup, restitution=restitution)),
+        here.physics,
     )
     outcomes = []
     for n in range(1, 16):

@@ -3,7 +3,7 @@ solution and completion, and memory.
 
     python -m tools.bench.analysis            everything; tools that are not installed are named
     python -m tools.bench.analysis --quick    small nets only
-    python -m tools.bench.analysis --write docs/figures-analysis.md    also write the table as a page
+    python -m tools.bench.analysis --write docs/figures-analysis.md    also write the page
 
 Every measurement runs in a process of its own, so its peak memory is its own. Seconds are CPU
 seconds without imports and compilation. Only figures of the same run are comparable: the ratios say
@@ -200,8 +200,13 @@ def firings_ours(name: str, engine: str) -> dict[str, Any]:
 
     def work() -> dict[str, Any]:
         seen = simulate(
-            gspn, np.random.default_rng(1), replicas=2000, horizon=2500.0, firings=count, engine=engine,  # type: ignore[arg-type]
-        )  # fmt: skip
+            gspn,
+            np.random.default_rng(1),
+            replicas=2000,
+            horizon=2500.0,
+            firings=count,
+            engine=engine,  # type: ignore[arg-type]
+        )
         return {"firings": seen.firings}
 
     return timed(work)
@@ -235,7 +240,8 @@ def firings_snakes(name: str) -> dict[str, Any]:
 
 
 def long_run_ours(name: str, engine: str) -> dict[str, Any]:
-    """Build and solve the chain of a Kanban net."""
+    """Build and solve the chain of a Kanban net: all throughputs and mean tokens."""
+    from petrobot.coordinator.analysis.time import linear
     from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
     from petrobot.coordinator.analysis.time.markov import long_run
 
@@ -247,6 +253,8 @@ def long_run_ours(name: str, engine: str) -> dict[str, Any]:
         return {
             "states": run.chain.n,
             "residual": run.residual,
+            "precision": linear.TOLERANCE,
+            "measures": len(run.throughput) + len(run.mean_tokens),
             "throughput": run.throughput["tin1"],
         }
 
@@ -254,7 +262,7 @@ def long_run_ours(name: str, engine: str) -> dict[str, Any]:
 
 
 def long_run_storm(name: str) -> dict[str, Any]:
-    """Storm: the long-run share of time that a place is marked."""
+    """Storm: the long-run share of time that a place is marked, at its default precision."""
     import stormpy
 
     jani = storm_jani(storm_model(SPACES[name](), KANBAN_RATES))
@@ -264,7 +272,12 @@ def long_run_storm(name: str) -> dict[str, Any]:
         model = stormpy.build_model(jani, [formula])
         found = stormpy.model_checking(model, formula)
         value = getattr(found, "get_value", None) or found.at  # renamed in stormpy 2
-        return {"states": model.nr_states, "value": value(model.initial_states[0])}
+        return {
+            "states": model.nr_states,
+            "precision": 1e-6,  # Storm's default (`storm --help`, option precision)
+            "measures": 1,
+            "value": value(model.initial_states[0]),
+        }
 
     return timed(work)
 
@@ -291,10 +304,16 @@ def completion_ours(name: str, engine: str) -> dict[str, Any]:
 
 
 MEASURES: dict[str, Callable[..., dict[str, Any]]] = {
-    "space": space_ours, "space-snakes": space_snakes, "space-pm4py": space_pm4py, "space-storm": space_storm,
-    "firings": firings_ours, "firings-snakes": firings_snakes,
-    "long-run": long_run_ours, "long-run-storm": long_run_storm, "completion": completion_ours,
-}  # fmt: skip
+    "space": space_ours,
+    "space-snakes": space_snakes,
+    "space-pm4py": space_pm4py,
+    "space-storm": space_storm,
+    "firings": firings_ours,
+    "firings-snakes": firings_snakes,
+    "long-run": long_run_ours,
+    "long-run-storm": long_run_storm,
+    "completion": completion_ours,
+}
 
 
 def one(measure: str, name: str, engine: str) -> None:
@@ -356,10 +375,14 @@ def bench_spaces(names: tuple[str, ...]) -> None:
         tell(f"state space of {name}: {size} (ratio: how many times slower than numpy)")
         reference = None
         for what, measure, engine in (
-            ("numpy", "space", "numpy"), ("auto", "space", "auto"), ("integers", "space", "integers"),
-            ("numba", "space", "numba"), ("Storm", "space-storm", ""), ("SNAKES", "space-snakes", ""),
+            ("numpy", "space", "numpy"),
+            ("auto", "space", "auto"),
+            ("integers", "space", "integers"),
+            ("numba", "space", "numba"),
+            ("Storm", "space-storm", ""),
+            ("SNAKES", "space-snakes", ""),
             ("pm4py", "space-pm4py", ""),
-        ):  # fmt: skip
+        ):
             if (engine == "integers" and name not in QUICK) or (not engine and name in OTHERS_SKIP):
                 continue
             said = measured(measure, name, engine)
@@ -390,8 +413,11 @@ def bench_stochastic(quick: bool) -> None:
     for name in ("stages-4",) if quick else ("stages-4", "stages-8", "stages-16"):
         said = measured("completion", name, "auto")
         if said:
-            tell(f"completion of the catching task, {name}: {said['states']:,} markings, " f"build {said['build_seconds']:.3f} s, "
-                  f"mean and probability {said['seconds']:.4f} s, {said['megabytes']:.0f} MB")  # fmt: skip
+            tell(
+                f"completion of the catching task, {name}: {said['states']:,} markings, "
+                f"build {said['build_seconds']:.3f} s, "
+                f"mean and probability {said['seconds']:.4f} s, {said['megabytes']:.0f} MB"
+            )
 
 
 def main() -> None:

@@ -66,7 +66,8 @@ from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION as V
 
 PAYLOADS = [
-    [[]] * 19_900, [{}] * 19_900, [[None] * 5] * 19_900, [None] * 130_000, [1.5] * 110_000, ["x"] * 130_000,
+    [[]] * 19_900, [{}] * 19_900, [[None] * 5] * 19_900, [None] * 130_000, [1.5] * 110_000,
+    ["x"] * 130_000,
     bytes(1_900_000), "x" * 1_900_000, {str(n): n for n in range(21_000)}, [[None] * 40] * 99_000,
 ]
 
@@ -78,7 +79,8 @@ async def main():
     print("ready", flush=True)
     for _ in range(3):
         for payload in PAYLOADS:
-            outcomes = await asyncio.gather(*(client.call("echo", {"v": payload}) for _ in range(2)))
+            two = (client.call("echo", {"v": payload}) for _ in range(2))
+            outcomes = await asyncio.gather(*two)
             print(len(str(payload)[:9]), outcomes[0].status, outcomes[0].cause, flush=True)
     await client.close()
 

@@ -212,7 +212,8 @@ def main() -> None:
     base = statistics.median(bench.us["bare wire"])
     print(f"{options.rounds} rounds of {options.tokens} tokens; load {load()}")
     print(
-        f"{'us per token':28}{'median':>10}{'best':>10}{'worst':>10}{'x wire':>8}{'syncs/firing':>14}"
+        f"{'us per token':28}{'median':>10}{'best':>10}{'worst':>10}{'x wire':>8}"
+        f"{'syncs/firing':>14}"
     )
     rows: dict[str, Any] = {}
     for name, values in bench.us.items():

@@ -35,7 +35,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from tools.bench.processes import load, quantile
 
-from petrobot.services.comm.calls.caller import CallAccepted, CallEnded, Caller, Notice, PeerLost
+from petrobot.services.comm.calls.caller import Caller, Notice, PeerLost
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.streams.stream import STALE_AFTER, Incoming, StreamReceiver
@@ -82,10 +82,10 @@ async def lose_a_node(fault: LinkFault) -> tuple[float, float]:
             raise TimeoutError("the node does not answer")
         caller.call(client.now(), m.Call("1", "move"))
         client.flush()
-        await until(CallAccepted)
+        await until(m.Accept)
         began = client.now()
         inflict(fault, process, cable)
-        known, ended = await until(PeerLost), await until(CallEnded)
+        known, ended = await until(PeerLost), await until(m.Outcome)
         await client.close()
         cable.close()
     return known - began, ended - began
@@ -94,11 +94,11 @@ async def lose_a_node(fault: LinkFault) -> tuple[float, float]:
 async def false_alarms(seconds: float) -> dict[str, int]:
     """How often nodes that live were said to be lost, and how their runs ended meanwhile."""
     lost: list[PeerLost] = []
-    ended: list[CallEnded] = []
+    ended: list[m.Outcome] = []
 
     def take(now: float, notices: list[Notice]) -> None:
         lost.extend(one for one in notices if isinstance(one, PeerLost))
-        ended.extend(one for one in notices if isinstance(one, CallEnded))
+        ended.extend(one for one in notices if isinstance(one, m.Outcome))
 
     with contextlib.ExitStack() as stack:
         clients = []

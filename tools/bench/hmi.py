@@ -46,7 +46,8 @@ from tests.page.conftest import ARGUMENTS, BROWSER  # noqa: E402
 RATE = 50
 PROBE = """() => {
   const { link } = window.petrobot;
-  const probe = (window.probe = { late: [], frames: 0, painted: 0, before: link.deltas, from: performance.now() });
+  const probe = { late: [], frames: 0, painted: 0, before: link.deltas, from: performance.now() };
+  window.probe = probe;
   const paint = link.painted;
   link.painted = (changed, changes) => {
     paint(changed, changes);
@@ -54,14 +55,15 @@ PROBE = """() => {
     probe.painted += 1;
     const stamp = link.state.variables.stamp;
     const done = new MessageChannel();
-    done.port1.onmessage = () => probe.late.push(performance.timeOrigin + performance.now() - stamp);
+    const now = () => performance.timeOrigin + performance.now();
+    done.port1.onmessage = () => probe.late.push(now() - stamp);
     done.port2.postMessage(0); // a task of its own: it runs after this frame was painted
   };
   const frame = () => { probe.frames += 1; requestAnimationFrame(frame); };
   requestAnimationFrame(frame);
 }"""
-READ = """() => ({ late: probe.late, frames: probe.frames, painted: probe.painted, gaps: window.petrobot.link.gaps,
-  seconds: (performance.now() - probe.from) / 1000 })"""
+READ = """() => ({ late: probe.late, frames: probe.frames, painted: probe.painted,
+  gaps: window.petrobot.link.gaps, seconds: (performance.now() - probe.from) / 1000 })"""
 
 
 class SyntheticMission:

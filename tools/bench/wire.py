@@ -163,7 +163,8 @@ def scheduled(how: str, arguments: argparse.Namespace) -> dict[str, Any]:
     show("calls", calls)
     show("streams (age when taken)", streams)
     print(
-        f"\n{'goal (median, least and largest of the rounds)':52}{'limit':>7}{'median':>8}{'least':>8}{'largest':>8}"
+        f"\n{'goal (median, least and largest of the rounds)':52}{'limit':>7}{'median':>8}"
+        f"{'least':>8}{'largest':>8}"
     )
     for goal, (found, limit, met) in goals.items():
         row = "".join(f"{one:8.2f}" for one in (quantile(found, 0.5), min(found), max(found)))

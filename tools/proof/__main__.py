@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import Any
 
-from tools.proof import catching, convergence, learning, long_tests
+from tools.proof import catching, convergence, learning, long_tests, physics
 from tools.proof.page import figures
 from tools.proof.proof import KEPT, ROOT, FigureProof
 
@@ -25,7 +25,13 @@ FIGURES = ROOT / "docs" / "figures.md"
 
 def proofs() -> list[FigureProof]:
     """All of them, in the order in which people wait for them."""
-    return [*catching.proofs(), *convergence.proofs(), *long_tests.proofs(), *learning.proofs()]
+    return [
+        *catching.proofs(),
+        *physics.proofs(),
+        *convergence.proofs(),
+        *long_tests.proofs(),
+        *learning.proofs(),
+    ]
 
 
 def kept(proof: FigureProof) -> dict[str, Any] | None:

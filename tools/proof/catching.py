@@ -40,7 +40,7 @@ SOURCES = (
         "sim",
     ),
 )
-APART = ("services/mobile", "sim/track", "sim/rover")
+APART = ("services/mobile", "sim/track")
 
 
 def wilson_lower(successes: int, trials: int, z: float = 1.959964) -> float:
@@ -120,7 +120,9 @@ def same_file_anywhere() -> Result:
 
 def disturbances() -> list[str]:
     """Every disturbed regime by name, each at every speed."""
-    laboratory = tomllib.loads((ROOT / "sim" / "laboratory.toml").read_text(encoding="utf-8"))
+    laboratory = tomllib.loads(
+        (ROOT / "sim" / "catching" / "laboratory.toml").read_text(encoding="utf-8")
+    )
     return [f"{speed}+{name}" for name in laboratory["disturbances"] for speed in FLOORS]
 
 

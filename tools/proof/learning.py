@@ -294,7 +294,7 @@ STEPS: Mapping[str, Callable[[Sizes, argparse.Namespace], Result]] = {
 }
 CHAPTER = "Learning and forecasting, lock step"
 SOURCES = ("coordinator", "services.toml", "services", "sim")
-APART = ("coordinator/page", "services/mobile", "sim/track", "sim/rover")
+APART = ("coordinator/page", "services/mobile", "sim/track")
 FULL = ROOT / "reports" / "proof" / "learning"
 
 

@@ -71,7 +71,7 @@ def run_task(name: str, *arguments: str) -> dict[str, Any]:
     Raises RuntimeError when the command fails in another way than by the task's own outcome.
     """
     path = KEPT / f"{name}.run.json"
-    done = command("coordinator", "run", *arguments, "--quiet", "--json", str(path))
+    done = command("petrobot.coordinator", "run", *arguments, "--quiet", "--json", str(path))
     if done.returncode not in (0, 1):
         raise RuntimeError(
             f"petrobot run {' '.join(arguments)}: exit {done.returncode}\n{done.stderr[-2000:]}"

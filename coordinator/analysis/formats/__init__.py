@@ -1,25 +1,178 @@
-"""Net files by their endings: read, write, and list what the written format cannot keep."""
+"""Net files by their endings: read, write, and list what the written format cannot keep.
+
+`FORMATS` is the one table of what each format can say, and `losses` the one place that compares it
+with a net: a feature that the net has and the table does not promise for the format is lost.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
+from re import Pattern
 
-from petrobot.coordinator.analysis.formats import exports, pnml, tina
-from petrobot.coordinator.analysis.formats.greatspn import parse_pnpro
+from petrobot.coordinator.analysis.formats import exports, greatspn, pnml, tina
 from petrobot.coordinator.analysis.formats.netfile import NetFile, NetFileError
-from petrobot.coordinator.analysis.formats.pnml import parse_pnml
-from petrobot.coordinator.analysis.time.gspn import Chain
+from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 
-READ: dict[str, Callable[[bytes, str], NetFile]] = {
-    ".pnml": parse_pnml,
-    ".xml": parse_pnml,
-    ".pnpro": parse_pnpro,
+
+class Feature(StrEnum):
+    """What a net may have beyond places, transitions, weighted arcs and tokens, in plain words."""
+
+    NAME = "the name of the net"
+    LABELS = "display names"
+    POSITIONS = "positions of the drawing"
+    INHIBITORS = "inhibitor arcs"
+    CAPACITIES = "capacities"
+    PRIORITIES = "priorities"
+    UNTIMED = "that no transition has a time"
+    RATES = "rates and weights"
+    SERVERS = "numbers of servers"
+    BEYOND = "data beyond the net"
+
+
+HAS: Mapping[Feature, Callable[[NetFile], bool]] = {
+    Feature.NAME: lambda model: bool(model.name),
+    Feature.LABELS: lambda model: bool(model.labels),
+    Feature.POSITIONS: lambda model: bool(model.positions),
+    Feature.INHIBITORS: lambda model: any(model.net.inhibit),
+    Feature.CAPACITIES: lambda model: any(c is not None for c in model.net.capacity),
+    Feature.PRIORITIES: lambda model: len(_ranks(model)) > 1,
+    Feature.UNTIMED: lambda model: model.gspn is None and bool(model.net.transitions),
+    Feature.RATES: lambda model: model.gspn is not None,
+    Feature.SERVERS: lambda model: (
+        model.gspn is not None
+        and any(
+            rate is not None and servers != 1
+            for rate, servers in zip(model.gspn.rate, model.gspn.servers, strict=True)
+        )
+    ),
+    Feature.BEYOND: lambda model: bool(model.beyond),
+}
+
+
+def _ranks(model: NetFile) -> set[int]:
+    """Return the priorities of the transitions that compete by priority: in a GSPN the immediate
+    ones."""
+    rates = model.gspn.rate if model.gspn else (None,) * len(model.net.priority)
+    return {own for own, rate in zip(model.net.priority, rates, strict=True) if rate is None}
+
+
+KEPT = ""
+AS_INHIBITORS = "written as inhibitor arcs with the same effect"
+OWN_DATA = "not part of ISO PNML: written as tool-specific data, which only petrobot reads"
+
+
+@dataclass(frozen=True)
+class Format:
+    """What a file format can say: `says` maps a feature to KEPT or to the form it is written in."""
+
+    write: Callable[[NetFile], str]
+    says: Mapping[Feature, str] = field(default_factory=dict)
+    names: Pattern[str] | None = None
+    """The names that the format allows; others are replaced."""
+    instead: str = ""
+    """What is written, if it is not the net at all."""
+
+
+FORMATS: Mapping[str, Format] = {
+    ".pnml": Format(
+        pnml.write_pnml,
+        {
+            Feature.NAME: KEPT,
+            Feature.LABELS: KEPT,
+            Feature.POSITIONS: KEPT,
+            Feature.UNTIMED: KEPT,
+            Feature.INHIBITORS: "not part of ISO PNML: written as arc types of other tools "
+            "(`type` and `arctype`); a tool that reads only the standard takes them for normal "
+            "arcs",
+            Feature.CAPACITIES: OWN_DATA,
+            Feature.PRIORITIES: OWN_DATA,
+            Feature.RATES: OWN_DATA,
+            Feature.SERVERS: OWN_DATA,
+        },
+        pnml.XML_ID,
+    ),
+    ".net": Format(
+        tina.write_tina,
+        {
+            Feature.NAME: KEPT,
+            Feature.LABELS: KEPT,
+            Feature.UNTIMED: KEPT,
+            Feature.INHIBITORS: KEPT,
+            Feature.PRIORITIES: KEPT,
+            Feature.CAPACITIES: AS_INHIBITORS,
+        },
+        tina.ANY_NAME,
+    ),
+    ".pnpro": Format(
+        greatspn.write_pnpro,
+        {
+            Feature.NAME: KEPT,
+            Feature.POSITIONS: KEPT,
+            Feature.INHIBITORS: KEPT,
+            Feature.RATES: KEPT,
+            Feature.SERVERS: KEPT,
+            Feature.PRIORITIES: KEPT,
+            Feature.CAPACITIES: AS_INHIBITORS,
+            Feature.UNTIMED: "written as immediate transitions of weight 1",
+        },
+        greatspn.IDENTIFIER,
+    ),
+    ".dot": Format(
+        exports.write_dot,
+        {
+            Feature.NAME: KEPT,
+            Feature.LABELS: KEPT,
+            Feature.UNTIMED: KEPT,
+            Feature.INHIBITORS: "drawn with a round head",
+        },
+    ),
+    ".drn": Format(
+        lambda model: exports.write_drn(Chain.of(_timed(model))),
+        instead="the net itself: only its chain over the tangible markings is written",
+    ),
+}
+"""Formats that can be written, by ending."""
+
+READ: Mapping[str, Callable[[bytes, str], NetFile]] = {
+    ".pnml": pnml.parse_pnml,
+    ".xml": pnml.parse_pnml,
+    ".tapn": pnml.parse_pnml,
+    ".pnpro": greatspn.parse_pnpro,
     ".net": lambda text, file: tina.parse_tina(_utf8(text, file), file),
 }
-"""Readers by ending. `.xml` is PNML as PIPE writes it. Bytes, because XML declares its encoding."""
-WRITE = (".pnml", ".net", ".dot", ".drn")
-"""Endings that can be written."""
+"""Readers by ending. `.xml` is PNML as PIPE writes it, `.tapn` as TAPAAL does. Bytes, because XML
+declares its encoding."""
+
+
+def losses(model: NetFile, ending: str) -> list[str]:
+    """Return what a file of this ending does not say of the net, or says in another form."""
+    target = FORMATS[ending]
+    if target.instead:
+        return [target.instead]
+    return list(_losses(model, target, ending))
+
+
+def _losses(model: NetFile, target: Format, ending: str) -> Iterator[str]:
+    in_place = ending == ".pnml" and model.document is not None
+    for feature, has in HAS.items():
+        if feature is Feature.BEYOND or not has(model):
+            continue
+        if feature not in target.says:
+            yield str(feature)
+        elif target.says[feature] != KEPT:
+            yield f"{feature}: {target.says[feature]}"
+    if not in_place:
+        yield from model.beyond
+        if target.names is not None:
+            _, renamed = model.with_names(target.names)
+            if renamed:
+                some = ", ".join(f"{old!r} as {new!r}" for old, new in list(renamed.items())[:3])
+                yield f"{len(renamed)} ids that the format does not allow: written {some}" + (
+                    ", ..." if len(renamed) > 3 else ""
+                )
 
 
 def read_net(path: Path) -> NetFile:
@@ -45,27 +198,24 @@ def _utf8(text: bytes, file: str) -> str:
         raise NetFileError(file, "file", str(error), "give a UTF-8 file") from error
 
 
+def _timed(model: NetFile) -> Gspn:
+    if model.gspn is None:
+        raise NetFileError("drn", "rates", "the net has none", "give rates; a CTMC needs them")
+    return model.gspn
+
+
 def written(model: NetFile, target: Path) -> tuple[str, list[str]]:
     """Return (the net as text, what is lost) in the format of the target's ending.
 
     Raises NetFileError.
     """
-    match target.suffix.lower():
-        case ".pnml":
-            return pnml.write_pnml(model), pnml.losses(model)
-        case ".net":
-            return tina.write_tina(model), tina.losses(model)
-        case ".dot":
-            return exports.write_dot(model), ["a drawing: priorities, capacities and rates"]
-        case ".drn":
-            if model.gspn is None:
-                raise NetFileError(
-                    str(target), "rates", "the net has none", "give rates; a CTMC needs them"
-                )
-            return exports.write_drn(Chain.of(model.gspn)), [
-                "the net itself: only its chain is written"
-            ]
-    ending = f"the ending {target.suffix}" if target.suffix else "a file without ending"
-    raise NetFileError(
-        str(target), "file", f"no writer for {ending}", f"end its name in {', '.join(WRITE)}"
-    )
+    found = FORMATS.get(target.suffix.lower())
+    if found is None:
+        ending = f"the ending {target.suffix}" if target.suffix else "a file without ending"
+        raise NetFileError(
+            str(target), "file", f"no writer for {ending}", f"end its name in {', '.join(FORMATS)}"
+        )
+    try:
+        return found.write(model), losses(model, target.suffix.lower())
+    except NetFileError as error:
+        raise NetFileError(str(target), error.element, error.problem, error.remedy) from error

@@ -6,25 +6,31 @@ behaviour, and listed in `notes` if it does not.
 
 from __future__ import annotations
 
-import ast
 import json
+import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from itertools import chain, count
 from typing import Any
 from xml.etree.ElementTree import Element
 
 from petrobot.coordinator.analysis.time.gspn import Gspn
-from petrobot.coordinator.task.net import Net
+from petrobot.coordinator.task.net import Arcs, Net
 
 
 class NetFileError(ValueError):
-    """A file cannot be read or a net cannot be written: file, element, problem and remedy."""
+    """A file cannot be read or a net cannot be written: file, line, element, problem, remedy."""
 
-    def __init__(self, file: str, element: str, problem: str, remedy: str = "") -> None:
+    def __init__(
+        self, file: str, element: str, problem: str, remedy: str = "", *, line: int | None = None
+    ) -> None:
         """Compose the one-line message."""
         self.file, self.element, self.problem, self.remedy = file, element, problem, remedy
-        super().__init__(f"{file}: {element}: {problem}" + (f"; {remedy}" if remedy else ""))
+        self.line = line
+        at = file if line is None else f"{file}:{line}"
+        super().__init__(f"{at}: {element}: {problem}" + (f"; {remedy}" if remedy else ""))
 
 
 @dataclass(frozen=True)
@@ -43,9 +49,74 @@ class NetFile:
     positions: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Drawing positions by id (drawing units of the file, y downwards)."""
     notes: tuple[str, ...] = ()
-    """What the file contains beyond the net, without effect on its behaviour."""
+    """How the net here differs from its file, without effect on the behaviour."""
+    beyond: tuple[str, ...] = ()
+    """What the file contains beyond the net: pages, drawings, data of other tools."""
     document: Element | None = field(default=None, compare=False, repr=False)
-    """The XML tree of a PNML file, so that writing keeps graphics, pages, tool-specific data."""
+    """The XML tree of an ISO PNML file, so that writing PNML keeps what is in `beyond`."""
+
+    def with_names(self, legal: re.Pattern[str]) -> tuple[NetFile, dict[str, str]]:
+        """Return the net with names that match a pattern and differ from each other.
+
+        Also returns the new names of the nodes that got one, by their old names. Their old names
+        become labels.
+        """
+        net = self.net
+        kept = [name for name in net.places if legal.fullmatch(name)]
+        taken = set(kept)
+        new: dict[tuple[str, str], str] = {("place", name): name for name in kept}
+        for name in net.transitions:
+            if legal.fullmatch(name) and name not in taken:
+                new["transition", name] = name
+                taken.add(name)
+        for kind, names in (("place", net.places), ("transition", net.transitions)):
+            for name in names:
+                if (kind, name) not in new:
+                    new[kind, name] = _unused(name, legal, taken, kind[0])
+                    taken.add(new[kind, name])
+        changed = {name: to for (_, name), to in new.items() if name != to}
+        if not changed:
+            return self, {}
+        places = tuple(new["place", name] for name in net.places)
+        transitions = tuple(new["transition", name] for name in net.transitions)
+        renamed = replace(net, places=places, transitions=transitions)
+        moved = {
+            to: self.labels.get(name, name)
+            for (_, name), to in new.items()
+            if name != to or name in self.labels
+        }
+        return replace(
+            self,
+            net=renamed,
+            gspn=replace(self.gspn, net=renamed) if self.gspn else None,
+            labels=moved,
+            positions={
+                to: self.positions[name] for (_, name), to in new.items() if name in self.positions
+            },
+        ), changed
+
+
+def _unused(name: str, legal: re.Pattern[str], taken: set[str], letter: str) -> str:
+    """Return a legal name like `name` that is not taken."""
+    stem = re.sub(r"\W", "_", name, flags=re.ASCII)
+    stem = stem if legal.fullmatch(stem) else f"{letter}_{stem}"
+    return next(one for one in chain([stem], (f"{stem}_{i}" for i in count(2))) if one not in taken)
+
+
+def thresholds(net: Net, t: int) -> Arcs:
+    """Return the inhibitor arcs that have the effect of those of t and of all capacities.
+
+    Raises NetFileError if no inhibitor arc has that effect.
+    """
+    bars = net.compiled.bars[t]
+    if any(k < 1 for _, k in bars):
+        raise NetFileError(
+            "net",
+            f"transition {net.transitions[t]}",
+            "it would always exceed a capacity, so it can never fire",
+            "raise the capacity",
+        )
+    return bars
 
 
 class NetDraft:
@@ -54,6 +125,8 @@ class NetDraft:
     def __init__(self, file: str) -> None:
         """Start an empty net; errors name `file`."""
         self.file = file
+        self.line: int | None = None
+        """The line that is being read; the reader keeps it up to date for the errors."""
         self.places: dict[str, int] = {}
         self.capacity: dict[str, int] = {}
         self.transitions: dict[str, int] = {}
@@ -63,13 +136,19 @@ class NetDraft:
         self.rates: dict[str, float] = {}
         self.weights: dict[str, float] = {}
         self.servers: dict[str, int | None] = {}
+        self.constants: dict[str, Fraction] = {}
         self.notes: list[str] = []
 
+    def fault(self, element: str, problem: str, remedy: str = "") -> NetFileError:
+        """Return an error at the line that is being read."""
+        return NetFileError(self.file, element, problem, remedy, line=self.line)
+
     def place(self, name: str, tokens: int, capacity: int | None = None) -> None:
-        """Add a place. Raises NetFileError if the id is taken or `tokens` is negative."""
+        """Add a place. Raises NetFileError if the id is taken or a number is negative."""
         self._fresh(name)
-        if tokens < 0:
-            raise NetFileError(self.file, f"place {name}", f"{tokens} tokens", "give 0 or more")
+        for what, number in (("tokens", tokens), ("tokens as its capacity", capacity)):
+            if number is not None and number < 0:
+                raise self.fault(f"place {name}", f"{number} {what}", "give 0 or more")
         self.places[name] = tokens
         if capacity is not None:
             self.capacity[name] = capacity
@@ -82,9 +161,7 @@ class NetDraft:
 
     def _fresh(self, name: str) -> None:
         if name in self.places or name in self.transitions:
-            raise NetFileError(
-                self.file, name, "this id occurs twice", "ids must be unique in a file"
-            )
+            raise self.fault(name, "this id occurs twice", "ids must be unique in a file")
 
     def arc(
         self, source: str, target: str, weight: int, what: str = "normal", element: str = "arc"
@@ -96,22 +173,25 @@ class NetDraft:
         place, transition = (source, target) if source in self.places else (target, source)
         if place not in self.places or transition not in self.transitions:
             remedy = "an arc connects a place and a transition of the file"
-            raise NetFileError(
-                self.file, element, f"it leads from {source!r} to {target!r}", remedy
-            )
+            raise self.fault(element, f"it leads from {source!r} to {target!r}", remedy)
         if weight < 1:
-            raise NetFileError(self.file, element, f"a weight of {weight}", "give 1 or more")
+            raise self.fault(element, f"a weight of {weight}", "give 1 or more")
         into = source == place
+        if what != "normal" and not into:
+            raise self.fault(
+                element,
+                f"{'an inhibitor' if what == 'inhibitor' else 'a test'} arc that leaves a "
+                "transition",
+                "it must lead from a place to a transition",
+            )
         if what == "inhibitor":
-            if not into:
-                raise NetFileError(
-                    self.file,
-                    element,
-                    "an inhibitor arc that leaves a transition",
-                    "it must lead from a place to a transition",
+            known = self.inhibit[transition].get(place)
+            if known is not None:
+                self.notes.append(
+                    f"{element}: of parallel inhibitor arcs between {source} and {target} the "
+                    "lowest weight counts"
                 )
-            known = self.inhibit[transition].get(place, weight)
-            self.inhibit[transition][place] = min(known, weight)
+            self.inhibit[transition][place] = min(known or weight, weight)
         elif what == "test":
             self._test(place, transition, weight)
         else:
@@ -128,6 +208,32 @@ class NetDraft:
         if missing > 0:
             for table in (self.consume[transition], self.produce[transition]):
                 table[place] = table.get(place, 0) + missing
+
+    def number(self, element: str, text: str) -> Fraction:
+        """Return the exact value of an expression of numbers, constants, + - * / and parentheses.
+
+        Raises NetFileError.
+        """
+        try:
+            return evaluate(text, self.constants)
+        except (ValueError, ZeroDivisionError) as error:
+            remedy = "use numbers and declared constants with + - * / ( )"
+            raise self.fault(element, f"{_short(text)!r} has no value: {error}", remedy) from error
+
+    def whole(self, element: str, text: str) -> int:
+        """Return an expression as a whole number. Raises NetFileError."""
+        value = self.number(element, text)
+        if value.denominator != 1:
+            raise self.fault(
+                element,
+                f"expected a whole number, got {_short(text)!r}",
+                "tokens and weights are whole numbers",
+            )
+        return int(value)
+
+    def position(self, element: str, x: str | None, y: str | None) -> tuple[float, float]:
+        """Return the position in a drawing; a missing coordinate is 0. Raises NetFileError."""
+        return float(self.number(element, x or "0")), float(self.number(element, y or "0"))
 
     def net(self) -> Net:
         """Return the net. Raises NetFileError if it is malformed."""
@@ -152,47 +258,112 @@ class NetDraft:
             raise NetFileError(self.file, "rates", str(error)) from error
 
 
-def arithmetic(file: str, element: str, text: str, names: Mapping[str, float]) -> float:
-    """Evaluate an expression of numbers, names, + - * / and parentheses. Raises NetFileError."""
-    try:
-        return _value(ast.parse(text.strip(), mode="eval").body, names)
-    except (SyntaxError, KeyError, TypeError, ZeroDivisionError) as error:
-        remedy = "use numbers and declared constants with + - * / ( )"
-        raise NetFileError(file, element, f"{text!r} has no value", remedy) from error
+def _short(text: str) -> str:
+    """Return a text cut to the length of a message."""
+    return text if len(text) <= 40 else f"{text[:39]}…"
 
 
-def _value(node: ast.expr, names: Mapping[str, float]) -> float:
-    match node:
-        case ast.Constant(value=int() | float() as number):
-            return float(number)
-        case ast.Name(id=name):
-            return names[name]
-        case ast.UnaryOp(op=ast.USub(), operand=inner):
-            return -_value(inner, names)
-        case ast.BinOp(left=left, op=ast.Add(), right=right):
-            return _value(left, names) + _value(right, names)
-        case ast.BinOp(left=left, op=ast.Sub(), right=right):
-            return _value(left, names) - _value(right, names)
-        case ast.BinOp(left=left, op=ast.Mult(), right=right):
-            return _value(left, names) * _value(right, names)
-        case ast.BinOp(left=left, op=ast.Div(), right=right):
-            return _value(left, names) / _value(right, names)
-    raise TypeError(type(node).__name__)
+LEXEME = re.compile(
+    r"\s*(?:(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)"
+    r"|(?P<name>[^\W\d]\w*)|(?P<sign>[-+*/()]))"
+)
+LARGEST = Fraction(10**300)
+"""Magnitude of the numbers in net files: with it every value is also a finite float."""
+NESTED = 50
+"""The most parentheses and signs inside each other."""
 
 
-def whole_number(
-    file: str, element: str, text: str, names: Mapping[str, float] | None = None
-) -> int:
-    """Evaluate an expression to a whole number. Raises NetFileError."""
-    value = arithmetic(file, element, text, names or {})
-    if value != int(value):
-        raise NetFileError(
-            file,
-            element,
-            f"expected a whole number, got {text!r}",
-            "tokens and weights are whole numbers",
-        )
-    return int(value)
+def evaluate(text: str, names: Mapping[str, Fraction]) -> Fraction:
+    """Return the exact value of an expression of numbers, names, + - * / and parentheses.
+
+    Raises ValueError and ZeroDivisionError.
+    """
+    return _Expression(text, names).value()
+
+
+class _Expression:
+    """Arithmetic as other tools write it, by recursive descent; exact, because tokens are.
+
+    It is our own because Python's parser refuses constants that are named like its keywords
+    (`lambda`) and accepts much that no other tool means.
+    """
+
+    def __init__(self, text: str, names: Mapping[str, Fraction]) -> None:
+        self.names = names
+        self.words: list[tuple[str, str]] = []
+        at = 0
+        text = text.strip()
+        while at < len(text):
+            found = LEXEME.match(text, at)
+            if found is None:
+                raise ValueError(f"unexpected {text[at:].strip()[:1]!r}")
+            self.words.append((found.lastgroup or "", found[found.lastgroup or 0]))
+            at = found.end()
+        self.next = 0
+
+    def value(self) -> Fraction:
+        """Return the value of the whole text. Raises ValueError and ZeroDivisionError."""
+        value = self._sum(0)
+        if self.next < len(self.words):
+            raise ValueError(f"unexpected {self.words[self.next][1]!r}")
+        return value
+
+    def _accept(self, signs: str) -> str:
+        """Return and skip the next sign if it is one of these, else ""."""
+        kind, word = self.words[self.next] if self.next < len(self.words) else ("", "")
+        if kind != "sign" or word not in signs:
+            return ""
+        self.next += 1
+        return word
+
+    def _sum(self, depth: int) -> Fraction:
+        value = self._product(depth)
+        while sign := self._accept("+-"):
+            term = self._product(depth)
+            value = _bounded(value + term if sign == "+" else value - term)
+        return value
+
+    def _product(self, depth: int) -> Fraction:
+        value = self._factor(depth)
+        while sign := self._accept("*/"):
+            factor = self._factor(depth)
+            value = _bounded(value * factor if sign == "*" else value / factor)
+        return value
+
+    def _factor(self, depth: int) -> Fraction:
+        if depth > NESTED:
+            raise ValueError(f"nested more than {NESTED} deep")
+        if sign := self._accept("+-"):
+            value = self._factor(depth + 1)
+            return -value if sign == "-" else value
+        if self._accept("("):
+            value = self._sum(depth + 1)
+            if not self._accept(")"):
+                raise ValueError("a closing parenthesis is missing")
+            return value
+        if self.next >= len(self.words):
+            raise ValueError("it ends too early")
+        kind, word = self.words[self.next]
+        self.next += 1
+        if kind == "number":
+            # Fraction("1e999999999") would need gigabytes; a float tells the magnitude first.
+            if len(word) > 300 or not float(word) < float(LARGEST):
+                raise ValueError("the number is too large")
+            if "e" in word.lower() and float(word) < 1 / float(LARGEST):
+                return Fraction(0)
+            return Fraction(word)
+        if kind == "name":
+            if word not in self.names:
+                raise ValueError(f"unknown name {word!r}")
+            return self.names[word]
+        raise ValueError(f"unexpected {word!r}")
+
+
+def _bounded(value: Fraction) -> Fraction:
+    """Return the value. Raises ValueError where arithmetic with it would not end in time."""
+    if abs(value) > LARGEST or value.denominator > LARGEST:
+        raise ValueError("the number is too large or too fine")
+    return value
 
 
 TABLES = {"rates", "weights", "servers", "default_rate"}

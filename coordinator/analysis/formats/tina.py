@@ -8,14 +8,16 @@ TINA toolbox.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 
-from petrobot.coordinator.analysis.formats.netfile import NetDraft, NetFile, NetFileError
+from petrobot.coordinator.analysis.formats.netfile import NetDraft, NetFile, thresholds
 from petrobot.coordinator.task.net import Net
 
-TOKEN = re.compile(r"\{(?:\\.|[^}\\])*\}|->|[^\s{]+")
-PLAIN = re.compile(r"[A-Za-z_'][\w']*\Z")
+TOKEN = re.compile(r"\s*(\{(?:\\.|[^}\\])*\}|->|[^\s{}#]+)")
+PLAIN = re.compile(r"[A-Za-z_'][A-Za-z0-9_']*\Z")
 SCALE = {"K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
-ARC = re.compile(r"(?P<kind>\*|\?-|\?|!-|!)(?P<weight>\d+[KMGT]?)\Z")
+ARC = re.compile(r"(?P<kind>\*|\?-|\?|!-|!)(?P<weight>[0-9]{1,300}[KMGT]?)\Z")
+MARKING = re.compile(r"\(([0-9]{1,300}[KMGT]?)\)")
 
 
 def parse_tina(text: str, file: str = "net") -> NetFile:
@@ -25,137 +27,222 @@ def parse_tina(text: str, file: str = "net") -> NetFile:
 
 class _TinaReading:
     def __init__(self, text: str, file: str) -> None:
-        self.file = file
+        self.draft = NetDraft(file)
         self.name = ""
         self.tokens: dict[str, int] = {}
-        self.labels: dict[str, str] = {}
-        self.arcs: list[tuple[str, str, int, str, str]] = []
+        self.labels: dict[str, tuple[str, int]] = {}
+        self.arcs: list[tuple[str, str, int, str, int]] = []
         self.transitions: list[str] = []
-        self.above: list[tuple[list[str], list[str]]] = []
-        self.notes: list[str] = []
-        for number, line in enumerate(text.replace("\\\n", " ").splitlines(), 1):
-            words = TOKEN.findall(line.split("#")[0])
+        self.above: list[tuple[list[str], list[str], int]] = []
+        self.beyond: list[str] = []
+        self.line = 0
+        for self.line, line in _logical_lines(text):
+            self.draft.line = self.line
+            words = self._words(line)
             if words:
-                self._line(words, f"line {number}")
+                self._statement(words)
 
-    def _line(self, words: list[str], at: str) -> None:
+    def _words(self, line: str) -> list[str]:
+        """Return the words of a line up to a comment. Raises NetFileError."""
+        words, at = [], 0
+        while line[at:].strip():
+            if line[at:].lstrip().startswith("#"):
+                break
+            found = TOKEN.match(line, at)
+            if found is None:
+                rest = line[at:].strip()
+                raise self.draft.fault("line", f"unexpected {rest[:20]!r}", "braces come in pairs")
+            words.append(found[1])
+            at = found.end()
+        return words
+
+    def _statement(self, words: list[str]) -> None:
         match words[0]:
             case "net":
+                self._only(words, 2, "net NAME")
                 self.name = _bare(words[1]) if len(words) > 1 else ""
             case "tr":
-                self._transition(words[1:], at)
+                self._transition(words[1:])
             case "pl":
-                self._place(words[1:], at)
+                self._place(words[1:])
             case "lb":
-                self.labels[_bare(words[1])] = _bare(words[2])
+                self._only(words, 3, "lb NODE LABEL")
+                if len(words) < 3:
+                    raise self.draft.fault(
+                        " ".join(words), "a label needs a node and a text", "write lb NODE LABEL"
+                    )
+                self.labels[_bare(words[1])] = _bare(words[2]), self.line
             case "pr":
-                split = (
-                    words.index(">")
-                    if ">" in words
-                    else words.index("<")
-                    if "<" in words
-                    else len(words)
-                )
-                first, second = (
-                    [_bare(w) for w in part] for part in (words[1:split], words[split + 1 :])
-                )
-                self.above.append((first, second) if ">" in words else (second, first))
+                self._priority(words[1:])
             case "nt":
-                self.notes.append(f"{at}: a note")
+                self.beyond.append(f"the note in line {self.line}")
             case other:
-                raise NetFileError(
-                    self.file,
-                    at,
+                raise self.draft.fault(
+                    "line",
                     f"a line that begins with {other!r}",
                     "expected net, tr, pl, lb, pr or nt",
                 )
 
-    def _transition(self, words: list[str], at: str) -> None:
+    def _only(self, words: list[str], most: int, form: str) -> None:
+        if len(words) > most:
+            raise self.draft.fault(words[0], f"unexpected {words[most]!r}", f"write {form}")
+
+    def _priority(self, words: list[str]) -> None:
+        signs = [word for word in words if word in ("<", ">")]
+        if len(signs) != 1 or words[0] in signs or words[-1] in signs:
+            raise self.draft.fault("pr", "not of the form A ... > B ...", "write pr HIGH > LOW")
+        split = words.index(signs[0])
+        first, second = ([_bare(w) for w in part] for part in (words[:split], words[split + 1 :]))
+        high, low = (first, second) if signs[0] == ">" else (second, first)
+        self.above.append((high, low, self.line))
+
+    def _labelled(self, name: str, rest: list[str]) -> list[str]:
+        """Read `: LABEL` after a name; return the words that follow."""
+        if not rest or rest[0] != ":":
+            return rest
+        if len(rest) < 2:
+            raise self.draft.fault(name, "no label after the colon", "write NAME : LABEL")
+        self.labels[name] = _bare(rest[1]), self.line
+        return rest[2:]
+
+    def _transition(self, words: list[str]) -> None:
         if not words:
-            raise NetFileError(self.file, at, "a transition without a name")
+            raise self.draft.fault("tr", "a transition without a name", "write tr NAME IN -> OUT")
         name = _bare(words[0])
+        element = f"transition {name}"
         self.transitions.append(name)
-        rest = words[1:]
-        if rest and rest[0] == ":":
-            self.labels[name], rest = _bare(rest[1]), rest[2:]
+        rest = self._labelled(name, words[1:])
         if rest and rest[0][0] in "[]":
             if rest[0] not in ("[0,w[", "[0,inf["):
-                raise NetFileError(
-                    self.file,
-                    at,
-                    f"a time interval {rest[0]}",
-                    "only untimed nets are read; remove it",
+                raise self.draft.fault(
+                    element, f"a time interval {rest[0]}", "only untimed nets are read; remove it"
                 )
             rest = rest[1:]
-        if "->" not in rest:
-            raise NetFileError(
-                self.file, at, "no -> in a transition", "write tr NAME INPUTS -> OUTPUTS"
-            )
+        if rest.count("->") != 1:
+            problem = "no -> in a transition" if "->" not in rest else "two -> in a transition"
+            raise self.draft.fault(element, problem, "write tr NAME INPUTS -> OUTPUTS")
         arrow = rest.index("->")
         for word in _joined(rest[:arrow]):
-            self._arc(word, name, at, True)
+            self._arc(word, name, True)
         for word in _joined(rest[arrow + 1 :]):
-            self._arc(word, name, at, False)
+            self._arc(word, name, False)
 
-    def _arc(self, word: str, transition: str, at: str, into: bool) -> None:
+    def _arc(self, word: str, transition: str, into: bool) -> None:
         place, suffix = _split(word)
         kind, weight = "normal", 1
-        if suffix:
+        if suffix or not place:
             found = ARC.match(suffix)
-            if found is None or found["kind"][0] == "!" or (found["kind"] != "*" and not into):
-                raise NetFileError(
-                    self.file, at, f"unknown arc {word!r}", "write p, p*2, p?2 or p?-2"
+            if (
+                found is None
+                or not place
+                or found["kind"][0] == "!"
+                or (found["kind"] != "*" and not into)
+            ):
+                raise self.draft.fault(
+                    f"transition {transition}", f"unknown arc {word!r}", "write p, p*2, p?2 or p?-2"
                 )
             kind = {"*": "normal", "?": "test", "?-": "inhibitor"}[found["kind"]]
             weight = _number(found["weight"])
         self.tokens.setdefault(place, 0)
         source, target = (place, transition) if into else (transition, place)
-        self.arcs.append((source, target, weight, kind, at))
+        self.arcs.append((source, target, weight, kind, self.line))
 
-    def _place(self, words: list[str], at: str) -> None:
+    def _place(self, words: list[str]) -> None:
+        if not words:
+            raise self.draft.fault("pl", "a place without a name", "write pl NAME (TOKENS)")
         name = _bare(words[0])
         self.tokens.setdefault(name, 0)
-        rest = words[1:]
-        if rest and rest[0] == ":":
-            self.labels[name], rest = _bare(rest[1]), rest[2:]
-        for word in rest:
-            if not re.fullmatch(r"\(\d+[KMGT]?\)", word):
-                raise NetFileError(
-                    self.file, at, f"unexpected {word!r} after a place", "write pl NAME (TOKENS)"
+        for word in self._labelled(name, words[1:]):
+            found = MARKING.fullmatch(word)
+            if found is None:
+                raise self.draft.fault(
+                    f"place {name}",
+                    f"unexpected {word!r} after a place",
+                    "write pl NAME (TOKENS)",
                 )
-            self.tokens[name] += _number(word[1:-1])
+            self.tokens[name] += _number(found[1])
 
     def result(self) -> NetFile:
         """Return the net. Raises NetFileError."""
-        draft = NetDraft(self.file)
+        draft = self.draft
         for place, tokens in self.tokens.items():
             draft.place(place, tokens)
         priority = self._priorities()
+        draft.line = None
         for transition in dict.fromkeys(self.transitions):
             draft.transition(transition, priority.get(transition, 0))
         tests_last = sorted(self.arcs, key=lambda arc: arc[3] == "test")
-        for source, target, weight, kind, at in tests_last:
-            draft.arc(source, target, weight, kind, at)
-        labels = {n: text for n, text in self.labels.items() if text != n}
-        return NetFile(draft.net(), self.name, None, labels, {}, (*draft.notes, *self.notes))
+        for source, target, weight, kind, draft.line in tests_last:
+            draft.arc(source, target, weight, kind, f"transition {_of(draft, source, target)}")
+        for name, (_, draft.line) in self.labels.items():
+            if name not in draft.places and name not in draft.transitions:
+                raise draft.fault(f"label of {name}", "no such node", "name a place or transition")
+        labels = {n: text for n, (text, _) in self.labels.items() if text != n}
+        return NetFile(
+            draft.net(), self.name, None, labels, {}, tuple(draft.notes), tuple(self.beyond)
+        )
 
     def _priorities(self) -> dict[str, int]:
         """Return priority levels that express the pairs in the file.
 
-        Raises NetFileError if levels would rank pairs that the file does not rank.
+        The level of a transition is the length of the longest chain of pairs below it. Raises
+        NetFileError for a cycle, and if levels would rank pairs that the file does not rank.
         """
-        pairs = {(high, low) for highs, lows in self.above for high in highs for low in lows}
-        if not pairs:
+        lower: dict[str, set[str]] = {name: set() for name in self.transitions}
+        for highs, lows, line in self.above:
+            self.draft.line = line
+            for name in (*highs, *lows):
+                if name not in lower:
+                    raise self.draft.fault(
+                        "pr", f"{name!r} is not a transition", "name transitions of the net"
+                    )
+            for high in highs:
+                lower[high].update(lows)
+        if not self.above:
             return {}
-        level = dict.fromkeys(self.transitions, 0)
-        for _ in level:
-            for high, low in pairs:
-                level[high] = max(level.get(high, 0), level.get(low, 0) + 1)
-        implied = {(a, b) for a in level for b in level if level[a] > level[b]}
-        if implied - pairs - {(a, d) for a, b in pairs for c, d in pairs if b == c}:
+        number = {name: i for i, name in enumerate(lower)}
+        level, below = dict[str, int](), dict[str, int]()  # below: a bit mask of all ranked below
+        waiting = set(lower)
+        while waiting:
+            ready = [name for name in lower if name in waiting and lower[name] <= level.keys()]
+            if not ready:
+                raise self.draft.fault(
+                    "pr",
+                    f"the priorities of {', '.join(sorted(waiting)[:5])} form a cycle",
+                    "remove one of them",
+                )
+            for name in ready:
+                level[name] = max((level[one] + 1 for one in lower[name]), default=0)
+                below[name] = 0
+                for one in lower[name]:
+                    below[name] |= below[one] | 1 << number[one]
+            waiting -= set(ready)
+        at_most = [0] * (max(level.values()) + 1)
+        for name, own in level.items():
+            for higher in range(own + 1, len(at_most)):
+                at_most[higher] |= 1 << number[name]
+        if any(below[name] != at_most[level[name]] for name in level):
             remedy = "only priorities that form levels over all transitions are read"
-            raise NetFileError(self.file, "pr", "priorities between some pairs only", remedy)
+            raise self.draft.fault("pr", "priorities between some pairs only", remedy)
         return level
+
+
+def _logical_lines(text: str) -> Iterator[tuple[int, str]]:
+    """Yield (number of its first line, line); a backslash at the end continues a line."""
+    begun, held = 0, ""
+    for number, line in enumerate(text.splitlines(), 1):
+        begun = begun or number
+        if line.endswith("\\"):
+            held += line[:-1] + " "
+            continue
+        yield begun, held + line
+        begun, held = 0, ""
+    if held:
+        yield begun, held
+
+
+def _of(draft: NetDraft, source: str, target: str) -> str:
+    return source if source in draft.transitions else target
 
 
 def _joined(words: list[str]) -> list[str]:
@@ -188,18 +275,14 @@ def _number(text: str) -> int:
 
 
 def _quoted(name: str) -> str:
+    """Return a name or label as it is written; a line end in a label becomes a space."""
+    name = " ".join(name.splitlines())
     return name if PLAIN.match(name) else "{" + re.sub(r"([\\{}])", r"\\\1", name) + "}"
 
 
-def losses(model: NetFile) -> list[str]:
-    """Return what a `.net` file cannot express."""
-    net: Net = model.net
-    out = []
-    if any(c is not None for c in net.capacity):
-        out.append("capacities: written as inhibitor arcs")
-    if model.gspn is not None:
-        out.append("rates and weights")
-    return out
+ANY_NAME = re.compile(r"[^\n\r\x0b\x0c\x1c-\x1e\x85\u2028\u2029]+")
+"""Names in braces may hold everything but the end of a line; a place and a transition must differ.
+"""
 
 
 def write_tina(model: NetFile) -> str:
@@ -207,18 +290,12 @@ def write_tina(model: NetFile) -> str:
 
     Raises NetFileError.
     """
-    net = model.net
+    model, _ = model.with_names(ANY_NAME)
+    net: Net = model.net
     lines = [f"net {_quoted(model.name or 'net')}"]
     for t, name in enumerate(net.transitions):
         label = f" : {_quoted(model.labels[name])}" if name in model.labels else ""
-        below = net.compiled.bars[t]
-        if any(k < 1 for _, k in below):
-            raise NetFileError(
-                "net",
-                f"transition {name}",
-                "it would always exceed a capacity, so it can never fire",
-                "raise the capacity",
-            )
+        below = thresholds(net, t)
         need = [_quoted(net.places[p]) + (f"*{w}" if w > 1 else "") for p, w in net.consume[t]]
         need += [f"{_quoted(net.places[p])}?-{k}" for p, k in below]
         give = [_quoted(net.places[p]) + (f"*{w}" if w > 1 else "") for p, w in net.produce[t]]

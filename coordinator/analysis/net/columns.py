@@ -1,4 +1,5 @@
-"""The firing rule for many markings side by side: places are rows of an array, markings its columns.
+"""The firing rule for many markings side by side: places are rows of an array, markings its
+columns.
 
 Used where trials are played in parallel (`time/simulate.py`, `studies/forecast/play.py`).
 """

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from petrobot.coordinator.analysis.limits import overtime
 from petrobot.coordinator.analysis.net.space import Space
 from petrobot.coordinator.analysis.net.structure import place_bounds
 from petrobot.coordinator.task.net import Marking, Net
@@ -194,6 +195,8 @@ class _Tree:
         expanded: set[Marking] = set()
         queue = deque([0])
         while queue:
+            if overtime():
+                return False
             i = queue.popleft()
             if self.nodes[i].marking in expanded:
                 continue

@@ -15,9 +15,11 @@ or adds tokens where the other has an inhibitor or a capacity.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
+from petrobot.coordinator.analysis.limits import overtime
+from petrobot.coordinator.task.compiled import Arcs
 from petrobot.coordinator.task.net import Marking, Net
 
 SIPHON_EFFORT = 5_000
@@ -44,18 +46,7 @@ def minimal_traps(net: Net, effort: int = SIPHON_EFFORT) -> PlaceSets:
 
 def largest_trap(net: Net, within: frozenset[int]) -> frozenset[int]:
     """Return the largest trap inside a set of places (may be empty)."""
-    inside = set(within)
-    while True:
-        leaks = {
-            p
-            for arcs, back in zip(net.consume, net.produce, strict=True)
-            if not any(q in inside for q, _ in back)
-            for p, _ in arcs
-            if p in inside
-        }
-        if not leaks:
-            return frozenset(inside)
-        inside -= leaks
+    return _largest_closed(within, net.consume, net.produce)
 
 
 def empty_siphon(net: Net, marking: Marking) -> frozenset[int]:
@@ -63,18 +54,30 @@ def empty_siphon(net: Net, marking: Marking) -> frozenset[int]:
 
     Its places can never be marked again.
     """
-    inside = {p for p, n in enumerate(marking) if not n}
+    unmarked = (p for p, n in enumerate(marking) if not n)
+    return _largest_closed(unmarked, net.produce, net.consume)
+
+
+def _largest_closed(
+    places: Iterable[int], arcs: Sequence[Arcs], others: Sequence[Arcs]
+) -> frozenset[int]:
+    """Return the largest subset of the places in which each transition with one of its `arcs` there
+    also has one of its `others` there.
+
+    A trap for (consume, produce), a siphon for (produce, consume).
+    """
+    inside = set(places)
     while True:
-        fed = {
+        open_places = {
             p
-            for arcs, source in zip(net.produce, net.consume, strict=True)
-            if not any(q in inside for q, _ in source)
-            for p, _ in arcs
+            for own, back in zip(arcs, others, strict=True)
+            if not any(q in inside for q, _ in back)
+            for p, _ in own
             if p in inside
         }
-        if not fed:
+        if not open_places:
             return frozenset(inside)
-        inside -= fed
+        inside -= open_places
 
 
 def controlled_siphons(
@@ -114,7 +117,7 @@ def _closed_sets(net: Net, consume: list[int], produce: list[int], effort: int) 
             if any(inside & known == known for known in found):
                 continue  # contains a set already found, so it cannot be minimal
             left -= 1
-            if left < 0:
+            if left < 0 or overtime():
                 return PlaceSets(_minimal(found), False)
             open_ = [t for t in transitions if produce[t] & inside and not consume[t] & inside]
             if not open_:
@@ -137,7 +140,10 @@ def _bits(mask: int) -> list[int]:
 
 
 def _minimal(found: list[int]) -> tuple[frozenset[int], ...]:
-    kept = [s for s in found if not any(other != s and s & other == other for other in found)]
+    kept: list[int] = []
+    for one in sorted(found, key=int.bit_count):  # a set can only contain smaller ones
+        if not any(one & other == other for other in kept):
+            kept.append(one)
     return tuple(frozenset(bit.bit_length() - 1 for bit in _bits(s)) for s in sorted(set(kept)))
 
 
@@ -197,6 +203,8 @@ def hunt_deadlock(
     came: dict[Marking, tuple[Marking, int]] = {}
     stack = [net.initial]
     while stack:
+        if overtime():
+            return Hunt(None, len(seen), False)
         marking = stack.pop()
         enabled = net.enabled(marking)
         if not enabled and not (final and final(marking)):

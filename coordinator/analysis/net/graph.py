@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from petrobot.coordinator.analysis.limits import keep_time
+
 Mask = NDArray[np.bool_]
 Index = NDArray[np.int64]
 
@@ -67,6 +69,7 @@ class Graph:
         reached[seeds] = True
         front = np.flatnonzero(reached)
         while len(front):
+            keep_time("verdicts")
             at = ranges(row[front], row[front + 1])
             at = at if order is None else order[at]
             if edges is not None:
@@ -86,6 +89,7 @@ class Graph:
         came[start] = -1
         front = np.array([start])
         while len(front) and not goals[front].any():
+            keep_time("verdicts")
             at = ranges(self.row[front], self.row[front + 1])
             at = at if edges is None else at[edges[at]]
             at = at[came[self.target[at]] == -2]
@@ -110,6 +114,7 @@ class Graph:
         """
         if len(self.target) + self.n <= SMALL:
             return _tarjan(self.n, self.row.tolist(), self.target.tolist())
+        keep_time("verdicts")
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import connected_components
 
@@ -154,6 +159,7 @@ class Graph:
             winning[:] = True
         forced = ~free & ~hits
         while True:
+            keep_time("verdicts")
             # First the vertices that the environment can push out of the set ...
             leaves = forced & winning[self.source] & ~goal[self.source] & ~winning[self.target]
             if leaves.any():

@@ -1,29 +1,16 @@
-"""The ordinary view of a task: its net with the sets that the qualitative verdicts need, and the
-net closed by a refill.
+"""The ordinary view of a task: its net with the sets that the verdicts need.
 
-The net is `Task.net` (docs/semantics.md, section 8). A task ends, so liveness and properness are
-judged on the closed net: in exactly the final markings *refill* puts the initial marking back; in
-the markings of `final_error`, an honest end with something out of order, *repair* does so, which
-stands for a person who mends it and starts again.
+The net is `Task.net` (docs/semantics.md, section 8).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numpy as np
-
-from petrobot.coordinator.analysis.net.robot import Roles
-from petrobot.coordinator.analysis.net.space import Space
 from petrobot.coordinator.task import End, Kind, Task
 from petrobot.coordinator.task.conditions import Expression
-from petrobot.coordinator.task.net import Arcs, Marking, Net
-
-REFILL, REPAIR = "refill", "repair"
-CLOSINGS = 1_000
-"""Final markings that a net is closed from at most."""
+from petrobot.coordinator.task.net import Marking, Net
 
 
 @dataclass(frozen=True)
@@ -98,93 +85,15 @@ class OrdinaryView:
         }
 
     @cached_property
-    def controllable(self) -> frozenset[str]:
-        """T_c: transitions that begin runs from resources and control places alone, and the
-        operator's hand."""
-        flat = self.task.flat
-        starting = frozenset().union(*self.starts.values())
-        kinds = {p.name: p.kind for p in flat.places.values()}
-        free = {
-            t.name
-            for t in flat.transitions.values()
-            if t.name in starting and not any(kinds[a.place] is Kind.ACTION for a in t.inputs)
-        }
-        operator = set(self.net.transitions) - set(self.task.net.transitions)
-        return frozenset(free | operator)
-
-    def roles(self, closed: Net) -> Roles:
-        """The parts that transitions and markings play in the closed net."""
-        runs, net = self.task.runs_place, self.task.net
-        place = net.place_index[runs] if runs else -1
-        takes = frozenset(
+    def run_starts(self) -> frozenset[str]:
+        """The transitions that take a run from the runs place."""
+        net = self.task.net
+        place = net.place_index[self.task.runs_place] if self.task.runs_place else -1
+        return frozenset(
             name
-            for t, name in enumerate(net.transitions)
-            if dict(net.consume[t]).get(place, 0) > dict(net.produce[t]).get(place, 0)
+            for name, changes in zip(net.transitions, net.compiled.changes, strict=True)
+            if dict(changes).get(place, 0) < 0
         )
-        return Roles(
-            self.is_nominal,
-            self.error_exits,
-            self.controllable,
-            self.starts,
-            takes,
-            frozenset(self.task.goal_transitions),
-            frozenset(closed.transitions) - frozenset(self.net.transitions),
-        )
-
-    def closed(self, space: Space) -> Net:
-        """The net closed by refill and repair, from the complete space of the open one. Raises
-        ValueError if it cannot be."""
-        if not space.complete:
-            raise ValueError(
-                f"the closed net needs all final markings; the search stopped: {space.reason}"
-            )
-        ends = [
-            (kind, space.marking(int(i)))
-            for kind, predicate in ((REFILL, self.is_final), (REPAIR, self._only_final_error))
-            for i in np.flatnonzero(space.where(predicate))
-        ]
-        if not ends:
-            raise ValueError(
-                "no final marking is reachable, so there is nothing to close the net from"
-            )
-        if len(ends) > CLOSINGS:
-            raise ValueError(
-                f"{len(ends)} final markings are reachable; at most {CLOSINGS} can be "
-                "closed: narrow `final`"
-            )
-        return closed_net(self.net, ends)
-
-    def _only_final_error(self, marking: Marking) -> bool:
-        return self.is_final_error(marking) and not self.is_final(marking)
-
-
-def closed_net(net: Net, ends: list[tuple[str, Marking]]) -> Net:
-    """The net with one transition (a name and the exact marking it fires in) for each end, leading
-    to the initial marking."""
-    names = list(_numbered([name for name, _ in ends], set(net.transitions)))
-    start: Arcs = tuple((p, n) for p, n in enumerate(net.initial) if n)
-    exact = [
-        (
-            tuple((p, n) for p, n in enumerate(end) if n),
-            tuple((p, n + 1) for p, n in enumerate(end)),
-        )
-        for _, end in ends
-    ]
-    return replace(
-        net,
-        transitions=(*net.transitions, *names),
-        consume=(*net.consume, *(need for need, _ in exact)),
-        produce=(*net.produce, *(start for _ in ends)),
-        inhibit=(*net.inhibit, *(below for _, below in exact)),
-        priority=(*net.priority, *(0 for _ in ends)),
-    )
-
-
-def _numbered(names: list[str], taken: set[str]) -> Iterator[str]:
-    """The names, with a number behind those that stand there more than once or are taken."""
-    many = {name for name in names if names.count(name) > 1 or name in taken}
-    for i, name in enumerate(names, 1):
-        yield f"{name} {i}" if name in many else name
 
 
 def _with_operator(net: Net, places: tuple[int, ...]) -> Net:

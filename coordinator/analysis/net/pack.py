@@ -5,8 +5,8 @@ A field of `width` value bits holds the tokens of a place; the guard bit just ab
 stored marking. With all guards G set, `(M | G) - s` leaves the guard of place p set exactly when
 M(p) >= s(p), and no field borrows from the next one. So one subtraction tests all consumed weights
 (guards must stay) and all bars (guards must go) of a transition; `task/compiled.py` has turned
-capacities into bars. A guard that is set after a firing is a token count that outgrew its field: the
-caller widens the field and continues.
+capacities into bars. A guard that is set after a firing is a token count that outgrew its field:
+the caller widens the field and continues.
 """
 
 from __future__ import annotations

@@ -37,13 +37,20 @@ NARROW = 8
 little)."""
 
 
+JUDGED = 6
+"""Peak memory of a search and all verdicts on its space, relative to what the engine held at its
+end (5.2 for Kanban-5: the strong components, reversed edges and columns of tokens)."""
+
+
 @dataclass(frozen=True, slots=True)
 class SearchLimits:
     """Limits of a search in markings, seconds and bytes; None means no limit.
 
-    `memory` counts what the engine itself holds. `seconds` needs a `clock` (s), because nothing in
-    this package reads a clock of its own. `progress` is called after each block of markings with
-    (markings found, markings expanded).
+    `memory` is for the search and the verdicts on what it finds, so the engine itself may hold one
+    part in JUDGED of it. `seconds` needs a `clock` (s), because nothing in this package reads a
+    clock of its own; they begin with each search, unless `due` says when the last one must end on
+    that clock. `progress` is called after each block of markings with (markings found, markings
+    expanded).
     """
 
     states: int | None = None
@@ -51,6 +58,7 @@ class SearchLimits:
     memory: int | None = None
     clock: Callable[[], float] | None = None
     progress: Callable[[int, int], None] | None = None
+    due: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse a time limit without a clock to measure it."""
@@ -260,14 +268,12 @@ def _run(
                 limits.progress(engine.states, engine.expanded)
             if cap is not None and engine.states >= cap:
                 break
-            if limits.memory is not None and engine.nbytes > limits.memory:
+            if limits.memory is not None and engine.nbytes * JUDGED > limits.memory:
                 return f"memory limit of {limits.memory} bytes"
-            if (
-                limits.seconds is not None
-                and limits.clock
-                and limits.clock() - started > limits.seconds
-            ):
-                return f"time limit of {limits.seconds:g} s"
+            if limits.seconds is not None and limits.clock:
+                due = started + limits.seconds if limits.due is None else limits.due
+                if limits.clock() > due:
+                    return f"time limit of {limits.seconds:g} s"
     except TooManyTokens as grown:
         return str(grown)
     except MemoryError:

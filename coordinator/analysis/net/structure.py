@@ -17,6 +17,7 @@ from math import gcd
 import numpy as np
 from numpy.typing import NDArray
 
+from petrobot.coordinator.analysis.limits import overtime
 from petrobot.coordinator.task.net import Net
 
 EFFORT = 2_000
@@ -73,14 +74,17 @@ def _semiflows(rows: Sequence[Vector], effort: int) -> Semiflows:
     LNCS 483 (1991).
     """
     live = [({i: 1}, dict(row)) for i, row in enumerate(rows)]
-    while True:
+    while not overtime():
         columns = _signs(live)
         if not columns:
             return Semiflows(tuple(y for y, _ in live), True)
         column = min(columns, key=lambda c: columns[c][0] * columns[c][1] - sum(columns[c]))
         if columns[column][0] * columns[column][1] > effort * 50:
             break
-        live = _annul(live, column)
+        fewer = _annul(live, column)
+        if fewer is None:
+            break
+        live = fewer
         if len(live) > effort:
             break
     return Semiflows(tuple(y for y, rest in live if not rest), False)
@@ -95,16 +99,18 @@ def _signs(live: list[tuple[Vector, Vector]]) -> dict[int, list[int]]:
     return signs
 
 
-def _annul(live: list[tuple[Vector, Vector]], column: int) -> list[tuple[Vector, Vector]]:
+def _annul(live: list[tuple[Vector, Vector]], column: int) -> list[tuple[Vector, Vector]] | None:
     """Replace the rows that are not zero in a column by their combinations that are zero there.
 
-    Of all rows only those of minimal support are kept.
+    Of all rows only those of minimal support are kept. None if time ran out.
     """
     kept = [row for row in live if column not in row[1]]
     plus = [row for row in live if row[1].get(column, 0) > 0]
     minus = [row for row in live if row[1].get(column, 0) < 0]
     fresh = []
     for a in plus:
+        if overtime():
+            return None
         for b in minus:
             u, v = -b[1][column], a[1][column]
             y, rest = _combined(a[0], u, b[0], v), _combined(a[1], u, b[1], v)
@@ -124,16 +130,19 @@ def _combined(a: Vector, u: int, b: Vector, v: int) -> Vector:
 
 def _minimal_supports(
     kept: list[tuple[Vector, Vector]], fresh: list[tuple[Vector, Vector]]
-) -> list[tuple[Vector, Vector]]:
+) -> list[tuple[Vector, Vector]] | None:
     """Return the rows whose support contains no other support (one row of equal supports stays).
 
-    Supports are compared as bit masks, small ones first; `kept` is minimal in itself already.
+    Supports are compared as bit masks, small ones first; `kept` is minimal in itself already. None
+    if time ran out.
     """
     old = [(sum(1 << i for i in row[0]), row) for row in kept]
     new: list[tuple[int, tuple[Vector, Vector]]] = []
     for mask, row in sorted(
         ((sum(1 << i for i in row[0]), row) for row in fresh), key=lambda one: one[0].bit_count()
     ):
+        if overtime():
+            return None
         if not any(mask & other == other for other, _ in new) and not any(
             mask & other == other for other, _ in old
         ):

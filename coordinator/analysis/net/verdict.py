@@ -18,11 +18,14 @@ class Witness:
     firings: tuple[str, ...]
     marking: dict[str, int] = field(default_factory=dict)
     loop: tuple[str, ...] = ()
+    steps: tuple[str, ...] = ()
+    """Executed tasks only: each stimulus in words, with the firings that it causes."""
 
     def to_json(self) -> dict[str, Any]:
         """Return plain data."""
         out: dict[str, Any] = {"firings": list(self.firings), "marking": dict(self.marking)}
-        return out | ({"loop": list(self.loop)} if self.loop else {})
+        out |= {"loop": list(self.loop)} if self.loop else {}
+        return out | ({"steps": list(self.steps)} if self.steps else {})
 
 
 @dataclass(frozen=True, slots=True)

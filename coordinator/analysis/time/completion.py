@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from petrobot.coordinator.analysis.limits import keep_time
 from petrobot.coordinator.analysis.net.graph import Mask, sum_by
 from petrobot.coordinator.analysis.time.gspn import Chain, Values
 from petrobot.coordinator.analysis.time.linear import SolveOrder, solve
@@ -146,6 +147,7 @@ def completion_time(
     # smaller than rounding errors.
     ahead = np.where(reached, 0.0, whole.h[made.tangible])
     while (len(absorbed) - 1) % LOOK or float(np.sum(p * ahead)) > left * whole.probability:
+        keep_time("distribution of the completion time")
         if len(absorbed) > steps:
             raise ArithmeticError(
                 f"the distribution of the completion time needs more than {steps} jumps; "

@@ -16,10 +16,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from petrobot.coordinator.analysis.limits import keep_time
 from petrobot.coordinator.analysis.net.graph import Graph, Index, Mask, sum_by
 from petrobot.coordinator.analysis.net.space import SearchLimits, Space, explore
 from petrobot.coordinator.task.net import Marking, Net
@@ -131,13 +133,16 @@ class Gspn:
             initial[self.net.place_index[name]] = n
         return replace(self, net=replace(self.net, initial=tuple(initial)))
 
-    def degree(self, marking: Marking, t: int) -> int:
-        """Return how many servers of an enabled timed transition are busy in a marking."""
-        servers = self.servers[t]
-        if servers == 1 or not self.net.consume[t]:
-            return 1
-        able = min(marking[p] // w for p, w in self.net.consume[t])
-        return able if servers is None else min(able, servers)
+    def busy_servers(self, t: int, tokens: Mapping[int, NDArray[Any]]) -> NDArray[Any]:
+        """Return how many servers of a timed transition are busy in markings that enable it.
+
+        `tokens`: by place that the transition needs, its tokens in each of these markings.
+        """
+        needs, servers = self.net.compiled.needs[t], self.servers[t]
+        able: NDArray[Any] = np.ones(1)
+        if needs:
+            able = np.min([tokens[p] // w for p, w in needs], axis=0)
+        return able if servers is None else np.minimum(able, servers)
 
 
 @dataclass(frozen=True)
@@ -176,6 +181,7 @@ class Chain:
                 f"a Markov chain needs all markings; the search stopped: {space.reason}; "
                 "simulate instead"
             )
+        keep_time("Markov chain")
         label = space.label.astype(np.int64)
         timed = np.array([r is not None for r in gspn.rate], dtype=np.bool_)
         vanishing = np.zeros(len(space), dtype=np.bool_)
@@ -260,6 +266,6 @@ def _degrees(gspn: Gspn, space: Space, label: Index) -> Values:
             continue
         edges = np.flatnonzero(label == t)
         at = space.source[edges]
-        able = np.min([space.tokens(p)[at] // w for p, w in gspn.net.consume[t]], axis=0)
-        degree[edges] = able if servers is None else np.minimum(able, servers)
+        tokens = {p: space.tokens(p)[at] for p, _ in gspn.net.compiled.needs[t]}
+        degree[edges] = gspn.busy_servers(t, tokens)
     return degree

@@ -14,10 +14,12 @@ Res. 33, 1985). Larger ones come from Gauss-Seidel.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import Any
 
 import numpy as np
 
+from petrobot.coordinator.analysis.limits import keep_time
 from petrobot.coordinator.analysis.net.graph import Graph, Index, Mask, ranges, sum_by
 from petrobot.coordinator.analysis.time.gspn import Values
 
@@ -105,6 +107,7 @@ def solve(plan: SolveOrder, value: Values, b: Values) -> Values:
     graph = plan.graph
     x = np.zeros_like(b, dtype=np.float64)
     for single, groups in plan.waves:
+        keep_time("linear system")
         if len(single):
             x[single] = b[single] + _gather(graph, value, x, single)
         for group in groups:
@@ -169,6 +172,7 @@ def _sweep(n: int, rows: Index, columns: Index, value: Values, right: Values) ->
     coarse, x = Coarse(n, rows, columns), factor.solve(right)
     inverse: Values | None = None
     for k in range(SWEEPS):
+        keep_time("linear system")
         before = x
         x = factor.solve(right + lower @ x)
         if np.max(np.abs(x - before)) <= TOLERANCE * max(1e-300, float(np.max(np.abs(x)))):
@@ -199,19 +203,59 @@ def stationary(n: int, rows: Index, columns: Index, value: Values) -> Values:
     # backward sweep run forward along the edges.
     factor, lower = triangular(n, n - 1 - columns, n - 1 - rows, value)
     coarse, x = Coarse(n, n - 1 - rows, n - 1 - columns), np.full(n, 1.0 / n)
+    mixing = Mixing()
+    moved = inf
     for k in range(SWEEPS):
-        before = x
-        x = factor.solve(lower @ x)
-        x /= x.sum()
-        if np.max(np.abs(x - before)) <= TOLERANCE * float(np.max(x)):
-            return np.asarray(x[::-1].copy())
+        keep_time("stationary distribution")
+        swept = factor.solve(lower @ x)
+        swept /= swept.sum()
+        change = swept - x
+        moved = float(np.max(np.abs(change)))
+        if moved <= TOLERANCE * float(np.max(swept)):
+            return np.asarray(swept[::-1].copy())
         if coarse.is_due(k):
-            x = x * coarse.scale(value, x)
+            x = swept * coarse.scale(value, swept)
             x /= x.sum()
-    raise NotConverged(
-        f"the stationary vector still moved by {np.max(np.abs(x - before)):.2e} after "
-        f"{SWEEPS} sweeps"
-    )
+            mixing = Mixing()
+            continue
+        mixed = mixing.next(swept, change)
+        # A mixture may have negative entries, of which aggregation and sums make no sense.
+        x = mixed if float(mixed.min()) > 0 else swept
+    raise NotConverged(f"the stationary vector still moved by {moved:.2e} after {SWEEPS} sweeps")
+
+
+class Mixing:
+    """Anderson's acceleration of a fixed-point iteration x = g(x), here of the sweeps.
+
+    The next x is the combination of the last DEPTH + 1 results whose changes g(x) - x nearly cancel
+    (least squares). For linear g that is about as good as GMRES: Kanban-4 takes 91 sweeps instead
+    of 231. Source: D. G. Anderson, Iterative procedures for nonlinear integral equations, J. ACM 12
+    (1965).
+    """
+
+    DEPTH = 4
+
+    def __init__(self) -> None:
+        """Begin without any results."""
+        self.last: tuple[Values, Values] | None = None
+        self.results: list[Values] = []
+        self.changes: list[Values] = []
+
+    def next(self, result: Values, change: Values) -> Values:
+        """Return the next x from g(x) and g(x) - x."""
+        if self.last is not None:
+            self.results = [*self.results, result - self.last[0]][-self.DEPTH :]
+            self.changes = [*self.changes, change - self.last[1]][-self.DEPTH :]
+        self.last = result, change
+        if not self.changes:
+            return result
+        gram = np.array([[a @ b for b in self.changes] for a in self.changes])
+        right = np.array([a @ change for a in self.changes])
+        weight = np.linalg.lstsq(gram, right, rcond=1e-14)[0]
+        out = result.copy()
+        for w, step in zip(weight.tolist(), self.results, strict=True):
+            out -= w * step
+        return out
 
 
 class Coarse:

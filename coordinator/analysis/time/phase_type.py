@@ -7,9 +7,9 @@ With cv the coefficient of variation (standard deviation / mean):
   both moments exactly for 1 / k <= cv^2 <= 1 / (k - 1).
 - cv^2 > 1: two exponential branches with balanced means (hyper-exponential).
 
-Source: H. C. Tijms, Stochastic Models: An Algorithmic Approach, Wiley 1994, section A.4. If cv^2
-asks for more stages than allowed, the mean is kept and the variance is too large; the error of the
-90 % quantile says by how much.
+Source: H. C. Tijms, A First Course in Stochastic Models, Wiley 2003, appendix B (pages 445 to 447).
+If cv^2 asks for more stages than allowed, the mean is kept and the variance is too large; the error
+of the 90 % quantile says by how much.
 """
 
 from __future__ import annotations

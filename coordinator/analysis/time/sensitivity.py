@@ -9,7 +9,7 @@ amounts of its edges. For x = b + A x this gives
 with v the expected visits before the end: one adjoint solve serves all parameters. The change of
 the sojourn time needs no term of its own, because x_i contains it. In the long run, flows take the
 role of visits, and the bias g of the Poisson equation g = (f - R) s + A (g + gain) that of x.
-Source: X.-R. Cao, Stochastic Learning and Optimization, Springer 2007, chapter 2.
+Source: X.-R. Cao, Stochastic Learning and Optimization, Springer 2007.
 """
 
 from __future__ import annotations

@@ -134,12 +134,10 @@ class _Replicas:
         rate, servers = self.gspn.rate[t], self.gspn.servers[t]
         if rate is None:
             return np.asarray(able * self.gspn.weight[t])
-        if servers == 1 or not self.net.consume[t]:
+        if servers == 1:
             return np.asarray(able * rate)
-        degree = np.min([self.tokens[p] // w for p, w in self.net.consume[t]], axis=0)
-        return np.asarray(
-            able * rate * (degree if servers is None else np.minimum(degree, servers))
-        )
+        tokens = {p: self.tokens[p] for p, _ in self.net.compiled.needs[t]}
+        return np.asarray(able * rate * self.gspn.busy_servers(t, tokens))
 
 
 def simulate(

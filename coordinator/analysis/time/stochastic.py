@@ -32,6 +32,8 @@ STAGES = 8
 markings, so it is small."""
 
 Weights = dict[str, int]
+DECLARED, MEASURED = "declared in the task file", "measured"
+"""Where the numbers of an action come from."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class Measured:
     waits: Mapping[str, float] = field(default_factory=dict)
     switches: Mapping[str, float] = field(default_factory=dict)
     preempted: Mapping[tuple[str, str], Mapping[str, Estimate]] = field(default_factory=dict)
+    sources: Mapping[tuple[str, str], str] = field(default_factory=dict)
+    """Where the numbers in `runs` and `preempted` come from, in words, by the same keys."""
 
 
 def is_cause(transition: Transition) -> bool:
@@ -87,10 +91,24 @@ class StochasticView:
     fit_errors: Mapping[str, float]
     """Relative error of the 90 % quantile of each fitted duration, by `place.action.status` or by
     timer."""
+    sources: Mapping[str, str] = field(default_factory=dict)
+    """By transition of the GSPN: where its rate or weight comes from, in words. Transitions whose
+    weight is 1 because the net gives them no choice are not in it."""
 
     def projected(self, marking: Marking) -> Marking:
         """Return the marking of the ordinary net that a marking of the GSPN projects to."""
         return marking[: len(self.task.net.places)]
+
+    @cached_property
+    def numbers(self) -> dict[str, tuple[str, ...]]:
+        """By source: the actions (`place.action`) and transitions whose numbers come from it."""
+        out: dict[str, dict[str, None]] = {}
+        for name, (place, action, _) in self.statuses.items():
+            out.setdefault(self.sources[name], {})[f"{place}.{action}"] = None
+        for case, name in self.origin.items():
+            if case in self.sources:
+                out.setdefault(self.sources[case], {})[name] = None
+        return {source: tuple(names) for source, names in out.items()}
 
     @cached_property
     def cases(self) -> dict[str, tuple[str, ...]]:
@@ -135,6 +153,7 @@ class _Derivation:
         self.assumptions: list[str] = []
         self.errors: dict[str, float] = {}
         self.possible: dict[str, set[Status]] = {}
+        self.sources: dict[str, str] = {}
         self.phases: dict[str, list[str]] = {}
         self.by: dict[tuple[str, str], str] = {}
         for place in task.places.values():
@@ -159,19 +178,36 @@ class _Derivation:
         )
         gspn = Gspn.of(net, self.rates, weights=self.weights, servers=self.servers)
         assumed = tuple(dict.fromkeys(self.assumptions))
-        return StochasticView(self.task, gspn, self.origin, self.statuses, assumed, self.errors)
+        return StochasticView(
+            self.task, gspn, self.origin, self.statuses, assumed, self.errors, self.sources
+        )
 
     # Transitions of the GSPN.
 
     def _immediate(
-        self, name: str, need: Weights, give: Weights, weight: float, priority: int
+        self,
+        name: str,
+        need: Weights,
+        give: Weights,
+        weight: float,
+        priority: int,
+        source: str = "",
     ) -> None:
         self.arcs[name], self.weights[name], self.priority[name] = (need, give), weight, priority
+        if source:
+            self.sources[name] = source
 
     def _timed(
-        self, name: str, need: Weights, give: Weights, rate: float, servers: int | None = None
+        self,
+        name: str,
+        need: Weights,
+        give: Weights,
+        rate: float,
+        source: str,
+        servers: int | None = None,
     ) -> None:
         self.arcs[name], self.rates[name], self.servers[name] = (need, give), rate, servers
+        self.sources[name] = source
 
     # Action places.
 
@@ -240,9 +276,19 @@ class _Derivation:
                 {chain[0]: 1},
                 estimate.share * branch.probability,
                 CHOICE,
+                self._source(name, action),
             )
             for phase, following in zip(chain, [*chain[1:], end], strict=True):
-                self._timed(phase, {phase: 1}, {following: 1}, branch.rate)
+                source = self._source(name, action)
+                self._timed(phase, {phase: 1}, {following: 1}, branch.rate, source)
+
+    def _source(self, place: str, action: str) -> str:
+        """Return where the numbers of an action in a place come from."""
+        primitive = self.task.primitive_task_of(place).name
+        for key in ((place, action), (primitive, action)):
+            if key in self.measured.runs:
+                return self.measured.sources.get(key, MEASURED)
+        return DECLARED
 
     def _alternatives(self, place: Place) -> dict[str, float]:
         primitive = self.task.primitive_task_of(place.name)
@@ -278,7 +324,12 @@ class _Derivation:
         name, served = place.name, place.servers is not None
         need = {f"{name}.begin": 1} | ({f"{name}.server": 1} if served else {})
         self.places[f"{name}.{action}"] = 0
-        self._immediate(f"{name}.{action}", need, {f"{name}.{action}": 1}, chosen, CHOICE)
+        primitive = self.task.primitive_task_of(name)
+        source = ""
+        if len(primitive.alternatives) > 1:
+            known = primitive.name in self.measured.choice
+            source = "measured shares of the alternatives" if known else "assumed equally likely"
+        self._immediate(f"{name}.{action}", need, {f"{name}.{action}": 1}, chosen, CHOICE, source)
 
     def _status(
         self,
@@ -297,14 +348,15 @@ class _Derivation:
         duration = self._duration(
             key, estimate.mean, (estimate.cv * estimate.mean) ** 2, self.stages
         )
+        source = self._source(name, action)
         if (status, duration) not in shared:
-            shared[status, duration] = self._phases(place, status, duration, len(shared))
+            shared[status, duration] = self._phases(place, status, duration, len(shared), source)
         entries = shared[status, duration]
         for i, (entry, share) in enumerate(entries):
             label = key if len(entries) == 1 else f"{key}.{i + 1}"
             self.statuses[label] = (name, action, status)
             self._immediate(
-                label, {f"{name}.{action}": 1}, {entry: 1}, estimate.share * share, CHOICE
+                label, {f"{name}.{action}": 1}, {entry: 1}, estimate.share * share, CHOICE, source
             )
 
     def _duration(self, key: str, mean: float, variance: float, stages: int) -> PhaseType:
@@ -318,7 +370,7 @@ class _Derivation:
         return duration
 
     def _phases(
-        self, place: Place, status: Status, duration: PhaseType, number: int
+        self, place: Place, status: Status, duration: PhaseType, number: int, source: str
     ) -> list[tuple[str, float]]:
         """Add chains of phases; return the places where a run enters, with their probabilities.
 
@@ -333,12 +385,12 @@ class _Derivation:
             self.places |= dict.fromkeys(chain, 0)
             self.phases[place.name] += chain
             for i in range(1, longest):
-                self._timed(f"{stem}{i}", {f"{stem}{i}": 1}, {f"{stem}{i + 1}": 1}, rate)
+                self._timed(f"{stem}{i}", {f"{stem}{i}": 1}, {f"{stem}{i + 1}": 1}, rate, source)
             need = {f"{stem}{longest}": 1, f"{place.name}.going": 1}
             give = {f"{place.name}.{status}": 1} | (
                 {f"{place.name}.server": 1} if place.servers is not None else {}
             )
-            self._timed(f"{stem}{longest}", need, give, rate)
+            self._timed(f"{stem}{longest}", need, give, rate, source)
             entries += [(f"{stem}{longest - b.stages + 1}", b.probability) for b in branches]
         return entries
 
@@ -435,10 +487,15 @@ class _Derivation:
         elif t.after is not None:
             self._timer(t, name, need, give)
         elif t.events:
-            self._timed(name, need, give, share / self._wait(t), 1)
+            measured = all(event in self.measured.waits for event in t.events)
+            source = "measured mean wait" if measured else "mean wait declared in the task file"
+            self._timed(name, need, give, share / self._wait(t), source, 1)
         else:
             weight = share * (t.weight if t.weight is not None else 1.0)
-            self._immediate(name, need, give, weight, TASK + t.priority)
+            source = "weight declared in the task file" if t.weight is not None else ""
+            if t.name in self.measured.switches:
+                source = "measured frequency of its condition"
+            self._immediate(name, need, give, weight, TASK + t.priority, source)
 
     def _switch(self, t: Transition) -> float:
         """Return how often a condition on variables is true, relative to its competitors."""
@@ -490,12 +547,13 @@ class _Derivation:
         duration = self._duration(f"{t.name}.after", t.after, 0.0, self.timer_stages)
         (branch,) = duration.branches
         count, last = f"{name}.phase", branch.stages - 1
-        self._timed(name, need | ({count: last} if last else {}), give, branch.rate, 1)
+        source = f"declared: after {t.after:g} s"
+        self._timed(name, need | ({count: last} if last else {}), give, branch.rate, source, 1)
         if not last:
             return
         self.places[count] = 0
         tick = f"{name}.tick"
-        self._timed(tick, dict(need), {**need, count: 1}, branch.rate, 1)
+        self._timed(tick, dict(need), {**need, count: 1}, branch.rate, source, 1)
         self.inhibit[tick] = {i.place: i.threshold for i in t.inhibitors} | {count: last}
         for place, n in need.items():
             self._immediate(f"{name}.reset {place}", {count: 1}, {}, 1.0, FLUSH)

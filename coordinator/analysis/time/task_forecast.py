@@ -40,6 +40,9 @@ from petrobot.coordinator.analysis.time.stochastic import StochasticView
 from petrobot.coordinator.task import Counts, End, Status
 from petrobot.coordinator.task.net import Marking
 
+MATTERS = 0.01
+"""Share of the time of a mission run above which an error of a fit is reported."""
+
 
 @dataclass(frozen=True, slots=True)
 class Worth:
@@ -108,6 +111,44 @@ class Forecast:
         space = self.chain.space
         places = enumerate(self.view.task.net.places)
         return {name: float(self._time @ space.tokens(p)) / self.mission_time for p, name in places}
+
+    @cached_property
+    def occupancy(self) -> dict[str, float]:
+        """Share of the time in which each place of the task is marked, mission runs without
+        pauses."""
+        space = self.chain.space
+        places = enumerate(self.view.task.net.places)
+        return {
+            name: float(self._time @ (space.tokens(p) > 0)) / self.mission_time
+            for p, name in places
+        }
+
+    @property
+    def approximations(self) -> list[str]:
+        """What the fit of a distribution may change in the text above, most important first.
+
+        An error of the 90 % quantile matters as far as its duration has a share in the time of a
+        mission run; less than MATTERS of it is left out.
+        """
+        shares = {f"{w.place}.{w.action}": w.time_share for w in self.worth}
+        gspn = self.view.gspn
+        for label, (place, action, status) in self.view.statuses.items():
+            key = f"{place}.{action}.{status}"
+            chosen = gspn.weight[gspn.net.transition_index[label]]
+            shares[key] = shares.get(key, 0.0) + chosen * shares.get(f"{place}.{action}", 0.0)
+        after = {n: t.after for n, t in self.view.task.transitions.items() if t.after is not None}
+        for name, seconds in after.items():
+            shares[name] = self.firings.get(name, 0.0) * seconds / self.mission_time
+        found = []
+        for key, error in self.view.fit_errors.items():
+            share = shares.get(key, shares.get(key.rpartition(".")[0], 0.0))
+            if abs(error) * share >= MATTERS:
+                found.append((abs(error) * share, key, error, share))
+        return [
+            f"{key}: its 90 % quantile is {100 * error:+.0f} % off, because a duration has few "
+            f"phases; it has {100 * share:.0f} % of the time"
+            for _, key, error, share in sorted(found, reverse=True)
+        ]
 
     @cached_property
     def goal_reliability(self) -> float | None:
@@ -270,6 +311,7 @@ class Forecast:
             "residual": self.done.residual,
             "assumptions": list(self.view.assumptions),
             "fit_errors": dict(self.view.fit_errors),
+            "sources": {source: list(names) for source, names in self.view.numbers.items()},
         }  # fmt: skip
 
 

@@ -72,12 +72,14 @@ def change_task(task: Task, measured: Measured, changes: Sequence[Change]) -> tu
     Raises NetFileError.
     """
     runs: Runs = dict(measured.runs)
+    sources = dict(measured.sources)
     for change in changes:
         if len(change.subject) == 1:
             task = _other_tokens(task, change)
         else:
-            _other_estimate(task, runs, change)
-    return task, replace(measured, runs=runs)
+            for key in _other_estimate(task, runs, change):
+                sources[key] = f"what if {change.text}"
+    return task, replace(measured, runs=runs, sources=sources)
 
 
 def _other_tokens(task: Task, change: Change) -> Task:
@@ -89,8 +91,13 @@ def _other_tokens(task: Task, change: Change) -> Task:
     return replace(task, places={**task.places, name: replace(place, tokens=n, capacity=capacity)})
 
 
-def _other_estimate(task: Task, runs: Runs, change: Change) -> None:
-    """Change the estimates of one action, or of all actions of a primitive task."""
+def _other_estimate(task: Task, runs: Runs, change: Change) -> list[tuple[str, str]]:
+    """Change the estimates of one action, or of all actions of a primitive task.
+
+    What was measured in single places counts before what is known of the primitive task, so it is
+    changed as well. Returns the keys of the changed estimates.
+    """
+    changed = []
     *subject, word, key = change.subject
     primitive = task.primitive_tasks.get(subject[0]) if subject else None
     if primitive is None or len(subject) > 2 or word not in list(Status) or key not in FIELDS:
@@ -103,7 +110,12 @@ def _other_estimate(task: Task, runs: Runs, change: Change) -> None:
                 f"its alternatives are {', '.join(primitive.alternatives)}",
             )
         known = runs.get((primitive.name, action), primitive.estimates)
-        runs[primitive.name, action] = _altered(known, Status(word), key, change)
+        places = [p.name for p in task.flat.places.values() if p.task == primitive.name]
+        measured = [(place, action) for place in places if (place, action) in runs]
+        for one in measured or [(primitive.name, action)]:
+            runs[one] = _altered(runs.get(one, known), Status(word), key, change)
+            changed.append(one)
+    return changed
 
 
 def _altered(
@@ -120,10 +132,14 @@ def _altered(
     found = {**known, status: replace(known[status], **{key: value})}
     if key != "share":
         return found
+    # With preemptions as causes of their own, the shares of the statuses add up to less than 1.
+    whole = sum(e.share for e in known.values()) or 1.0
     rest = sum(e.share for s, e in known.items() if s is not status)
-    if rest == 0 and value < 1:
+    if rest == 0 and value < whole:
         raise change.fault("no other status is known for the remaining share")
-    scale = (1 - value) / rest if rest else 0.0
+    if value > whole:
+        raise change.fault(f"only a share of {whole:.3g} of the runs ends by itself")
+    scale = (whole - value) / rest if rest else 0.0
     return {s: e if s is status else replace(e, share=e.share * scale) for s, e in found.items()}
 
 

@@ -1,2 +1,1 @@
-"""The operator's commands: each steers the mission run that goes on, in the protocol that the page
-speaks too."""
+"""The operator's commands: each steers the active mission run, by the same protocol as the page."""

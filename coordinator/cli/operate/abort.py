@@ -1,4 +1,4 @@
-"""Give the run up: its actions are cancelled, their devices stopped, and it ends in ERROR."""
+"""Abort the active run: its actions are cancelled, their devices stop, and it ends in ERROR."""
 
 from __future__ import annotations
 

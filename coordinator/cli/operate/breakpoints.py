@@ -1,5 +1,5 @@
-"""Pause the run before a transition fires or when a token enters a place; without a name, tell
-where it would."""
+"""Pause the active run before a transition fires or when a token enters a place. Without a name,
+list the breakpoints."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ EXAMPLE = "petrobot break start"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("element", nargs="?", help="a transition or place of the task")
-    parser.add_argument("--off", action="store_true", help="no longer pause there")
+    parser.add_argument("--off", action="store_true", help="remove this breakpoint")
     hand.add_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Set, clear or tell breakpoints."""
+    """Set, remove or list breakpoints."""
     if options.element is None:
         return asyncio.run(_list(options))
     return hand.give(options, "breakpoint", lambda client: _data(client, options), _told)

@@ -1,4 +1,4 @@
-"""Raise an external event by hand, in a sensor's place."""
+"""Raise an external event by hand, instead of a sensor."""
 
 from __future__ import annotations
 

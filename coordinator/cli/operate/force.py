@@ -1,4 +1,4 @@
-"""Leave an action place by one of its exits whatever its run does; the run counts neither as
+"""Fire an outgoing transition of an action place, whatever its run does. The run counts neither as
 success nor as failure."""
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ EXAMPLE = "petrobot force catch_ball missed"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("place", help="an action place of the task")
-    parser.add_argument("exit", help="a transition that leaves it")
+    parser.add_argument("exit", help="an outgoing transition of that place")
     hand.add_arguments(parser)
 
 
@@ -25,7 +25,7 @@ def run(options: argparse.Namespace) -> int:
     """Force."""
 
     async def told(client: OperatorClient, answer: hand.Answer) -> str:
-        return f"left {options.place} by {options.exit}"
+        return f"fired {options.exit}, and took the token out of {options.place}"
 
     return hand.give(options, "force_exit", lambda client: _data(client, options), told)
 
@@ -40,5 +40,5 @@ def _data(client: OperatorClient, options: argparse.Namespace) -> dict[str, Any]
     run_id = next((run["id"] for run in client.state["runs"].values() if run["place"] == place), "")
     return {
         "run": run_id,
-        "transition": hand.named(exits[place], options.exit, f"way out of {place}"),
+        "transition": hand.named(exits[place], options.exit, f"outgoing transition of {place}"),
     }

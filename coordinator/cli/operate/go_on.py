@@ -1,4 +1,4 @@
-"""Let a paused run go on. (`petrobot resume RUN` is for a run whose coordinator was killed.)"""
+"""Continue the paused run. (`petrobot resume RUN` is for a run whose coordinator was killed.)"""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Go on."""
+    """Continue."""
     return hand.give(options, "resume", told=_told)
 
 
 async def _told(client: OperatorClient, answer: hand.Answer) -> str:
-    return "goes on"
+    return "continues"

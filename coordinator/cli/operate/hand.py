@@ -1,5 +1,5 @@
-"""What the operator's commands share: the run is found, the controls are taken, one command is
-given, its answer is told."""
+"""Shared by the operator's commands: find the run, take the controls, give one command, and print
+its answer."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 Answer = dict[str, Any]
 BAD_INPUT = frozenset({"bad_data", "unknown", "unknown_command"})
-"""Codes of answers that say the command itself makes no sense."""
+"""Codes of answers to commands that can never succeed as they were given."""
 
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
-    """Which run."""
+    """Add the options that name the run."""
     parser.add_argument(
-        "--run", metavar="RUN", help="a run's id or folder (default: the newest run that goes on)"
+        "--run", metavar="RUN", help="a run's id or folder (default: the newest active run)"
     )
     parser.add_argument(
         "--journal",
@@ -39,13 +39,13 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Which run, who gives the command, and how the answer is written."""
+    """Add the options that name the run and the operator, and say how the answer is printed."""
     add_run_arguments(parser)
     parser.add_argument(
         "--as",
         dest="name",
         metavar="NAME",
-        help="who you are for the others (default: your user name)",
+        help="your name as other operators see it (default: your user name)",
     )
     parser.add_argument(
         "--take",
@@ -53,8 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         type=float,
         const=30.0,
-        help="ask whoever holds the controls for them, and wait up to S seconds (default: "
-        "%(const)g)",
+        help="ask the operator who holds the controls to hand them over, and wait up to S seconds "
+        "(default: %(const)g)",
     )
     parser.add_argument(
         "--json", metavar="FILE", help="write the answer as JSON (- for standard output)"
@@ -67,10 +67,10 @@ def give(
     data: Callable[[OperatorClient], dict[str, Any]] | None = None,
     told: Callable[[OperatorClient, Answer], Awaitable[str]] | None = None,
 ) -> int:
-    """Give one command and tell its answer: 0, 1 when it was refused.
+    """Give one command and print its answer. Return 0, or 1 if it was refused.
 
-    `data(hand)` is asked for once the snapshot is there; `told(hand, answer)` gives what people are
-    told when it was obeyed.
+    `data(hand)` makes the command's data once the snapshot has arrived; `told(hand, answer)` makes
+    the text that is printed when the command was accepted.
     """
     return asyncio.run(_give(options, verb, data, told))
 
@@ -101,7 +101,7 @@ async def _give(
 
 
 def show(options: argparse.Namespace, answer: Mapping[str, Any], text: str) -> None:
-    """The answer for people, or where --json says."""
+    """Print the answer as text, or write it where --json says."""
     if options.json:
         write_json(options.json, answer)
     if options.json != "-":
@@ -109,7 +109,7 @@ def show(options: argparse.Namespace, answer: Mapping[str, Any], text: str) -> N
 
 
 def find(options: argparse.Namespace) -> Door:
-    """The door of the run that is meant."""
+    """Return the door of the run that the options name."""
     from petrobot.coordinator.operator.door_file import find_door
     from petrobot.coordinator.run.folder import NoRunError
 
@@ -120,8 +120,8 @@ def find(options: argparse.Namespace) -> Door:
 
 
 def connect(door: Door, name: str | None) -> OperatorClient:
-    """A client of the run. The same name is the same operator at each call: the controls stay his
-    for 10 s in between."""
+    """Return a client of the run. Commands under the same name are of the same operator, who keeps
+    the controls for 10 s after each."""
     from petrobot.coordinator.operator.client import OperatorClient
 
     name = name or user_name()
@@ -130,7 +130,7 @@ def connect(door: Door, name: str | None) -> OperatorClient:
 
 
 def user_name() -> str:
-    """Who sits at this terminal."""
+    """The name of the user at this terminal."""
     try:
         return getpass.getuser()
     except (KeyError, OSError):
@@ -138,21 +138,21 @@ def user_name() -> str:
 
 
 async def take_controls(hand: OperatorClient, wait: float | None) -> None:
-    """Take the controls, or ask for them and wait `wait` seconds. Raises CommandError (1) when
-    another keeps them."""
+    """Take the controls, or ask for them and wait `wait` seconds. Raises CommandError (1) if
+    another operator keeps them."""
     answer = await hand.command("take_controls")
     if answer.get("ok"):
         return
     holder = hand.state["controls"]["holder"]
     if wait is None:
-        raise CommandError(1, f"{holder} holds the controls; --take asks for them")
+        raise CommandError(1, f"{holder} holds the controls; ask for them with --take")
     await hand.command("ask_controls")
     if not await hand.until(lambda state: bool(state["controls"]["holder"] == hand.who), wait):
         raise CommandError(1, f"{holder} did not hand over the controls within {wait:g} s")
 
 
 def named(known: Mapping[str, Any], name: str, what: str) -> str:
-    """A name that the task knows. Raises CommandError (2) with the nearest ones."""
+    """Return a name that is known. Raises CommandError (2), which suggests the nearest names."""
     from petrobot.coordinator.task.wording import nearest
 
     if name not in known:

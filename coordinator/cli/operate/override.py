@@ -1,4 +1,4 @@
-"""Choose the alternative of a primitive task by hand, or give the choice back."""
+"""Choose the action of a primitive task by hand, or let the run choose again."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EXAMPLE = "petrobot override track_ball predict_kalman"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("task", help="a primitive task")
-    parser.add_argument("action", nargs="?", help="the alternative that is run from now on")
+    parser.add_argument("action", nargs="?", help="the action to use from now on")
     parser.add_argument("--free", action="store_true", help="let the run choose again")
     hand.add_arguments(parser)
 
@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Override."""
     if options.free is (options.action is not None):
-        raise CommandError(2, f"name an action for {options.task}, or say --free")
+        raise CommandError(2, f"name an action for {options.task}, or give --free")
 
     def data(client: OperatorClient) -> dict[str, Any]:
         selectors = client.state["selectors"]

@@ -1,5 +1,4 @@
-"""Pause the run that goes on: nothing fires or starts, and every node says whether its devices
-hold."""
+"""Pause the active run: nothing fires or starts, and each node reports whether its devices hold."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ if TYPE_CHECKING:
 EXAMPLE = "petrobot pause"
 WORDS = {
     "held": "holds",
-    "cannot_hold": "CANNOT HOLD: its action goes on",
+    "cannot_hold": "CANNOT HOLD: its action continues",
     "stopped": "stands still",
     "idle": "has nothing to do",
     "lost": "DID NOT ANSWER",
@@ -34,4 +33,6 @@ def run(options: argparse.Namespace) -> int:
 async def _told(client: OperatorClient, answer: hand.Answer) -> str:
     nodes = answer.get("nodes", {})
     lines = [f"  {node:12} {WORDS.get(said, said)}" for node, said in nodes.items()]
-    return "\n".join(["paused; `petrobot continue` goes on, `petrobot step` fires once", *lines])
+    return "\n".join(
+        ["paused; next: `petrobot continue`, or `petrobot step` for one firing", *lines]
+    )

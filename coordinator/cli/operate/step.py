@@ -1,4 +1,4 @@
-"""Let a paused run go on for one firing, or stop a running one after the next."""
+"""Fire one transition of a paused run, or pause an active one after its next firing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = "petrobot step"
 PATIENCE = 2.0
-"""Seconds to wait for the firing before it is said that it is still to come."""
+"""How long to wait for the firing before the answer says that it is still to come (s)."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,7 +33,7 @@ def run(options: argparse.Namespace) -> int:
         if not await client.until(
             lambda state: state["mission"].get("firings", 0) > seen, PATIENCE
         ):
-            return "it goes on until something can fire, and pauses then"
+            return "no transition can fire yet; the run will pause after the next firing"
         firing = client.state["firings"][-1]
         answer["firing"] = firing
         return f"fired {firing['transition']} ({firing['cause']})"

@@ -1,4 +1,4 @@
-"""Put tokens into a control place, or take some out: more or fewer runs, another path."""
+"""Add or remove tokens of a control place: more or fewer runs, another path."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ EXAMPLE = "petrobot token runs +2"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("place", help="a control place of the task")
-    parser.add_argument("tokens", type=_change, help="how many more (+2) or fewer (-1)")
+    parser.add_argument("tokens", type=_change, help="how many to add (+2) or to remove (-1)")
     hand.add_arguments(parser)
 
 
@@ -42,6 +42,6 @@ def _change(text: str) -> int:
         value = 0
     if not value:
         raise argparse.ArgumentTypeError(
-            f"{text} changes nothing: write how many tokens more or fewer, as +1 or -1"
+            f"expected how many tokens to add or remove, such as +1 or -1, got {text}"
         )
     return value

@@ -1,5 +1,4 @@
-"""Follow the run that goes on: firings, starts and ends of actions, commands of operators; until it
-ends."""
+"""Follow the active run until it ends: firings, starts and ends of actions, operators' commands."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = "petrobot watch --json - | jq .kind"
 ENDED = {"success": 0, "failure": 1, "error": 1, "aborted": 1, "stopped": 1}
-"""Exit code by the state in which a run ends."""
+"""Exit code for each state in which a run ends."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,20 +30,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--as",
         dest="name",
         metavar="NAME",
-        help="who you are for the others (default: your user name)",
+        help="your name as other operators see it (default: your user name)",
     )
     parser.add_argument(
-        "--json", metavar="FILE", help="every change as a line of JSON (- for standard output)"
+        "--json", metavar="FILE", help="write each change as a line of JSON (- for standard output)"
     )
 
 
 def run(options: argparse.Namespace) -> int:
-    """Watch; 0 when the run ends in success, 1 when it ends otherwise."""
+    """Watch. Return 0 if the run ends in success, 1 if it ends otherwise."""
     if options.json in (None, "-"):
         return asyncio.run(_watch(options, sys.stdout))
     path, lines = Path(options.json), io.StringIO()
     try:
-        with path.open("a", encoding="utf-8") as file:  # refused now if it cannot be written
+        with path.open("a", encoding="utf-8") as file:  # fails now if it cannot be written
             if not path.is_file():  # a pipe or a terminal: every line at once
                 return asyncio.run(_watch(options, file))
         try:
@@ -93,7 +92,7 @@ def _snapshot(client: OperatorClient) -> str:
 
 
 def _line(change: Mapping[str, Any]) -> str:
-    """A change in words; empty for what people need not read."""
+    """Describe a change in words; empty for changes that people need not read."""
     words = _WORDS.get(change["kind"])
     said = words(change) if words is not None else ""
     return f"{change.get('time', 0.0):10.3f} s  {said}" if said else ""
@@ -108,7 +107,7 @@ def _ended(change: Mapping[str, Any]) -> str:
 def _paused(change: Mapping[str, Any]) -> str:
     paused = change["paused"]
     if paused is None:
-        return "goes on"
+        return "continued"
     nodes = ", ".join(f"{node} {answer}" for node, answer in paused["nodes"].items())
     return f"paused   {paused['reason']}" + (f" ({nodes})" if nodes else "")
 

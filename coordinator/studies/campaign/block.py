@@ -28,7 +28,12 @@ from petrobot.coordinator.studies.campaign.trials import CostOf, TrialLog
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import TaskFileError
 from petrobot.coordinator.task.file import load as load_task
-from petrobot.services.comm.location_file import Directory, DirectoryError
+from petrobot.services.comm.location_file import (
+    FIRST_PHYSICS,
+    Directory,
+    DirectoryError,
+    same_physics,
+)
 from petrobot.services.comm.location_file import load as load_directory
 from petrobot.services.comm.lockstep.cell import CellError, Delays, LockStepCell
 from petrobot.services.comm.lockstep.party import TICK, Party
@@ -134,6 +139,13 @@ def run_block(bench: LoadedPlan, block: Block, weights: Sequence[Weights]) -> di
             close = getattr(party, "close", None)
             if close is not None:
                 close()
+    physics = mission.score.get("physics", "")
+    if physics and not same_physics(bench.plan.physics, physics):
+        raise CampaignError(
+            f"seed {block.seed}: ran with the physics {physics!r}, the campaign's is "
+            f"{bench.plan.physics or FIRST_PHYSICS!r}: trials of different physics are not pooled; "
+            "write the same `physics` in services.toml ([nodes.NAME] of the simulated node)"
+        )
     return {
         "index": block.index,
         "trials": [trial.to_plain() for trial in log.trials],

@@ -148,7 +148,12 @@ class Campaign:
         name = identity(self.plan)
         summary = Summary.of(self.bench.task, self.table.rows(), name, self.plan.options)
         write_estimates(
-            self.folder, summary.estimates, self.policy.selectors(), name, summary.asked()
+            self.folder,
+            summary.estimates,
+            self.policy.selectors(),
+            name,
+            summary.asked(),
+            self.plan.physics,
         )
         return result_of(self.folder, self.plan, summary, self.policy.state())
 

@@ -84,17 +84,19 @@ def write_estimates(
     selectors: Mapping[str, Mapping[str, Any]],
     campaign: str,
     asked: Mapping[str, Question] | None = None,
+    physics: str = "",
 ) -> Path:
     """Write the runs of a campaign to its estimates file, under the campaign's own origin, and
     return its path.
 
     Merging it twice counts nothing twice, and what others have learned into the file stays.
-    `asked`: by what the actions of each primitive task are judged. Raises CampaignError.
+    `asked`: by what the actions of each primitive task are judged; `physics`: that of the
+    simulated laboratory. Raises CampaignError.
     """
     path = folder / ESTIMATES
     try:
         origin = CAMPAIGN + campaign
-        EstimatesFile(path, origin).put_closed(origin, estimates, selectors, asked or {})
+        EstimatesFile(path, origin).put_closed(origin, estimates, selectors, asked or {}, physics)
     except EstimatesError as fault:
         raise CampaignError(
             f"{fault}. If it is removed, the same command makes it again from the table"

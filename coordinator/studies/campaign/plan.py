@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from petrobot.services.comm.location_file import same_physics
 from petrobot.services.host.json_text import json_text
 from petrobot.services.host.whole_file import write_whole
 
@@ -57,6 +58,9 @@ class CampaignPlan:
     """Path of a file of scripted actions, as for `petrobot run --mock`."""
     digests: Mapping[str, str] = field(default_factory=dict)
     """SHA-256 of the files above, by key."""
+    physics: str = ""
+    """Name and version of the simulated laboratory's physics; empty: it has only one, or the
+    campaign is older than this key."""
 
     def to_plain(self) -> dict[str, Any]:
         """Return plain data for manifest and workers."""
@@ -183,10 +187,12 @@ def _remedy(folder: Path) -> str:
 def differences(old: CampaignPlan, new: CampaignPlan) -> list[str]:
     """Return the keys in which two plans differ, except paths of files with the same contents."""
     before, after = old.to_plain(), new.to_plain()
-    same_file = {
+    same = {
         key for key in ("task", "services", "mock") if old.digests.get(key) == new.digests.get(key)
     }
-    return [key for key in before if key not in same_file and before[key] != after.get(key)]
+    if same_physics(old.physics, new.physics):
+        same.add("physics")
+    return [key for key in before if key not in same and before[key] != after.get(key)]
 
 
 def identity(plan: CampaignPlan) -> str:
@@ -195,4 +201,6 @@ def identity(plan: CampaignPlan) -> str:
     data = plan.to_plain()
     for key in ("task", "services", "mock"):
         data[key] = plan.digests.get(key, "")
+    if same_physics(plan.physics, ""):
+        del data["physics"]  # so campaigns that are older than this key keep their identity
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]

@@ -78,7 +78,8 @@ def question_of(
     off.
     """
     target = options.get("target", primitive.target_reliability if declared else None)
-    return Question(primitive.cost, target, options.get("rho"))
+    costs = tuple(primitive.costs.items())
+    return Question(primitive.cost, target, options.get("rho"), declared=costs)
 
 
 def comparisons(

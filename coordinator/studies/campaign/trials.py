@@ -23,7 +23,7 @@ from petrobot.coordinator.engine.instructions import (
 from petrobot.coordinator.engine.stimuli import RunEnded, Stimulus
 from petrobot.coordinator.task import End, Executed, Kind, Status, Task
 from petrobot.coordinator.task.net import Marking
-from petrobot.services.comm.calls.caller import CallProgress
+from petrobot.services.comm.protocol.messages import Feedback
 
 DIGITS = 6
 """Decimals of all times and costs in the table (microseconds)."""
@@ -180,7 +180,7 @@ class TrialLog:
         elif isinstance(instruction, Finished):
             self._finished(now, instruction)
 
-    def progress(self, now: float, run: str, notice: CallProgress) -> None:
+    def progress(self, now: float, run: str, notice: Feedback) -> None:
         """Ignore progress."""
 
     def settled(self, now: float, state: State) -> None:

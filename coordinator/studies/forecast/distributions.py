@@ -32,10 +32,10 @@ from petrobot.coordinator.studies.forecast.history import (
     NONE,
     Codes,
     Runs,
+    RunVocabulary,
     Seen,
     Training,
     Values,
-    Vocabulary,
 )
 
 ALPHA = 0.01
@@ -358,7 +358,7 @@ def dependences(training: Training) -> list[dict[str, Any]]:
     return sorted(out, key=lambda d: float(d["p"]))
 
 
-def first_statuses(vocabulary: Vocabulary, runs: Runs, trials: int) -> Codes:
+def first_statuses(vocabulary: RunVocabulary, runs: Runs, trials: int) -> Codes:
     """Return the status code of the first run in each place of each trial, (q, trials); CENSORED -
     1 if there is none."""
     out = np.full((len(vocabulary.places), trials), CENSORED - 1)

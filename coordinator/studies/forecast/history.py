@@ -38,7 +38,7 @@ class ForecastError(Exception):
 
 
 @dataclass(frozen=True)
-class Vocabulary:
+class RunVocabulary:
     """Numeric codes of the action places, transitions and actions of a flat task."""
 
     places: tuple[str, ...]
@@ -53,7 +53,7 @@ class Vocabulary:
     own ends are unknown."""
 
     @classmethod
-    def of(cls, task: Task) -> Vocabulary:
+    def of(cls, task: Task) -> RunVocabulary:
         """Return the codes of a task."""
         flat = task.flat
         taking = [
@@ -167,7 +167,7 @@ class Training:
     """The measured trials of a regime."""
 
     task: Task
-    vocabulary: Vocabulary
+    vocabulary: RunVocabulary
     trials: tuple[Trial, ...]
     runs: Runs
     waits: dict[str, tuple[Values, Codes]]
@@ -179,7 +179,7 @@ class Training:
     @classmethod
     def of(cls, task: Task, trials: Iterable[Trial], *, whole: bool = True) -> Training:
         """Prepare trials. Raises ValueError if there are none."""
-        kept, vocabulary = tuple(trials), Vocabulary.of(task)
+        kept, vocabulary = tuple(trials), RunVocabulary.of(task)
         if not kept:
             raise ValueError("expected at least one trial to learn from, got none")
         waits: dict[str, list[tuple[float, int]]] = {}
@@ -240,7 +240,7 @@ def _waited(timer: str, trial: Trial) -> list[float]:
     return out
 
 
-def _runs(vocabulary: Vocabulary, trials: tuple[Trial, ...]) -> Runs:
+def _runs(vocabulary: RunVocabulary, trials: tuple[Trial, ...]) -> Runs:
     places = {name: i for i, name in enumerate(vocabulary.places)}
     actions = {name: i + 1 for i, name in enumerate(vocabulary.actions)}
     flat = [(i, run) for i, trial in enumerate(trials) for run in trial.runs if run.place in places]
@@ -286,13 +286,13 @@ def _ended_before(flat: list[tuple[int, RunEntry]], j: int, begin: int, end: int
     return sorted((i for i in over if i < j), key=lambda i: flat[i][1].begun + flat[i][1].took)
 
 
-def _outcome(vocabulary: Vocabulary, run: RunEntry) -> int:
+def _outcome(vocabulary: RunVocabulary, run: RunEntry) -> int:
     status = STATUSES.index(Status(run.status)) if run.status else CENSORED
     told = run.taken in vocabulary.transitions and (run.cancelled or run.place in vocabulary.open)
     return vocabulary.outcome(status, vocabulary.transitions.index(run.taken) if told else -1)
 
 
-def _is_cut_off(vocabulary: Vocabulary, run: RunEntry) -> bool:
+def _is_cut_off(vocabulary: RunVocabulary, run: RunEntry) -> bool:
     """Return whether a run was cut off: by a transition that fires as the marking allows, or by
     nothing of the task (an abort, the end of the records)."""
     if run.cancelled and run.taken in vocabulary.transitions:
@@ -313,8 +313,9 @@ def reads_variables(t: Transition) -> bool:
 # It holds only sums and samples of runs, so each run stands alone, without what ended before it.
 
 
-def read_estimates(path: Path) -> Estimates:
-    """Read an estimates file. Raises ForecastError."""
+def read_estimates(path: Path) -> tuple[Estimates, str]:
+    """Read an estimates file; return what it holds and the physics in which it was learned. Raises
+    ForecastError."""
     try:
         kept = EstimatesFile(path).read() if path.exists() else None
     except EstimatesError as fault:
@@ -324,7 +325,7 @@ def read_estimates(path: Path) -> Estimates:
             f"{path} holds no estimates; give a campaign's folder or a file that `run "
             "--learn` wrote"
         )
-    return kept.estimates
+    return kept.estimates, kept.physics
 
 
 def trainings_of(task: Task, estimates: Estimates) -> dict[str, Training]:

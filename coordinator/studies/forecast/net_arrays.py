@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from petrobot.coordinator.analysis.time.stochastic import is_cause
-from petrobot.coordinator.studies.forecast.history import STATUSES, Vocabulary, reads_variables
+from petrobot.coordinator.studies.forecast.history import STATUSES, RunVocabulary, reads_variables
 from petrobot.coordinator.task import Counts, End, Kind, Status, Task, Transition
 from petrobot.coordinator.task.compiled import CompiledNet
 from petrobot.coordinator.task.compiled_task import CompiledTransition, compile_transitions
@@ -69,7 +69,7 @@ class Structure:
     """A flat task."""
 
     task: Task
-    vocabulary: Vocabulary
+    vocabulary: RunVocabulary
     moves: tuple[Move, ...]
     initial: np.ndarray
     rule: CompiledNet
@@ -82,7 +82,7 @@ class Structure:
     def of(cls, task: Task) -> Structure:
         """Raises ValueError for what cannot be played, with the remedy."""
         flat = task.flat
-        vocabulary = Vocabulary.of(flat)
+        vocabulary = RunVocabulary.of(flat)
         for place in flat.places.values():
             if place.kind is Kind.ACTION and (place.servers or 1) > 1:
                 raise ValueError(
@@ -106,7 +106,7 @@ class Structure:
 
 def _move(
     flat: Task,
-    vocabulary: Vocabulary,
+    vocabulary: RunVocabulary,
     t: Transition,
     compiled: CompiledTransition,
     assumptions: list[str],

@@ -341,7 +341,7 @@ class Play:
         for name in ("_column", "_replicate", "_now", "_begun", "_goals", "_good"):
             setattr(self, name, getattr(self, name)[kept])
         for name in (
-            "_tokens", "_phase", "_status", "_want", "_preempted", "_end", "_due", "_action", "_outcome", "_took",
-            "_came", "_beyond",
+            "_tokens", "_phase", "_status", "_want", "_preempted", "_end",
+            "_due", "_action", "_outcome", "_took", "_came", "_beyond",
         ):  # fmt: skip
             setattr(self, name, getattr(self, name)[:, kept])

@@ -10,7 +10,7 @@ from typing import Any
 from petrobot.coordinator.learning.learner import LearningSelector
 from petrobot.coordinator.learning.learning import Learning
 from petrobot.coordinator.learning.records import Record, RunEnd
-from petrobot.coordinator.run.recording import Step
+from petrobot.coordinator.run.recording import RecordedStep
 from petrobot.coordinator.run.timeline import Bar, Timeline
 from petrobot.coordinator.studies.report.action_pictures import (
     Curves,
@@ -214,7 +214,7 @@ class ObservedRun:
         self._selector = learner or LearningSelector(Learning(task))
         self._probability: dict[tuple[str, str], Curves] = {}
 
-    def step(self, step: Step) -> None:
+    def step(self, step: RecordedStep) -> None:
         """Observe one stimulus and its instructions."""
         seen = len(self._selector.records)
         self._selector.stimulus(step.time, step.stimulus)

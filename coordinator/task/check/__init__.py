@@ -14,12 +14,12 @@ from petrobot.coordinator.task.check.completeness import (
     unoffered,
 )
 from petrobot.coordinator.task.check.conflicts import conflicts
-from petrobot.coordinator.task.check.findings import Finding, Report
+from petrobot.coordinator.task.check.findings import CheckReport, Finding
 from petrobot.coordinator.task.check.flow import never_marked, odd_ends, timeless_cycles, unused
 from petrobot.coordinator.task.validation import faults
 from petrobot.coordinator.task.wording import Severity
 
-__all__ = ["Finding", "Report", "Severity", "check"]
+__all__ = ["CheckReport", "Finding", "Severity", "check"]
 
 _CHECKS: tuple[Callable[[Task], Iterator[Finding]], ...] = (
     uncovered_exits,
@@ -40,7 +40,7 @@ def check(
     *,
     translates: Mapping[str, str] | None = None,
     source: str = "services.toml",
-) -> Report:
+) -> CheckReport:
     """Everything that can be said of the task without exploring it.
 
     `offers`: the node of each action that is offered; `translates`: the primitive task that each of
@@ -48,7 +48,7 @@ def check(
     """
     broken = faults(task)
     if broken:
-        return Report(
+        return CheckReport(
             tuple(Finding(Severity.ERROR, "inconsistent", f.key, f.text, f.remedy) for f in broken)
         )
     found = [finding for part in _CHECKS for finding in part(task.flat)]
@@ -56,4 +56,4 @@ def check(
         found += unoffered(task, offers, source)
     if translates is not None:
         found += translating_others(task, translates, source)
-    return Report(tuple(sorted(found, key=lambda f: _ORDER.index(f.severity))))
+    return CheckReport(tuple(sorted(found, key=lambda f: _ORDER.index(f.severity))))

@@ -1,5 +1,5 @@
-"""Every action place has a normal and an error way out, and the exits of each status cover all
-cases."""
+"""Completeness: every action place has outgoing arcs for a normal end and for an error, and their
+conditions cover all cases."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from petrobot.coordinator.task import (
 )
 from petrobot.coordinator.task.check.findings import Finding
 from petrobot.coordinator.task.conditions import Expression
-from petrobot.coordinator.task.conditions.regions import Answer, Domain, covering
+from petrobot.coordinator.task.conditions.regions import Certainty, Domain, covering
 from petrobot.coordinator.task.validation import condition_domains
 from petrobot.coordinator.task.wording import Severity, listed, nearest
 
@@ -52,7 +52,7 @@ def exits(task: Task, place: Place, end: End) -> list[Transition]:
 
 def _missing(place: Place, end: End) -> Finding:
     what = "success or failure" if end is End.NORMAL else "error"
-    text = f"no {end} way out: a run that ends with {what} could go nowhere"
+    text = f"no outgoing arc `{end}`: the token of a run that ends with {what} would stay for ever"
     remedy = f'add a transition with in = ["{place.name}:{end}"]'
     return Finding(Severity.ERROR, f"no-{end}-exit", f"places.{place.name}", text, remedy)
 
@@ -69,13 +69,13 @@ def _uncovered(
         f"places.{place.name}",
         "let one exit take what is left (no `when`, lower priority)",
     )
-    if verdict.answer is Answer.REFUTED:
+    if verdict.answer is Certainty.REFUTED:
         text = (
             f"after {status} the conditions of its exits {names} may all be false: "
             "finished, nowhere to go"
         )
         yield Finding(Severity.ERROR, "uncovered-exit", key, text, remedy, verdict.witness)
-    elif verdict.answer is Answer.UNKNOWN:
+    elif verdict.answer is Certainty.UNKNOWN:
         text = (
             f"after {status} it is not known whether the conditions of its exits {names} "
             "cover all cases"
@@ -150,7 +150,8 @@ def _unheard(task: Task, t: Transition, event: Event) -> Finding:
     return Finding(Severity.ERROR, "event-unheard", key, text, remedy)
 
 
-# Whether some node offers every action that the task may choose, and offers it for that primitive task.
+# Whether some node offers every action that the task may choose, and offers it for that primitive
+# task.
 
 
 def unoffered(task: Task, offers: Mapping[str, str], source: str) -> Iterator[Finding]:

@@ -14,9 +14,9 @@ from collections.abc import Iterator
 from itertools import combinations
 from math import gcd
 
-from petrobot.coordinator.task import Early, End, Input, Kind, Scope, Task, Transition
+from petrobot.coordinator.task import EarlyEvent, End, Input, Kind, Scope, Task, Transition
 from petrobot.coordinator.task.check.findings import Finding
-from petrobot.coordinator.task.conditions.regions import Answer, Domain, exclusive
+from petrobot.coordinator.task.conditions.regions import Certainty, Domain, exclusive
 from petrobot.coordinator.task.net import Net
 from petrobot.coordinator.task.validation import condition_domains, is_pulse
 from petrobot.coordinator.task.wording import Severity
@@ -29,7 +29,8 @@ Flow = dict[int, int]
 
 
 def semiflows(task: Task) -> tuple[Flow, ...]:
-    """P-semiflows without control places; empty if there are none or too many to find here."""
+    """Return P-semiflows without control places; empty if there are none, or too many to compute
+    here."""
     net = task.net
     places = [i for i, p in enumerate(task.places.values()) if p.kind is not Kind.CONTROL]
     rows: list[tuple[Flow, dict[int, int]]] = [({p: 1}, _effects(net, p)) for p in places]
@@ -68,8 +69,8 @@ def _effects(net: Net, place: int) -> dict[int, int]:
 def _combine(
     a: tuple[Flow, dict[int, int]], b: tuple[Flow, dict[int, int]], t: int
 ) -> tuple[Flow, dict[int, int]]:
-    """The positive combination of a row that gains and one that loses in which t changes
-    nothing."""
+    """Return the positive combination of a row that gains by t and one that loses by t, in which
+    t cancels out."""
     x, y = -b[1][t], a[1][t]
     flow = _sum(a[0], x, b[0], y)
     effect = _sum(a[1], x, b[1], y)
@@ -83,7 +84,7 @@ def _sum(a: dict[int, int], x: int, b: dict[int, int], y: int) -> dict[int, int]
 
 
 def _minimal(rows: list[tuple[Flow, dict[int, int]]]) -> list[tuple[Flow, dict[int, int]]]:
-    """Rows whose support contains no other row's."""
+    """Return the rows whose support contains the support of no other row."""
     kept: list[tuple[Flow, dict[int, int]]] = []
     for row in sorted(rows, key=lambda r: len(r[0])):
         if not any(other[0].keys() <= row[0].keys() for other in kept):
@@ -97,7 +98,9 @@ Trigger = tuple[str, str]
 
 
 def conflicts(task: Task) -> Iterator[Finding]:
-    """Conflicts that nothing settles (errors) and those that arrival order settles (notes)."""
+    """Find conflicts that the arcs suggest: those that the task does not decide (warnings), and
+    those that the order of arrival decides (notes). Whether any comes to pass is for the execution
+    graph."""
     domains, flows, net = condition_domains(task), semiflows(task), task.net
     for t, u in combinations(task.transitions.values(), 2):
         shared = sorted(_shared(task, t, u))
@@ -113,7 +116,7 @@ def _judge(
     task: Task, t: Transition, u: Transition, shared: list[str], domains: dict[str, Domain]
 ) -> Iterator[Finding]:
     verdict = exclusive([t.when, u.when], domains)
-    if verdict.answer is Answer.PROVED:
+    if verdict.answer is Certainty.PROVED:
         return
     key, over = f"transitions.{t.name}", " and ".join(shared)
     if not last_triggers(task, t) & last_triggers(task, u):
@@ -130,19 +133,19 @@ def _judge(
         return
     unsure = (
         " (it is not known whether their conditions exclude each other)"
-        if verdict.answer is Answer.UNKNOWN
+        if verdict.answer is Certainty.UNKNOWN
         else ""
     )
     text = (
-        f"{t.name} and {u.name} can become fireable together, compete for {over}, and "
-        f"nothing settles it{unsure}"
+        f"{t.name} and {u.name} may both want the last token of {over}, and the task does not say "
+        f"which one gets it{unsure}"
     )
-    remedy = "give exclusive conditions, or different `priority`, or a `weight` to each"
-    yield Finding(Severity.ERROR, "unsettled-conflict", key, text, remedy, verdict.witness)
+    remedy = "give one a higher `priority`, each a `weight`, or exclusive conditions"
+    yield Finding(Severity.WARNING, "unsettled-conflict", key, text, remedy, verdict.witness)
 
 
 def _shared(task: Task, t: Transition, u: Transition) -> set[str]:
-    """What both take: places of shared tokens, latched events, raised events."""
+    """Return what both take: tokens of a place, latched events, raised events, room."""
     shared = {
         a.place
         for a in t.inputs
@@ -155,7 +158,7 @@ def _shared(task: Task, t: Transition, u: Transition) -> set[str]:
 
 
 def _room(task: Task, t: Transition) -> set[str]:
-    """The room that the transition takes up in places of limited capacity."""
+    """Return the places of limited capacity that the transition fills."""
     net = task.net
     return {
         f"room in {net.places[p]}"
@@ -176,15 +179,15 @@ def _same_token(task: Task, t: Transition, a: Input, u: Transition, b: Input) ->
 
 
 def _mutual_bars(t: Transition, u: Transition) -> set[str]:
-    """Inhibitor arcs by which each bars the other."""
+    """Return the inhibitor arcs by which each transition bars the other."""
     one = {i.place for i in u.inhibitors} & {o.place for o in t.outputs}
     other = {i.place for i in t.inhibitors} & {o.place for o in u.outputs}
     return {f"the way past {p}" for p in one | other} if one and other else set()
 
 
 def excluded(task: Task, t: Transition, u: Transition) -> bool:
-    """Whether tokens alone keep the two from being fireable together: one run in two states, or an
-    inhibitor arc."""
+    """Whether tokens alone exclude that both are fireable: they need one run in two states, or an
+    inhibitor arc separates them."""
     limits = {i.place: i.threshold for i in t.inhibitors}
     if any(b.weight >= limits[b.place] for b in u.inputs if b.place in limits):
         return True
@@ -199,18 +202,18 @@ def excluded(task: Task, t: Transition, u: Transition) -> bool:
 
 
 def _state(arc: Input) -> str:
-    """The state of the run that the arc asks for."""
+    """Return the state of the run that the arc requires."""
     return "live" if arc.end in _LIVE_ENDS else str(arc.end)
 
 
 def _preempts(t: Transition) -> bool:
-    """As the engine ranks it: a run's end goes before its preemption, unless a weight is
-    declared."""
+    """Whether the engine ranks it as a preemption: the end of a run has precedence over its
+    preemption, unless a weight is declared."""
     return t.weight is None and any(a.end is End.PREEMPT for a in t.inputs)
 
 
 def last_triggers(task: Task, t: Transition) -> set[Trigger]:
-    """What can be the last thing to come before the transition can fire."""
+    """Return what can be the last condition to become true before the transition can fire."""
     pulses = {("event", e) for e in t.events if is_pulse(task.events[e])}
     if pulses:
         return pulses
@@ -232,7 +235,7 @@ def last_triggers(task: Task, t: Transition) -> set[Trigger]:
 
 
 def _holds_until_fired(task: Task, event: str) -> bool:
-    """Whether the event's flag can only be set once all tokens of a transition that waits for it
-    are there."""
+    """Whether the event's flag can be set only when a transition that waits for it has all its
+    tokens."""
     e = task.events[event]
-    return e.scope is Scope.EXTERNAL and not is_pulse(e) and e.early is Early.DROP
+    return e.scope is Scope.EXTERNAL and not is_pulse(e) and e.early is EarlyEvent.DROP

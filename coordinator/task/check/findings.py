@@ -1,5 +1,5 @@
-"""What a check finds: findings by severity, each with its key, a sentence, a remedy and, where
-there is one, a witness."""
+"""Findings of a check: severity, key in the task file, a sentence, a remedy, and values that show
+it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from petrobot.coordinator.task.wording import Severity
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that is wrong or worth knowing. `code` is a fixed word for programs, `key` the key
-    in the task file."""
+    """One thing that is wrong or worth knowing. `code` is a fixed word for programs; `key` is the
+    key in the task file."""
 
     severity: Severity
     code: str
@@ -30,7 +30,7 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class CheckReport:
     """All findings, errors first."""
 
     findings: tuple[Finding, ...]

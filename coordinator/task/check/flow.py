@@ -1,5 +1,5 @@
-"""Flow of tokens without a state space: timeless cycles, what can never be marked, ends that make
-no sense, loose parts."""
+"""Checks of the flow of tokens that need no state space: cycles without time, places that are never
+marked, ends at the beginning, unused declarations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from petrobot.coordinator.task.wording import Severity, listed
 
 
 def timeless_cycles(task: Task) -> Iterator[Finding]:
-    """Transitions that could fire for ever without time passing."""
+    """Find transitions that could fire for ever without time passing."""
     loose = endless(task)
     if loose:
         text = f"{listed(loose)} can fire again and again without time passing"
@@ -21,8 +21,8 @@ def timeless_cycles(task: Task) -> Iterator[Finding]:
 
 
 def never_marked(task: Task) -> Iterator[Finding]:
-    """Places that no firing can mark and transitions that can never fire, taking every token that
-    ever was as still there."""
+    """Find places that no firing can mark and transitions that can never fire. The search
+    over-approximates: it never removes a token."""
     marked = {p.name for p in task.places.values() if p.tokens or p.kind is Kind.CONTROL}
     able: set[str] = set()
     while True:
@@ -40,7 +40,7 @@ def never_marked(task: Task) -> Iterator[Finding]:
         if place.name not in marked or (
             place.kind is Kind.CONTROL and not place.tokens and place.name not in fed
         ):
-            hand = " but by the operator's hand" if place.kind is Kind.CONTROL else ""
+            hand = ", unless the operator adds one" if place.kind is Kind.CONTROL else ""
             text = f"it never holds a token{hand}"
             severity = Severity.NOTE if place.kind is Kind.CONTROL else Severity.WARNING
             yield Finding(
@@ -61,7 +61,7 @@ def never_marked(task: Task) -> Iterator[Finding]:
 
 
 def odd_ends(task: Task) -> Iterator[Finding]:
-    """A task that is over before it begins."""
+    """Find ends that the initial marking already satisfies."""
     tokens = {p.name: p.tokens for p in task.places.values()}
     for key, predicate in (("task.final", task.final), ("task.final_error", task.final_error)):
         if (
@@ -80,15 +80,15 @@ def odd_ends(task: Task) -> Iterator[Finding]:
 
 
 def unused(task: Task) -> Iterator[Finding]:
-    """Declarations that nothing refers to."""
+    """Find declarations that nothing refers to."""
     events = {e for t in task.transitions.values() for e in t.events}
     places = [p for p in task.places.values() if p.kind is Kind.ACTION]
     for event in task.events.values():
         if event.name not in events:
             how = (
-                "raised for nothing"
+                "raised, but no transition uses it"
                 if event.scope is Scope.INTERNAL
-                else "waited for by no transition"
+                else "no transition waits for it"
             )
             yield Finding(
                 Severity.NOTE,
@@ -101,15 +101,20 @@ def unused(task: Task) -> Iterator[Finding]:
         if primitive not in {p.task for p in places}:
             key = f"primitive_tasks.{primitive}"
             yield Finding(
-                Severity.NOTE, "unused", key, "no place runs it", "drop it, or give it a place"
+                Severity.NOTE,
+                "unused",
+                key,
+                "no action place runs it",
+                "drop it, or give it a place",
             )
     written = {v for p in places for v in p.out.values()}
+    written |= {name for t in task.transitions.values() for name, _ in t.sets}
     read = {n for t in task.transitions.values() if t.when is not None for n in t.when.names}
     for variable in task.variables.values():
         if variable.name in read and variable.name not in written and variable.initial is None:
             text = (
-                "conditions read it, no run writes it and it has no initial value: until "
-                "global memory does, they are false"
+                "conditions read it, but no run writes it and it has no initial value: they are "
+                "false until global memory writes it"
             )
             remedy = "give `initial`, or let a place write it with `out`"
             yield Finding(

@@ -38,7 +38,7 @@ _DIGITS = 40
 
 
 class ConditionError(ValueError):
-    """The text is no condition. `at` is the 0-based position of the fault in `source`."""
+    """The text is not a condition. `at` is the position of the fault in `source`, from 0."""
 
     def __init__(self, text: str, source: str, at: int) -> None:
         super().__init__(f"{text} at column {at + 1}: {source[:at]}>>>{source[at:]}")
@@ -117,6 +117,10 @@ class Expression:
         """All names that the condition reads."""
         return frozenset(n.name for n in walk(self.tree) if isinstance(n, Name))
 
+    def value(self, values: Mapping[str, Any]) -> Any:
+        """The value of a literal or a name. Raises ConditionFault for a name that is unknown."""
+        return _value(self.tree, values)
+
     def holds(self, values: Mapping[str, Any]) -> bool:
         """Whether the condition is true for the values. Raises ConditionFault when it has no truth
         value."""
@@ -141,6 +145,24 @@ def rename(expression: Expression, names: Mapping[str, str]) -> Expression:
         text += expression.text[end : node.at] + names.get(node.name, node.name)
         end = node.at + len(node.name)
     return parse(text + expression.text[end:])
+
+
+def with_values(expression: Expression, values: Mapping[str, Any]) -> Expression:
+    """Return the condition with literals in place of the names in the mapping."""
+    return Expression(expression.text, _with_values(expression.tree, values))
+
+
+def _with_values(node: Node, values: Mapping[str, Any]) -> Node:
+    if isinstance(node, Name):
+        return Literal(values[node.name], node.at) if node.name in values else node
+    if isinstance(node, Not):
+        return Not(_with_values(node.operand, values), node.at)
+    if isinstance(node, And | Or):
+        return type(node)(tuple(_with_values(part, values) for part in node.operands), node.at)
+    if isinstance(node, Compare):
+        left, right = _with_values(node.left, values), _with_values(node.right, values)
+        return Compare(node.sign, left, right, node.at)
+    return node
 
 
 def walk(node: Node) -> Iterator[Node]:
@@ -284,7 +306,7 @@ class _Parser:
         raise self.fault(
             "a value or a name is missing"
             if kind == "end"
-            else f"{text!r} is no value and no name",
+            else f"{text!r} is neither a value nor a name",
             at,
         )
 

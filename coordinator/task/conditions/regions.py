@@ -10,7 +10,7 @@ gap as there are such names.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise, product
@@ -29,6 +29,7 @@ from petrobot.coordinator.task.conditions.language import (
     Or,
     is_number,
     walk,
+    with_values,
 )
 from petrobot.coordinator.task.wording import nearest
 
@@ -47,8 +48,8 @@ class Domain:
     """Smallest value of an `int`."""
 
 
-class Answer(StrEnum):
-    """Answer to a question about all values."""
+class Certainty(StrEnum):
+    """Certainty to a question about all values."""
 
     PROVED = "proved"
     REFUTED = "refuted"
@@ -56,10 +57,10 @@ class Answer(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Judgement:
     """An answer; when refuted, `witness` are values that show it."""
 
-    answer: Answer
+    answer: Certainty
     witness: Mapping[str, Any] | None = None
 
 
@@ -73,12 +74,12 @@ def kind_faults(expression: Expression, domains: Mapping[str, Domain]) -> list[s
     return faults
 
 
-def exclusive(conditions: Sequence[Expression | None], domains: Mapping[str, Domain]) -> Verdict:
+def exclusive(conditions: Sequence[Expression | None], domains: Mapping[str, Domain]) -> Judgement:
     """Whether no values make two of the conditions true (None: always true)."""
     return _decide(conditions, domains, lambda truths: sum(truths) >= 2)
 
 
-def covering(conditions: Sequence[Expression | None], domains: Mapping[str, Domain]) -> Verdict:
+def covering(conditions: Sequence[Expression | None], domains: Mapping[str, Domain]) -> Judgement:
     """Whether all values make at least one of the conditions true, once every name has been
     written."""
     return _decide(conditions, domains, lambda truths: not any(truths))
@@ -86,16 +87,16 @@ def covering(conditions: Sequence[Expression | None], domains: Mapping[str, Doma
 
 def _decide(
     conditions: Sequence[Expression | None], domains: Mapping[str, Domain], bad: Any
-) -> Verdict:
+) -> Judgement:
     real = [c for c in conditions if c is not None]
-    choices = _regions(real, domains)
+    choices = region_values(real, domains)
     if prod(len(c) for c in choices.values()) > LIMIT:
-        return Verdict(Answer.UNKNOWN)
+        return Judgement(Certainty.UNKNOWN)
     for values in product(*choices.values()):
         assignment = dict(zip(choices, values, strict=True))
         if bad([c is None or _holds(c, assignment) for c in conditions]):
-            return Verdict(Answer.REFUTED, assignment)
-    return Verdict(Answer.PROVED)
+            return Judgement(Certainty.REFUTED, assignment)
+    return Judgement(Certainty.PROVED)
 
 
 def _holds(condition: Expression, values: Mapping[str, Any]) -> bool:
@@ -105,10 +106,27 @@ def _holds(condition: Expression, values: Mapping[str, Any]) -> bool:
         return False
 
 
-def _regions(
+def can_hold(
+    condition: Expression,
+    values: Mapping[str, Any],
+    free: Collection[str],
+    domains: Mapping[str, Domain],
+) -> bool:
+    """Return whether the condition is true for the values, or for some values of the names in
+    `free` beside them. Above `LIMIT` combinations it counts as possible."""
+    known = {name: values[name] for name in condition.names - set(free) if name in values}
+    fixed = with_values(condition, known)
+    choices = {n: c for n, c in region_values([fixed], domains).items() if n in free}
+    if prod(len(c) for c in choices.values()) > LIMIT:
+        return True
+    chosen = (dict(zip(choices, some, strict=True)) for some in product(*choices.values()))
+    return any(_holds(fixed, some) for some in chosen)
+
+
+def region_values(
     conditions: Iterable[Expression], domains: Mapping[str, Domain]
 ) -> dict[str, list[Any]]:
-    """One value of each region, for each name."""
+    """Return one value of each region, for each name that the conditions read."""
     comparisons = [n for c in conditions for n in walk(c.tree) if isinstance(n, Compare)]
     names = sorted({name for c in conditions for name in c.names})
     regions: dict[str, list[Any]] = {}

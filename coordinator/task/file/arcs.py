@@ -17,7 +17,7 @@ _ARC = re.compile(
 
 
 class ArcError(ValueError):
-    """The text is no arc: what is wrong and how it is written."""
+    """The text is not an arc; the message says how one is written."""
 
 
 def read_input(text: str) -> Input | Inhibitor:
@@ -25,7 +25,7 @@ def read_input(text: str) -> Input | Inhibitor:
     found = _ARC.match(text.strip())
     if not found:
         raise ArcError(
-            f"{text!r} is no arc: write PLACE, PLACE*2, PLACE:normal, PLACE:preempt=success "
+            f"{text!r} is not an arc: write PLACE, PLACE*2, PLACE:normal, PLACE:preempt=success "
             "or !PLACE"
         )
     weight = int(found["weight"] or 1)
@@ -44,7 +44,7 @@ def read_output(text: str) -> Output:
     """An arc of `out`. Raises ArcError."""
     found = _ARC.match(text.strip())
     if not found or found["bar"] or found["end"]:
-        raise ArcError(f"{text!r} is no arc of `out`: write PLACE or PLACE*2")
+        raise ArcError(f"{text!r} is not an arc of `out`: write PLACE or PLACE*2")
     return Output(found["place"], int(found["weight"] or 1))
 
 

@@ -11,14 +11,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from petrobot.coordinator.task import (
-    Early,
+    EarlyEvent,
     Estimate,
     Event,
+    EventMemory,
     Inhibitor,
     Input,
     Kind,
-    Memory,
     Output,
+    Parameter,
     Place,
     PrimitiveTask,
     Reference,
@@ -33,12 +34,14 @@ from petrobot.coordinator.task import (
     VariableType,
 )
 from petrobot.coordinator.task.conditions import ConditionError, Expression, parse
+from petrobot.coordinator.task.expansion import written
 from petrobot.coordinator.task.file.arcs import ArcError, read_input, read_output
 from petrobot.coordinator.task.file.errors import TaskFileError, key_lines, line_of
 from petrobot.coordinator.task.validation import faults as task_faults
 from petrobot.coordinator.task.wording import Fault, nearest
 
-# Reading one TOML table: every key is asked for by name and type, every fault is collected, leftovers are refused.
+# Reading one TOML table: every key is asked for by name and type, every fault is collected,
+# leftovers are refused.
 
 E = TypeVar("E", bound=StrEnum)
 _KINDS: Mapping[type, str] = {
@@ -74,7 +77,7 @@ class Table:
         """A finite number; required without a default."""
         value = float(self._value(name, float, default, 1.0))
         if not isfinite(value):
-            self.fault(name, f"{value} is no finite number", "give a finite number")
+            self.fault(name, f"expected a finite number, got {value}", "give a finite number")
             return 1.0
         return value
 
@@ -119,7 +122,7 @@ class Table:
         values: list[Any] = self._value(name, list, [], [])
         for value in values:
             if not isinstance(value, str):
-                self.fault(name, f"{value!r} is no text", "write each in quotes")
+                self.fault(name, f"expected a text, got {value!r}", "write each in quotes")
         return tuple(v for v in values if isinstance(v, str))
 
     def plain(self, name: str) -> dict[str, Any]:
@@ -144,7 +147,7 @@ class Table:
             if isinstance(value, dict):
                 found[key] = Table(value, f"{outer.key}.{key}", self.faults)
             else:
-                outer.fault(key, f"{value!r} is no table", f"write [{outer.key}.{key}]")
+                outer.fault(key, f"expected a table, got {value!r}", f"write [{outer.key}.{key}]")
         return found
 
     def done(self) -> None:
@@ -249,6 +252,7 @@ def _task(root: Table) -> Task:
         places={n: _place(n, t) for n, t in root.tables("places").items()},
         transitions={n: _transition(n, t) for n, t in root.tables("transitions").items()},
         subnets={n: _subnet(n, t) for n, t in root.tables("subnets").items()},
+        errors_to=_errors_to(root),
     )
     head.any("final_error")
     head.done()
@@ -269,9 +273,14 @@ def _primitive_task(name: str, t: Table) -> PrimitiveTask:
         start=t.word("start", Start, Start.WHEN_FREE),
         stop_within=t.number("stop_within", 2.0),
         estimates=_estimates(t),
+        costs=_costs(t.table("costs")),
     )
     t.done()
     return primitive
+
+
+def _costs(t: Table) -> dict[str, float]:
+    return {action: t.number(action) for action in t.data}
 
 
 def _texts(t: Table) -> dict[str, str]:
@@ -300,8 +309,8 @@ def _event(name: str, t: Table) -> Event:
     event = Event(
         name=name,
         scope=t.word("scope", Scope),
-        memory=t.word("memory", Memory, Memory.PULSE),
-        early=t.word("early", Early, Early.DROP),
+        memory=t.word("memory", EventMemory, EventMemory.PULSE),
+        early=t.word("early", EarlyEvent, EarlyEvent.DROP),
         by=t.text("by", ""),
         mean_wait=t.maybe_number("mean_wait"),
         text=t.text("text", ""),
@@ -310,16 +319,32 @@ def _event(name: str, t: Table) -> Event:
     return event
 
 
+def _errors_to(t: Table) -> str:
+    """The key `to` of an `[errors]` table; empty without the table."""
+    if "errors" not in t.data:
+        t.table("errors")
+        return ""
+    errors = t.table("errors")
+    to = errors.text("to")
+    errors.done()
+    return to
+
+
 def _place(name: str, t: Table) -> Place:
     place = Place(
         name=name,
-        kind=t.word("kind", Kind),
+        kind=_kind(t),
         tokens=t.integer("tokens", 0),
         capacity=t.maybe_integer("capacity"),
         task=t.text("task", ""),
         args={n: _argument(v) for n, v in t.plain("args").items()},
         out=_texts(t.table("out")),
         servers=t.maybe_integer("servers"),
+        tries=t.integer("tries", 1),
+        retry_unknown=t.flag("retry_unknown"),
+        timeout=t.maybe_number("timeout"),
+        listen=t.flag("listen"),
+        holds=t.texts("holds", single=True),
         subnet=t.text("subnet", ""),
         macro=t.text("macro", ""),
         label=t.text("label", ""),
@@ -328,6 +353,16 @@ def _place(name: str, t: Table) -> Place:
     )
     t.done()
     return place
+
+
+def _kind(t: Table) -> Kind:
+    """The kind of a place: plain if the file says nothing."""
+    for key, kind in (("task", Kind.ACTION), ("subnet", Kind.MACRO)):
+        if key in t.data and "kind" not in t.data:
+            t.any("kind")
+            t.fault("kind", f"missing beside `{key}`", f'write kind = "{kind}"')
+            return kind
+    return t.word("kind", Kind, Kind.PLAIN)
 
 
 def _argument(value: Any) -> Value:
@@ -348,6 +383,7 @@ def _transition(name: str, t: Table) -> Transition:
         priority=t.integer("priority", 0),
         weight=t.maybe_number("weight"),
         after=t.maybe_number("after"),
+        sets=_sets(t.table("set")),
         error_branch=t.flag("error_branch"),
         macro=t.text("macro", ""),
         label=t.text("label", ""),
@@ -357,6 +393,18 @@ def _transition(name: str, t: Table) -> Transition:
     t.any("when")
     t.done()
     return transition
+
+
+def _sets(t: Table) -> tuple[tuple[str, Expression], ...]:
+    """The new values of variables: a text is a condition's literal or name, all else a literal."""
+    found: list[tuple[str, Expression]] = []
+    for name in t.data:
+        value = t.any(name)
+        try:
+            found.append((name, parse(value if isinstance(value, str) else written(value))))
+        except (ConditionError, ValueError) as error:
+            t.fault(name, str(error), "write a literal ('text', 3, true) or a name")
+    return tuple(found)
 
 
 def _inputs(t: Table) -> list[Input | Inhibitor]:
@@ -400,6 +448,12 @@ def _subnet(name: str, t: Table) -> Subnet:
         entry=t.text("entry"),
         normal=t.text("normal"),
         error=t.text("error", ""),
+        errors_to=_errors_to(t),
+        parameters=_parameters(t.table("parameters")),
     )
     t.done()
     return subnet
+
+
+def _parameters(t: Table) -> dict[str, Parameter]:
+    return {name: t.word(name, Parameter) for name in t.data}

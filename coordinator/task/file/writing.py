@@ -8,7 +8,7 @@ from dataclasses import fields
 from enum import StrEnum
 from typing import Any
 
-from petrobot.coordinator.task import Place, Reference, Subnet, Task, Transition
+from petrobot.coordinator.task import Kind, Place, Reference, Subnet, Task, Transition
 from petrobot.coordinator.task.conditions import Expression
 from petrobot.coordinator.task.file.arcs import write_arc
 from petrobot.coordinator.task.file.reading import SCHEMA
@@ -29,6 +29,7 @@ def dumps(task: Task) -> str:
     lines += _section("task", head)
     if task.parameters:
         lines += _section("task.parameters", task.parameters, keep=True)
+    lines += _errors("", task.errors_to)
     for group in ("primitive_tasks", "variables", "events"):
         for name, record in getattr(task, group).items():
             lines += _section(f"{group}.{_name(name)}", _changed(record))
@@ -41,7 +42,17 @@ def dumps(task: Task) -> str:
 def _subnet(subnet: Subnet) -> list[str]:
     key = f"subnets.{_name(subnet.name)}"
     ports = {"entry": subnet.entry, "normal": subnet.normal, "error": subnet.error}
-    return _section(key, ports) + _net(f"{key}.", subnet.places, subnet.transitions)
+    parameters = subnet.parameters and _section(f"{key}.parameters", subnet.parameters)
+    return [
+        *_section(key, ports),
+        *parameters,
+        *_errors(f"{key}.", subnet.errors_to),
+        *_net(f"{key}.", subnet.places, subnet.transitions),
+    ]
+
+
+def _errors(prefix: str, to: str) -> list[str]:
+    return _section(f"{prefix}errors", {"to": to}) if to else []
 
 
 def _net(
@@ -49,7 +60,10 @@ def _net(
 ) -> list[str]:
     lines: list[str] = []
     for name, place in places.items():
-        lines += _section(f"{prefix}places.{_name(name)}", _changed(place))
+        values = _changed(place)
+        if place.kind is Kind.PLAIN:
+            del values["kind"]
+        lines += _section(f"{prefix}places.{_name(name)}", values)
     for name, transition in transitions.items():
         lines += _section(f"{prefix}transitions.{_name(name)}", _transition(transition))
     return lines
@@ -64,6 +78,8 @@ def _transition(t: Transition) -> dict[str, Any]:
     rest = _changed(t)
     for name in ("inputs", "inhibitors", "outputs", "events"):
         rest.pop(name, None)
+    if "sets" in rest:
+        values["set"] = dict(rest.pop("sets"))
     return values | rest
 
 

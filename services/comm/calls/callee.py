@@ -12,6 +12,9 @@ It is used both in real time (`server.py` drives it) and in lock step. The node 
 - A run is active no longer than its deadline, and no longer than its offer's `orphan_time` without
   its caller.
 - A device accepts orders from one caller at a time: the holder of its lease.
+- ACCEPT comes before every other message about its run. With `accept_after` it is held for that
+  long and left out if the run has finished by then: a RESULT says as much, and a message less saves
+  both ends a quarter of the time that a short call takes.
 
 Refusals are outcomes with status error and executed = no: unknown_service, local_only, old_epoch,
 device_leased, device_needs_coordinator, cancelled (before it began), and busy from the node's
@@ -21,27 +24,21 @@ perhaps even its id, is no longer kept).
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Mapping
+import heapq
+from collections import OrderedDict, deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from types import NoneType
 from typing import Any, Final
 
 from petrobot.services.comm.calls.events import EventBoard
 from petrobot.services.comm.calls.peers import (
-    COORDINATOR,
     Inline,
     Offer,
     Peers,
 )
-from petrobot.services.comm.calls.runs import (
-    DEADLINE,
-    NEVER,
-    ActiveRun,
-    ActiveRuns,
-    ResultStore,
-    Retention,
-)
 from petrobot.services.comm.protocol.messages import (
+    COORDINATOR,
     Accept,
     Answer,
     Bye,
@@ -65,15 +62,258 @@ from petrobot.services.comm.protocol.messages import (
 from petrobot.services.comm.protocol.plain import NotPlainError, plain
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, negotiate
 
+NEVER: Final = float("inf")
+DEADLINE: Final = "deadline"
+ORPHAN: Final = "orphan"
+
+
+@dataclass(slots=True)
+class ActiveRun:
+    """An active run; times in seconds on the node's clock.
+
+    `stopping` is set when it was ordered to stop; `reason` says why.
+    """
+
+    call: Call
+    peer: str
+    began: float
+    device: str
+    orphan_time: float | None
+    limit: float = NEVER
+    """When its deadline is over (s)."""
+    held: float | None = None
+    """Since when an operator holds it (s)."""
+    stopping: bool = False
+    reason: str = ""
+
+
+class ActiveRuns(dict[str, ActiveRun]):
+    """Active runs by call id, with a heap of the times at which one of them must be looked at.
+
+    Entries of the heap are never removed early. One that is taken out is compared with the run as
+    it is now: it may have finished, or its deadline may have moved.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._timers: list[tuple[float, str, str]] = []
+
+    def limit(self, id_: str, due: float) -> None:
+        """The run must have finished at `due` (s)."""
+        self[id_].limit = due
+        heapq.heappush(self._timers, (due, DEADLINE, id_))
+
+    def watch_orphan(self, id_: str, due: float) -> None:
+        """At `due` (s) the run's caller may have been away for too long."""
+        heapq.heappush(self._timers, (due, ORPHAN, id_))
+
+    def hold_all(self, now: float, devices: Collection[str]) -> None:
+        """Stop the clocks of the deadlines of these devices' runs ("" for runs without a
+        device)."""
+        for run in self.values():
+            if run.device in devices and run.held is None:
+                run.held = now
+
+    def release_all(self, now: float, devices: Collection[str] | None) -> None:
+        """Restart the stopped deadlines of these devices' runs (None: of all), later by the
+        duration of the pause."""
+        for id_, run in self.items():
+            if run.held is None or (devices is not None and run.device not in devices):
+                continue
+            pause, run.held = now - run.held, None
+            if run.limit < NEVER:
+                self.limit(id_, run.limit + pause)
+
+    def over(self, now: float) -> Iterator[tuple[float, str, str, ActiveRun]]:
+        """Yield what is due: time, DEADLINE or ORPHAN, id and run. A stopped or moved deadline is
+        not due."""
+        while self._timers and self._timers[0][0] <= now:
+            due, kind, id_ = heapq.heappop(self._timers)
+            run = self.get(id_)
+            if run is not None and (kind == ORPHAN or (run.held is None and due >= run.limit)):
+                yield due, kind, id_, run
+
+    def due(self) -> float:
+        """Return when `over` has something to yield next (s)."""
+        while self._timers and self._timers[0][2] not in self:
+            heapq.heappop(self._timers)
+        return self._timers[0][0] if self._timers else NEVER
+
+
+# What a node remembers of finished calls: results until they are acknowledged, ids for longer.
+
+
+@dataclass(frozen=True, slots=True)
+class Retention:
+    """How long the node remembers finished calls."""
+
+    results: float = 600.0
+    """How long an unacknowledged result is kept (s)."""
+    result_count: int = 1_000
+    """How many unacknowledged results are kept."""
+    result_bytes: int = 64 << 20
+    """How large the kept results may be together (bytes, about as on the wire). The newest is
+    always kept."""
+    id_groups: int = 100_000
+    """How many groups of ids are remembered after their results are dropped (`FinishedIds`);
+    without limit of time."""
+    lease: float = 2.0
+    """After this time (s) the lease of a device is free when its holder is away and none of its
+    runs is active."""
+
+
+_SCALAR = 9
+"""Bytes of a number on the wire: one marker and eight bytes."""
+_NUMBERS = frozenset((float, int, bool, NoneType))
+
+
+def weight_of(value: Any) -> int:
+    """Estimate how many bytes plain data takes on the wire."""
+    kind = type(value)
+    if kind is str or kind is bytes:
+        return len(value) + _SCALAR
+    if kind is dict:
+        weight = _SCALAR
+        for key, item in value.items():
+            weight += len(key) + (_SCALAR if type(item) in _NUMBERS else weight_of(item))
+        return weight
+    if kind is list or kind is tuple:
+        if _NUMBERS.issuperset(map(type, value)):
+            return _SCALAR * (1 + len(value))
+        return _SCALAR + sum(map(weight_of, value))
+    return _SCALAR
+
+
+_DIGITS = "0123456789"
+_SHIFT = 12
+_IN_GROUP = (1 << _SHIFT) - 1
+"""4,096 numbers are in one group: a bit set of 512 bytes when all of them are used."""
+
+
+class FinishedIds:
+    """Ids of calls whose results are dropped, stored so compactly that ordinary use never forgets
+    one.
+
+    Callers count their calls (docs/protocol.md, `id`). So an id is split into its text and its
+    trailing number, and the numbers of one text are bits of a Python integer, 4,096 per group. A
+    million calls of one caller need 245 groups, about 128 KB. At most `limit` groups are kept; then
+    the oldest is dropped.
+
+    Dropping a group means that an unknown id may have run before. `complete` says whether that can
+    be; the callee then refuses repeated calls that it does not know (`Call.again`).
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._groups: OrderedDict[tuple[str, int], int] = OrderedDict()
+        self.complete = True
+        """Whether no id was ever forgotten: then an unknown id certainly never ran here."""
+
+    def __contains__(self, id_: str) -> bool:
+        text, number = _split(id_)
+        bits = self._groups.get((text, number >> _SHIFT))
+        return bits is not None and bits >> (number & _IN_GROUP) & 1 == 1
+
+    def add(self, id_: str) -> None:
+        """Remember an id."""
+        text, number = _split(id_)
+        groups, group = self._groups, (text, number >> _SHIFT)
+        groups[group] = groups.get(group, 0) | 1 << (number & _IN_GROUP)
+        if len(groups) > self._limit:
+            groups.popitem(last=False)
+            self.complete = False
+
+
+def _split(id_: str) -> tuple[str, int]:
+    """Split an id into its text and its trailing number. Leading zeros stay with the text, so no
+    two ids give the same pair."""
+    text = id_.rstrip(_DIGITS)
+    digits = id_[len(text) :]
+    if not digits:
+        return text, 0
+    if digits[0] == "0":
+        digits = digits.lstrip("0")
+        return id_[: len(id_) - len(digits)], int(digits or 0)
+    return text, int(digits)
+
+
+class ResultStore:
+    """Results by call id. `forgotten` is called with each id whose result is dropped."""
+
+    def __init__(self, keeping: Retention, forgotten: Callable[[str], None]) -> None:
+        self._keeping = keeping
+        self._forgotten = forgotten
+        # An OrderedDict finds its first entry at once. A plain dict scans over all entries that
+        # were deleted before it, and results are deleted at the front.
+        self._results: OrderedDict[str, tuple[Outcome, str, float, int]] = OrderedDict()
+        self._weight = 0
+        self.kept: Collection[str] = self._results.keys()
+        """Ids whose result is kept (for a quick look; see `in`)."""
+        self.gone = FinishedIds(keeping.id_groups)
+        """Ids whose result is dropped."""
+
+    def __contains__(self, id_: str) -> bool:
+        return id_ in self._results or id_ in self.gone
+
+    def add(self, now: float, peer: str, outcome: Outcome, weight: int | None = None) -> None:
+        """Keep a result for its caller. `weight` is its length on the wire (bytes); it is estimated
+        when left out."""
+        if weight is None:
+            weight = weight_of(outcome.values) if outcome.values else 0
+        results, id_ = self._results, outcome.id
+        older = results.get(id_)
+        self._weight += weight if older is None else weight - older[3]
+        results[id_] = (outcome, peer, now, weight)
+        while len(results) > self._keeping.result_count or (
+            self._weight > self._keeping.result_bytes and len(results) > 1
+        ):
+            self._forget(next(iter(results)))
+
+    def get(self, id_: str) -> Outcome | None:
+        """Return the result of this call, None if it is not kept."""
+        stored = self._results.get(id_)
+        return None if stored is None else stored[0]
+
+    def owner(self, id_: str) -> str:
+        """Return the caller of this result; empty if it is not kept."""
+        stored = self._results.get(id_)
+        return "" if stored is None else stored[1]
+
+    def acknowledge(self, peer: str, ids: Iterable[str]) -> None:
+        """Drop the results that the caller has stored; ids of other callers are ignored."""
+        get = self._results.get
+        for id_ in ids:
+            stored = get(id_)
+            if stored is not None and stored[1] == peer:
+                self._forget(id_)
+
+    def of(self, peer: str) -> list[str]:
+        """Return the ids of the results kept for this caller."""
+        return [id_ for id_, (_, owner, _, _) in self._results.items() if owner == peer]
+
+    def due(self) -> float | None:
+        """Return when the oldest result has been kept long enough (s)."""
+        for _, _, at, _ in self._results.values():
+            return at + self._keeping.results
+        return None
+
+    def advance(self, now: float) -> None:
+        """Drop the results that have been kept long enough."""
+        while (due := self.due()) is not None and due <= now:
+            self._forget(next(iter(self._results)))
+
+    def _forget(self, id_: str) -> None:
+        self._weight -= self._results.pop(id_)[3]
+        self.gone.add(id_)
+        self._forgotten(id_)
+
+
 __all__ = [
     "Callee",
-    "CancelOrder",
-    "CommandOrder",
     "Inline",
     "Offer",
     "Order",
     "Retention",
-    "StartOrder",
 ]
 
 ERROR: Final = "error"
@@ -83,33 +323,13 @@ ANSWERS: Final = 64
 some hundred bytes."""
 
 
-@dataclass(frozen=True, slots=True)
-class StartOrder:
-    """Order: begin this run, and report its end with `finish`."""
+Order = Call | Cancel | Command
+"""What the node must do: a message of a caller that was accepted, or a CANCEL of the node's own.
 
-    call: Call
-    peer: str
-
-
-@dataclass(frozen=True, slots=True)
-class CancelOrder:
-    """Order: stop this run, stop routine first. `finish` still reports its end. Given once per
-    run."""
-
-    id: str
-    reason: str
-    """"cancelled", "deadline", "orphan", or the text that the caller gave."""
-
-
-@dataclass(frozen=True, slots=True)
-class CommandOrder:
-    """Order: carry out a command, and report with `answer`."""
-
-    command: Command
-    peer: str
-
-
-Order = StartOrder | CancelOrder | CommandOrder
+Call: begin this run, and report its result with `finish`. Cancel: stop this run, stop routine
+first; `finish` still reports its result; given once per run. `reason` is "cancelled", "deadline",
+"orphan", or the text that the caller gave. Command: carry it out, and report with `answer`.
+"""
 
 
 class Callee:
@@ -129,6 +349,7 @@ class Callee:
         directory: str = "",
         any_directory: bool = False,
         keeping: Retention | None = None,
+        accept_after: float = 0.0,
     ) -> None:
         self.name = name
         self.boot = boot
@@ -141,6 +362,10 @@ class Callee:
         self._keeping = keeping or Retention()
         self._peers = Peers(name, directory, any_directory, self._keeping.lease)
         self._running = ActiveRuns()
+        self._accept_after = accept_after
+        self._accepts: deque[tuple[float, str]] = deque()
+        """Runs whose ACCEPT is held: until when (s), and id. Those of finished runs are left
+        out."""
         self._results = ResultStore(self._keeping, self.events.forget_run)
         self._commands: dict[str, tuple[str, str]] = {}
         """Caller and verb of each command that waits for its answer."""
@@ -291,6 +516,7 @@ class Callee:
             text = f"{owner} already made a call with this id; use unique ids"
             self._messages.append((peer, Outcome(id_, ERROR, {}, "id_taken", text, Executed.NO)))
         elif run is not None:
+            self._send_accepts(NEVER)
             self._messages.append((peer, Accept(id_)))
         elif outcome is not None:
             self._messages.append((peer, outcome))
@@ -322,8 +548,14 @@ class Callee:
         if deadline is not None:
             self._running.limit(call.id, now + deadline)
             self.soonest = min(self.soonest, now + deadline)
-        self._messages.append((peer, Accept(call.id)))
-        self._orders.append(StartOrder(call, peer))
+        if self._accept_after:
+            due = now + self._accept_after
+            self._accepts.append((due, call.id))
+            if due < self.soonest:
+                self.soonest = due
+        else:
+            self._messages.append((peer, Accept(call.id)))
+        self._orders.append(call)
 
     def _take_ack(self, now: float, peer: str, ack: ResultAck) -> None:
         self._results.acknowledge(peer, (ack.id, *ack.more))
@@ -360,7 +592,7 @@ class Callee:
         if command.verb == RELEASE:
             self._running.release_all(now, [command.target] if command.target else None)
             self.soonest = min(self.soonest, self._running.due())
-        self._orders.append(CommandOrder(command, peer))
+        self._orders.append(command)
 
     def _known_command(self, peer: str, id_: str) -> None:
         """Answer a repeated command with its stored answer, or not until the answer is there; never
@@ -373,42 +605,26 @@ class Callee:
 
     # Reports of the node.
 
-    def finish(
-        self,
-        now: float,
-        id: str,  # noqa: A002
-        status: str,
-        values: Mapping[str, Any] | None = None,
-        cause: str = "",
-        text: str = "",
-        executed: Executed = Executed.YES,
-        seconds: float | None = None,
-        cpu_seconds: float = 0.0,
-        deferred: bool = False,
-    ) -> Outcome:
+    def finish(self, now: float, end: Outcome, *, plain_already: bool = False) -> Outcome:
         """A run has finished: store its outcome, send it to the caller and return it.
 
-        `seconds` is measured here when it is left out. A run that was stopped by its deadline ends
-        as ERROR `deadline` whatever it reports; one that was stopped for another reason keeps its
-        own status if it finished before. Raises ValueError if no such run is active.
+        `plain_already`: its values came in a message or were checked, so they are plain data.
+        A run that was stopped by its deadline ends as ERROR `deadline` whatever it reports; one
+        that was stopped for another reason keeps its own status if it finished before. Raises
+        ValueError if no such run is active.
         """
-        run = self._running.pop(id, None)
+        run = self._running.pop(end.id, None)
         if run is None:
-            raise ValueError(f"run {id}: no active run has this id")
-        took = now - run.began if seconds is None else seconds
-        if run.reason == "deadline":
-            text = (
-                text
-                or f"took longer than its deadline (it finished with {status} after {took:.3f} s)"
+            raise ValueError(f"run {end.id}: no active run has this id")
+        if run.reason == DEADLINE:
+            text = end.text or (
+                f"took longer than its deadline (it finished with {end.status} after "
+                f"{end.seconds:.3f} s)"
             )
-            outcome = Outcome(id, ERROR, {}, "deadline", text, executed, took, cpu_seconds)
-        else:
-            if run.stopping and cause == "cancelled":
-                cause, text = run.reason, text or run.call.service
-            outcome = Outcome(
-                id, status, values or {}, cause, text, executed, took, cpu_seconds, deferred
-            )
-        outcome = _sendable(outcome)
+            end = replace(end, status=ERROR, values={}, cause=DEADLINE, text=text, deferred=False)
+        elif run.stopping and end.cause == "cancelled":
+            end = replace(end, cause=run.reason, text=end.text or run.call.service)
+        outcome = _sendable(end, plain_already or not end.values)
         self._end(now, run.peer, outcome)
         return outcome
 
@@ -489,6 +705,15 @@ class Callee:
         """Return the service of each active run, by call id."""
         return {id_: run.call.service for id_, run in self._running.items()}
 
+    def service_of(self, id_: str) -> str | None:
+        """Return the service of a run; None if it is not active."""
+        run = self._running.get(id_)
+        return None if run is None else run.call.service
+
+    def commander(self, id_: str) -> str:
+        """Return the caller of a command that waits for its answer; empty if none does."""
+        return self._commands.get(id_, ("", ""))[0]
+
     # Time.
 
     def advance(self, now: float) -> None:
@@ -498,6 +723,17 @@ class Callee:
             if kind == DEADLINE or self._is_orphan(run, due):
                 self._stop(id_, run, kind, kind)
         self._results.advance(now)
+        if self._accepts:
+            self._send_accepts(now)
+
+    def _send_accepts(self, now: float) -> None:
+        """Send the held ACCEPTs that are due; NEVER: all of them."""
+        accepts = self._accepts
+        while accepts and (accepts[0][0] <= now or accepts[0][1] not in self._running):
+            _, id_ = accepts.popleft()
+            run = self._running.get(id_)
+            if run is not None and self._peers.is_up(run.peer):
+                self._messages.append((run.peer, Accept(id_)))
 
     def _is_orphan(self, run: ActiveRun, now: float) -> bool:
         return run.orphan_time is not None and self._peers.is_away(now, run.peer, run.orphan_time)
@@ -505,6 +741,10 @@ class Callee:
     def due(self) -> float | None:
         """Return when `advance` must be called next (s), None if never."""
         soonest = self._running.due()
+        while self._accepts and self._accepts[0][1] not in self._running:
+            self._accepts.popleft()
+        if self._accepts:
+            soonest = min(soonest, self._accepts[0][0])
         results = self._results.due()
         self.soonest = soonest if results is None else min(soonest, results)
         return self.soonest if self.soonest < NEVER else None
@@ -512,7 +752,7 @@ class Callee:
     def _stop(self, id_: str, run: ActiveRun, reason: str, cause: str) -> None:
         if not run.stopping:
             run.stopping, run.reason = True, cause
-            self._orders.append(CancelOrder(id_, reason))
+            self._orders.append(Cancel(id_, reason))
 
     def _end(self, now: float, peer: str, outcome: Outcome) -> None:
         self._results.add(now, peer, outcome)
@@ -520,17 +760,21 @@ class Callee:
         self._send(peer, outcome)
 
     def _send(self, peer: str, message: Message) -> None:
+        if self._accepts and type(message) is not Outcome:
+            self._send_accepts(NEVER)
         if self._peers.is_up(peer) or self._peers.get(peer) is None:
             self._messages.append((peer, message))
 
 
-def _sendable(outcome: Outcome) -> Outcome:
+def _sendable(outcome: Outcome, plain_already: bool) -> Outcome:
     """Return the outcome in plain data, or an ERROR outcome if its values are not plain."""
     try:
-        values = plain(outcome.values, "values") if outcome.values else outcome.values
+        values = outcome.values if plain_already else plain(outcome.values, "values")
     except NotPlainError as fault:
         text = f"the values that it returned cannot be sent: {fault}"
         return replace(
             outcome, status=ERROR, values={}, cause="bad_result", text=text, deferred=False
         )
+    if values is outcome.values and type(outcome.status) is str:
+        return outcome
     return replace(outcome, status=str(outcome.status), values=values)

@@ -3,7 +3,7 @@
 It is used both in real time (`client.py` drives it) and in lock step (its messages travel in
 envelopes). It guarantees:
 
-- Every call ends with exactly one `CallEnded`, whatever happens to the connection or the peer.
+- Every call ends with exactly one Outcome, whatever happens to the connection or the peer.
 - A call is never repeated under another id. After a lost connection the same call is sent again
   under its id to the same boot of the peer, marked `again`: the peer either knows the id or says
   that it may have forgotten it, and so runs the call at most once. It is never sent to another
@@ -15,51 +15,327 @@ envelopes). It guarantees:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import heapq
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple, Protocol
 
 from petrobot.services.comm.calls.events import EventIntake
-from petrobot.services.comm.calls.pending import (
-    LOST,
-    NEVER,
-    REFUSED,
-    UNREACHABLE,
-    FinishedCalls,
-    Patience,
-    PeerAbsence,
-    PendingCall,
-    PendingCalls,
-    Waiter,
-)
 from petrobot.services.comm.protocol import messages as m
-from petrobot.services.comm.protocol.messages import Answer, Event, Outcome
+from petrobot.services.comm.protocol.messages import Call, Executed, Outcome, ResultAck
 from petrobot.services.comm.protocol.plain import plain
 
-# Notices: what a caller reports to its owner.
+NEVER: Final = float("inf")
+_SPARE: Final = 256
 
 
 @dataclass(frozen=True, slots=True)
-class CallAccepted:
-    """The peer accepted the call; its run begins."""
+class Patience:
+    """How long the caller waits (s)."""
 
-    id: str
+    reconnect: float = 2.0
+    """For a lost connection to come back, before its calls end."""
+    again: float = 0.1
+    """Between two calls that fail at once because the peer is not there; calls in between wait."""
+    accept: float = 1.0
+    """For ACCEPT."""
+    stop: float = 5.0
+    """For RESULT after the deadline or a CANCEL: the node's stop routine and kill take time."""
+    answer: float = 2.0
+    """For the answer to a command."""
+    acknowledge: float = 0.05
+    """How long an acknowledgement waits for others, to be sent in one message with them."""
 
 
-@dataclass(frozen=True, slots=True)
-class CallProgress:
-    """Progress of a run (0 to 1)."""
+class Waiter(Protocol):
+    """Receives the result of one call, for example an asyncio future."""
 
-    id: str
-    fraction: float
-    data: Mapping[str, Any]
+    def done(self) -> bool:
+        """Return whether it no longer wants the result."""
+
+    def set_result(self, outcome: Outcome, /) -> None:
+        """Receive the result."""
 
 
-@dataclass(frozen=True, slots=True)
-class CallEnded:
-    """The one result of a call."""
+@dataclass(slots=True)
+class PendingCall:
+    """A call without a result. `made` and the due times are on the caller's clock (s)."""
 
-    outcome: Outcome
+    call: Call
+    any_boot: bool
+    """While unsent, the call may go to any boot of the peer; False if its owner names one."""
+    made: float
+    waiter: Waiter | None = None
+    """Receives the result instead of a notice; the result is then acknowledged."""
+    sent: bool = False
+    accepted: bool = False
+    cancel: str | None = None
+    accept_due: float = NEVER
+    result_due: float = NEVER
+    held: float | None = None
+    """Since when an operator holds its run (s)."""
+
+    @property
+    def if_unsent(self) -> Executed:
+        """Return `executed` if the call ends unsent: unknown if its owner may have sent it before a
+        restart."""
+        return Executed.NO if self.any_boot and not self.call.again else Executed.UNKNOWN
+
+
+class PendingCalls(dict[str, PendingCall]):
+    """Pending calls by id, with their timeouts.
+
+    All calls wait equally long for ACCEPT, so these timeouts are a queue; those for RESULT are a
+    heap. Entries are not removed early: one that is due is compared with the call as it is now.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._accepts: deque[tuple[float, str]] = deque()
+        self._most = _SPARE
+        """Length of the ACCEPT queue above which entries of finished calls are removed from it."""
+        self._results: list[tuple[float, str]] = []
+
+    def watch_new(self, due: float, id_: str) -> None:
+        """Expect ACCEPT until `due` for a call that was sent when it was made (its `accept_due` is
+        set)."""
+        accepts = self._accepts
+        accepts.append((due, id_))
+        if len(accepts) > self._most:
+            # Most of these calls are finished long before they are due. Without this a second of
+            # quick calls would leave a hundred thousand entries.
+            self._drop_past()
+
+    def watch_accept(self, pending: PendingCall, due: float) -> None:
+        """Expect ACCEPT until `due` (s)."""
+        pending.accept_due = due
+        self.watch_new(due, pending.call.id)
+
+    def watch_result(self, pending: PendingCall, due: float) -> None:
+        """Expect RESULT until `due` (s), or until an earlier time that is already set."""
+        if due < pending.result_due:
+            pending.result_due = due
+            heapq.heappush(self._results, (due, pending.call.id))
+
+    def hold(self, now: float, id_: str) -> None:
+        """Stop the clock of this call's wait for RESULT."""
+        pending = self.get(id_)
+        if pending is not None and pending.held is None:
+            pending.held = now
+
+    def release(self, now: float, id_: str) -> None:
+        """Restart the clock, later by the duration of the pause."""
+        pending = self.get(id_)
+        if pending is None or pending.held is None:
+            return
+        pause, pending.held = now - pending.held, None
+        if pending.result_due < NEVER:
+            pending.result_due += pause
+            heapq.heappush(self._results, (pending.result_due, id_))
+
+    def not_accepted(self, now: float) -> Iterator[str]:
+        """Yield ids that have waited too long for ACCEPT."""
+        while self._accepts and self._accepts[0][0] <= now:
+            due, id_ = self._accepts.popleft()
+            pending = self.get(id_)
+            if pending is not None and not pending.accepted and pending.accept_due <= due:
+                yield id_
+
+    def not_answered(self, now: float) -> Iterator[str]:
+        """Yield ids that have waited too long for RESULT."""
+        while self._results and self._results[0][0] <= now:
+            due, id_ = heapq.heappop(self._results)
+            pending = self.get(id_)
+            if pending is not None and pending.held is None and due >= pending.result_due:
+                yield id_
+
+    def due(self) -> float:
+        """Return when the next timeout is due (s)."""
+        self._drop_past()
+        while self._results and self._results[0][1] not in self:
+            heapq.heappop(self._results)
+        accept = self._accepts[0][0] if self._accepts else NEVER
+        return min(accept, self._results[0][0]) if self._results else accept
+
+    def _drop_past(self) -> None:
+        accepts, find = self._accepts, self.get
+        while accepts:
+            pending = find(accepts[0][1])
+            if pending is not None and not pending.accepted:
+                break
+            accepts.popleft()
+        self._most = 2 * len(self) + _SPARE
+
+
+# A lost connection: which calls wait for it, and how the others end.
+
+LOST: Final = "lost"
+UNREACHABLE: Final = "unreachable"
+REFUSED: Final = "refused"
+
+
+class CallEnd(NamedTuple):
+    """Why a call ends: cause and text of its ERROR outcome."""
+
+    cause: str
+    text: str
+
+
+class PeerAbsence:
+    """The time during which there is no connection to one peer."""
+
+    def __init__(self, peer: str, patience: Patience) -> None:
+        self._peer = peer
+        self._patience = patience
+        self._refusal = ""
+        self._trouble = ""
+        """Why there is no connection, as far as is known."""
+        self._why = ""
+        self._again_from = 0.0
+        self.until = NEVER
+        """Calls wait until then (s); NEVER: they do not wait."""
+
+    def over(self) -> None:
+        """The peer is connected."""
+        self._refusal, self._trouble, self.until = "", "", NEVER
+
+    def wait(self, now: float) -> None:
+        """A connection is being tried, for the first time or again: calls wait for it."""
+        self._wait_until(
+            now + self._patience.reconnect,
+            f"{self._peer} did not come back within {self._patience.reconnect:g} s",
+        )
+
+    def fail(self, trouble: str) -> None:
+        """An attempt to connect has failed; waiting calls still wait."""
+        self._trouble = trouble
+
+    def give_up(self) -> CallEnd:
+        """The peer's process is gone. Return how all calls end."""
+        self.until = NEVER
+        return CallEnd(LOST, f"{self._peer} is gone: nothing listens at its address any more")
+
+    def refuse(self, code: str, text: str) -> CallEnd:
+        """The peer refuses us until further notice. Return how all calls end."""
+        self._refusal, self.until = f"{self._peer} refuses the connection: {code}: {text}", NEVER
+        return CallEnd(REFUSED, self._refusal)
+
+    def new_call(self, now: float) -> CallEnd | None:
+        """Return how a new call ends at once; None if it waits.
+
+        A call that follows a failed one too soon waits a little: a task that repeats a failed call
+        at once must not loop as fast as the machine can.
+        """
+        if now < self.until < NEVER:
+            return None
+        text = self._refusal or self._with_trouble(f"{self._peer} is not connected")
+        away = CallEnd(REFUSED if self._refusal else UNREACHABLE, text)
+        if now < self._again_from:
+            self._wait_until(self._again_from, away.text)
+            return None
+        self._again_from = now + self._patience.again
+        return away
+
+    def advance(self, now: float) -> CallEnd | None:
+        """Return how the waiting calls end now; None if they still wait."""
+        if now < self.until:
+            return None
+        self.until = NEVER
+        return CallEnd(
+            REFUSED if self._refusal else LOST, self._refusal or self._with_trouble(self._why)
+        )
+
+    def _with_trouble(self, text: str) -> str:
+        return f"{text} ({self._trouble})" if self._trouble and self._trouble not in text else text
+
+    def _wait_until(self, until: float, why: str) -> None:
+        self.until, self._why = until, why
+
+
+# What a caller remembers of finished calls: stored results, calls given up, acknowledgements to
+# send.
+
+REMEMBERED: Final = 10_000
+"""How many ids of finished calls are remembered at least."""
+ACKS_AT_ONCE: Final = 64
+"""So many acknowledgements are sent without waiting for more."""
+IN_ONE: Final = 200
+"""Most acknowledgements in one message: as many of the longest ids fit its size limit."""
+
+
+class FinishedCalls:
+    """Finished calls of one caller. An acknowledgement waits up to `delay` seconds to be sent with
+    others."""
+
+    def __init__(self, delay: float) -> None:
+        self._delay = delay
+        self._safe: dict[str, bool] = {}
+        self._given_up: OrderedDict[str, None] = OrderedDict()
+        self._acks: list[str] = []
+        self.due = NEVER
+        """When the waiting acknowledgements must be sent (s)."""
+
+    def end(self, id_: str, safe: bool) -> None:
+        """The peer's result of this call has arrived; `safe`: it is stored already."""
+        self._safe[id_] = safe
+
+    def _prune(self) -> None:
+        """Forget the oldest in bulk, so that no single call pays for it. Results that are not
+        stored yet stay."""
+        for old in list(self._safe)[:REMEMBERED]:
+            if self._safe[old]:
+                del self._safe[old]
+
+    def is_safe(self, id_: str) -> bool | None:
+        """Return whether the peer's result of this call is stored; None if none has arrived."""
+        return self._safe.get(id_)
+
+    def give_up(self, id_: str) -> None:
+        """This call ended here without the peer's result."""
+        self._given_up[id_] = None
+        if len(self._given_up) > REMEMBERED:
+            del self._given_up[next(iter(self._given_up))]
+
+    def was_given_up(self, id_: str) -> bool:
+        """Return whether this call ended here and the peer's own result has not arrived since."""
+        return id_ in self._given_up
+
+    def turn_up(self, id_: str) -> None:
+        """The peer's own result of a call that had ended here has arrived late; it is only
+        recorded."""
+        self._given_up.pop(id_, None)
+        self.end(id_, True)
+
+    def acknowledge(self, now: float, *ids: str) -> None:
+        """Tell the peer soon that these results are stored."""
+        safe, acks = self._safe, self._acks
+        if not acks:
+            self.due = now + self._delay
+        for id_ in ids:
+            safe[id_] = True
+        acks += ids
+        if len(safe) > 2 * REMEMBERED:
+            self._prune()
+        if len(acks) >= ACKS_AT_ONCE:
+            self.due = now
+
+    def take_acks(self) -> list[ResultAck]:
+        """Take out all waiting acknowledgements. Call it once they are `due`."""
+        acks, self._acks, self.due = self._acks, [], NEVER
+        return [
+            ResultAck(acks[n], tuple(acks[n + 1 : n + IN_ONE])) for n in range(0, len(acks), IN_ONE)
+        ]
+
+    def link_lost(self) -> None:
+        """Drop waiting acknowledgements: the peer lists the results that it keeps when it is
+        back."""
+        self._acks.clear()
+        self.due = NEVER
+
+    def peer_is_new(self) -> None:
+        """The peer is a new process: results of calls given up cannot arrive any more."""
+        self._given_up.clear()
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,63 +347,22 @@ class LateResult:
 
 
 @dataclass(frozen=True, slots=True)
-class EventArrived:
-    """An event; each number of a source arrives once."""
-
-    event: Event
-
-
-@dataclass(frozen=True, slots=True)
-class CommandAnswered:
-    """Answer to a command. `ok` is False, with `cause` in the data, if the peer gave none."""
-
-    answer: Answer
-
-
-@dataclass(frozen=True, slots=True)
 class PeerLost:
     """The connection is closed."""
 
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class PeerBack:
-    """The connection is open. `runs` are ids of this caller's calls that the peer still runs or
-    whose results it keeps."""
+Notice = m.Welcome | PeerLost | m.Accept | m.Feedback | m.Outcome | LateResult | m.Event | m.Answer
+"""What a caller reports to its owner: messages of the peer, and what is known without one.
 
-    name: str
-    boot: str
-    same_boot: bool
-    """Whether the peer is the same process as before (False at the first connection)."""
-    offers: tuple[str, ...]
-    runs: tuple[str, ...]
+WELCOME: the connection is open; its `runs` are ids of this caller's calls that the peer still runs
+or whose results it keeps. Outcome: the one result of a call, from the peer or decided here. Event:
+each number of a source comes once. Answer: `ok` is False, with `cause` in the data, if the peer
+gave none.
+"""
 
-
-Notice = (
-    CallAccepted
-    | CallProgress
-    | CallEnded
-    | LateResult
-    | EventArrived
-    | CommandAnswered
-    | PeerLost
-    | PeerBack
-)
-
-
-__all__ = [
-    "CallAccepted",
-    "CallEnded",
-    "Caller",
-    "CommandAnswered",
-    "EventArrived",
-    "LateResult",
-    "Notice",
-    "Patience",
-    "PeerBack",
-]
-__all__ += ["CallProgress", "PeerLost"]
+__all__ = ["Caller", "LateResult", "Notice", "Patience", "PeerLost"]
 
 ERROR: Final = "error"
 
@@ -256,7 +491,7 @@ class Caller:
     def cancel(self, now: float, id: str, reason: str = "", within: float | None = None) -> None:  # noqa: A002
         """Ask the peer to stop a call's run. An id that is not pending is ignored.
 
-        The call still ends with one `CallEnded`: with cause `no_answer` if the peer does not
+        The call still ends with one Outcome: with cause `no_answer` if the peer does not
         confirm `within` seconds (None: `Patience.stop`).
         """
         pending = self._pending.get(id)
@@ -312,7 +547,7 @@ class Caller:
             self._ack(now, id)
 
     def disown(self, now: float, id: str) -> None:  # noqa: A002
-        """Stop a run that the peer still keeps (`PeerBack.runs`) and the owner cannot use. Its
+        """Stop a run that the peer still keeps (`Welcome.runs`) and the owner cannot use. Its
         result comes as `LateResult`."""
         if id not in self._pending and self.up:
             self._settled.give_up(id)
@@ -335,9 +570,7 @@ class Caller:
         self.up = True
         self._absence.over()
         self.boot, self.offers = welcome.boot, welcome.offers
-        self._notices.append(
-            PeerBack(welcome.name, welcome.boot, same, welcome.offers, welcome.runs)
-        )
+        self._notices.append(welcome)
         if not same:
             self._forget_boot()
         if self._names is not None:
@@ -431,7 +664,7 @@ class Caller:
                 safe.append(id_)
             else:
                 self._settled.end(id_, False)
-            self._notices.append(CallEnded(outcome))
+            self._notices.append(outcome)
         if safe:
             self._ack(now, *safe)
 
@@ -450,24 +683,24 @@ class Caller:
         if pending is None or pending.accepted:
             return
         pending.accepted = True
-        self._notices.append(CallAccepted(accept.id))
+        self._notices.append(accept)
         if pending.call.deadline is not None:
             self._watch(pending, pending.made + pending.call.deadline + self._patience.stop)
 
     def _take_feedback(self, now: float, feedback: m.Feedback) -> None:
         if feedback.id in self._pending:
-            self._notices.append(CallProgress(feedback.id, feedback.fraction, feedback.data))
+            self._notices.append(feedback)
 
     def _take_event(self, now: float, event: m.Event) -> None:
         new, ack = self._events.take(event, self._auto_ack)
         if ack is not None:
             self._messages.append(ack)
         if new:
-            self._notices.append(EventArrived(event))
+            self._notices.append(event)
 
     def _take_answer(self, now: float, answer: m.Answer) -> None:
         if self._commands.pop(answer.id, None) is not None:
-            self._notices.append(CommandAnswered(answer))
+            self._notices.append(answer)
 
     def advance(self, now: float) -> None:
         """End the calls that have waited too long."""
@@ -554,10 +787,10 @@ class Caller:
             self._settled.give_up(id_)
         outcome, waiter = m.Outcome(id_, ERROR, {}, cause, text, executed), pending.waiter
         if waiter is None:
-            self._notices.append(CallEnded(outcome))
+            self._notices.append(outcome)
         elif not waiter.done():
             waiter.set_result(outcome)
 
     def _no_answer(self, id_: str, cause: str) -> None:
         self._commands.pop(id_, None)
-        self._notices.append(CommandAnswered(m.Answer(id_, False, {"cause": cause})))
+        self._notices.append(m.Answer(id_, False, {"cause": cause}))

@@ -19,7 +19,7 @@ import ssl
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
-from petrobot.services.comm.calls.caller import Caller, Notice
+from petrobot.services.comm.calls.caller import NEVER, Caller, Notice
 from petrobot.services.comm.calls.link import (
     READ_BUFFER,
     AsyncLink,
@@ -28,7 +28,6 @@ from petrobot.services.comm.calls.link import (
     clock_of,
     futures_of,
 )
-from petrobot.services.comm.calls.pending import NEVER
 from petrobot.services.comm.protocol.messages import (
     Bye,
     Call,

@@ -109,8 +109,8 @@ class Heartbeat:
         """Return what to do at `now`. Call it when `due`."""
         late = now - self._due
         if late > self._timing.silence / 2:
-            # This process itself stood still. What the other side sent meanwhile may still be in the
-            # socket, so give it one more heartbeat before it counts as lost.
+            # This process itself stood still. What the other side sent meanwhile may still be in
+            # the socket, so give it one more heartbeat before it counts as lost.
             self.heard = max(self.heard, now - self._timing.silence + self._timing.heartbeat)
         silent = now - self.heard
         if silent >= self._timing.silence:
@@ -197,8 +197,8 @@ class AsyncLink(asyncio.BufferedProtocol):
         self.made()
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        # A memoryview, not the bytearray: under TLS asyncio slices it, and a slice of a bytearray is
-        # a copy.
+        # A memoryview, not the bytearray: under TLS asyncio slices it, and a slice of a bytearray
+        # is a copy.
         return self._view
 
     def buffer_updated(self, nbytes: int) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from petrobot.services.comm.protocol.messages import Call, Hello, Outcome, Refuse
+from petrobot.services.comm.protocol.messages import COORDINATOR, Call, Hello, Outcome, Refuse
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION, negotiate
 
 Inline = Callable[[float, Call], Outcome]
@@ -31,7 +31,6 @@ class Offer:
     """Roles of the callers that may call it; empty: all."""
 
 
-COORDINATOR: Final = "coordinator"
 NODE: Final = "node"
 KNOWN: Final = 256
 """How many callers are remembered after their connection closed."""
@@ -163,7 +162,8 @@ class Peers:
         if offer.roles and peer.role not in offer.roles:
             return (
                 "not_for_role",
-                f"{call.service} only serves {' and '.join(sorted(offer.roles))}, not a {peer.role}",
+                f"{call.service} only serves {' and '.join(sorted(offer.roles))}, "
+                f"not a {peer.role}",
             )
         return self._lease(now, name, peer, offer.device, in_use) if offer.device else None
 

@@ -3,7 +3,7 @@
     server = Server(callee, on_orders=node.take)
     await server.start("127.0.0.1", 7001)
     ...
-    callee.finish(server.now(), id, "success", values)
+    callee.finish(server.now(), Outcome(id, "success", values))
     server.flush()
 
 Inline services (`Offer.inline`) are answered inside the loop; all other calls become orders for

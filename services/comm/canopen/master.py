@@ -343,8 +343,8 @@ class CanopenMaster(Generic[Link]):
         passed_over = self.phase is MasterPhase.CONFIGURING or (
             self._manner.old_emergencies and self._resetting
         )
-        # An emergency during configuration or a reset may be old. A fault that persists shows in the
-        # statusword.
+        # An emergency during configuration or a reset may be old. A fault that persists shows in
+        # the statusword.
         if message.code and not passed_over:
             self._fault(axis, message.code)
 

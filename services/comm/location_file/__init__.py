@@ -7,6 +7,7 @@ import importlib
 import importlib.util
 import logging
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -15,13 +16,14 @@ from typing import Any
 
 from petrobot.services.comm.location_file import reading as directory_file
 from petrobot.services.comm.lockstep.party import TICK
+from petrobot.services.comm.protocol.messages import COORDINATOR
 
 _log = logging.getLogger(__name__)
-COORDINATOR = directory_file.COORDINATOR
 COORDINATOR_PORT = directory_file.COORDINATOR_PORT
 SHIPPED = Path(__file__).parents[3]
 """Folder with petrobot's own files, so that a copied services.toml still finds the shipped
 parameter files."""
+CELL = "services.toml"
 MEMORY = "memory"
 MEMORY_CALLS = ("memory.get", "memory.put", "memory.compare_and_set", "memory.list")
 """Services of the node that has the global memory."""
@@ -46,6 +48,9 @@ class NodeEntry:
     sim: str = ""
     """Import path of the function that makes the simulated laboratory's party, `function(directory,
     name)`; empty for a real node."""
+    physics: str = ""
+    """Simulated node: what computes its mechanics, by a name that its laboratory knows; empty: the
+    laboratory's own choice."""
     worker_memory_mb: int = 4096
     """Limit of the address space of each worker process (MiB).
 
@@ -247,6 +252,7 @@ def parse(text: str, source: Path) -> Directory:
     tables, digest, faults = directory_file.read(text, str(source), MEMORY)
     if faults:
         raise DirectoryError(tuple(faults))
+    _find_modules_in(source.parent)
     devices = {n: _device(n, t) for n, t in tables["devices"].items()}
     return Directory(
         source=source,
@@ -281,7 +287,7 @@ def _action(name: str, table: Mapping[str, Any], devices: Mapping[str, DeviceEnt
     return ActionEntry(
         name=name,
         run=table["run"],
-        task=table["task"],
+        task=table.get("task", ""),
         node=devices[device].node if device else table["node"],
         device=device,
         args=table.get("args", {}),
@@ -303,6 +309,36 @@ def _seconds(value: float | None) -> float | None:
     return None if value is None else float(value)
 
 
+FIRST_PHYSICS = "bullet 3.2.7"
+"""What made the records of a laboratory that has more than one physics, if they do not say it: at
+first there was only this one."""
+
+
+def physics_of(directory: Directory) -> str:
+    """Return name and version of what computes the mechanics of the simulated node, for records;
+    empty if no node is simulated, if its laboratory has only one physics, or if it is not installed
+    on this computer.
+
+    A laboratory says it by a function `physics(directory, name)` in the module that `sim` names.
+    Raises what that function raises: a ValueError for a name that it does not know.
+    """
+    name = directory.laboratory()
+    if not name:
+        return ""
+    module, _, _ = directory.nodes[name].sim.partition(":")
+    try:
+        tell = resolve(f"{module}:physics")
+    except ImportError:
+        return ""
+    return str(tell(directory, name))
+
+
+def same_physics(one: str, other: str) -> bool:
+    """Return whether records of these two may be pooled; records that do not say it (empty) count
+    as those of the first physics."""
+    return (one or FIRST_PHYSICS) == (other or FIRST_PHYSICS)
+
+
 def verify_imports(directory: Directory, node: str) -> tuple[str, ...]:
     """Import what a node of this host must load; return one line per fault, empty when all imports
     succeed."""
@@ -321,6 +357,19 @@ def verify_imports(directory: Directory, node: str) -> tuple[str, ...]:
     ]
     found = [(key, _import_fault(path)) for key, path in places]
     return tuple(f"{directory.source}: {key}: {fault}" for key, fault in found if fault)
+
+
+def _find_modules_in(folder: Path) -> None:
+    """Let every process that reads a location file import the modules beside it.
+
+    The folder comes last, so nothing in it hides an installed module. A folder that belongs to a
+    package is left out: its modules already have a name.
+    """
+    found = folder.resolve()
+    package = (found / "__init__.py").exists() or found == (SHIPPED / CELL).resolve().parent
+    if not package and str(found) not in sys.path:
+        sys.path.append(str(found))
+        importlib.invalidate_caches()
 
 
 def _import_fault(path: str) -> str:
@@ -370,8 +419,8 @@ def resolve(path: str) -> Any:
         module = importlib.import_module(module_name(written))
     except ImportError as fault:
         raise ImportError(
-            f"cannot import {written!r} ({fault}); install its package on this host or put "
-            "its folder on PYTHONPATH"
+            f"cannot import {written!r} ({fault}); put it beside the location file, or install "
+            "its package on this host"
         ) from fault
     except Exception as fault:
         raise ImportError(

@@ -11,7 +11,6 @@ from __future__ import annotations
 import ast
 import errno
 import importlib.util
-import ipaddress
 import socket
 from collections.abc import Container, Iterator
 from contextlib import contextmanager
@@ -20,8 +19,7 @@ from pathlib import Path
 
 from petrobot.services.comm.location_file import Directory, DirectoryError, module_name
 from petrobot.services.comm.location_file.reading import Faults, nearest
-
-LOOPBACK_NAMES = ("localhost", "ip6-localhost")
+from petrobot.services.comm.protocol.security import is_loopback
 
 
 def misplaced(
@@ -62,16 +60,6 @@ def misplaced(
     if actions:
         _check_arguments(directory, here, faults)
     return tuple(faults.lines)
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether only this host reaches the address."""
-    if host in LOOPBACK_NAMES:
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _text(path: Path) -> str:
@@ -151,12 +139,12 @@ def _unknown(path: str) -> str:
     except Exception as fault:  # a parent package that cannot be imported, whatever it raises
         return (
             f"cannot find {module!r} ({type(fault).__name__}: {fault}); install its "
-            "package here or put its folder on PYTHONPATH"
+            "package here or put it beside the location file"
         )
     if spec is None:
         return (
-            f"no module {module!r} on this host; install its package here or put its "
-            "folder on PYTHONPATH"
+            f"no module {module!r} on this host; install its package here or put it beside "
+            "the location file"
         )
     names = _names(spec)
     if names is None or attribute in names:
@@ -241,6 +229,7 @@ def refuse_unusable(directory: Directory, node: str) -> None:
             0
         ]
         with socket.socket(family, kind, number) as probe:
-            # The same option as the listener has: connections that have ended do not block the port.
+            # The same option as the listener has: connections that have ended do not block the
+            # port.
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)

@@ -11,6 +11,8 @@ import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
+from petrobot.services.comm.protocol.messages import COORDINATOR
+
 SCHEMA = 1
 Tables = dict[str, dict[str, Any]]
 
@@ -102,6 +104,7 @@ SHAPES: Mapping[str, Mapping[str, KeySpec]] = {
             True,
         ),
         "sim": _path_key("function"),
+        "physics": KeySpec("the name of what computes a laboratory's mechanics", _text),
         "worker_memory_mb": KeySpec(
             "a whole number of MiB above 0",
             lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0,
@@ -114,7 +117,7 @@ SHAPES: Mapping[str, Mapping[str, KeySpec]] = {
     "devices": {"node": _name_key("a node", required=True), "driver": _path_key("Class")},
     "actions": {
         "run": _path_key("function", required=True),
-        "task": _name_key("the primitive task that the action translates", required=True),
+        "task": _name_key("the primitive task that the action translates"),
         "device": _name_key("a device"),
         "node": KeySpec("the name of one node", _text),
         "args": KeySpec("a table of arguments", lambda v: isinstance(v, dict)),
@@ -143,7 +146,6 @@ FLAT: Mapping[str, KeySpec] = {
 }
 CHANNELS = ("call", "can", "image", "stream", "control")
 KEYS = ("file", "certificates", "also")
-COORDINATOR = "coordinator"
 COORDINATOR_PORT = 7299
 """Port of the coordinator unless `[coordinator]` sets another."""
 TOP = ("schema", COORDINATOR, *SHAPES, *FLAT)

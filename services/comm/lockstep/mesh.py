@@ -27,11 +27,18 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final
 
-from petrobot.services.comm.location_file import COORDINATOR
 from petrobot.services.comm.location_file.host_checks import cannot_listen
 from petrobot.services.comm.lockstep.cell import CellError, Delays, LocalParties, LockStepCell
 from petrobot.services.comm.lockstep.party import Party, Posted
-from petrobot.services.comm.protocol.messages import Bye, Hello, Message, Refuse, Tick, Welcome
+from petrobot.services.comm.protocol.messages import (
+    COORDINATOR,
+    Bye,
+    Hello,
+    Message,
+    Refuse,
+    Tick,
+    Welcome,
+)
 from petrobot.services.comm.protocol.security import NONCE_BYTES, UNPROVEN, Keys, require_key
 from petrobot.services.comm.protocol.wire import (
     NEWEST_VERSION,
@@ -497,7 +504,8 @@ class Member:
             if posted.due <= tick.number or self._hosts.get(envelope.party) != self.name:
                 raise PartyLostError(
                     peer,
-                    f"its envelope from {envelope.source} to {envelope.party} is late or misdirected",
+                    f"its envelope from {envelope.source} to {envelope.party} is late or "
+                    "misdirected",
                 )
             self._half.own(envelope.source, peer)
             self._half.deliver(tick.number, posted)

@@ -8,9 +8,10 @@ import signal
 import sys
 from typing import Protocol
 
-from petrobot.services.comm.location_file import COORDINATOR, Directory
+from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.lockstep.mesh import Delays, Member
 from petrobot.services.comm.lockstep.party import Party
+from petrobot.services.comm.protocol.messages import COORDINATOR
 from petrobot.services.comm.protocol.security import KeyNeededError, Keys, is_loopback
 from petrobot.services.comm.tls.credentials import shared_keys
 

@@ -14,13 +14,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
 from math import inf
 from operator import attrgetter
+from types import ModuleType
 from typing import Any, Final, NamedTuple, get_args
 
 import msgpack
-import numpy as np
 
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.lockstep.party import Envelope, Posted
@@ -31,6 +33,7 @@ from petrobot.services.comm.protocol.plain import (
     MAX_CONTAINERS,
     NotPlainError,
     inspect,
+    is_numpy,
     pack_array,
     unpack_array,
 )
@@ -161,7 +164,7 @@ WRITERS: Mapping[int, Callable[[Any], tuple[Any, ...] | None]] = {
 """Fast writer by kind: returns the array that is the body, or None if the table must look at the
 message."""
 
-__all__ += ["encode_all", "kind_of", "no_extension", "unpack"]
+__all__ += ["encode_all", "kind_of", "no_extension", "read_fields", "unpack"]
 
 KIB, MIB = 1024, 1024 * 1024
 
@@ -283,6 +286,13 @@ def _numbers(value: list[Any]) -> tuple[float, ...]:
     return tuple(map(float, value))
 
 
+@cache
+def _leaves(numpy: ModuleType | None) -> frozenset[type]:
+    """Return what may stand in an envelope beside plain data: messages, and arrays if numpy was
+    imported, which decoding an array does."""
+    return _MESSAGES if numpy is None else _MESSAGES | {numpy.ndarray}
+
+
 def _executed(value: str) -> Executed:
     found = EXECUTED.get(value)
     if found is None:
@@ -302,7 +312,7 @@ def _posted(item: Any) -> Posted:
     ):
         raise _FieldError("expected an envelope of seven fields")
     due, sequence, party, source, target, channel, body = item
-    inspect(body, _LEAVES)
+    inspect(body, _leaves(sys.modules.get("numpy")))
     return Posted(
         _count(due),
         _count(sequence),
@@ -405,7 +415,7 @@ def _reader(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
 
 
 _SPECS: dict[int, _Spec] = {cls.KIND: _Spec(cls) for cls in get_args(Message)}
-_LEAVES: frozenset[type] = frozenset((np.ndarray, *get_args(Message)))
+_MESSAGES: frozenset[type] = frozenset(get_args(Message))
 _pack = msgpack.Packer(buf_size=64 * KIB).pack
 unpack = msgpack.unpackb
 
@@ -524,9 +534,9 @@ def _tick_out(tick: Any) -> tuple[int, list[Any]]:
 
 
 def _extension(value: Any) -> msgpack.ExtType:
-    if isinstance(value, np.ndarray):
+    if is_numpy(value, "ndarray"):
         return msgpack.ExtType(_ARRAY, pack_array(value))
-    if type(value) in _LEAVES and type(value) is not Tick:
+    if type(value) in _MESSAGES and type(value) is not Tick:
         return msgpack.ExtType(_MESSAGE, encode(value))
     raise TypeError(f"a {type(value).__name__} cannot be sent in an envelope")
 
@@ -584,20 +594,40 @@ def decode_kind(body: bytes | memoryview, kind: int) -> Message:
 
 def decode_by_table(body: bytes | memoryview, kind: int, size: int) -> Message:
     """Decode a body of `size` bytes by the table: any kind, and any fault."""
-    spec = _SPECS[kind]
-    index = 2  # the field to blame if `unpack` itself fails: the map of arguments or values
     try:
+        small = size <= UNCOUNTED and kind != _TICK
+        found = unpack(body, ext_hook=no_extension) if small else _unpack_counted(body, kind)
+    except Exception as fault:
+        raise ProtocolError("malformed", f"kind {kind}: {_not_readable(fault)}") from None
+    return _by_table(list(found), kind, size <= NAME_LENGTH)
+
+
+def read_fields(fields: list[Any]) -> Message:
+    """Return the message of a body that is unpacked already, as `decode` does. Raises
+    ProtocolError."""
+    kind = fields[0] if fields else None
+    if type(kind) is not int or kind not in _SPECS:
+        raise ProtocolError("unknown_kind", f"expected a known kind, found {kind!r:.80}")
+    reader = READERS.get(kind)
+    if reader is not None:
         try:
-            if size <= UNCOUNTED and kind != _TICK:
-                fields = unpack(body, ext_hook=no_extension)
-            else:
-                fields = list(_unpack_counted(body, kind))
-        except Exception as fault:
-            raise _not_readable(fault) from None
+            message = reader(fields, False)
+            if message is not None:
+                return message
+        except Exception:
+            pass  # the table below finds the fault and words it
+    return _by_table(fields, kind, short=False)
+
+
+def _by_table(fields: list[Any], kind: int, short: bool) -> Message:
+    """Check unpacked fields by the table. `short`: the body is shorter than the longest name."""
+    spec = _SPECS[kind]
+    index = 0
+    try:
         del fields[0]
         if tuple(map(type, fields)) != spec.types:
             _other_types(spec, fields)
-        for index, check in spec.checks if size <= NAME_LENGTH else spec.long_checks:
+        for index, check in spec.checks if short else spec.long_checks:
             fields[index] = check(fields[index])
     except _FieldError as fault:
         long = "a name is too long: " if isinstance(fault, _LongNameError) else ""

@@ -13,7 +13,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
+
+COORDINATOR: Final = "coordinator"
+"""Name of the coordinator: its role in HELLO, its table in services.toml, its certificate."""
 
 
 class Executed(StrEnum):

@@ -8,13 +8,16 @@ of lock step. Data is checked by the sender (`plain`) and by the receiver (`insp
 from __future__ import annotations
 
 import struct
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from itertools import islice
 from types import NoneType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
+# numpy is imported where it is used: importing it takes a third of the time in which a worker
+# starts, and many nodes and workers never see an array.
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 DEPTH = 32
 """Deepest nesting of plain data."""
@@ -47,7 +50,8 @@ _BASES: tuple[tuple[type, Callable[[Any], Any]], ...] = (
 )
 _NUMPY_KINDS = "biufUS"
 """Kinds of numpy scalars that are numbers or text. A date would silently become a number."""
-_DTYPES: Mapping[int, np.dtype[Any]] = {1: np.dtype("u1"), 2: np.dtype("<f8")}
+_DTYPES: Mapping[int, str] = {1: "|u1", 2: "<f8"}
+"""`dtype.str` of the arrays that may be sent, by its code on the wire."""
 _CODES = {dtype: code for code, dtype in _DTYPES.items()}
 _MAX_DIMENSIONS = 4
 
@@ -128,8 +132,8 @@ def _plain_list(value: Sequence[Any], where: str, depth: int, left: list[int]) -
 
 
 def _plain_other(value: Any, where: str, depth: int, left: list[int]) -> Any:
-    if isinstance(value, np.generic):
-        if value.dtype.kind in _NUMPY_KINDS and not isinstance(item := value.item(), np.generic):
+    if is_numpy(value, "generic"):
+        if value.dtype.kind in _NUMPY_KINDS and not is_numpy(item := value.item(), "generic"):
             return _plain(item, where, depth, left)
         raise NotPlainError(f"{where}: a numpy {value.dtype.name} is not plain data")
     for base, convert in _BASES:
@@ -143,8 +147,13 @@ def _plain_other(value: Any, where: str, depth: int, left: list[int]) -> Any:
                 "use a dict"
             )
         return _plain(dict(items), where, depth, left)
-    remedy = "; use .tolist()" if isinstance(value, np.ndarray) else ""
+    remedy = "; use .tolist()" if is_numpy(value, "ndarray") else ""
     raise NotPlainError(f"{where}: a {type(value).__name__} is not plain data{remedy}")
+
+
+def is_numpy(value: Any, name: str) -> bool:
+    """Whether a value is of this class of numpy. Where numpy was never imported, none is."""
+    return isinstance(value, getattr(sys.modules.get("numpy"), name, ()))
 
 
 def inspect(value: Any, extra: frozenset[type] = frozenset(), depth: int = DEPTH) -> None:
@@ -190,13 +199,15 @@ def copy_array(array: NDArray[Any]) -> NDArray[Any]:
 
     Raises NotPlainError.
     """
+    import numpy as np
+
     _code(array)
     copy: NDArray[Any] = np.frombuffer(array.tobytes(), array.dtype).reshape(array.shape)
     return copy
 
 
 def _code(array: NDArray[Any]) -> int:
-    code = _CODES.get(array.dtype)
+    code = _CODES.get(array.dtype.str)
     if code is None or array.ndim > _MAX_DIMENSIONS:
         raise NotPlainError(
             f"an array of {array.dtype} with {array.ndim} dimensions: only uint8 or float64, "
@@ -215,7 +226,9 @@ def unpack_array(data: bytes) -> NDArray[Any]:
         or len(data) < 2 + 4 * data[1]
     ):
         raise NotPlainError("malformed array")
-    dtype = _DTYPES[data[0]]
+    import numpy as np
+
+    dtype = np.dtype(_DTYPES[data[0]])
     start = 2 + 4 * data[1]
     shape = struct.unpack(f">{data[1]}I", data[2:start])
     count = 1

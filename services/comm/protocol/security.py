@@ -55,9 +55,12 @@ class KeyNeededError(Exception):
     """A socket that other hosts can reach must not be opened without a key."""
 
 
+LOOPBACK_NAMES = ("localhost", "ip6-localhost")
+
+
 def is_loopback(host: str) -> bool:
     """Return whether only processes of this host can reach a socket bound to `host`."""
-    if host == "localhost":
+    if host in LOOPBACK_NAMES:
         return True
     try:
         return ipaddress.ip_address(host).is_loopback
@@ -104,9 +107,9 @@ class Seal:
 
     def __init__(self, key: bytes, direction: str, transcript: bytes) -> None:
         own = proof(key, direction, transcript).ljust(_BLOCK, b"\0")
-        # HMAC is H(key ^ opad | H(key ^ ipad | message)), with ipad 0x36 and opad 0x5c repeated (RFC
-        # 2104). The two hashes that have already consumed the padded key are kept and copied for
-        # each frame. On a short frame this takes a third of the time of hmac.digest.
+        # HMAC is H(key ^ opad | H(key ^ ipad | message)), with ipad 0x36 and opad 0x5c repeated
+        # (RFC 2104). The two hashes that have already consumed the padded key are kept and copied
+        # for each frame. On a short frame this takes a third of the time of hmac.digest.
         self._inner: _Hash = hashlib.sha256(bytes(byte ^ 0x36 for byte in own))
         self._outer: _Hash = hashlib.sha256(bytes(byte ^ 0x5C for byte in own))
         self._number = 0

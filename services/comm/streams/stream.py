@@ -396,8 +396,8 @@ class StreamReceiver:
 
     def poll(self) -> None:
         """Read all that has arrived; never blocks."""
-        # epoll first: a read of a socket without data raises an exception, and this function runs in
-        # every servo cycle.
+        # epoll first: a read of a socket without data raises an exception, and this function runs
+        # in every servo cycle.
         ready = {number for number, _ in self._ready.poll(0.0)}
         now = self._clock()
         for number, guest in list(self._guests.items()):

@@ -63,7 +63,8 @@ def make_certificates(
         ) from fault
     except ValueError as fault:
         raise CertificateError(
-            f"{folder}: its files are not an authority that this command made ({fault}); remove them"
+            f"{folder}: its files are not an authority that this command made ({fault}); "
+            "remove them"
         ) from fault
     return written
 

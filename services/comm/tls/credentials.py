@@ -20,11 +20,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.protocol.messages import COORDINATOR
 from petrobot.services.comm.protocol.security import KeyFileError, Keys, read_key, read_secret
 from petrobot.services.comm.tls.expiry import watch
 
-COORDINATOR: Final = "coordinator"
-"""The party whose certificate the coordinator and the operator's tools show."""
 CA_FILE: Final = "ca.pem"
 MADE_BY: Final = "`petrobot keys --tls`"
 RENEW: Final = "run {command} where the authority's key is, and copy {name}.pem and {name}.key here"

@@ -48,9 +48,16 @@ def test_a_trial_has_its_runs_and_what_took_them() -> None:
     assert len(log.trials) == 3
     trial = log.trials[0]
     by_place = {run.place: run for run in trial.runs}
-    assert [by_place[p].taken for p in ("locate_ball", "track_ball", "move_to_point", "catch_ball", "return_home")] == [
-        "located", "tracked", "in_place", "missed", "homed",
-    ]  # fmt: skip
+    assert [
+        by_place[p].taken
+        for p in ("locate_ball", "track_ball", "move_to_point", "catch_ball", "return_home")
+    ] == [
+        "located",
+        "tracked",
+        "in_place",
+        "missed",
+        "homed",
+    ]
     assert by_place["locate_ball"].seconds == pytest.approx(0.4, abs=0.01)
     assert by_place["locate_ball"].took >= by_place["locate_ball"].seconds
     assert by_place["locate_ball"].values == {"images": 20.0}

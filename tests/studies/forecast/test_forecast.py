@@ -83,7 +83,7 @@ def test_without_dependence_the_product_is_not_rejected(pair: Task, make_trials:
 
 
 def test_a_changed_world_is_not_agreed_with(pair: Task, make_trials: Make) -> None:
-    """The comparison can fail: other times and other shares are told."""
+    """The comparison can fail: it reports other times and other shares."""
     made = forecast(pair, make_trials(1500, np.random.default_rng(6)))
     slower = [
         replace(t, time=t.time * 1.05 if t.time else None)

@@ -79,7 +79,7 @@ def dependent(random: np.random.Generator) -> Trial:
 def test_a_doubtful_forecast_is_told_and_not_registered(
     write_campaign: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Exit code 1 and no file; --doubtful registers it, and the comparison says so."""
+    """Exit code 1 and no file. With --doubtful it is registered, and the comparison mentions it."""
     random = np.random.default_rng(1)
     train = write_campaign("train", ONE_WAY, [dependent(random) for _ in range(300)])
     out = tmp_path / "f.json"

@@ -195,7 +195,8 @@ def test_a_loop_that_is_counted_is_no_geometric_one() -> None:
 
 
 def test_a_rare_further_round_is_like_the_last_frequent_one() -> None:
-    """Five of 65 are interrupted a third time, and then done: nobody goes round for ever."""
+    """Five of 65 trials are interrupted a third time and then end: no trial is interrupted for
+    ever."""
 
     def rounds(n: int) -> Trial:
         ends = [("error", "again")] * (n - 1) + [("success", "done")]

@@ -229,7 +229,8 @@ def test_the_stochastic_view_preempts_when_the_other_has_ended(
 
 
 def test_a_watch_that_never_ends_by_itself_is_played_and_solved() -> None:
-    """All its runs were cut off: it goes on until it is preempted, whatever the other one takes."""
+    """All its recorded runs were cut off, so it stays active until it is preempted, whatever the
+    other run takes."""
     task = loads(ONE_WAY, "scan.toml")
     trials = [one_way(np.random.default_rng(seed), 1e9) for seed in range(400)]
     training = Training.of(task, trials)
@@ -243,8 +244,8 @@ def test_a_watch_that_never_ends_by_itself_is_played_and_solved() -> None:
 
 
 def test_what_was_never_seen_is_told() -> None:
-    """Nothing else takes the run now, so it goes on for longer than any that was seen: the forecast
-    says that it is doubtful."""
+    """No other transition takes the run now, so it stays active for longer than any recorded one:
+    the forecast says that it is doubtful."""
     alone = HEAD.replace('out = ["watch", "locate"]', 'out = ["watch"]')
     text = (
         alone
@@ -372,8 +373,8 @@ out = ["idle"]
 
 
 def test_a_timer_over_two_runs_fires_once_for_both() -> None:
-    """At 1.02 s, as measured, not at the declared 1 s: whichever run goes on then, and only if both
-    do."""
+    """It fires at 1.02 s, as measured, not at the declared 1 s, and only if both runs are still
+    active."""
     text = (
         BOTH_WAYS
         + """

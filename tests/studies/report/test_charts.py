@@ -114,8 +114,8 @@ def test_shapes_differ_by_more_than_colour() -> None:
 
 
 def test_a_picture_of_its_own_has_the_days_colours() -> None:
-    """No variable of the page is left in a file that stands alone; what is no colour of ours is
-    left as it is."""
+    """A picture in a file of its own refers to no variable of the page. Colours that are not ours
+    stay as they are."""
     svg = charts.points("t", "x", "y", {str(i): [((float(i), 1.0), "tip")] for i in range(9)})
     assert {f"var(--{name})" for name in colours.SERIES} <= set(
         re.findall(r"var\(--[a-z0-9-]+\)", svg)

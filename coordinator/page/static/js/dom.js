@@ -108,7 +108,7 @@ export class Press {
     setTimeout(() => this.draw());
   }
 
-  /** True while a press goes on: `draw` is then called as soon as it is over, the last one that was asked for. */
+  /** True during a press: the last `draw` that was requested is then called when the press ends. */
   holds(draw) {
     this.later = this.going ? draw : null;
     return Boolean(this.going);

@@ -23,7 +23,7 @@ async function need(method, path, body) {
   return null;
 }
 
-/** The emergency stop while there is no live connection; whether it was carried out. */
+/** Give the emergency stop without a live connection. Returns whether it was carried out. */
 export async function stopPastTheLink() {
   try {
     const name = localStorage.getItem("petrobot.name") ?? "operator";
@@ -53,13 +53,12 @@ export const importNet = (form, text) => need("POST", "/api/import", { form, tex
 
 /** This window's desk: a newer drawing of it takes the place of the one that is checked or analysed just now. */
 const DESK = Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("");
-const SUPERSEDED = 409;
 
 /** What the check says of a document; null when the server cannot tell, or was asked about a newer one. */
 export async function checkDocument(name, document, renames) {
   try {
     const answer = await ask("POST", "/api/check", { name, document, renames, desk: DESK });
-    if (answer.status === SUPERSEDED) return null;
+    if (answer.value.superseded) return null;
     return answer.ok ? answer.value : { findings: [{ severity: "error", key: "", text: String(answer.value), remedy: "" }], text: "" };
   } catch {
     return null;
@@ -70,7 +69,7 @@ export async function checkDocument(name, document, renames) {
 export async function analyseDocument(name, document, renames) {
   try {
     const answer = await ask("POST", "/api/analyse", { name, document, renames, desk: DESK });
-    if (answer.status === SUPERSEDED) return null;
+    if (answer.value.superseded) return null;
     return answer.ok ? answer.value : String(answer.value);
   } catch {
     return "the server cannot be reached";

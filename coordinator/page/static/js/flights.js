@@ -65,7 +65,7 @@ export class Flights {
     if (this.going.some((flight) => this.moves(flight))) this.frame = requestAnimationFrame((next) => this.step(next));
   }
 
-  /** False when the flight is over. */
+  /** Returns false when the flight has ended. */
   advance(flight, passed) {
     if (!this.moves(flight)) return true;
     flight.done += passed;

@@ -153,7 +153,7 @@ export class History {
     attribute(this.startHere, "title", why || null);
   }
 
-  // ---- the run that goes on, as this page has seen it ----------------------------------------------------------------
+  // ---- the active run, as this page has seen it ----------------------------------------------------------------------
 
   restart() {
     const { task, marking, mission } = this.link.state;

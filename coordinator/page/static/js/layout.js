@@ -3,7 +3,7 @@
 import { snap } from "./geometry.js";
 import { layered } from "./layers.js";
 
-let last = { key: "", positions: {} }; // a net without positions is drawn anew at each edit
+let last = { key: "", positions: {} }; // a net without positions is drawn again at each edit
 
 /** Positions {name: [x, y]} for a net {places, transitions, arcs}, left to right along the flow of tokens. */
 export function automatic(net) {

@@ -82,7 +82,7 @@ export class Link {
       const { status } = await fetch("/page/icon.svg", { method: "HEAD", cache: "no-store" });
       this.refused = status === UNKNOWN_HERE;
     } catch {
-      this.refused = false; // nobody answers at all
+      this.refused = false; // no answer at all
     }
     this.note("connection");
   }
@@ -203,7 +203,7 @@ export class Link {
     this.receivedAt = performance.now();
   }
 
-  /** The mission's clock now (s): it goes on between messages in real time, and only by messages in lock step. */
+  /** The mission's clock now (s): in real time it advances between messages, in lock step only with messages. */
   now() {
     const { mission, time, paused } = this.state;
     const goes = mission.mode === "realtime" && ["running", "stopping"].includes(mission.state) && !paused && this.connected;

@@ -93,7 +93,7 @@ export class Live {
     if (all || changed.has("paused") || changed.has("controls")) this.paintText();
   }
 
-  /** Lists and text: nobody reads them faster than ten times a second, and laying out text is what costs most. */
+  /** Update lists and text ten times a second at most: people read no faster, and laying out text costs most. */
   paintText() {
     const changed = this.stale;
     if (!changed.size) return;
@@ -128,6 +128,7 @@ export class Live {
     if (this.labelled !== task) {
       this.labelled = task;
       this.labels = new Map([...(task?.places ?? []), ...(task?.transitions ?? [])].map((e) => [e.name, e.label]));
+      for (const t of task?.transitions ?? []) if (this.labels.has(t.made_from) && !t.label) this.labels.set(t.name, this.labels.get(t.made_from) || t.made_from);
     }
     return words(this.labels.get(name) || name);
   }
@@ -148,7 +149,7 @@ export class Live {
     const { task } = this.link.state;
     const element = [...(task?.places ?? []), ...(task?.transitions ?? [])].find((e) => e.name === name);
     if (element && !this.view.elements.has(name)) this.open(element.in_macro ?? "");
-    return this.canvas.goTo(name);
+    return this.canvas.goTo(element?.made_from || name);
   }
 
   paintTokens() {

@@ -15,7 +15,7 @@ export class Minimap {
     host.append(this.svg);
   }
 
-  /** Draw all elements of a view anew (after its structure changed). */
+  /** Draw all elements of a view again (after its structure changed). */
   draw(view) {
     this.view = view;
     const box = view.box;

@@ -224,7 +224,7 @@ export class NetView {
     attribute(arc.node, "aria-label", `${how} from ${from.name} to ${to.name}${arc.weight > 1 ? `, weight ${arc.weight}` : ""}`);
   }
 
-  /** Draw again the arcs of elements that were moved; all arcs are routed anew when `all`. */
+  /** Draw the arcs of moved elements again; with `all`, route all arcs again. */
   reroute(names, all = false) {
     if (all) this.crowd = (this.crowd ?? 0) + 1;
     const list = [...this.elements.values()].filter((e) => !this.isFolded(e));
@@ -403,7 +403,7 @@ export class NetView {
 
   resized() {
     const { clientWidth: w, clientHeight: h } = this.svg;
-    if ((!this.size || this.view === this.fitted) && w && this.elements.size) this.fit(); // nobody has moved or zoomed it
+    if ((!this.size || this.view === this.fitted) && w && this.elements.size) this.fit(); // the user has not moved or zoomed it
     this.size = [w, h];
     this.events.moved?.(this);
   }

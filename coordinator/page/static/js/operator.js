@@ -64,7 +64,7 @@ export class Operator {
     return answer;
   }
 
-  /** Take the controls if nobody has them; false, with a word, when somebody else does. */
+  /** Take the controls if they are free. Returns false, and shows a message, if another operator holds them. */
   async hold() {
     if (this.link.mayAct) return true;
     const { holder } = this.link.state.controls;

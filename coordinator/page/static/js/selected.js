@@ -47,6 +47,8 @@ export class Selected {
     const tokens = state.marking[place.name] ?? 0;
     const full = place.capacity !== null && place.capacity !== undefined && tokens >= place.capacity;
     const facts = [["Tokens", place.capacity ? `${tokens} of ${place.capacity}` : tokens]];
+    const left = state.marking[`${place.name}.left`];
+    if (left !== undefined && state.task.places.some((p) => p.made_from === place.name)) facts.push(["Tries left", left]);
     if (place.primitive_task) facts.push(["Primitive task", words(place.primitive_task)]);
     const primitive = state.task.primitive_tasks[place.primitive_task];
     if (primitive?.goal) facts.push(["Goal", primitive.goal]);
@@ -64,9 +66,10 @@ export class Selected {
     return [this.head(place.kind === "action" ? "Action place" : `${words(place.kind)} place`.replace(/^./, (c) => c.toUpperCase()), place.name, place.label), this.facts(facts), h("div", { class: "buttons" }, buttons)];
   }
 
-  /** A button for each way out of a place whose run goes on. */
+  /** A button for each outgoing transition of a place whose run is active. */
   exits(state, place, run, may) {
-    return state.task.arcs.filter((a) => a.direction === "in" && a.place === place.name).map((a) =>
+    const made = new Set(state.task.transitions.filter((t) => t.made_from).map((t) => t.name));
+    return state.task.arcs.filter((a) => a.direction === "in" && a.place === place.name && !made.has(a.transition)).map((a) =>
       action("exit", `Force ${words(a.transition)}`, () => this.operator.give("force_exit", { run: run.id, transition: a.transition }), !may, "Take the controls first"));
   }
 

@@ -10,7 +10,7 @@ export class Selectors {
     Object.assign(this, { root, content });
   }
 
-  /** A row stays as long as its task offers the same: whoever is choosing from it while a run learns goes on choosing. */
+  /** Keep a row while its task offers the same actions: an operator may be choosing from it while a run learns. */
   paint() {
     const list = Object.entries(this.link.state.selectors).filter(([, selector]) => (selector.alternatives ?? []).length > 1);
     this.root.hidden = !list.length;

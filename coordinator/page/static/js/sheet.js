@@ -22,7 +22,8 @@ export function onlyErrors(net) {
   return { ...net, places: net.places.map((p) => (used.get(p.name) ? { ...p, error: true } : p)) };
 }
 
-const macrosOf = (task) => new Map([...task.places, ...task.transitions].map((e) => [e.name, e.in_macro ?? ""]));
+/** What each element is drawn within: what it was made from, else its macro place. */
+const macrosOf = (task) => new Map([...task.places, ...task.transitions].map((e) => [e.name, e.made_from || (e.in_macro ?? "")]));
 
 /** The macro places around an element of the whole net, innermost first. */
 function around(macros, name) {
@@ -47,8 +48,9 @@ export function sheetOf(task, inside) {
     const chain = [name, ...around(macros, name)];
     return inside ? chain[chain.indexOf(inside) - 1] : chain.at(-1);
   };
-  const here = (e) => (e.in_macro ?? "") === inside;
-  const arcs = task.arcs.map((a) => ({ ...a, place: shownAs(a.place) })).filter((a) => a.place);
+  const here = (e) => !e.made_from && (e.in_macro ?? "") === inside;
+  const made = new Set([...task.places, ...task.transitions].filter((e) => e.made_from).map((e) => e.name));
+  const arcs = task.arcs.filter((a) => !made.has(a.place) && !made.has(a.transition)).map((a) => ({ ...a, place: shownAs(a.place) })).filter((a) => a.place);
   const joined = new Set(arcs.map((a) => a.transition));
   const outside = (t) => inside && joined.has(t.name) && !around(macros, t.name).includes(inside);
   const transitions = task.transitions.filter((t) => here(t) || outside(t)).map((t) => (here(t) ? t : { ...t, x: undefined, y: undefined, outside: true }));
@@ -76,7 +78,8 @@ export function tokensOf(task, marking) {
   const shown = { ...marking };
   const macros = macrosOf(task);
   for (const place of task.places) if (place.kind === "macro") shown[place.name] = 0;
-  for (const [name, n] of Object.entries(marking)) for (const macro of around(macros, name)) shown[macro] += n;
+  const made = new Set(task.places.filter((p) => p.made_from).map((p) => p.name));
+  for (const [name, n] of Object.entries(marking)) for (const macro of made.has(name) ? [] : around(macros, name)) shown[macro] += n;
   return shown;
 }
 

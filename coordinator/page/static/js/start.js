@@ -121,7 +121,7 @@ class LearningPart {
   }
 }
 
-/** A simulated run from a record: what becomes of the runs that went on then. */
+/** A simulated run from a record: how the actions that were active then continue. */
 export function departDialog(run, record, going, labelOf, send) {
   const chosen = going.map((place) => [place, select(`Run in ${labelOf(place)}`, GOING, "again")]);
   const seed = whole("Seed", run.seed, 0);

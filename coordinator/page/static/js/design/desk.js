@@ -1,4 +1,4 @@
-// The task file on the desk: open, begin anew, save, import and export, with nothing lost on the way.
+// The open task file: open, new, save, import and export; unsaved work is never lost.
 
 import { openDialog } from "../dialog.js";
 import { h } from "../dom.js";

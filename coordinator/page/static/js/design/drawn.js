@@ -39,7 +39,7 @@ function placeOf(data, net, name, p, errors) {
   const inside = groups(p) ? within(net, name) : [];
   const isError = errors.has(name) || (inside.some((n) => errors.has(n)) && inside.every((n) => errors.has(n) || groups(net.places?.[n])));
   const hint = inside.length ? `${name}\nholds ${inside.join(", ")}` : name;
-  return { name, kind: p.kind ?? "control", label: p.label ?? "", x: p.x, y: p.y, tokens: tokensIn(data, net, name), sub: words(subs[p.kind] ?? ""), error: isError, hint };
+  return { name, kind: p.kind ?? "plain", label: p.label ?? "", x: p.x, y: p.y, tokens: tokensIn(data, net, name), sub: words(subs[p.kind] ?? ""), error: isError, hint };
 }
 
 function transitionOf(data, name, t, error, outside) {

@@ -8,7 +8,7 @@ import { events, variables } from "./declared.js";
 import { around, groups, within } from "./macros.js";
 import { readValue, writeValue } from "./values.js";
 
-const KINDS = ["action", "resource", "control", "macro"];
+const KINDS = ["plain", "action", "resource", "control", "macro"];
 const ENDS = { normal: "normal: the run ended in success or failure", error: "error: the run ended in error", preempt: "preempt: cancel a run that is still active", going: "going: only while a run is active; it continues" };
 const COUNTS = ["success", "failure", "error", "none"];
 const VALUE_HINT = "a number, \"text\", true, or $variable";
@@ -31,7 +31,7 @@ export class Inspector {
     const key = JSON.stringify([[...selection.names], selection.arc?.id, this.model.sheet]);
     const same = key === this.key && !force;
     if (same && (typing || this.press.holds(() => this.show(this.designer.selection)))) return;
-    // a field says that it was changed before the focus goes on to the next: that one must still be there then
+    // a field reports its change before the focus moves to the next field, which must still exist then
     if (this.changing) this.later = setTimeout(() => this.draw());
     else this.draw();
     this.key = key;
@@ -97,14 +97,14 @@ export class Inspector {
 
   place(name, place) {
     const set = (fields) => this.model.set(name, fields);
-    const kind = this.field("Kind", this.choice(place.kind, KINDS.map((k) => [k, k]), (k) => set({ kind: k })));
+    const kind = this.field("Kind", this.choice(place.kind ?? "plain", KINDS.map((k) => [k, k]), (k) => set({ kind: k === "plain" ? null : k })));
     const common = [
       this.field("Tokens at the start", this.number(place.tokens ?? 0, (n) => set({ tokens: n || null }), { min: 0 })),
       place.kind === "action" ? this.field("Runs at once", this.number(place.servers, (n) => set({ servers: n }), { min: 1, placeholder: "1" })) : this.field("Capacity", this.number(place.capacity, (n) => set({ capacity: n }), { min: 1, placeholder: "unlimited" })),
     ];
     const own = place.kind === "action" ? this.actionFields(name, place) : place.kind === "macro" ? this.macroFields(name, place) : [];
     const holds = place.kind === "macro" ? null : h("div", { class: "two" }, common);
-    return [this.head(`${place.kind} place`, place.label || name), this.name(name), this.label(name, place), kind, own, holds, this.macro(name, place)];
+    return [this.head(`${place.kind ?? "plain"} place`, place.label || name), this.name(name), this.label(name, place), kind, own, holds, this.macro(name, place)];
   }
 
   /** Within which macro place an element is drawn, where there is one to choose. */

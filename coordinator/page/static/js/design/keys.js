@@ -5,10 +5,10 @@ import { h } from "../dom.js";
 import { nudge } from "./arrange.js";
 
 const STEP = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
-const TOOL = { v: "select", 1: "action", 2: "resource", 3: "control", 4: "macro", t: "transition", a: "arc", i: "inhibit" };
+const TOOL = { v: "select", 1: "action", 2: "resource", 3: "control", 4: "macro", 5: "plain", t: "transition", a: "arc", i: "inhibit" };
 
 const LIST = [
-  ["1 2 3 4", "tool for an action, resource, control or macro place; Enter adds one beside the selection"],
+  ["1 2 3 4 5", "tool for an action, resource, control, macro or plain place; Enter adds one beside the selection"],
   ["T", "tool for a transition"], ["A, I", "arc or inhibitor arc from the selected element: go to the target with Ctrl and arrows, press Enter"],
   ["V, Esc", "back to the selection tool; Esc never deletes anything"],
   ["Ctrl + arrows", "select the nearest element in that direction"], ["[ and ]", "previous and next element"],

@@ -36,7 +36,7 @@ export class Model {
     this.changed("load");
   }
 
-  /** The server has what was `sent`; undo goes on to work across a save, and what was drawn meanwhile stays. */
+  /** The server has stored what was `sent`. Undo still works across a save, and what was drawn meanwhile stays. */
   savedAs({ name, revision, document }, sent) {
     this.name = name;
     this.base = revision;
@@ -150,10 +150,10 @@ export class Model {
   }
 
   addPlace(kind, x, y) {
-    const stem = { action: "action", resource: "resource", control: "control", macro: "macro" }[kind];
+    const stem = { action: "action", resource: "resource", control: "control", macro: "macro", plain: "place" }[kind];
     return this.edit(`add ${kind} place`, (_, net) => {
       const name = this.freeName(stem, net);
-      net.places[name] = { kind, ...(kind === "resource" ? { tokens: 1, capacity: 1 } : {}), ...(kind === "control" ? { capacity: 10 } : {}), ...this.here, x, y };
+      net.places[name] = { ...(kind === "plain" ? {} : { kind }), ...(kind === "resource" ? { tokens: 1, capacity: 1 } : {}), ...(kind === "control" ? { capacity: 10 } : {}), ...this.here, x, y };
       return name;
     });
   }
@@ -190,14 +190,14 @@ export class Model {
     return null;
   }
 
-  /** The first way out of an action place is the normal one, the second the error branch. */
+  /** The first outgoing arc of an action place is the normal one, the second the error branch. */
   nextEnd(net, place) {
     if (!["action", "macro"].includes(net.places[place].kind)) return null;
     const ends = new Set(Object.values(net.transitions).flatMap((t) => listed(t.in).map(readArc)).filter((a) => a?.place === place).map((a) => a.end));
     return ends.has("normal") && !ends.has("error") ? "error" : "normal";
   }
 
-  /** A transition for one way out of an action place; gives its name. */
+  /** Make a transition for one outgoing arc of an action place. Returns its name. */
   addExit(place, end, x, y) {
     return this.edit(end === "error" ? "add error branch" : "add exit", (_, net) => {
       const name = this.freeName(end === "error" ? `${place}_error` : `${place}_done`, net);
@@ -279,6 +279,13 @@ export class Model {
       if (t.when) t.when = renamed(t.when, from, to);
     }
     for (const e of [...Object.values(net.places), ...Object.values(net.transitions)]) if (e.macro === from) e.macro = to;
+    for (const p of Object.values(net.places)) {
+      if (p.holds) p.holds = listed(p.holds).map((n) => (n === from ? to : n));
+      const kinds = p.kind === "macro" ? data.subnets?.[p.subnet]?.parameters : null;
+      for (const [name, kind] of Object.entries(kinds ?? {})) if (kind === "place" && p.args?.[name] === from) p.args[name] = to;
+    }
+    const errors = this.sheet ? net.errors : data.errors;
+    if (errors?.to === from) errors.to = to;
     if (this.inside === from) this.inside = to;
     if (this.sheet) {
       for (const key of ["entry", "normal", "error"]) if (net[key] === from) net[key] = to;

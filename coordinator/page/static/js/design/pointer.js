@@ -14,7 +14,7 @@ export class Pointer {
     addEventListener("keyup", (e) => e.code === "Space" && (this.space = false));
   }
 
-  /** End what goes on without any effect: the drawing was altered under the pointer. */
+  /** End the current gesture without any effect: the drawing was changed under the pointer. */
   stop() {
     this.cancel?.();
   }
@@ -64,7 +64,7 @@ export class Pointer {
 
   /**
    * A drag draws from where it began to where it ended, whatever is selected. A press without a drag chooses: where the arc
-   * begins, or where the one that has begun ends. So what a press means is known only when it is over.
+   * begins, or where the one that has begun ends. So the meaning of a press is known only at its end.
    */
   arcDown(event, element) {
     const { designer, view } = this;

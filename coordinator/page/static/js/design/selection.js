@@ -29,7 +29,7 @@ export class Selection {
     return names;
   }
 
-  /** Forget what is no longer drawn. */
+  /** Deselect elements that are no longer drawn. */
   prune(picture) {
     const drawn = new Set([...picture.places, ...picture.transitions].map((e) => e.name));
     this.names = new Set([...this.names].filter((n) => drawn.has(n)));

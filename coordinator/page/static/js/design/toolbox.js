@@ -8,7 +8,8 @@ const NEARLY = 16;
 const APART = 70;
 const TOOLS = [
   ["select", "select", "Select", "V"], ["action", "action", "Action place", "1"], ["resource", "resource", "Resource place", "2"],
-  ["control", "control", "Control place", "3"], ["macro", "macro", "Macro place", "4"], ["transition", "transition", "Transition", "T"],
+  ["control", "control", "Control place", "3"], ["macro", "macro", "Macro place", "4"],
+  ["plain", "plain", "Plain place", "5"], ["transition", "transition", "Transition", "T"],
   ["arc", "arc", "Arc", "A"], ["inhibit", "inhibitor", "Inhibitor arc", "I"],
 ];
 const SAID = { select: "", arc: "Drag from a place to a transition, or choose one after the other.", inhibit: "Drag from a place to the transition that its tokens block." };
@@ -54,7 +55,7 @@ export class Toolbox {
     this.tell(message);
   }
 
-  /** A tool chosen by the keyboard acts at once: there is no pointer to say where. */
+  /** A tool chosen by keyboard acts at once: there is no pointer that could choose the point. */
   pressed(key, event) {
     this.use(key);
     if (event.detail === 0 && key !== "select" && !this.draws) this.insertFree(key);
@@ -90,7 +91,7 @@ export class Toolbox {
     return name;
   }
 
-  /** A transition for a way out of an action place that has none yet. */
+  /** Make a transition for an end of an action place that has no outgoing arc yet. */
   addExit(place, end) {
     const { model } = this.designer;
     const at = this.view.elements.get(place);

@@ -33,7 +33,7 @@ export class Verdicts {
     fill(this.list);
   }
 
-  /** The check found no fault: analyse once the drawing has settled, unless a mission goes on. */
+  /** The check found no fault: analyse when the drawing stays unchanged, unless a mission is active. */
   soon() {
     clearTimeout(this.later);
     const busy = () => ["running", "preparing", "stopping"].includes(this.designer.link.state.mission.state);

@@ -1,11 +1,16 @@
-"""Where the ball may touch something: a small PyBullet space of ball, table and cup, stepped at 1
-kHz.
+"""The back end `bullet`: PyBullet computes the arm's dynamics and the ball's contacts.
 
-The cup is 16 flat boxes and a disc that move with the arm. Bullet gives bodies without mass no
-velocity in a contact, so the cup is a free body with a mass (1 t) that no ball can move; each step
-puts it where the arm holds it, with the velocity that takes it to where the arm will hold it next.
-It is loaded as URDF, since a body made otherwise has 16 shapes at most, and with two bodies a step
-takes more than twice the time (21 us instead of 9).
+Nothing else imports PyBullet, and this module is imported only when the back end is chosen.
+
+The arm is given to PyBullet as URDF with the published values. Rotor inertia (up to 2.3 kg m^2 at
+the joint, more than most links) is added in sim/catching/puma.py, since URDF cannot express it.
+
+The ball's contacts are a small space of ball, table and cup, stepped at 1 kHz. The cup is 16 flat
+boxes and a disc that move with the arm. Bullet gives bodies without mass no velocity in a contact,
+so the cup is a free body with a mass (1 t) that no ball can move; each step puts it where the arm
+holds it, with the velocity that takes it to where the arm will hold it next. It is loaded as URDF,
+since a body made otherwise has 16 shapes at most, and with two bodies a step takes more than twice
+the time (21 us instead of 9).
 
 Restitution: Bullet lets contacts act before bodies touch and then forgets the bounce, and its
 correction of overlap adds speed. With a breaking threshold of 10 um and a correction of 2 % per
@@ -17,27 +22,144 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pybullet
 
+from petrobot.sim.catching.arm_motion import Six
 from petrobot.sim.catching.ball import BallModel, BallState
-from petrobot.sim.catching.puma_model import Frame3
-from petrobot.sim.catching.truth import CupTruth, TableTruth
+from petrobot.sim.catching.physics import TABLE_TOP
+from petrobot.sim.catching.puma_model import (
+    JOINTS,
+    Frame3,
+    PrincipalInertia,
+    PumaModel,
+    real_inertia,
+    twist,
+)
+from petrobot.sim.catching.truth import CupTruth, TableTruth, Vector
 
 _ANVIL = 1000.0
 """kg, mass of the cup."""
 _HULL_MARGIN = 0.001
 """m by which Bullet enlarges a cylinder of a URDF in all directions."""
-_SLAB = 0.030
-"""m, thickness of the table top."""
 Quaternion = tuple[float, float, float, float]
+_LEAST_MASS = 1e-9
+"""kg, for links whose mass the publications leave out."""
+_ZERO = (0.0, 0.0, 0.0)
 
 
-class ContactSpace:
-    """Ball, table and cup in a physics client of its own. Everything in the base frame."""
+def urdf(model: PumaModel, flange_load: PrincipalInertia | None = None) -> str:
+    """Return the arm as URDF text: links base, link1 to link6; `flange_load`: what is bolted to
+    link 6, in frame 6."""
+    base = _inertial_text(PrincipalInertia(0.0, _ZERO, _ZERO), _ZERO, 0.0)
+    parts = [
+        '<robot name="arm">',
+        f'<link name="base">{base}</link>',
+    ]
+    for i, link in enumerate(model.links):
+        x, y, z = model.base if i == 0 else (model.a[i - 1], 0.0, model.d[i - 1])
+        roll = 0.0 if i == 0 else model.alpha[i - 1]
+        parent = "base" if i == 0 else f"link{i}"
+        parts.append(
+            f'<joint name="joint{i + 1}" type="revolute"><parent link="{parent}"/><child '
+            f'link="link{i + 1}"/>'
+            f'<origin xyz="{x!r} {y!r} {z!r}" rpy="{roll!r} 0 0"/><axis xyz="0 0 1"/>'
+            f'<limit lower="{model.lower[i]}" upper="{model.upper[i]}" effort="{model.torque[i]}" '
+            f'velocity="{model.speed[i]}"/></joint>'
+        )
+        parts.append(f'<link name="link{i + 1}">{_inertial(model, i, link)}</link>')
+    if flange_load is not None:
+        end = len(model.links) - 1
+        parts.append(
+            '<joint name="load" type="fixed"><parent link="link6"/><child link="load"/>'
+            f'<origin xyz="{model.a[end]!r} 0 {model.d[end]!r}" rpy="{model.alpha[end]!r} 0 '
+            '0"/></joint>'
+            f'<link name="load">{_inertial_text(flange_load, flange_load.centre, 0.0)}</link>'
+        )
+    parts.append("</robot>")
+    return "\n".join(parts)
+
+
+def _inertial(model: PumaModel, i: int, link: PrincipalInertia) -> str:
+    """Return the link's inertial element: its centre moved from DH frame i + 1 to the URDF link
+    frame, turned by the twist."""
+    c, s = model.twists[i]
+    x, y, z = link.centre
+    return _inertial_text(
+        link, (model.a[i] + x, c * y - s * z, model.d[i] + s * y + c * z), model.alpha[i]
+    )
+
+
+def _inertial_text(link: PrincipalInertia, centre: tuple[float, float, float], roll: float) -> str:
+    ixx, iyy, izz = real_inertia(link.inertia)
+    x, y, z = centre
+    return (
+        f'<inertial><origin xyz="{x!r} {y!r} {z!r}" rpy="{roll!r} 0 0"/><mass '
+        f'value="{max(link.mass, _LEAST_MASS)!r}"/>'
+        f'<inertia ixx="{ixx!r}" iyy="{iyy!r}" izz="{izz!r}" ixy="0" ixz="0" iyz="0"/></inertial>'
+    )
+
+
+class BulletArmDynamics:
+    """Mass matrix and bias torques of the arm by PyBullet, without rotors and friction; a physics
+    client of its own. Implements `physics.ArmDynamics`."""
+
+    def __init__(
+        self, model: PumaModel, gravity: float, flange_load: PrincipalInertia | None = None
+    ) -> None:
+        self._client = pybullet.connect(pybullet.DIRECT)
+        pybullet.setGravity(0.0, 0.0, -gravity, physicsClientId=self._client)
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "arm.urdf"
+            file.write_text(urdf(model, flange_load), encoding="utf-8")
+            self._body = pybullet.loadURDF(
+                str(file),
+                useFixedBase=True,
+                flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+                physicsClientId=self._client,
+            )
+        self._zero = [0.0] * JOINTS
+
+    def mass_matrix(self, q: Sequence[float]) -> Vector:
+        """Return the mass matrix (6, 6) kg m^2."""
+        return np.array(
+            pybullet.calculateMassMatrix(self._body, list(q), physicsClientId=self._client)
+        )
+
+    def bias(self, q: Sequence[float], qd: Sequence[float]) -> Six:
+        """Return six torques (N m) that hold the arm against gravity, Coriolis and centrifugal
+        forces."""
+        torques: Six = pybullet.calculateInverseDynamics(
+            self._body, q, qd, self._zero, physicsClientId=self._client
+        )
+        return torques
+
+    def link_frame(self, q: Sequence[float], link: int) -> tuple[Vector, Vector]:
+        """Return origin (3,) and rotation (3, 3) of a URDF link (0 to 5) as PyBullet places it; for
+        checks."""
+        for joint, angle in enumerate(q):
+            pybullet.resetJointState(self._body, joint, angle, physicsClientId=self._client)
+        state = pybullet.getLinkState(
+            self._body, link, computeForwardKinematics=1, physicsClientId=self._client
+        )
+        return np.array(state[4]), np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(
+            3, 3
+        )
+
+    def close(self) -> None:
+        """Disconnect the physics client."""
+        if self._client >= 0:
+            pybullet.disconnect(physicsClientId=self._client)
+            self._client = -1
+
+
+class BulletBallContact:
+    """Ball, table and cup in a physics client of its own. Everything in the base frame. Implements
+    `physics.BallContact`."""
 
     def __init__(
         self,
@@ -100,8 +222,8 @@ class ContactSpace:
 
     def _make_table(self, table: TableTruth, ball: Mapping[str, Any]) -> None:
         length = table.far_edge - table.near_edge
-        half = [length / 2.0, table.half_width, _SLAB / 2.0]
-        centre = (table.near_edge + length / 2.0, 0.0, table.top - _SLAB / 2.0)
+        half = [length / 2.0, table.half_width, TABLE_TOP / 2.0]
+        centre = (table.near_edge + length / 2.0, 0.0, table.top - TABLE_TOP / 2.0)
         self._table = self._body(0.0, self._shape(pybullet.GEOM_BOX, halfExtents=half), centre)
         self._surface(self._table, float(ball["table_restitution"]), float(ball["friction"]))
 
@@ -203,28 +325,3 @@ def quaternion(frame: Frame3) -> Quaternion:
         return (yx + xy) / s, 0.25 * s, (zy + yz) / s, (zx - xz) / s
     s = 2.0 * math.sqrt(1.0 + zz - xx - yy)
     return (zx + xz) / s, (zy + yz) / s, 0.25 * s, (xy - yx) / s
-
-
-def twist(
-    before: Frame3, after: Frame3, dt: float
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Velocity of the origin (m/s) and angular velocity (rad/s) that lead from one frame to another
-    in `dt` (s).
-
-    Angular velocity to first order in the angle turned, half the sum of axis x change of axis:
-    exact to 1e-5 at 5 rad/s.
-    """
-    if before is after:
-        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    o, p = before.origin, after.origin
-    wx = wy = wz = 0.0
-    for a, b in zip(before[:3], after[:3], strict=True):
-        wx += a[1] * b[2] - a[2] * b[1]
-        wy += a[2] * b[0] - a[0] * b[2]
-        wz += a[0] * b[1] - a[1] * b[0]
-    half = 0.5 / dt
-    return ((p[0] - o[0]) / dt, (p[1] - o[1]) / dt, (p[2] - o[2]) / dt), (
-        wx * half,
-        wy * half,
-        wz * half,
-    )

@@ -1,0 +1,135 @@
+"""Why a state of the execution graph is a dead end: which place is short, which firing took from it
+last, and by which path it should have come back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from petrobot.coordinator.analysis.execution.graph import ExecutionGraph
+from petrobot.coordinator.engine import Phase, State
+from petrobot.coordinator.engine.draft import Draft
+from petrobot.coordinator.engine.firing import Obstacle, obstacles
+from petrobot.coordinator.task.compiled_task import CompiledTransition
+from petrobot.coordinator.task.net import Net
+
+MOST = 4
+"""The most waiting transitions that are explained one by one."""
+
+
+def settled(x: ExecutionGraph, state: int) -> int:
+    """Return the state in which a dead end comes to rest: the nearest one that nothing leaves."""
+    out = np.bincount(x.source, minlength=len(x)) == 0
+    edges = x.graph.path(state, out)
+    return int(x.target[edges[-1]]) if edges else state
+
+
+def describe(x: ExecutionGraph, state: int) -> str:
+    """Return the marked places of a state, with how the runs in them ended."""
+    at, net = x.states[state], x.engine.compiled.net
+    told = []
+    for place, tokens in zip(net.places, at.marking, strict=True):
+        ended = [_ended(at, place, i) for i in range(tokens)] if place in at.tokens else []
+        if any(ended):
+            told.append(f"{place} ({', '.join(one or 'active' for one in ended)})")
+        elif tokens:
+            told.append(f"{place}:{tokens}" if tokens > 1 else place)
+    told += [f"{run.place} (stopping)" for run in at.stopping.values()]
+    return " ".join(told) or "nothing marked"
+
+
+def _ended(at: State, place: str, i: int) -> str:
+    runs = at.tokens[place]
+    run = runs[i] if i < len(runs) else None
+    return f"ended in {run.status}" if run is not None and run.phase is Phase.DONE else ""
+
+
+def explain(x: ExecutionGraph, state: int) -> str:
+    """Return why nothing can happen any more in a settled state."""
+    draft = Draft(x.engine.compiled, x.states[state])
+    ended = {r.place for r in x.states[state].runs() if r.phase is Phase.DONE}
+    firings = x.firings(state)
+    waiting = [t for t in x.engine.compiled.transitions if _near(t, ended, draft.marking)]
+    told = []
+    for t in waiting:
+        found = obstacles(draft, t)
+        if ended and all(_other_end(draft, one) for one in found):
+            continue
+        parts = [_cause(x, draft, firings, one) for one in found if not _other_end(draft, one)]
+        told.append(f"{t.name} {' and '.join(parts)}")
+    more = f"; and {len(told) - MOST} more" if len(told) > MOST else ""
+    if told:
+        return "; ".join(told[:MOST]) + more
+    if ended:
+        return f"no transition takes what ended in {', '.join(sorted(ended))} that way"
+    final = x.engine.compiled.task.final
+    return f"no transition takes what is left, and the end asks for {final}"
+
+
+def _near(t: CompiledTransition, ended: set[str], marking: Sequence[int]) -> bool:
+    if ended:
+        return any(arc.name in ended for arc in t.actions)
+    return any(marking[p] for p, _ in t.needs)
+
+
+def _other_end(draft: Draft, one: Obstacle) -> bool:
+    """Whether the obstacle is only that the run there ended in another way."""
+    if one.kind != "run" or one.place is None:
+        return False
+    return bool(draft.tokens.get(draft.compiled.net.places[one.place]))
+
+
+def _cause(x: ExecutionGraph, draft: Draft, firings: tuple[str, ...], one: Obstacle) -> str:
+    if one.kind != "short" or one.place is None:
+        return one.text
+    return f"{one.text}: {_fate(x.engine.compiled.net, draft, firings, one.place)}"
+
+
+def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
+    """Return who took the place's tokens last, and what became of them."""
+    change = [dict(changes).get(place, 0) for changes in net.compiled.changes]
+    givers = [t for t, gain in enumerate(change) if gain > 0]
+    order = [net.transition_index[name] for name in firings]
+    last = max((i for i, t in enumerate(order) if change[t] < 0), default=None)
+    back = ", ".join(f"`{net.transitions[t]}`" for t in givers)
+    if last is None:
+        return f"only {back} can fill it" if givers else "nothing ever fills it"
+    taker = f"taken by `{net.transitions[order[last]]}`"
+    if not givers:
+        return f"{taker}, and no transition returns it"
+    last_mover, carried = _carried(net, order[last:])
+    held = [net.places[p] for p in sorted(carried) if draft.marking[p]]
+    mover = net.transitions[last_mover]
+    if last_mover != order[last] and not _leads(net, carried, set(givers)):
+        return f"{taker}, never returned by `{mover}`"
+    if last_mover == order[last] and not _leads(net, carried, set(givers)):
+        return f"{taker}, and nothing that follows it returns it"
+    where = f"still held with {' and '.join(held)}" if held else f"to be returned by {back}"
+    if last_mover != order[last]:
+        return f"{taker}, not returned by `{mover}`; {where}"
+    return f"{taker}, {where}"
+
+
+def _carried(net: Net, order: list[int]) -> tuple[int, set[int]]:
+    """Follow the tokens that the first firing gave through the others. Return the last firing that
+    moved some of them on, and the places to which they came."""
+    mover, carried = order[0], {p for p, _ in net.produce[order[0]]}
+    for t in order[1:]:
+        taken = {p for p, _ in net.consume[t]} & carried
+        if taken and taken != {p for p, _ in net.produce[t]} & taken:
+            mover, carried = t, (carried - taken) | {p for p, _ in net.produce[t]}
+    return mover, carried
+
+
+def _leads(net: Net, places: set[int], givers: set[int]) -> bool:
+    """Whether arcs lead from one of the places to a giver."""
+    reached = set(places)
+    while True:
+        fed = {t for t, arcs in enumerate(net.consume) if reached & {p for p, _ in arcs}}
+        if fed & givers:
+            return True
+        more = {p for t in fed for p, _ in net.produce[t]}
+        if more <= reached:
+            return False
+        reached |= more

@@ -1,0 +1,259 @@
+"""The execution graph X: the states in which the engine rests, and what leads from one to the next.
+
+The successor of a state under a stimulus is what `Engine.handle` gives; there is no second firing
+rule. Two engine states are one state of X when they differ in nothing that the future depends on
+(`names.py`). States are numbered in breadth-first order, 0 is the state after `Begin`, so the path
+to a state is shortest. The first engine state found stands for all that are the same; hence each
+path along the search tree can be replayed by the engine as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from petrobot.coordinator.analysis.execution.names import Cause, Names, Orders, TooManyValues
+from petrobot.coordinator.analysis.net.graph import Graph, Mask
+from petrobot.coordinator.engine import (
+    Begin,
+    Engine,
+    Fired,
+    Instruction,
+    Mode,
+    Policy,
+    Report,
+    State,
+    Stimulus,
+)
+from petrobot.coordinator.engine.step import at_end
+from petrobot.coordinator.task import Status, Task
+
+STEPS = 300_000
+"""The most stimuli and firings for one graph; they take about twenty seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """An edge of a path: a stimulus in words, and the transitions that it fires."""
+
+    text: str
+    firings: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.text} -> {' '.join(self.firings) or 'nothing'}"
+
+
+@dataclass(frozen=True)
+class ExecutionGraph:
+    """The states found and their edges. If the search stopped early, only the first `expanded`
+    states have their edges, `complete` is False and `reason` says why."""
+
+    engine: Engine
+    names: Names
+    states: tuple[State, ...]
+    orders: tuple[Orders, ...]
+    """By state: which of its timers elapses before which."""
+    came: tuple[tuple[int, Stimulus] | None, ...]
+    """By state: the state and the stimulus by which it was first found."""
+    source: NDArray[np.int32]
+    target: NDArray[np.int32]
+    label: NDArray[np.int32]
+    """By edge: number of its step."""
+    steps: tuple[Step, ...]
+    first: tuple[str, ...]
+    """Transitions that fire at `Begin`, before any stimulus."""
+    expanded: int
+    complete: bool
+    reason: str
+    livelocks: tuple[int, ...]
+    """States after which transitions fire for ever without a stimulus."""
+    crowded: dict[str, int]
+    """By action place that should hold one run: a state in which it holds more."""
+    contests: dict[tuple[str, ...], int]
+    """Conflicts that only the order in the file settles: a state in which it comes to that."""
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    @cached_property
+    def graph(self) -> Graph:
+        """The states and edges as a graph."""
+        return Graph(len(self.states), self.source, self.target)
+
+    @cached_property
+    def fires(self) -> Mask:
+        """Which edges fire a transition."""
+        some = np.array([bool(step.firings) for step in self.steps] or [False])
+        mask: Mask = some[self.label]
+        return mask
+
+    def firing(self, names: Iterable[str]) -> Mask:
+        """Return which edges fire one of the transitions."""
+        wanted = frozenset(names)
+        some = np.array([bool(wanted.intersection(s.firings)) for s in self.steps] or [False])
+        mask: Mask = some[self.label]
+        return mask
+
+    @cached_property
+    def final(self) -> Mask:
+        """States in which the mission run has ended with `final`."""
+        return self._ended(Status.SUCCESS)
+
+    @cached_property
+    def given_up(self) -> Mask:
+        """States in which the mission run has ended with `final_error`."""
+        return self._ended(Status.ERROR)
+
+    def _ended(self, status: Status) -> Mask:
+        finished = (
+            s.mode is Mode.FINISHED
+            and (s.closing or at_end(self.engine.compiled, s.marking)) is status
+            for s in self.states
+        )
+        return np.fromiter(finished, np.bool_, len(self.states))
+
+    @cached_property
+    def dead(self) -> Mask:
+        """States that are no end, and from which neither a firing nor an end can be reached."""
+        alive = self.final | self.given_up
+        alive[self.source[self.fires]] = True
+        alive[self.expanded :] = True  # not examined
+        return ~self.graph.backward(alive)
+
+    def path(self, state: int) -> list[Step]:
+        """Return a shortest path from the beginning to the state."""
+        edges = self.graph.path(0, _only(len(self), state)) or []
+        return [self.steps[self.label[e]] for e in edges]
+
+    def stimuli(self, state: int) -> list[Stimulus]:
+        """Return stimuli, `Begin` first, by which the engine comes from its initial state to
+        exactly `states[state]`."""
+        found = list[Stimulus]()
+        while (came := self.came[state]) is not None:
+            state = came[0]
+            found.append(came[1])
+        return [Begin(), *reversed(found)]
+
+    def firings(self, state: int) -> tuple[str, ...]:
+        """Return the transitions that fire on a shortest path to the state."""
+        return self.first + tuple(t for step in self.path(state) for t in step.firings)
+
+    def marked(self, state: int) -> dict[str, int]:
+        """Return the marked places of a state."""
+        places = self.engine.compiled.net.places
+        return {p: n for p, n in zip(places, self.states[state].marking, strict=True) if n}
+
+
+def execute(
+    task: Task, *, limit: int = STEPS, free_choice: bool = False, engine: Engine | None = None
+) -> ExecutionGraph:
+    """Explore the execution graph of a task, up to a limit in stimuli and firings.
+
+    With `free_choice` a conflict that nothing but the order in the file settles may go either way.
+    Raises TooManyValues.
+    """
+    return _Search(engine or Engine(task, policy=Policy(ask_undecided=free_choice))).run(limit)
+
+
+@dataclass
+class _Search:
+    engine: Engine
+    names: Names = field(init=False)
+    index: dict[Hashable, int] = field(default_factory=dict)
+    states: list[State] = field(default_factory=list)
+    orders: list[Orders] = field(default_factory=list)
+    came: list[tuple[int, Stimulus] | None] = field(default_factory=list)
+    steps: dict[Step, int] = field(default_factory=dict)
+    livelocks: list[int] = field(default_factory=list)
+    crowded: dict[str, int] = field(default_factory=dict)
+    contests: dict[tuple[str, ...], int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.names = Names(self.engine)
+
+    def run(self, limit: int) -> ExecutionGraph:
+        """Explore until nothing new is found or the limit is reached."""
+        begun = self.engine.initial()
+        state, said = self.engine.handle(begun, Begin())
+        first = _fired(said)
+        self._found(begun, frozenset(), state, said, None)
+        source, target, label = list[int](), list[int](), list[int]()
+        handled = i = 0
+        while i < len(self.states) and handled < limit:
+            for cause in self._causes(i):
+                before = self.states[i]
+                state, said = self.engine.handle(before, cause.stimulus)
+                j = self._found(before, self.orders[i], state, said, (i, cause.stimulus))
+                step = Step(cause.text, _fired(said))
+                handled += 1 + len(step.firings)
+                if i != j or step.firings:
+                    source.append(i)
+                    target.append(j)
+                    label.append(self.steps.setdefault(step, len(self.steps)))
+            i += 1
+        complete = i == len(self.states)
+        return ExecutionGraph(
+            self.engine,
+            self.names,
+            tuple(self.states),
+            tuple(self.orders),
+            tuple(self.came),
+            np.array(source, dtype=np.int32),
+            np.array(target, dtype=np.int32),
+            np.array(label, dtype=np.int32),
+            tuple(self.steps),
+            first,
+            i,
+            complete,
+            "" if complete else f"more than {limit} stimuli and firings",
+            tuple(self.livelocks),
+            self.crowded,
+            self.contests,
+        )
+
+    def _causes(self, i: int) -> Iterable[Cause]:
+        return () if i in self.livelocks else self.names.stimuli(self.states[i], self.orders[i])
+
+    def _found(
+        self,
+        before: State,
+        orders: Orders,
+        state: State,
+        said: tuple[Instruction, ...],
+        came: tuple[int, Stimulus] | None,
+    ) -> int:
+        after = self.names.next_orders(before, orders, state)
+        reports = [i for i in said if isinstance(i, Report)]
+        endless = any(r.key == "timeless" for r in reports)
+        key = (self.names.key(state, after), endless)
+        number = self.index.setdefault(key, len(self.states))
+        if number == len(self.states):
+            self.states.append(state)
+            self.orders.append(after)
+            self.came.append(came)
+            if endless:
+                self.livelocks.append(number)
+        for report in reports:
+            if report.key == "unsafe":
+                self.crowded.setdefault(report.of, number)
+        for instruction in said:
+            if rivals := self.names.undecided(instruction):
+                self.contests.setdefault(rivals, number)
+        return number
+
+
+def _fired(said: tuple[Instruction, ...]) -> tuple[str, ...]:
+    return tuple(i.transition for i in said if isinstance(i, Fired))
+
+
+def _only(n: int, state: int) -> Mask:
+    mask = np.zeros(n, dtype=np.bool_)
+    mask[state] = True
+    return mask
+
+
+__all__ = ["STEPS", "ExecutionGraph", "Step", "TooManyValues", "execute"]

@@ -1,0 +1,326 @@
+"""What of an engine state the future depends on, up to names; and the stimuli that can come in it.
+
+A state of the execution graph keeps tokens, runs in their order, latched events, armed timers, an
+open draw, and of each variable that a condition reads only its region. It drops ids, counters,
+clocks, records, reports and arguments: no firing depends on them (docs/execution-graph.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+from petrobot.coordinator.engine import (
+    Choose,
+    Chosen,
+    Engine,
+    EventOccurred,
+    Mode,
+    Phase,
+    Run,
+    RunEnded,
+    RunRaised,
+    State,
+    Stimulus,
+    StopConfirmed,
+    Subject,
+    TimerFired,
+    VariableChanged,
+)
+from petrobot.coordinator.engine.state import ACTIVE
+from petrobot.coordinator.task import End, Executed, Kind, Scope, Status
+from petrobot.coordinator.task.conditions import Compare, Literal, Name, walk
+from petrobot.coordinator.task.conditions.language import equal, is_number, with_values
+from petrobot.coordinator.task.conditions.regions import region_values
+from petrobot.coordinator.task.validation import is_pulse
+
+RUN_FIELDS = ("status", "reason", "executed")
+"""What conditions may ask of a run: `PLACE.status` and so on."""
+OUTCOMES = 256
+"""The most combinations of values and reasons that one end of a run is tried with."""
+
+Orders = frozenset[tuple[str, str]]
+"""Pairs of armed timers, by their transitions: the first elapses before the second."""
+
+
+class TooManyValues(ValueError):  # noqa: N818 - a limit of the analysis, not a fault of the task
+    """A run can end with more combinations of values than are tried."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A stimulus in a state, and how it reads."""
+
+    stimulus: Stimulus
+    text: str
+
+
+class Names:
+    """What the conditions of a task read, and so which parts of a state count."""
+
+    def __init__(self, engine: Engine) -> None:
+        """Collect them. Raises TooManyValues."""
+        self.engine = engine
+        compiled = engine.compiled
+        self._task = task = compiled.task
+        conditions = [x.when for x in compiled.transitions if x.when is not None]
+        parameters = dict(task.parameters)
+        fixed = [with_values(c, parameters) for c in conditions]
+        self._values = region_values(fixed, compiled.domains)
+        self._literals, self._together = _compared(fixed)
+        self._asked = {field: set[str]() for field in RUN_FIELDS}
+        """By what a condition asks of a run: places whose ended runs differ by it, because an arc
+        that takes them asks."""
+        read = {name for c in fixed for name in c.names}
+        self._known = {n for n in read if n not in _run_names(task)}
+        """Names whose value counts beside the runs."""
+        for x in compiled.transitions:
+            for name in x.when.names if x.when is not None else ():
+                place, _, field = name.rpartition(".")
+                arcs = [a for a in x.actions if a.name == place]
+                if field in RUN_FIELDS and place:
+                    if any(a.end in (End.NORMAL, End.ERROR) or a.takes_done for a in arcs):
+                        self._asked[field].add(place)
+                    if not any(a.end in (End.NORMAL, End.ERROR) for a in arcs):
+                        self._known.add(name)
+        self._status_read = {n.rpartition(".")[0] for n in read if n.endswith(".status")}
+        self._free = sorted(self._known & compiled.free)
+        self._mixed = {a.name for x in compiled.transitions for a in x.actions if a.takes_done}
+        """Places where an arc takes ended and active runs, so that their common order counts."""
+        self._waits = {
+            place: {
+                e
+                for x in compiled.transitions
+                for a in x.actions
+                if a.name == place
+                for e in a.raised
+            }
+            for place in compiled.action_places
+        }
+        self._ends = {place: self._ends_of(place) for place in compiled.action_places}
+        self.assumptions = tuple(
+            [f"{name} may take any value at any time" for name in self._free]
+            + [
+                f"the parameter {n} is {v!r}"
+                for n, v in parameters.items()
+                if any(n in c.names for c in conditions)
+            ]
+        )
+        """What the verdicts take for granted, as clauses."""
+
+    # --- which states are the same -----------------------------------------------------------
+
+    def key(self, state: State, orders: Orders) -> Hashable:
+        """Return what the future of the state depends on."""
+        if state.mode is Mode.FINISHED:
+            return (state.mode, state.marking)
+        runs, at = list[Hashable](), dict[str, tuple[str, int]]()
+        for place in self.engine.compiled.action_places:
+            present = state.tokens.get(place, ())
+            if place not in self._mixed:
+                present = tuple(
+                    sorted(present, key=lambda r: r.ended if r.phase is Phase.DONE else 0)
+                )
+            at |= {run.id: (place, i) for i, run in enumerate(present)}
+            ends = sorted(r.ended for r in present if r.phase is Phase.DONE)
+            runs.append(tuple(self._run(run, ends) for run in present))
+        stopping = sorted((r.place, r.phase.value, r.device) for r in state.stopping.values())
+        waiting = [r for r in state.runs() if r.phase is Phase.WAITING]
+        timers = sorted(
+            (name, timer.elapsed, tuple(at[i] for i in timer.runs))
+            for name, timer in state.timers.items()
+        )
+        draw = state.suspended
+        return (
+            state.mode,
+            state.closing,
+            state.marking,
+            tuple(runs),
+            tuple(stopping),
+            tuple(r.place for r in sorted(waiting, key=lambda r: r.order)),
+            state.flags.intersection(self.engine.compiled.waiting),
+            tuple(timers),
+            orders,
+            None if draw is None else (draw.pulse, draw.choices, draw.alternatives, draw.only),
+            tuple(
+                self.region(name, state.variables.get(name, _MISSING))
+                for name in sorted(self._known)
+            ),
+        )
+
+    def _run(self, run: Run, ends: list[int]) -> Hashable:
+        raised = run.raised & self._waits[run.place]
+        if run.phase is not Phase.DONE:
+            phase = "active" if run.phase in ACTIVE else run.phase.value
+            return (phase, run.device if run.phase is not Phase.QUEUED else "", raised)
+        status = run.status
+        if run.place not in self._asked["status"] and status is Status.FAILURE:
+            status = Status.SUCCESS
+        told = tuple(
+            self.region(f"{run.place}.{field}", value)
+            for field, value in (("reason", run.cause), ("executed", str(run.executed)))
+            if run.place in self._asked[field]
+        )
+        order = ends.index(run.ended) if run.place in self._mixed else 0
+        return ("done", status, told, raised, order)
+
+    def region(self, name: str, value: Any) -> Hashable:
+        """Return the region of a name's value: what the comparisons can tell of it."""
+        if name in self._together or value is _MISSING:
+            return (str(type(value).__name__), value if not isinstance(value, list | dict) else "")
+        kind = (
+            "bool"
+            if isinstance(value, bool)
+            else "number"
+            if is_number(value)
+            else type(value).__name__
+        )
+        told = tuple(
+            (equal(value, one), is_number(one) and kind == "number" and value < one)
+            for one in self._literals.get(name, ())
+        )
+        return (kind, value if kind == "bool" else None, told)
+
+    # --- what can come -----------------------------------------------------------------------
+
+    def stimuli(self, state: State, orders: Orders) -> Iterator[Cause]:
+        """Yield every stimulus of the world that can come in the state, one of each kind."""
+        draw = state.suspended
+        if draw is not None and draw.key:
+            for name in draw.alternatives:
+                yield Cause(Chosen(draw.key, name), f"{name} is drawn")
+            return
+        if state.mode is not Mode.RUNNING:
+            yield from self._stops(state)
+            return
+        for place in self.engine.compiled.action_places:
+            for i, run in enumerate(state.tokens.get(place, ())):
+                name = place if i == 0 else f"{place} (run {i + 1})"
+                yield from self._of_run(run, name)
+        yield from self._stops(state)
+        yield from self._events(state)
+        late = {later for _, later in orders}
+        for name, timer in sorted(state.timers.items()):
+            if not timer.elapsed and name not in late:
+                after = self._task.transitions[name].after
+                yield Cause(TimerFired(timer.key), f"{after:g} s pass")
+        for name in self._free:
+            now = self.region(name, state.variables.get(name))
+            for value in self._different(name):
+                if self.region(name, value) != now:
+                    yield Cause(VariableChanged(name, value), f"{name} becomes {value!r}")
+
+    def _of_run(self, run: Run, name: str) -> Iterator[Cause]:
+        if run.phase is Phase.CHOOSING:
+            compiled, known = self.engine.compiled, set[str]()
+            for action in compiled.primitives[run.place].alternatives:
+                device = compiled.devices.get(action, "")
+                if device not in known:  # actions on the same device are the same to the net
+                    known.add(device)
+                    yield Cause(Chosen(run.id, action), f"{name} starts")
+        elif run.phase in ACTIVE:
+            for end, text in self._ends[run.place]:
+                yield Cause(replace(end, run=run.id), f"{name} ends in {text}")
+            for event in sorted(self._waits[run.place] - run.raised):
+                yield Cause(RunRaised(run.id, event), f"{name} raises {event}")
+
+    def _stops(self, state: State) -> Iterator[Cause]:
+        seen = set[Hashable]()
+        for run in state.stopping.values():
+            if run.phase is Phase.STOPPING and (run.place, run.device) not in seen:
+                seen.add((run.place, run.device))
+                yield Cause(StopConfirmed(run.id), f"{run.place} has stopped")
+
+    def _events(self, state: State) -> Iterator[Cause]:
+        for event in self._task.events.values():
+            if event.scope is not Scope.EXTERNAL or event.name not in self.engine.compiled.waiting:
+                continue
+            kept = event.name in self.engine.compiled.kept
+            unset = not is_pulse(event) and event.name not in state.flags
+            if (is_pulse(event) or unset) and (kept or self.engine.awaits(state, event.name)):
+                yield Cause(EventOccurred(event.name), f"{event.name} comes")
+
+    def _ends_of(self, place: str) -> list[tuple[RunEnded, str]]:
+        """Return all ends of a run that something can tell apart, and how each reads."""
+        out = self._task.places[place].out
+        read = {result: name for result, name in out.items() if name in self._known}
+        statuses = [s for s in Status if s is not Status.FAILURE or place in self._status_read]
+        reason = f"{place}.reason"
+        reasons = self._different(reason) if reason in self._values else [""]
+        kinds = {name: self._task.variables[name].type for name in out.values()}
+        asked = f"{place}.executed"
+        done = self._different(asked) if asked in self._values else [Executed.YES.value]
+        found: list[tuple[RunEnded, str]] = []
+        for status in statuses:
+            missing = [_MISSING] if status is Status.ERROR else []
+            choices = [self._different(name) + missing for name in read.values()]
+            executed = done if status is Status.ERROR else [Executed.YES.value]
+            for cause, was, *values in product(reasons, executed, *choices):
+                given = {r: v for r, v in zip(read, values, strict=True) if v is not _MISSING}
+                told = [f"{read[r]} = {v!r}" for r, v in given.items()]
+                told += [f"reason {cause!r}"] if len(reasons) > 1 else []
+                told += [f"executed = {was}"] if len(executed) > 1 else []
+                text = status.value + (f" with {', '.join(told)}" if told else "")
+                if status is not Status.ERROR:
+                    given |= {r: _SOME[kinds[n].value] for r, n in out.items() if r not in read}
+                found.append((RunEnded("", status, cause, "", Executed(was), given), text))
+            if len(found) > OUTCOMES:
+                names = ", ".join(read.values()) or reason
+                raise TooManyValues(f"a run of {place} can end with too many values of {names}")
+        return found
+
+    def _different(self, name: str) -> list[Any]:
+        """Return one value of each region of a name."""
+        return list({self.region(name, value): value for value in self._values[name]}.values())
+
+    def undecided(self, instruction: object) -> tuple[str, ...]:
+        """Return the transitions of a conflict that only the order in the file settles, if the
+        instruction asks for one."""
+        if isinstance(instruction, Choose) and instruction.subject is Subject.CONFLICT:
+            return instruction.alternatives if not any(instruction.weights) else ()
+        return ()
+
+    def next_orders(self, before: State, orders: Orders, after: State) -> Orders:
+        """Return which timer elapses before which, after a stimulus.
+
+        Of two armed timers, a elapses before b if a was armed earlier and is not longer, or if both
+        were armed together and a is shorter.
+        """
+        old = {n for n, t in after.timers.items() if not t.elapsed and _armed(before, n) == t.key}
+        new = {n for n, t in after.timers.items() if not t.elapsed} - old
+        kept = {(a, b) for a, b in orders if a in old and b in old}
+        if new:
+            time = {n: self._task.transitions[n].after or 0.0 for n in old | new}
+            kept |= {(a, b) for a in old for b in new if time[a] <= time[b]}
+            kept |= {(a, b) for a in new for b in new if time[a] < time[b]}
+        return frozenset(kept)
+
+
+_MISSING = type("Missing", (), {"__repr__": lambda _: "nothing"})()
+_SOME: Mapping[str, Any] = {"bool": False, "int": 0, "float": 0.0, "str": "", "any": None}
+"""Values for variables that no condition reads."""
+
+
+def _armed(state: State, name: str) -> str:
+    timer = state.timers.get(name)
+    return "" if timer is None else timer.key
+
+
+def _run_names(task: Any) -> set[str]:
+    places = (p.name for p in task.places.values() if p.kind is Kind.ACTION)
+    return {f"{p}.{field}" for p in places for field in RUN_FIELDS}
+
+
+def _compared(conditions: list[Any]) -> tuple[dict[str, list[Any]], set[str]]:
+    """Return the literals that each name is compared with, and the names compared with others."""
+    literals: dict[str, list[Any]] = {}
+    together = set[str]()
+    for node in (n for c in conditions for n in walk(c.tree) if isinstance(n, Compare)):
+        for side, other in ((node.left, node.right), (node.right, node.left)):
+            if isinstance(side, Name) and isinstance(other, Literal):
+                literals.setdefault(side.name, []).append(other.value)
+            if isinstance(side, Name) and isinstance(other, Name):
+                together.add(side.name)
+    return literals, together

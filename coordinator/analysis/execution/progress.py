@@ -1,0 +1,569 @@
+"""Verdicts of progress, judged on the execution graph: can a task get stuck, can it always come to
+its end, does it recover from its errors.
+
+Notation: an *end* is a state in which the engine has finished with `final` or `final_error`; a
+*dead end* is a state that is no end and from which neither a firing nor an end can be reached. G
+are the nominal states: no place of an error branch is marked. A task ends, so live, proper, stable
+and controllable are judged with an edge from each end to the first state: first from those with
+`final` only, and where they do not hold so, also from those with `final_error`, which assumes that
+somebody mends what it leaves.
+
+Recovery from an error exit is judged on the graph as it is, from the firings of the exit in a
+nominal state, and G absorbs. *Possible*: G can be reached from every state just after the exit.
+*Sure*: no state from which G is lost can be reached. *kappa*: the largest number of further errors
+after which G is still reached for certain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from petrobot.coordinator.analysis.execution.causes import describe, explain, settled
+from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, Step, execute
+from petrobot.coordinator.analysis.net.graph import Graph, Mask
+from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
+from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
+from petrobot.coordinator.task import Kind
+from petrobot.coordinator.task.compiled_task import CompiledTransition
+
+FAIR = "every awaited event comes at some time, and a run may always end in each of its ways"
+"""What progress needs of the world."""
+MENDED = "somebody mends what `final_error` leaves and starts the task again"
+NEXT = "the next mission begins"
+NAMES = (
+    "deadlock_free",
+    "quasi_live",
+    "live",
+    "proper",
+    "one_run_each",
+    "returned",
+    "sound",
+    "stable",
+    "controllable",
+)
+"""The verdicts that are judged here."""
+GROUPS = 20
+"""The most dead ends that are told one by one."""
+EXAMINED = 1_000
+"""The most states of dead ends whose end is looked for; the nearest come first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recovery:
+    """What happens after an error exit, judged over all states just after it."""
+
+    error_exit: str
+    possible: PropertyVerdict
+    almost_sure: PropertyVerdict
+    kappa: int | None
+    """Further errors that the task certainly survives; None: any number; -1: G may not be reached
+    even without a further error."""
+    resumed: bool | None
+    """True: the run can still meet its goal; False: it is lost; None: the task has no runs place or
+    no goal transitions."""
+    strategy: tuple[str, ...]
+    """The fewest firings from the state just after the error back to the nominal flow."""
+    alone: bool = True
+    """Whether it can fire in the nominal flow; False: only while another error is handled."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contest:
+    """A conflict that only the order in the file settles."""
+
+    transitions: tuple[str, ...]
+    """The first one fires."""
+    over: tuple[str, ...]
+    """The places of which they want the same token."""
+    matters: Mapping[str, str]
+    """The verdicts that would not hold if another fired, with their reasons."""
+
+
+@dataclass(frozen=True)
+class DeadEnd:
+    """Dead ends with the same marked places: how many, the nearest, and its cause."""
+
+    count: int
+    reason: str
+    witness: Witness
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The verdicts on an execution graph. If the graph is not complete, only what was found can be
+    refused; all else is unknown."""
+
+    x: ExecutionGraph
+    view: OrdinaryView
+    free: Progress | None = None
+    """The same with conflicts that may go either way, where only the order in the file settles
+    some; else None."""
+
+    @cached_property
+    def contests(self) -> tuple[Contest, ...]:
+        """The conflicts that only the order in the file settles."""
+        if self.free is None:
+            return ()
+        compiled = self.x.engine.compiled
+        named = {t.name: t for t in compiled.transitions}
+        ours, theirs = self.verdicts(), self.free.verdicts()
+        matters = {
+            name: theirs[name].reason
+            for name in NAMES
+            if ours[name].holds and not theirs[name].holds
+        }
+        found = []
+        for rivals in sorted(
+            self.free.x.contests, key=lambda names: [named[n].index for n in names]
+        ):
+            needs = [{p for p, _ in named[n].needs} | set(named[n].flags) for n in rivals]
+            shared = set.intersection(*needs) or {p for p, _ in named[rivals[0]].bars}
+            over = [s if isinstance(s, str) else compiled.net.places[s] for s in shared]
+            found.append(Contest(rivals, tuple(sorted(over)), matters))
+        return tuple(found)
+
+    # --- stuck, or for ever on its way ------------------------------------------------------
+
+    @cached_property
+    def dead_ends(self) -> tuple[DeadEnd, ...]:
+        """Dead ends by marked places, nearest first."""
+        groups: dict[tuple[str, ...], list[int]] = {}
+        x = self.x
+        stuck = {settled(x, int(i)) for i in np.flatnonzero(x.dead)[:EXAMINED]}
+        for i in sorted(stuck.difference(x.livelocks)):
+            groups.setdefault(tuple(x.marked(i)), []).append(i)
+        return tuple(
+            DeadEnd(
+                len(members),
+                f"stuck with {describe(x, members[0])}: {explain(x, members[0])}",
+                self.witness(members[0]),
+            )
+            for members in list(groups.values())[:GROUPS]
+        )
+
+    @cached_property
+    def deadlock_free(self) -> PropertyVerdict:
+        """No dead end and no endless firing can be reached."""
+        for state in self.x.livelocks:
+            names = sorted(set(self.x.firings(state)[-20:]))
+            reason = f"{', '.join(names)} can fire for ever without time passing"
+            return self._no(reason, state)
+        for end in self.dead_ends:
+            return PropertyVerdict(False, end.reason, end.witness, complete=self.x.complete)
+        return self._yes("no state is a dead end")
+
+    @cached_property
+    def sound(self) -> PropertyVerdict:
+        """An end can be reached from everywhere."""
+        x = self.x
+        good = x.final | x.given_up
+        good[x.expanded :] = True
+        lost = np.flatnonzero(~x.graph.backward(good))
+        if not len(lost):
+            return self._yes("an end can be reached from every state")
+        first = int(lost[0])
+        reason = f"from {describe(x, first)} no designed end can be reached"
+        if not x.dead.any() and not x.livelocks:
+            final = x.engine.compiled.task.final
+            reason += f": the task can go on for ever, but never comes to {final}"
+        return self._no(reason, first)
+
+    @cached_property
+    def quasi_live(self) -> PropertyVerdict:
+        """Every transition can fire."""
+        fired = set(self.x.first).union(*(step.firings for step in self.x.steps))
+        idle = [t for t in self.x.engine.compiled.transitions if t.name not in fired]
+        if not idle:
+            return PropertyVerdict(True, "every transition can fire", assumption=self._fair)
+        if not self.x.complete:
+            return self._unknown(f"not fired so far: {', '.join(t.name for t in idle)}")
+        roots = [t for t in idle if not self._fed_by(t, {u.index for u in idle})] or idle
+        told = [f"{t.name} can never fire: {self._never(t.index)}" for t in roots]
+        if others := [t.name for t in idle if t not in roots]:
+            told.append(f"and so neither can {', '.join(others)}")
+        return PropertyVerdict(False, "; ".join(told))
+
+    def _fed_by(self, t: CompiledTransition, idle: set[int]) -> bool:
+        """Whether the transition needs a token that only transitions of `idle` give."""
+        net = self.x.engine.compiled.net
+        for p, w in t.needs:
+            givers = {u for u, arcs in enumerate(net.produce) if p in dict(arcs)}
+            if net.initial[p] < w and givers and givers <= idle - {t.index}:
+                return True
+        return False
+
+    def _never(self, t: int) -> str:
+        """Return why a transition never fires, in the words of the first thing that it lacks in
+        every state."""
+        from petrobot.coordinator.engine.draft import Draft
+        from petrobot.coordinator.engine.firing import obstacles
+
+        compiled = self.x.engine.compiled
+        lacking: list[set[str]] = []
+        for state in self.x.states:
+            found = obstacles(Draft(compiled, state), compiled.transitions[t])
+            lacking.append({_lack(one.kind, one.text) for one in found})
+            if not found:
+                return (
+                    "whenever its arcs allow it, its event or time does not come before others fire"
+                )
+        always = set.intersection(*lacking)
+        if always:
+            return f"whenever the engine rests, it {' and '.join(sorted(always))}"
+        return "what it needs is never there together"
+
+    # --- from mission to mission --------------------------------------------------------------
+
+    @cached_property
+    def live(self) -> PropertyVerdict:
+        """From everywhere every transition can fire again."""
+        names = [t.name for t in self.x.engine.compiled.transitions]
+        yes = "from every state every transition can fire again"
+        return self._again(
+            yes,
+            lambda again: again.without(
+                {n: frozenset({n}) for n in names}, "these never fire again"
+            ),
+        )
+
+    @cached_property
+    def proper(self) -> PropertyVerdict:
+        """The first state can be reached again from everywhere."""
+        yes = "the next mission can begin from every state"
+
+        def judged(again: _Again) -> tuple[int, str] | None:
+            away = ~again.graph.backward([0])
+            if not away.any():
+                return None
+            first = int(np.argmax(away))
+            return first, f"from {describe(self.x, first)} the next mission can never begin"
+
+        return self._again(yes, judged)
+
+    @cached_property
+    def stable(self) -> PropertyVerdict:
+        """The nominal flow is always reached again."""
+        nominal = self._nominal
+
+        def judged(again: _Again) -> tuple[int, str] | None:
+            met = np.zeros(len(again.graph.bottom), dtype=np.bool_)
+            met[again.graph.components[nominal]] = True
+            lost = (again.graph.bottom & ~met)[again.graph.components]
+            if not lost.any():
+                return None
+            first = int(np.argmax(lost))
+            return first, f"the task can leave its nominal flow for good: {describe(self.x, first)}"
+
+        return self._again("the nominal flow is always reached again", judged)
+
+    @cached_property
+    def controllable(self) -> PropertyVerdict:
+        """From everywhere each action can be made to start again."""
+        yes = "from every state each action can start again"
+        starts = self.view.starts
+        return self._again(yes, lambda again: again.without(starts, "these never start again"))
+
+    def _again(
+        self, yes: str, judged: Callable[[_Again], tuple[int, str] | None]
+    ) -> PropertyVerdict:
+        x = self.x
+        if not x.complete:
+            return self._unknown("")
+        found = judged(_Again(x, x.final))
+        if found is None:
+            return PropertyVerdict(True, yes, assumption=self._fair)
+        if x.given_up.any():
+            mended = judged(_Again(x, x.final | x.given_up))
+            if mended is None:
+                return PropertyVerdict(True, yes, assumption=MENDED)
+            found = mended
+        return self._no(found[1], found[0])
+
+    # --- what the ordinary net can only estimate ------------------------------------------------
+
+    @cached_property
+    def one_run_each(self) -> PropertyVerdict:
+        """No action place is entered while its run is there."""
+        for place, state in self.x.crowded.items():
+            reason = (
+                f"{place} is entered while its run is still active: it holds "
+                f"{self.x.marked(state).get(place, 2)} tokens, but can run only once at a time"
+            )
+            return self._no(reason, state)
+        return self._yes("no action place is entered while its run is active")
+
+    @cached_property
+    def returned(self) -> PropertyVerdict:
+        """Every resource has its first number of tokens at the end."""
+        net = self.x.engine.compiled.net
+        ends = np.flatnonzero(self.x.final)
+        for place in self.x.engine.compiled.task.places.values():
+            p = net.place_index[place.name]
+            for i in ends if place.kind is Kind.RESOURCE else ():
+                left = self.x.states[int(i)].marking[p]
+                if left != place.tokens:
+                    word = "loses" if left < place.tokens else "gains"
+                    reason = (
+                        f"{place.name} {word} tokens: {place.tokens} at the beginning, {left} at "
+                        "the end"
+                    )
+                    return self._no(reason, int(i))
+        return self._yes("every resource has its initial number of tokens at the end")
+
+    # --- recovery -------------------------------------------------------------------------------
+
+    @cached_property
+    def _nominal(self) -> Mask:
+        """G, without the states in which the task gave up or got stuck."""
+        good = (self.view.is_nominal(s.marking) and not s.stopping for s in self.x.states)
+        nominal = np.fromiter(good, np.bool_, len(self.x))
+        mask: Mask = nominal & ~self.x.given_up & ~self.x.dead
+        return mask
+
+    @cached_property
+    def recoveries(self) -> tuple[Recovery, ...]:
+        """What happens after each error exit that can fire; empty if the graph is not complete."""
+        if not self.x.complete:
+            return ()
+        nested = list(self._nested())
+        back = self.x.graph.backward(self._nominal)
+        lost = ~back
+        open_edges = ~self._nominal[self.x.source]
+        caught = self.x.graph.backward(lost, open_edges)
+        found = []
+        for t in self.x.engine.compiled.transitions:
+            if t.name in self.view.error_exits:
+                edges = np.flatnonzero(self.x.firing([t.name]))
+                if len(edges):
+                    found.append(self._recovery(t.name, edges, back, caught, nested))
+        return tuple(found)
+
+    def _recovery(
+        self,
+        name: str,
+        edges: NDArray[np.int64],
+        back: Mask,
+        caught: Mask,
+        nested: list[Mask],
+    ) -> Recovery:
+        x = self.x
+        first = edges[self._nominal[x.source[edges]]]
+        alone = bool(len(first))
+        edges = first if alone else edges
+        after = np.unique(x.target[edges])
+        held = [bool(w[after].all()) for w in nested]
+        kappa = None if held[-1] else held.index(False) - 1
+        inside = nested[-1 if kappa is None else max(kappa, 0)]
+        path = x.graph.path(int(after[0]), self._nominal, inside[x.target] & ~self._errors)
+        path = path or x.graph.path(int(after[0]), self._nominal) or []
+        when = "" if alone else ", while another error is being handled,"
+        return Recovery(
+            name,
+            self._every(
+                edges,
+                back,
+                f"after {name}{when} the task can always return",
+                "there is no way back",
+            ),
+            self._every(
+                edges,
+                ~caught,
+                f"after {name}{when} the task always returns",
+                "the task may never return",
+            ),
+            kappa,
+            self._resumed(after),
+            tuple(t for e in path for t in x.steps[x.label[e]].firings),
+            alone,
+        )
+
+    def _every(self, edges: NDArray[np.int64], good: Mask, yes: str, no: str) -> PropertyVerdict:
+        bad = edges[~good[self.x.target[edges]]]
+        if not len(bad):
+            return PropertyVerdict(True, f"{yes} to the nominal flow", assumption=self._fair)
+        edge = int(bad[0])
+        target = int(self.x.target[edge])
+        step = self.x.steps[self.x.label[edge]]
+        shown = self.witness(int(self.x.source[edge]))
+        whole = Witness(
+            (*shown.firings, *step.firings), self.x.marked(target), steps=(*shown.steps, str(step))
+        )
+        return PropertyVerdict(
+            False, f"{no} to the nominal flow from {describe(self.x, target)}", whole
+        )
+
+    @cached_property
+    def _errors(self) -> Mask:
+        return self.x.firing(self.view.error_exits)
+
+    def _nested(self) -> Iterator[Mask]:
+        """Yield W_0, W_1, ... until they no longer shrink: the states from which G is reached for
+        certain although that many further errors occur."""
+        x, calm = self.x, ~self._errors
+        quiet = Graph(len(x), x.source[calm], x.target[calm])
+        none = np.zeros(int(calm.sum()), dtype=np.bool_)
+        allowed: Mask | None = None
+        last: Mask | None = None
+        while True:
+            reaching = quiet.almost_sure(self._nominal, none, allowed=allowed)
+            if last is not None and np.array_equal(reaching, last):
+                return
+            yield reaching
+            last = reaching
+            allowed = np.ones(len(x), dtype=np.bool_)
+            allowed[x.source[self._errors & ~reaching[x.target]]] = False
+
+    def _resumed(self, after: NDArray[np.int32]) -> bool | None:
+        """Return whether a goal can be met from all these states before a new run is taken; None
+        without goal transitions or a runs place."""
+        goals, takes = self.view.task.goal_transitions, self.view.run_starts
+        if not goals or not takes:
+            return None
+        before = np.zeros(len(self.x), dtype=np.bool_)
+        before[self.x.source[self.x.firing(goals)]] = True
+        return bool(self.x.graph.backward(before, ~self.x.firing(takes))[after].all())
+
+    # --- words -----------------------------------------------------------------------------------
+
+    def verdicts(self) -> dict[str, PropertyVerdict]:
+        """Return all of them by name."""
+        return {name: getattr(self, name) for name in NAMES}
+
+    def size(self) -> dict[str, Any]:
+        """Return the size of the graph as plain data."""
+        return {
+            "states": len(self.x),
+            "edges": len(self.x.source),
+            "complete": self.x.complete,
+            "reason": self.x.reason,
+            "assumptions": list(self.x.names.assumptions),
+        }
+
+    def size_text(self) -> str:
+        """Return the size of the graph for people."""
+        partial = "" if self.x.complete else f" (partial: {self.x.reason})"
+        return f"{len(self.x)} states, {len(self.x.source)} edges{partial}"
+
+    @cached_property
+    def levels(self) -> tuple[int | None, ...]:
+        """Liveness level of each transition, as in `qualitative.py`; None if unknown."""
+        names = [t.name for t in self.x.engine.compiled.transitions]
+        if not self.x.complete:
+            return (None,) * len(names)
+        again = _Again(self.x, self.x.final | self.x.given_up)
+        always = again.in_every_bottom()
+        inner = np.unique(again.label[again.graph.inner]).tolist()
+        often = set[str]().union(*(again.steps[n].firings for n in inner))
+        once = set(self.x.first).union(*(step.firings for step in self.x.steps))
+        return tuple(
+            4 if n in always else 3 if n in often else 1 if n in once else 0 for n in names
+        )
+
+    @cached_property
+    def home_states(self) -> int | None:
+        """How many states can be reached again from every state; None if unknown."""
+        if not self.x.complete:
+            return None
+        graph = _Again(self.x, self.x.final | self.x.given_up).graph
+        bottoms = np.flatnonzero(graph.bottom)
+        return int((graph.components == bottoms[0]).sum()) if len(bottoms) == 1 else 0
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What is no fault but may surprise: what is assumed of variables, and places whose tokens
+        at the end depend on the path. These may be left over, lost, or a counter on purpose; only
+        the author knows."""
+        said = [f"assumes that {text}" for text in self.x.names.assumptions]
+        ends = [self.x.states[int(i)].marking for i in np.flatnonzero(self.x.final)]
+        for p, place in enumerate(self.x.engine.compiled.net.places):
+            held = {marking[p] for marking in ends}
+            if len(held) > 1:
+                said.append(
+                    f"{place} holds {min(held)} to {max(held)} tokens at the end, depending on the "
+                    "path"
+                )
+        return tuple(said)
+
+    def witness(self, state: int) -> Witness:
+        """Return a shortest path to a state, as firings and as stimuli with their firings."""
+        begin = Step("the mission begins", self.x.first)
+        steps = (str(begin), *map(str, self.x.path(state)))
+        return Witness(self.x.firings(state), self.x.marked(state), steps=steps)
+
+    @property
+    def _fair(self) -> str:
+        return " and ".join((FAIR, *self.x.names.assumptions))
+
+    def _yes(self, reason: str) -> PropertyVerdict:
+        if not self.x.complete:
+            return self._unknown("none found so far")
+        return PropertyVerdict(True, reason, assumption=self._fair)
+
+    def _no(self, reason: str, state: int) -> PropertyVerdict:
+        return PropertyVerdict(False, reason, self.witness(state), complete=self.x.complete)
+
+    def _unknown(self, more: str) -> PropertyVerdict:
+        text = f"unknown: the execution graph was not completed ({self.x.reason})"
+        return PropertyVerdict(None, f"{text}; {more}" if more else text, complete=False)
+
+
+def progress_of(view: OrdinaryView, limit: int) -> Progress:
+    """Return the verdicts on the execution graph of a task, within a limit in stimuli
+    and firings.
+
+    Raises TooManyValues.
+    """
+    free = execute(view.task, limit=limit, free_choice=True)
+    if not free.contests:
+        return Progress(free, view)
+    return Progress(execute(view.task, limit=limit), view, Progress(free, view))
+
+
+class _Again:
+    """The execution graph with an edge from some ends to the first state."""
+
+    def __init__(self, x: ExecutionGraph, ends: Mask) -> None:
+        self.x = x
+        closing = np.flatnonzero(ends).astype(np.int32)
+        source = np.concatenate((x.source, closing))
+        order = np.argsort(source, kind="stable")
+        target = np.concatenate((x.target, np.zeros(len(closing), dtype=np.int32)))
+        label = np.concatenate((x.label, np.full(len(closing), len(x.steps), dtype=np.int32)))
+        self.graph = Graph(len(x), source[order], target[order])
+        self.label = label[order]
+        self.steps = (*x.steps, Step(NEXT, x.first))
+
+    def in_every_bottom(self) -> set[str]:
+        """Return the transitions that fire again and again whatever happened."""
+        every: set[str] | None = None
+        ours = self.graph.components[self.graph.source]
+        for component in np.flatnonzero(self.graph.bottom).tolist():
+            labels = np.unique(self.label[ours == component]).tolist()
+            fired = set[str]().union(*(self.steps[n].firings for n in labels))
+            every = fired if every is None else every & fired
+        return every or set()
+
+    def without(self, wanted: Mapping[str, frozenset[str]], words: str) -> tuple[int, str] | None:
+        """Return a state from which some of the wanted never happen again, in words. Each wanted is
+        a name with the transitions of which one must fire."""
+        components = self.graph.components
+        ours = components[self.graph.source]
+        for component in np.flatnonzero(self.graph.bottom).tolist():
+            labels = np.unique(self.label[(ours == component)]).tolist()
+            fired = set[str]().union(*(self.steps[n].firings for n in labels))
+            never = [name for name, some in wanted.items() if not fired & some]
+            if never:
+                first = int(np.argmax(components == component))
+                return first, f"after {describe(self.x, first)} {words}: {', '.join(never)}"
+        return None
+
+
+def _lack(kind: str, text: str) -> str:
+    """What a transition lacks, without the number of tokens that a state happens to have."""
+    return text.partition(", which")[0] if kind == "short" else text.partition(", which holds")[0]

@@ -1,0 +1,247 @@
+"""XML of net files: a parser that knows the lines, and tables of what a reader understands.
+
+A reader declares for each element which attributes and children it reads (`READ`), which do not
+change the behaviour of the net (`DRAWN`), and which are accepted with one meaning only (`Only`).
+Everything else is refused with its line, so no part of a net is dropped in silence.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import cast
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+from xml.parsers import expat
+
+from petrobot.coordinator.analysis.formats.netfile import NetFileError
+
+DEEPEST = 100
+"""The most levels of elements. Real files have about ten; deeper trees exhaust Python's stack."""
+
+
+class LineElement(Element):
+    """An element that knows the line on which it begins."""
+
+    line: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Only:
+    """Accepted with one of these values (compared without spaces, in lower case), else refused."""
+
+    values: tuple[str, ...]
+    remedy: str
+
+    def allows(self, text: str) -> bool:
+        """Return whether the value means nothing beyond a plain net."""
+        return "".join(text.lower().split()) in self.values
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """Accepted with any value; if it is not one of `silent`, the reader adds the text as a note."""
+
+    silent: tuple[str, ...]
+    text: str
+
+
+READ = "read"
+DRAWN = "drawn"
+Known = str | Only | Note
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """What a reader knows of one element: its attributes and its children, by local name."""
+
+    attributes: Mapping[str, Known] = field(default_factory=dict)
+    children: Mapping[str, Known] = field(default_factory=dict)
+    repeated: frozenset[str] = frozenset()
+    """Children that are read and may occur more than once."""
+
+
+def parse_tree(text: str | bytes, file: str) -> LineElement:
+    """Parse XML. Raises NetFileError for anything but well-formed XML without entities."""
+    return _Parsing(file).parse(text)
+
+
+class _Parsing:
+    """Builds the tree from the events of expat, which tell the line, without recursion."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+        self.parser = expat.ParserCreate(namespace_separator="}")
+        self.parser.buffer_text = True
+        self.parser.StartElementHandler = self._start
+        self.parser.EndElementHandler = self._end
+        self.parser.CharacterDataHandler = self._text
+        self.parser.CommentHandler = self._comment
+        self.parser.EntityDeclHandler = self._entity
+        self.parser.SkippedEntityHandler = self._skipped
+        self.open: list[Element] = []
+        self.last: Element | None = None
+        """The child that ended last in the innermost open element; text after it is its tail."""
+        self.root: LineElement | None = None
+
+    def parse(self, text: str | bytes) -> LineElement:
+        """Return the root. Raises NetFileError."""
+        try:
+            self.parser.Parse(text, True)
+        except expat.ExpatError as error:
+            raise NetFileError(
+                self.file,
+                "XML",
+                expat.ErrorString(error.code),
+                "the file is incomplete or not XML",
+                line=error.lineno,
+            ) from error
+        except (ValueError, LookupError) as error:  # an encoding that is unknown, or of many bytes
+            raise self._fault(str(error), "save the file as UTF-8") from error
+        assert self.root is not None  # expat accepts no document without an element
+        return self.root
+
+    def _fault(self, problem: str, remedy: str) -> NetFileError:
+        line = self.parser.CurrentLineNumber
+        return NetFileError(self.file, "XML", problem, remedy, line=line)
+
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
+        if len(self.open) >= DEEPEST:
+            raise self._fault(
+                f"elements nested more than {DEEPEST} deep", "flatten the pages of the net"
+            )
+        node = LineElement(
+            _braced(name), {_braced(key): value for key, value in attributes.items()}
+        )
+        node.line = self.parser.CurrentLineNumber
+        if self.open:
+            self.open[-1].append(node)
+        else:
+            self.root = node
+        self.open.append(node)
+        self.last = None
+
+    def _end(self, _: str) -> None:
+        self.last = self.open.pop()
+
+    def _text(self, text: str) -> None:
+        if self.last is None:
+            self.open[-1].text = (self.open[-1].text or "") + text
+        else:
+            self.last.tail = (self.last.tail or "") + text
+
+    def _comment(self, text: str) -> None:
+        if self.open:
+            comment = cast(Element, ElementTree.Comment(text))
+            self.open[-1].append(comment)
+            self.last = comment
+
+    def _entity(self, *_: object) -> None:
+        raise self._fault(
+            "the file defines XML entities",
+            "replace them by their text (nested entities could exhaust the memory)",
+        )
+
+    def _skipped(self, name: str, _: object) -> None:
+        raise self._fault(f"the entity &{name}; is not defined here", "replace it by its text")
+
+
+def _braced(name: str) -> str:
+    """Return a name as ElementTree writes it: {namespace}local."""
+    return "{" + name if "}" in name else name
+
+
+def local(element: Element) -> str:
+    """Return the tag of an element without its namespace; "" for comments."""
+    return element.tag.rpartition("}")[2] if isinstance(element.tag, str) else ""
+
+
+def line_of(element: Element) -> int | None:
+    """Return the line on which an element begins; None if it was not read from a file."""
+    return element.line if isinstance(element, LineElement) else None
+
+
+def children(element: Element, tag: str) -> Iterator[Element]:
+    """Yield the children with this tag, in any namespace."""
+    return (child for child in element if local(child) == tag)
+
+
+def label(element: Element, tag: str) -> str | None:
+    """Return the text of a label (`<tag><text>..` or PIPE's `<tag><value>..`), or None."""
+    for child in children(element, tag):
+        for inner in child:
+            if local(inner) in ("text", "value"):
+                return "".join(inner.itertext()).strip()
+        return (child.get("value") or "".join(child.itertext())).strip()
+    return None
+
+
+LABEL = Vocabulary(
+    {"id": DRAWN, "value": READ},
+    {"text": READ, "value": READ, "graphics": DRAWN, "offset": DRAWN, "toolspecific": DRAWN},
+)
+
+
+def check(file: str, node: Element, known: Vocabulary, what: str) -> list[str]:
+    """Refuse what a vocabulary does not contain; return the notes about what it contains.
+
+    `what` names the element in messages ("place p"). Raises NetFileError.
+    """
+    notes = []
+    for key, value in node.attrib.items():
+        if "}" in key:  # xml:id, xsi:schemaLocation: about the document, not about the net
+            continue
+        rule = known.attributes.get(key)
+        notes += _judged(file, node, what, f"attribute {key}", value, rule, known.attributes)
+    seen = set[str]()
+    for child in node:
+        tag = local(child)
+        if not tag:
+            continue
+        rule = known.children.get(tag)
+        text = label(node, tag) or ""
+        notes += _judged(file, child, what, f"element <{tag}>", text, rule, known.children)
+        if rule is not READ and not isinstance(rule, Only):
+            continue
+        if tag in seen and tag not in known.repeated:
+            raise NetFileError(
+                file, what, f"<{tag}> occurs twice", "keep one of them", line=line_of(child)
+            )
+        seen.add(tag)
+    return notes
+
+
+def _judged(
+    file: str,
+    at: Element,
+    what: str,
+    part: str,
+    value: str,
+    rule: Known | None,
+    known: Mapping[str, Known],
+) -> list[str]:
+    if rule is None:
+        read = ", ".join(sorted(key for key, own in known.items() if own != DRAWN))
+        remedy = f"read here: {read or 'nothing'}; remove it in the tool that wrote the file"
+        raise NetFileError(file, what, f"unknown {part}", remedy, line=line_of(at))
+    if isinstance(rule, Only) and not rule.allows(value):
+        raise NetFileError(file, what, f"{part} is {value!r}", rule.remedy, line=line_of(at))
+    if isinstance(rule, Note) and "".join(value.lower().split()) not in rule.silent:
+        return [f"{what}: {part} = {value!r}: {rule.text}"]
+    return []
+
+
+NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
+"""Characters outside of the production Char of XML 1.0."""
+
+
+def xml_text(root: Element) -> str:
+    """Return a tree as an XML document. Raises NetFileError for characters XML cannot hold."""
+    ElementTree.indent(root)
+    text = ElementTree.tostring(root, encoding="unicode")
+    if found := NOT_XML.search(text):
+        raise NetFileError(
+            "XML", "names", f"one holds the character {found[0]!r}", "XML has none: rename it"
+        )
+    return f"<?xml version='1.0' encoding='UTF-8'?>\n{text}\n"

@@ -1,0 +1,159 @@
+"""May this task run? The findings on its file and the verdicts on its state space, together.
+
+`petrobot check`, `run`, `campaign` and the page ask here. They differ in what they do with the
+answer, not in the question.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.task.check import CheckReport, Finding, Severity, check
+
+if TYPE_CHECKING:  # the search needs numpy, which a command that only reads the file does without
+    from petrobot.coordinator.analysis.execution.progress import Contest
+    from petrobot.coordinator.analysis.net.space import SearchLimits
+    from petrobot.coordinator.analysis.report import Analysis
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """What a location file offers."""
+
+    offers: Mapping[str, str]
+    """The node of each action."""
+    source: str = "services.toml"
+    """The location file."""
+    translates: Mapping[str, str] | None = None
+    """The primitive task that each action translates, as its file says; None: not compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """What a judgement may cost. It is counted in states and not in seconds, so that a task gets
+    the same verdict on every machine."""
+
+    markings: int = 100_000
+    """The most markings of the ordinary net; they take about a second."""
+    steps: int = 60_000
+    """The most stimuli and firings of the engine for the execution graph; they take about four
+    seconds. The shipped tasks need less than a third of it."""
+
+    def limits(self) -> SearchLimits:
+        """Return the budget as limits of a search."""
+        from petrobot.coordinator.analysis.net.space import SearchLimits
+
+        return SearchLimits(states=self.markings)
+
+
+BUDGET = Budget()
+"""The budget of `petrobot check`, `run` and the page. `petrobot analyse` has limits of its own."""
+
+WORDS: Mapping[str, str] = {
+    "bounded": "Tokens stay bounded",
+    "safe": "Never two tokens in a place",
+    "deadlock_free": "Never stuck before its end",
+    "quasi_live": "Every transition can fire",
+    "live": "Every transition can fire again, whatever happened",
+    "proper": "Ready for the next mission, whatever happened",
+    "reversible": "Can come back to its beginning",
+    "one_run_each": "One run at a time in each action place",
+    "returned": "Every resource is back at the end",
+    "sound": "Can end properly from everywhere",
+    "stable": "Comes back to its nominal flow after errors",
+    "controllable": "Every error can be recovered from",
+}
+"""A sentence for each verdict that needs to be true."""
+
+
+@dataclass(frozen=True, slots=True)
+class MayRun:
+    """The answer. `analysis` is None where no search was asked for or the file is inconsistent."""
+
+    task: Task
+    report: CheckReport
+    analysis: Analysis | None
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing found forbids running the task."""
+        return self.report.ok and (self.analysis is None or not self.analysis.objections)
+
+    def refusal(self, cell: str = "") -> str:
+        """The findings that forbid running the task, in words; empty if there are none. `cell`
+        names the location file."""
+        if self.report.ok:
+            return ""
+        found = "\n".join(map(_line, self.report.errors))
+        return f"{self.task.name} may not run{f' with {cell}' if cell else ''}:\n{found}"
+
+    def objections(self) -> list[str]:
+        """What the state space shows against running the task, a line for each."""
+        found = {} if self.analysis is None else self.analysis.objections
+        return [
+            f"{self.task.name}: {name.replace('_', ' ')}: {verdict.reason}"
+            for name, verdict in found.items()
+        ]
+
+
+def may_run(task: Task, cell: Cell | None = None, budget: Budget | None = None) -> MayRun:
+    """Judge the task in a cell (None: whether its actions are offered is not examined).
+
+    With a budget the state space is searched as well.
+    """
+    report = (
+        check(task)
+        if cell is None
+        else check(task, cell.offers, translates=cell.translates, source=cell.source)
+    )
+    broken = any(finding.code == "inconsistent" for finding in report.errors)
+    if broken or budget is None:
+        return MayRun(task, report, None)
+    analysis = _search(task, budget)
+    return MayRun(task, _with_contests(report, analysis), analysis)
+
+
+def _search(task: Task, budget: Budget) -> Analysis:
+    from petrobot.coordinator.analysis.report import analyse
+
+    return analyse(task, limits=budget.limits(), steps=budget.steps)
+
+
+def _with_contests(report: CheckReport, analysis: Analysis) -> CheckReport:
+    """Return the findings with the conflicts that the execution graph shows in place of those that
+    the arcs suggest. Where there is no complete graph, the latter stand."""
+    if analysis.progress is None or not analysis.progress.x.complete:
+        return report
+    rest = [f for f in report.findings if f.code not in ("unsettled-conflict", "arrival-order")]
+    found = [_contest(contest) for contest in analysis.progress.contests]
+    errors = [f for f in found if f.severity is Severity.ERROR]
+    notes = [f for f in found if f.severity is Severity.NOTE]
+    return CheckReport((*errors, *rest, *notes))
+
+
+def _contest(contest: Contest) -> Finding:
+    first, *others = contest.transitions
+    names, over = " and ".join(contest.transitions), " and ".join(contest.over)
+    text = (
+        f"{names} may both want the last token of {over}, and the task does not say which one "
+        "gets it"
+    )
+    key = f"transitions.{first}"
+    if not contest.matters:
+        more = (
+            f"; {first} is first in the file and gets it, so {', '.join(others)} may have to wait"
+        )
+        return Finding(Severity.NOTE, "unsettled-conflict", key, f"{text}{more}")
+    told = "; ".join(
+        f"{name.replace('_', ' ')}: {reason}" for name, reason in contest.matters.items()
+    )
+    remedy = "give one a higher `priority`, each a `weight`, or exclusive conditions"
+    text = f"{text}; {first} is first in the file and gets it, but if another did: {told}"
+    return Finding(Severity.ERROR, "unsettled-conflict", key, text, remedy)
+
+
+def _line(finding: Finding) -> str:
+    return f"  {finding.key}: {finding.text}\n    {finding.remedy}"

@@ -1,0 +1,111 @@
+"""Measures of the user: arithmetic over the numbers of a forecast or a long run.
+
+Written as an expression, if wanted with a name in front: `late=late(20)`, `time(0.95)`,
+`busy=1-marked(arm_free)`, `rate(serve)/rate(arrive)`. The numbers are
+
+- `time(Q)`: the time (s) by which a share Q of the completing mission runs has completed;
+- `late(S)`: the probability that a mission run has not completed within S seconds;
+- `rate(TRANSITION)`: its firings per second; of a task in mission runs without pauses;
+- `tokens(PLACE)`, `marked(PLACE)`: time average of its tokens, share of time with any token;
+- `P_complete`, `R_goal`, `R_conj`, `mean` (s): as in the forecast.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from fractions import Fraction
+from math import isfinite
+
+from petrobot.coordinator.analysis.formats.netfile import NetFileError, evaluate
+from petrobot.coordinator.analysis.time.markov import LongRun
+from petrobot.coordinator.analysis.time.task_forecast import Forecast
+
+CALL = re.compile(r"([A-Za-z_]\w*)\(\s*([^()]*?)\s*\)")
+FORM = "write an expression of time(Q), late(S), rate(T), tokens(P), marked(P), mean, P_complete"
+
+
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """A measure as it was written, and its name in tables."""
+
+    name: str
+    text: str
+
+
+def read_measure(text: str) -> Measure:
+    """Split a measure into name and expression."""
+    name, sign, rest = text.partition("=")
+    return Measure(name.strip(), rest.strip()) if sign else Measure(text.strip(), text.strip())
+
+
+def value_of(measure: Measure, found: Forecast | LongRun) -> float:
+    """Return the value of a measure. Raises NetFileError."""
+    numbers: dict[str, Callable[[], float | None]] = {}
+    calls: dict[str, Callable[[str], float]] = {
+        "rate": lambda name: _named(measure, "transition", name, found.throughput),
+        "tokens": lambda name: _named(measure, "place", name, found.mean_tokens),
+        "marked": lambda name: _named(measure, "place", name, found.occupancy),
+    }
+    if isinstance(found, Forecast):
+        calls |= {
+            "time": lambda q: found.completion_time().quantile(_number(measure, q, 0.0, 1.0)),
+            "late": lambda s: _late(found, _number(measure, s, 0.0, float("inf"))),
+        }
+        numbers = {
+            "P_complete": lambda: found.completion_probability,
+            "R_goal": lambda: found.goal_reliability,
+            "R_conj": lambda: found.conjunctive_reliability,
+            "mean": lambda: found.done.mean,
+        }
+    names: dict[str, Fraction] = {}
+
+    def exact(value: float | None, what: str) -> Fraction:
+        if value is None or not isfinite(value):
+            raise _fault(measure, f"{what} is not defined here", "leave it out")
+        return Fraction(value)
+
+    def called(match: re.Match[str]) -> str:
+        word, argument = match.groups()
+        if word not in calls:
+            raise _fault(measure, f"unknown measure {word}(...)", FORM)
+        name = f"value_{len(names)}"
+        names[name] = exact(calls[word](argument), match[0])
+        return f" {name} "
+
+    text = CALL.sub(called, measure.text)
+    names |= {
+        word: exact(number(), word)
+        for word, number in numbers.items()
+        if re.search(rf"\b{word}\b", text)
+    }
+    try:
+        return float(evaluate(text, names))
+    except (ValueError, ZeroDivisionError) as error:
+        raise _fault(measure, str(error), FORM) from error
+
+
+def _late(found: Forecast, seconds: float) -> float:
+    share = found.completion_probability
+    return 1.0 - share * found.completion_time().cdf(seconds) if share > 0 else 1.0
+
+
+def _fault(measure: Measure, problem: str, remedy: str) -> NetFileError:
+    return NetFileError("--measure", measure.text, problem, remedy)
+
+
+def _named(measure: Measure, what: str, name: str, known: dict[str, float]) -> float:
+    if name not in known:
+        raise _fault(measure, f"no {what} {name!r}", f"{what}s: {', '.join(list(known)[:10])}")
+    return known[name]
+
+
+def _number(measure: Measure, text: str, above: float, below: float) -> float:
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise _fault(measure, f"expected a number, got {text!r}", FORM) from error
+    if not above < value < below:
+        raise _fault(measure, f"{text} is out of range", f"give more than {above:g}")
+    return value

@@ -1,0 +1,416 @@
+"""The flat net of a task: what is written in short becomes places, arcs and transitions.
+
+`expand` does all of it, in this order (docs/task-file.md, "What the short forms stand for"):
+
+1. `[errors]`: an error branch for each action place that has none, net by net;
+2. macro places with a subnet: its places and transitions, names prefixed, parameters replaced;
+3. `holds`: arcs from and to the resources;
+4. `tries`: a counter of the tries, and copies of the outgoing transitions by number of used tries;
+5. plain places: `final` asks that they are empty.
+
+Everything that looks at a task afterwards (engine, analysis, journal, exports) sees this net alone.
+What was added carries the name of its origin in `expanded_from`, stands behind what was written,
+and has a name with a dot.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import TYPE_CHECKING
+
+from petrobot.coordinator.task.conditions import Expression, parse, rename
+from petrobot.coordinator.task.elements import (
+    End,
+    Inhibitor,
+    Input,
+    Kind,
+    Output,
+    Parameter,
+    Place,
+    Reference,
+    Subnet,
+    Transition,
+    Value,
+)
+
+if TYPE_CHECKING:
+    from petrobot.coordinator.task.model import Task
+
+Places = Mapping[str, Place]
+Transitions = Mapping[str, Transition]
+
+
+class CircleError(ValueError):
+    """A subnet that contains itself; `key` is that of the macro place in the task file."""
+
+    def __init__(self, inside: tuple[str, ...], place: Place) -> None:
+        super().__init__(
+            f"subnet {place.subnet!r} contains itself by {' > '.join((*inside, place.subnet))}"
+        )
+        self.key = f"subnets.{inside[-1]}.places.{place.name}.subnet"
+
+
+def expand(task: Task) -> Task:
+    """Return the flat task; the task itself if nothing in it is written in short.
+
+    Raises CircleError on subnets that contain themselves. Other faults are for `validation`, which
+    must have found none before the result means anything.
+    """
+    places, transitions = (
+        task.places,
+        _with_error_branches(task.places, task.transitions, task.subnets, task.errors_to),
+    )
+    if any(p.kind is Kind.MACRO for p in places.values()):
+        places, transitions = _unfolded(places, transitions, task.subnets)
+    else:
+        transitions = _with_holding({p.name: p.holds for p in places.values()}, transitions)
+    copies: dict[str, tuple[str, ...]] = {}
+    if any(p.tries > 1 for p in places.values()):
+        places, transitions, copies = _with_tries(places, transitions)
+    places, transitions = _plainly(places), _written_first(transitions)
+    final = _with_empty_places(task.final, places)
+    if (places, transitions, final) == (task.places, task.transitions, task.final):
+        return task
+    goals = tuple(c for goal in task.goal_transitions for c in copies.get(goal, (goal,)))
+    return replace(
+        task,
+        places=places,
+        transitions=transitions,
+        subnets={},
+        final=final,
+        goal_transitions=goals,
+        errors_to="",
+    )
+
+
+# ------------------------------------------------------------------------- default error branches
+
+
+def _with_error_branches(
+    places: Places, transitions: Transitions, subnets: Mapping[str, Subnet], to: str
+) -> Transitions:
+    """The transitions of one net with an error branch to place `to` for each action place, and for
+    each macro place whose subnet can fail, that has none."""
+    if not to:
+        return transitions
+    handled = {a.place for t in transitions.values() for a in t.inputs if a.end is End.ERROR}
+    new: dict[str, Transition] = {}
+    for place in places.values():
+        subnet = subnets.get(place.subnet)
+        can_fail = place.kind is Kind.ACTION or (subnet is not None and bool(subnet.error))
+        if can_fail and place.name not in handled and place.name != to:
+            name = f"{place.name}.error"
+            new[name] = Transition(
+                name,
+                inputs=(Input(place.name, end=End.ERROR),),
+                outputs=(Output(to),),
+                macro=place.macro,
+                expanded_from=place.name,
+            )
+    return {**transitions, **new}
+
+
+# ------------------------------------------------------------------------------------- macro places
+
+
+@dataclass(frozen=True, slots=True)
+class _Scope:
+    """What the names in one net mean: its own places, the parameters of its subnet, else the names
+    of the task."""
+
+    prefix: str
+    places: Places
+    values: Mapping[str, Value] = field(default_factory=dict)
+    """By parameter: the full name of a place, a `Reference`, or a plain value."""
+
+    def place(self, name: str) -> str:
+        """The full name of a place."""
+        if name in self.places:
+            return self.prefix + name
+        return str(self.values.get(name, name))
+
+    def variable(self, name: str) -> str:
+        """The name of the variable that is meant."""
+        value = self.values.get(name)
+        return value.variable if isinstance(value, Reference) else name
+
+    def value(self, value: Value) -> Value:
+        """An argument: the parameter's own value where it refers to one."""
+        return self.values.get(value.variable, value) if isinstance(value, Reference) else value
+
+    def expression(self, expression: Expression) -> Expression:
+        """A condition or value with the names that are meant here."""
+        names = {n: self._text(n) for n in expression.names}
+        return rename(expression, {n: text for n, text in names.items() if n != text})
+
+    def _text(self, name: str) -> str:
+        if name in self.values:
+            value = self.values[name]
+            return value.variable if isinstance(value, Reference) else written(value)
+        place, dot, attribute = name.rpartition(".")
+        return f"{self.place(place)}.{attribute}" if dot else name
+
+
+def written(value: Value) -> str:
+    """A plain value as conditions write it. Raises ValueError for what they cannot say."""
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, str) and not ("'" in value and '"' in value):
+        return f'"{value}"' if "'" in value else f"'{value}'"
+    raise ValueError(f"{value!r} cannot stand in a condition")
+
+
+@dataclass(frozen=True, slots=True)
+class _Flat:
+    """What has been unfolded so far, by full name."""
+
+    subnets: Mapping[str, Subnet]
+    places: dict[str, Place] = field(default_factory=dict)
+    transitions: dict[str, Transition] = field(default_factory=dict)
+    entered: dict[str, Subnet] = field(default_factory=dict)
+    """The subnet of each macro place."""
+    holds: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """What a token in each place holds, macro places too: it is taken once for all that happens
+    inside, which may fork."""
+
+
+def _unfolded(
+    places: Places, transitions: Transitions, subnets: Mapping[str, Subnet]
+) -> tuple[Places, Transitions]:
+    flat = _Flat(subnets)
+    _unfold(flat, _Scope("", places), transitions, ())
+    holding = _with_holding(flat.holds, flat.transitions)  # arcs still name the macro places
+    return flat.places, {name: _rewired(t, flat.entered) for name, t in holding.items()}
+
+
+def _unfold(flat: _Flat, scope: _Scope, transitions: Transitions, inside: tuple[str, ...]) -> None:
+    """Add the places and transitions of one net, and those of the macro places in it."""
+    for place in scope.places.values():
+        name = scope.prefix + place.name
+        flat.holds[name] = tuple(scope.place(r) for r in place.holds)
+        if place.kind is not Kind.MACRO:
+            flat.places[name] = replace(
+                place,
+                name=name,
+                macro=_around(scope.prefix, place.macro),
+                args={n: scope.value(v) for n, v in place.args.items()},
+                out={n: scope.variable(v) for n, v in place.out.items()},
+                holds=flat.holds[name],
+            )
+        if place.kind is not Kind.MACRO or not place.subnet:
+            continue
+        if place.subnet in inside:
+            raise CircleError(inside, place)
+        flat.entered[name] = subnet = flat.subnets[place.subnet]
+        inner = _Scope(f"{name}.", subnet.places, _bound(scope, place, subnet))
+        own = _with_error_branches(
+            subnet.places, subnet.transitions, flat.subnets, subnet.errors_to
+        )
+        _unfold(flat, inner, own, (*inside, place.subnet))
+    for transition in transitions.values():
+        flat.transitions[scope.prefix + transition.name] = _in_scope(transition, scope)
+
+
+def _bound(scope: _Scope, macro: Place, subnet: Subnet) -> dict[str, Value]:
+    """What the parameters of a subnet stand for at one macro place."""
+    bound: dict[str, Value] = {}
+    for name, parameter in subnet.parameters.items():
+        given = macro.args[name]
+        if parameter is Parameter.PLACE:
+            bound[name] = scope.place(given)
+        elif parameter is Parameter.VARIABLE:
+            bound[name] = Reference(scope.variable(given))
+        else:
+            bound[name] = scope.value(given)
+    return bound
+
+
+def _around(prefix: str, macro: str) -> str:
+    """The full name of the innermost macro place around something: the one it names, else the one
+    whose subnet it is in."""
+    return prefix + macro if macro else prefix.removesuffix(".")
+
+
+def _in_scope(t: Transition, scope: _Scope) -> Transition:
+    if not scope.prefix:
+        return t
+    return replace(
+        t,
+        name=scope.prefix + t.name,
+        macro=_around(scope.prefix, t.macro),
+        expanded_from=t.expanded_from and scope.prefix + t.expanded_from,
+        when=t.when and scope.expression(t.when),
+        sets=tuple((scope.variable(n), scope.expression(e)) for n, e in t.sets),
+        inputs=tuple(replace(a, place=scope.place(a.place)) for a in t.inputs),
+        outputs=tuple(replace(a, place=scope.place(a.place)) for a in t.outputs),
+        inhibitors=tuple(replace(a, place=scope.place(a.place)) for a in t.inhibitors),
+    )
+
+
+def _rewired(transition: Transition, entries: Mapping[str, Subnet]) -> Transition:
+    """The transition with its arcs to and from macro places bent to the subnets' entry and exit
+    places."""
+    return replace(
+        transition,
+        inputs=tuple(_from(a, entries) for a in transition.inputs),
+        outputs=tuple(_to(a, entries) for a in transition.outputs),
+    )
+
+
+def _to(arc: Output, entries: Mapping[str, Subnet]) -> Output:
+    while arc.place in entries:
+        arc = replace(arc, place=f"{arc.place}.{entries[arc.place].entry}")
+    return arc
+
+
+def _from(arc: Input, entries: Mapping[str, Subnet]) -> Input:
+    if arc.place not in entries:
+        return arc
+    subnet = entries[arc.place]
+    return replace(
+        arc,
+        place=f"{arc.place}.{subnet.error if arc.end is End.ERROR else subnet.normal}",
+        end=None,
+    )
+
+
+# ---------------------------------------------------------------------------------- held resources
+
+
+def _with_holding(holds: Mapping[str, tuple[str, ...]], transitions: Transitions) -> Transitions:
+    """Transitions that take what their output places hold beyond their input places, and give back
+    what they no longer hold. A token that moves between two holding places never lets go."""
+    if not any(holds.values()):
+        return transitions
+    return {name: _holding(t, holds) for name, t in transitions.items()}
+
+
+def _holding(t: Transition, holds: Mapping[str, tuple[str, ...]]) -> Transition:
+    before, after = Counter[str](), Counter[str]()
+    for held, arcs in ((before, t.inputs), (after, t.outputs)):
+        for arc in arcs:
+            if not (isinstance(arc, Input) and arc.end is End.GOING):
+                for resource in holds[arc.place]:
+                    held[resource] += arc.weight
+    take, give = after - before, before - after
+    return replace(
+        t,
+        inputs=(*t.inputs, *(Input(r, n) for r, n in take.items())),
+        outputs=(*t.outputs, *(Output(r, n) for r, n in give.items())),
+    )
+
+
+# ------------------------------------------------------------------------------------------- tries
+
+
+def _with_tries(
+    places: Places, transitions: Transitions
+) -> tuple[Places, Transitions, dict[str, tuple[str, ...]]]:
+    """Count the tries of a place in `p.left` and `p.used`, and give the used ones back on every way
+    out.
+
+    Each outgoing transition becomes one copy for each number of used tries, of which exactly one
+    can fire: the net stays bounded and is exact without reset arcs. Also returns the names of the
+    copies by written transition.
+    """
+    again = {p.name: p for p in places.values() if p.tries > 1}
+    new_places: dict[str, Place] = {}
+    retries: dict[str, Transition] = {}
+    for p in again.values():
+        for suffix, tokens in (("left", p.tries - 1), ("used", 0)):
+            new_places[f"{p.name}.{suffix}"] = Place(
+                f"{p.name}.{suffix}",
+                Kind.RESOURCE,
+                tokens,
+                capacity=p.tries - 1,
+                macro=p.macro,
+                expanded_from=p.name,
+            )
+        retries[f"{p.name}.retry"] = Transition(
+            f"{p.name}.retry",
+            inputs=(Input(p.name, end=End.ERROR), Input(f"{p.name}.left")),
+            outputs=(Output(f"{p.name}.used"), Output(p.name)),
+            when=parse(_may_retry(p)),
+            macro=p.macro,
+            expanded_from=p.name,
+        )
+    written_ones: dict[str, Transition] = {}
+    copies: dict[str, Transition] = {}
+    names: dict[str, tuple[str, ...]] = {}
+    for t in transitions.values():
+        first, *others = _copies(t, again)
+        written_ones[first.name] = first
+        copies |= {c.name: c for c in others}
+        names[t.name] = (first.name, *(c.name for c in others))
+    return {**places, **new_places}, {**written_ones, **retries, **copies}, names
+
+
+def _may_retry(p: Place) -> str:
+    """The condition under which an ERROR leads to another try."""
+    known = "" if p.retry_unknown else f" and {p.name}.executed != 'unknown'"
+    return f"{p.name}.reason != 'emergency_stop'{known}"
+
+
+def _copies(t: Transition, again: Mapping[str, Place]) -> Iterator[Transition]:
+    """The transition by number of used tries of each such place that it takes a run from; first the
+    one that keeps its name."""
+    taken = [a for a in t.inputs if a.place in again and a.end is not End.GOING]
+    for number, used in enumerate(product(*(range(again[a.place].tries) for a in taken))):
+        copy = t
+        for arc, n in zip(taken, used, strict=True):
+            copy = _returning(copy, again[arc.place], arc, n)
+        if number:
+            name = f"{t.name}.{'_'.join(map(str, used))}"
+            copy = replace(copy, name=name, expanded_from=t.expanded_from or t.name)
+        yield copy
+
+
+def _returning(t: Transition, p: Place, arc: Input, used: int) -> Transition:
+    """The transition when it takes a run of p after so many used tries: it gives them back."""
+    counter, last = f"{p.name}.used", used == p.tries - 1
+    if used:
+        t = replace(
+            t,
+            inputs=(*t.inputs, Input(counter, used)),
+            outputs=(*t.outputs, Output(f"{p.name}.left", used)),
+        )
+    if last:
+        return t
+    t = replace(t, inhibitors=(*t.inhibitors, Inhibitor(counter, used + 1)))
+    if arc.end is End.ERROR:
+        refused = f"not ({_may_retry(p)})"
+        t = replace(t, when=parse(refused if t.when is None else f"({t.when.text}) and {refused}"))
+    return t
+
+
+# ------------------------------------------------------------------------------------ plain places
+
+
+def _written_first(transitions: Transitions) -> Transitions:
+    """What was made stands behind what was written: the order settles conflicts of last resort."""
+    made = {name: t for name, t in transitions.items() if t.expanded_from}
+    return {**{name: t for name, t in transitions.items() if name not in made}, **made}
+
+
+def _plainly(places: Places) -> Places:
+    """The places without the short forms that stand in the net now."""
+    if not any(p.holds or p.tries > 1 for p in places.values()):
+        return places
+    return {name: replace(p, holds=(), tries=1) for name, p in places.items()}
+
+
+def _with_empty_places(final: Expression, places: Places) -> Expression:
+    """`final`, and that the plain places which it does not name are empty."""
+    empty = [
+        f"{p.name} == 0"
+        for p in places.values()
+        if p.kind is Kind.PLAIN and not p.listen and p.name not in final.names
+    ]
+    return parse(" and ".join([f"({final.text})", *empty])) if empty else final

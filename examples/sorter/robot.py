@@ -1,0 +1,80 @@
+"""A robot that sorts parts: an arm on a rail and a barcode scanner, both simulated."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from petrobot import Context, Driver, Ports, Result, error, failure, key, success
+
+STATIONS = {"home": 0.0, "belt": 0.2, "left": 0.5, "right": 0.8}  # m along the rail
+
+
+class Arm(Driver):
+    """Moves along a rail. A real one would send its speed to a motor in `step`."""
+
+    period = 0.01  # s between two steps
+    speed: float = key(0.5, "m/s")
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        super().__init__(config, ports)
+        self.at = self.goal = 0.0  # m
+        self.paused = False
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        if body.get("to") not in STATIONS:
+            raise ValueError(f"to: {body.get('to')!r} is none of {', '.join(STATIONS)}")
+        self.goal = STATIONS[body["to"]]
+
+    def step(self, now: float) -> None:
+        if not self.paused:
+            most = self.speed * self.period
+            self.at += max(-most, min(most, self.goal - self.at))
+
+    def state(self) -> Mapping[str, Any]:
+        return {"at": self.at, "arrived": self.stopped()}
+
+    def stop(self, now: float) -> None:
+        self.goal = self.at
+
+    def stopped(self) -> bool:
+        return self.at == self.goal
+
+    def hold(self, now: float) -> str:
+        self.paused = True
+        return "held"
+
+    def release(self, now: float) -> None:
+        self.paused = False
+
+
+class Scanner(Driver):
+    """Reads barcodes; this one makes them up."""
+
+    unreadable: float = key(0.1, "share of the codes that cannot be read")
+
+    def read(self, ctx: Context) -> str | None:
+        draws = ctx.random("code")
+        return None if draws.random() < self.unreadable else str(draws.choice(["left", "right"]))
+
+
+async def move(ctx: Context, *, to: str) -> Result:
+    """Move the arm to a station."""
+    number = ctx.device.send({"to": to})
+    if not await ctx.wait(lambda: ctx.device.handled >= number, 1.0) or ctx.device.refused:
+        return error("refused", ctx.device.refused or "the arm does not answer")
+    if not await ctx.wait(lambda: ctx.device.state["arrived"], 5.0):
+        return error("blocked", f"the arm did not reach {to} within 5 s")
+    return success()
+
+
+async def grip(ctx: Context, *, slips: float = 0.2) -> Result:
+    """Close the gripper on a part; some slip out."""
+    await ctx.sleep(0.3)
+    slipped = ctx.random("grip").random() < slips
+    return error("slipped", "the part slipped out") if slipped else success()
+
+
+async def scan(ctx: Context) -> Result:
+    """Read the part's barcode: it names the bin."""
+    await ctx.sleep(0.1)
+    code = ctx.device.read(ctx)
+    return success(code=code) if code else failure("unreadable", "put it aside", code="left")

@@ -1,0 +1,219 @@
+"""The execution graph against the engine: random tasks are played with other values and other names
+than the graph was made with, by a clock, and no play leaves the graph; each dead end is replayed
+from the beginning, and the engine reports it."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, assume, event, given, settings
+from hypothesis import strategies as st
+
+from petrobot.coordinator.analysis.execution.causes import explain, settled
+from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, TooManyValues, execute
+from petrobot.coordinator.engine import (
+    ArmTimer,
+    Begin,
+    Choose,
+    Chosen,
+    Engine,
+    EventOccurred,
+    Finished,
+    Fired,
+    Instruction,
+    Mode,
+    Policy,
+    Report,
+    RunEnded,
+    RunRaised,
+    RunStarted,
+    State,
+    Stimulus,
+    StopConfirmed,
+    TimerFired,
+    VariableChanged,
+)
+from petrobot.coordinator.engine.firing import DEAD_END
+from petrobot.coordinator.engine.state import ACTIVE
+from petrobot.coordinator.task import Executed, Scope, Status, Task
+from petrobot.coordinator.task.file import loads
+from tests.engine.test_expansion import LISTEN, SETS, TRIES
+from tests.engine.test_properties import DEVICES, tasks
+
+LIMIT = 1_500
+"""Stimuli and firings for one graph; random tasks that need more are left out."""
+COMMON = settings(
+    phases=(Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink),
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
+)
+
+
+@dataclass
+class Player:
+    """The world: answers every order, raises events, and lets timers elapse by a clock."""
+
+    engine: Engine
+    data: st.DataObject
+    now: float = 0.0
+    due: dict[str, float] = field(default_factory=dict)
+    open: dict[str, Choose] = field(default_factory=dict)
+
+    def heard(self, said: tuple[Instruction, ...]) -> None:
+        """Note the orders of the engine."""
+        for one in said:
+            if isinstance(one, ArmTimer):
+                self.due[one.key] = self.now + one.seconds
+            if isinstance(one, Choose):
+                self.open[one.key] = one
+
+    def next(self, state: State) -> Stimulus | None:
+        """Draw one of the things that can happen now; None if nothing can."""
+        if state.suspended is not None and state.suspended.key:
+            return Chosen(
+                state.suspended.key, self.data.draw(st.sampled_from(state.suspended.alternatives))
+            )
+        armed = {t.key for t in state.timers.values() if not t.elapsed}
+        self.due = {key: due for key, due in self.due.items() if key in armed}
+        first = min(self.due.values(), default=None)
+        possible = self._possible(state)
+        possible += [TimerFired(key) for key, due in self.due.items() if due == first]
+        if not possible:
+            return None
+        chosen = self.data.draw(st.sampled_from(possible))
+        if isinstance(chosen, TimerFired):
+            self.now = self.due.pop(chosen.key)
+        elif self.data.draw(st.booleans()):  # else it comes at the same moment as the last one
+            end = self.now + 1.0 if first is None else first
+            self.now += (end - self.now) * self.data.draw(st.sampled_from((0.25, 0.5)))
+        return chosen
+
+    def _possible(self, state: State) -> list[Stimulus]:
+        found: list[Stimulus] = []
+        task = self.engine.task.flat
+        for run in state.runs():
+            if run.phase in ACTIVE:
+                status = self.data.draw(st.sampled_from(list(Status)))
+                cause = self.data.draw(st.sampled_from(("", "lost", "elsewhere", "emergency_stop")))
+                done = Executed.YES
+                if status is Status.ERROR:
+                    done = self.data.draw(st.sampled_from(Executed))
+                out = {name: self._value(v) for name, v in task.places[run.place].out.items()}
+                if status is Status.ERROR and self.data.draw(st.booleans()):
+                    out = {}
+                found += [RunEnded(run.id, status, cause, "", done, out)] * 3
+                found += [RunRaised(run.id, "seen"), RunStarted(run.id)]
+            elif run.id in self.open and run.phase == "choosing":
+                found += [Chosen(run.id, a) for a in self.open[run.id].alternatives]
+        for run_id in state.stopping:
+            found += [StopConfirmed(run_id), RunEnded(run_id, Status.SUCCESS)]
+        found += [EventOccurred(e.name) for e in task.events.values() if e.scope is Scope.EXTERNAL]
+        written = {v for p in task.places.values() for v in p.out.values()}
+        written |= {name for t in task.transitions.values() for name, _ in t.sets}
+        read = {n for t in task.transitions.values() if t.when for n in t.when.names}
+        for name in sorted((set(task.variables) & read) - written):
+            found.append(VariableChanged(name, self._value(name)))
+        return found
+
+    def _value(self, name: str) -> object:
+        kind = self.engine.task.flat.variables[name].type.value
+        return self.data.draw(st.booleans() if kind == "bool" else st.integers(-9, 9))
+
+
+class Path:
+    """A play, followed on the graph."""
+
+    def __init__(self, x: ExecutionGraph) -> None:
+        self.x = x
+        self.undecided = False
+        """Whether the order in the file settled a conflict in some play."""
+        self.index: dict[Hashable, int] = {}
+        for i, (state, orders) in enumerate(zip(x.states, x.orders, strict=True)):
+            self.index.setdefault(x.names.key(state, orders), i)
+        self.edges = {
+            (int(i), int(j), x.steps[n].firings)
+            for i, j, n in zip(x.source, x.target, x.label, strict=True)
+        }
+
+    def follow(self, player: Player, length: int) -> None:
+        """Play and check each step."""
+        engine, before = self.x.engine, self.x.engine.initial()
+        state, said = engine.handle(before, Begin())
+        orders = self.x.names.next_orders(before, frozenset(), state)
+        at = self.index[self.x.names.key(state, orders)]
+        assert at == 0
+        for _ in range(length):
+            player.heard(said)
+            stimulus = player.next(state)
+            if stimulus is None or state.mode is not Mode.RUNNING or at in self.x.livelocks:
+                return
+            before = state
+            state, said = engine.handle(before, stimulus)
+            if any(isinstance(i, Report) and i.key == "timeless" for i in said):
+                return  # the counter of such firings is not part of a state
+            self.undecided |= any(isinstance(i, Report) and i.key == "undecided" for i in said)
+            orders = self.x.names.next_orders(before, orders, state)
+            there = self.index.get(self.x.names.key(state, orders))
+            firings = tuple(i.transition for i in said if isinstance(i, Fired))
+            assert there is not None, stimulus
+            assert (at == there and not firings) or (at, there, firings) in self.edges, stimulus
+            if self.x.dead[at]:
+                assert not firings
+                assert not any(isinstance(i, Finished) and "dead" not in state.told for i in said)
+            at = there
+
+
+def graph_and_engine_agree(task: Task, data: st.DataObject) -> None:
+    """Make the graph, play beside it, replay its dead ends, and compare what the engine reports."""
+    devices = data.draw(st.sampled_from(({}, DEVICES)))
+    engine = Engine(task, devices, Policy(firing_limit=40))
+    try:
+        x = execute(task, limit=LIMIT, engine=engine)
+    except TooManyValues:
+        assume(False)
+    assume(x.complete)
+    event(f"dead ends: {min(int(x.dead.sum()), 3)}")
+    path = Path(x)
+    for _ in range(4):
+        path.follow(Player(engine, data), 25)
+    for i in np.flatnonzero(x.dead)[:10]:
+        end = settled(x, int(i))
+        state = engine.initial()
+        for stimulus in x.stimuli(end):
+            state, _ = engine.handle(state, stimulus)
+        assert state == x.states[end]
+        assert explain(x, end)
+    leaving = np.bincount(x.source[x.source != x.target], minlength=len(x))
+    for i, state in enumerate(x.states):
+        reported = DEAD_END in state.told or "dead" in state.told
+        if not x.dead[i]:
+            assert not reported
+        elif not leaving[i] and i not in x.livelocks and state.mode is not Mode.FINISHED:
+            assert reported
+    asking = Engine(task, devices, Policy(firing_limit=40, ask_undecided=True))
+    free = execute(task, limit=LIMIT, engine=asking)
+    if free.complete and not free.contests:
+        assert len(free) == len(x) and not path.undecided
+
+
+@settings(COMMON, max_examples=25)
+@given(tasks(), st.data())
+def test_every_play_of_the_engine_is_a_path(task: Task, data: st.DataObject) -> None:
+    graph_and_engine_agree(task, data)
+
+
+@pytest.mark.parametrize("text", [TRIES, LISTEN, SETS])
+@settings(COMMON, max_examples=8)
+@given(data=st.data())
+def test_so_it_is_for_short_forms(text: str, data: st.DataObject) -> None:
+    graph_and_engine_agree(loads(text), data)
+
+
+@pytest.mark.proof
+@settings(COMMON, max_examples=5000)
+@given(tasks(), st.data())
+def test_every_play_of_the_engine_is_a_path_at_length(task: Task, data: st.DataObject) -> None:
+    graph_and_engine_agree(task, data)

@@ -1,0 +1,408 @@
+"""Verdicts on the execution graph: small tasks with known answers, each with its cause."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from petrobot.coordinator.analysis.execution.graph import execute
+from petrobot.coordinator.analysis.execution.progress import MENDED, NAMES, Progress, progress_of
+from petrobot.coordinator.analysis.may_run import Budget, may_run
+from petrobot.coordinator.analysis.net.graph import Graph
+from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
+from petrobot.coordinator.analysis.net.space import explore
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.task.conditions import parse
+from petrobot.coordinator.task.file import load
+from petrobot.coordinator.task.net import Net
+from tests.analysis.random_nets import state_machines
+from tests.engine.conftest import make_task
+
+TASKS = Path(__file__).parents[2] / "coordinator" / "tasks"
+
+
+def judged(task: Task, limit: int = 40_000) -> Progress:
+    return progress_of(OrdinaryView(task), limit)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A small task that gets stuck, and what its dead end must be told by."""
+
+    places: str
+    net: Mapping[str, Mapping[str, Any]]
+    final: str
+    told: tuple[str, ...]
+    events: str = ""
+    more: Mapping[str, Any] | None = None
+
+    @property
+    def task(self) -> Task:
+        """The task."""
+        return make_task(self.places, self.net, self.events, final=self.final, **(self.more or {}))
+
+
+STUCK = {
+    "an ended run waits for a token that does not come back": Case(
+        "arm~=1 parts=2 tray=1 look!",
+        {
+            "next": {"in": "parts arm", "out": "look"},
+            "seen": {"in": "look:normal tray", "out": "arm"},
+            "lost": {"in": "look:error", "out": "arm"},
+        },
+        "parts == 0 and arm == 1",
+        ("look (ended in success)", "tray", "taken by `seen`, and no transition returns it"),
+    ),
+    "each of two branches holds what the other wants": Case(
+        "arm~=1 camera~=1 a=1 b=1 done hold_arm! hold_camera! both_a! both_b!",
+        {
+            "take_arm": {"in": "a arm", "out": "hold_arm"},
+            "take_camera": {"in": "b camera", "out": "hold_camera"},
+            "want_camera": {"in": "hold_arm:normal camera", "out": "both_a"},
+            "want_arm": {"in": "hold_camera:normal arm", "out": "both_b"},
+            "arm_back": {"in": "hold_arm:error", "out": "a arm"},
+            "camera_back": {"in": "hold_camera:error", "out": "b camera"},
+            "done_a": {"in": "both_a:normal", "out": "arm camera done"},
+            "done_b": {"in": "both_b:normal", "out": "arm camera done"},
+            "fail_a": {"in": "both_a:error", "out": "arm camera done"},
+            "fail_b": {"in": "both_b:error", "out": "arm camera done"},
+        },
+        "done == 2",
+        (
+            "want_camera needs camera, which is empty: taken by `take_camera`, still held with "
+            "hold_camera",
+            "want_arm needs arm, which is empty: taken by `take_arm`, still held with hold_arm",
+        ),
+    ),
+    "a branch forgets to return the arm": Case(
+        "arm~=1 parts=2 bin look!",
+        {
+            "next": {"in": "parts arm", "out": "look"},
+            "seen": {"in": "look:normal", "out": "arm"},
+            "dropped": {"in": "look:error", "out": "bin"},
+        },
+        "parts == 0 and arm == 1",
+        ("next needs arm, which is empty: taken by `next`, never returned by `dropped`",),
+    ),
+    "a preempting event can only come while the run is active": Case(
+        "go=1 hold! done",
+        {
+            "begin": {"in": "go", "out": "hold"},
+            "stop": {"in": "hold:preempt=none", "event": "bell", "out": "done"},
+            "broken": {"in": "hold:error", "out": "go"},
+        },
+        "done == 1",
+        ("no transition takes what ended in hold that way",),
+        "bell*",
+    ),
+    "a going arc tests a run that has ended": Case(
+        "go=1 watch! ready=1 done",
+        {
+            "begin": {"in": "go", "out": "watch"},
+            "fetch": {"in": "watch:going ready", "event": "bell", "out": "done"},
+            "end": {"in": "watch:normal done"},
+            "fail": {"in": "watch:error done"},
+        },
+        "watch == 0 and done == 0 and ready == 0 and go == 0",
+        ("end needs done, which is empty: only `fetch` can fill it",),
+        "bell",
+    ),
+    "a join waits for a run that ended in the other way": Case(
+        "go=1 a! b! done",
+        {
+            "begin": {"in": "go", "out": "a b"},
+            "both": {"in": "a:normal b:normal", "out": "done"},
+            "neither": {"in": "a:error b:error", "out": "done"},
+        },
+        "done == 1",
+        ("a (ended in", "b (ended in"),
+    ),
+    "no condition is true of what the run wrote": Case(
+        "go=1 look! low high",
+        {
+            "begin": {"in": "go", "out": "look"},
+            "few": {"in": "look:normal", "out": "low", "when": "n < 3"},
+            "many": {"in": "look:normal", "out": "high", "when": "n > 3"},
+            "fail": {"in": "look:error", "out": "low"},
+        },
+        "low == 1 or high == 1",
+        ("has a false condition (n < 3)", "has a false condition (n > 3)"),
+        more={"variables": {"n": 0}, "out": {"look": {"n": "n"}}},
+    ),
+    "a capacity bars the way for good": Case(
+        "go=2 look! box/1",
+        {
+            "begin": {"in": "go", "out": "look"},
+            "store": {"in": "look:normal", "out": "box"},
+            "fail": {"in": "look:error", "out": "go"},
+        },
+        "go == 0 and look == 0",
+        ("store is barred by box, which holds 1",),
+    ),
+}
+
+
+@pytest.mark.parametrize("what", STUCK)
+def test_a_dead_end_is_found_replayed_and_explained(what: str) -> None:
+    case = STUCK[what]
+    found = judged(case.task)
+    verdict = found.deadlock_free
+    assert verdict.holds is False and found.sound.holds is False
+    assert verdict.witness is not None and verdict.witness.steps
+    for words in case.told:
+        assert words in verdict.reason
+    *_, last = case.task.net.replay(verdict.witness.firings)
+    marked = {p: n for p, n in zip(case.task.net.places, last, strict=True) if n}
+    assert marked == verdict.witness.marking
+    answer = may_run(case.task, None, Budget())
+    assert not answer.ok and any("deadlock free" in line for line in answer.objections())
+
+
+def test_a_task_that_gives_up_after_three_errors_is_sound() -> None:
+    """`final_error` is also satisfied on the way: only a state at rest is an end."""
+    task = make_task(
+        "go=1 act! left=2 failed done",
+        {
+            "begin": {"in": "go", "out": "act"},
+            "good": {"in": "act:normal", "out": "done"},
+            "bad": {"in": "act:error", "out": "failed"},
+            "again": {"in": "failed left", "out": "act"},
+        },
+        final="done == 1",
+        final_error=parse("failed == 1"),
+    )
+    found = judged(task)
+    assert found.sound.holds and found.deadlock_free.holds
+    assert found.live.holds and found.live.assumption == MENDED
+    assert may_run(task, None, Budget()).ok
+
+
+def test_a_branch_that_can_never_fire_is_told_with_its_reason() -> None:
+    task = make_task(
+        "go=1 act! done bin",
+        {
+            "begin": {"in": "go", "out": "act"},
+            "good": {"in": "act:normal", "out": "done"},
+            "bad": {"in": "act:error", "out": "bin done"},
+            "never": {"in": "bin*2", "out": "done"},
+        },
+        final="done == 1",
+    )
+    verdict = judged(task).quasi_live
+    assert verdict.holds is False
+    assert verdict.reason == "never can never fire: whenever the engine rests, it needs 2 of bin"
+
+
+def test_endless_firing_is_told() -> None:
+    task = make_task(
+        "go=1 a b act!",
+        {
+            "begin": {"in": "go", "out": "act"},
+            "good": {"in": "act:normal", "out": "a"},
+            "bad": {"in": "act:error", "out": "go"},
+            "forth": {"in": "a", "out": "b"},
+            "back": {"in": "b", "out": "a"},
+        },
+        final="a == 9",
+    )
+    verdict = judged(task).deadlock_free
+    assert verdict.holds is False
+    assert verdict.reason == "back, forth can fire for ever without time passing"
+
+
+def test_a_loop_that_never_comes_to_its_end_is_not_sound() -> None:
+    task = make_task(
+        "go=1 act! done",
+        {
+            "begin": {"in": "go", "out": "act"},
+            "good": {"in": "act:normal", "out": "go"},
+            "bad": {"in": "act:error", "out": "go"},
+        },
+        final="done == 1",
+    )
+    found = judged(task)
+    assert found.deadlock_free.holds and found.sound.holds is False
+    assert "can go on for ever, but never comes to done == 1" in found.sound.reason
+
+
+def test_an_unfinished_graph_proves_nothing_and_still_refuses_what_it_found() -> None:
+    grows = make_task(
+        "go=1 act! bin",
+        {
+            "begin": {"in": "go", "out": "act"},
+            "good": {"in": "act:normal", "out": "go bin"},
+            "bad": {"in": "act:error", "out": "bin"},
+        },
+        final="bin == 1 and go == 3",
+    )
+    found = judged(grows, 40)
+    assert found.deadlock_free.holds is False and found.live.holds is None
+    fine = replace(
+        grows,
+        transitions={
+            **grows.transitions,
+            "bad": replace(grows.transitions["bad"], outputs=grows.transitions["good"].outputs),
+        },
+    )
+    verdicts = judged(fine, 40).verdicts()
+    assert {verdicts[name].holds for name in NAMES if name != "quasi_live"} == {None}
+    unknown = judged(fine, 40).deadlock_free
+    assert unknown.holds is None and "more than 40 stimuli and firings" in unknown.reason
+
+
+def test_the_order_of_timers_is_kept() -> None:
+    """The shorter of two timers that are armed together elapses first, so `late` never fires."""
+    net: dict[str, dict[str, Any]] = {
+        "soon": {"in": "wait", "out": "a", "after": 1.0},
+        "late": {"in": "wait", "out": "b", "after": 2.0},
+    }
+    found = judged(make_task("wait=1 a b", net, final="a == 1"))
+    assert found.quasi_live.holds is False and found.quasi_live.reason.startswith("late ")
+    assert found.deadlock_free.holds and len(found.x) == 2
+
+
+@pytest.mark.parametrize(
+    ("gone", "matters"), [("a b", False), ("a", True)], ids=["both go on", "one gets stuck"]
+)
+def test_a_conflict_is_a_note_unless_a_verdict_depends_on_it(gone: str, matters: bool) -> None:
+    """`first` and `second` want the same token; the engine serves `first`."""
+    net: dict[str, dict[str, Any]] = {
+        "first": {"in": "token", "out": "a"},
+        "second": {"in": "token", "out": "b"},
+        **{f"end_{p}": {"in": p, "out": "done", "after": 1.0} for p in gone.split()},
+    }
+    task = make_task("token=1 a b done", net, final="done == 1")
+    answer = may_run(task, None, Budget())
+    (found,) = (f for f in answer.report.findings if f.code == "unsettled-conflict")
+    assert "may both want the last token of token" in found.text
+    assert found.severity == ("error" if matters else "note")
+    assert answer.ok is not matters
+    assert ("deadlock free: stuck with b" in found.text) is matters
+    assert ("second may have to wait" in found.text) is not matters
+
+
+def test_transitions_that_are_never_ready_together_are_no_conflict() -> None:
+    net: dict[str, dict[str, Any]] = {
+        "first": {"in": "token", "out": "phase"},
+        "second": {"in": "phase token2", "out": "done"},
+        "third": {"in": "phase", "out": "done", "after": 1.0},
+    }
+    task = make_task("token=1 token2 phase done", net, final="done == 1")
+    codes = [f.code for f in may_run(task, None, Budget()).report.findings]
+    assert "unsettled-conflict" not in codes
+
+
+def test_a_variable_that_no_place_writes_is_named() -> None:
+    net = {"go": {"in": "a", "out": "b", "when": "n > 3"}}
+    found = judged(make_task("a=1 b", net, variables={"n": 0}, final="b == 1"))
+    assert found.sound.holds and "n may take any value at any time" in found.sound.assumption
+    assert found.notes == ("assumes that n may take any value at any time",)
+
+
+# --- recovery -------------------------------------------------------------------------------
+
+
+def arm(attempts: int, *, give_up: bool = True) -> Task:
+    """One action with an error exit, `attempts` retries, and a proper end."""
+    net = {
+        "start": {"in": "idle runs", "out": "move"},
+        "done": {"in": "move:normal", "out": "idle"},
+        "fault": {"in": "move:error", "out": "recover"},
+        "recovered": {"in": "recover:normal", "out": "clean"},
+        "again": {"in": "recover:error left", "out": "recover used"},
+        "forgive": {"in": "clean used", "out": "clean left"},
+        "back": {"in": "clean !used", "out": "idle"},
+    }
+    if give_up:
+        net["give_up"] = {"in": "recover:error !left", "out": "out_of_order"}
+    places = f"idle=1 runs=2 move! recover! clean left={attempts} used out_of_order"
+    return make_task(
+        places,
+        net,
+        final="runs == 0 and idle == 1",
+        final_error=parse("out_of_order == 1"),
+        runs_place="runs",
+        goal_transitions=("done",),
+    )
+
+
+@pytest.mark.parametrize("attempts", [1, 2, 3])
+def test_kappa_counts_the_errors_that_recovery_survives(attempts: int) -> None:
+    found = {r.error_exit: r for r in judged(arm(attempts)).recoveries}
+    fault = found["fault"]
+    assert fault.alone and fault.possible.holds is True
+    assert fault.almost_sure.holds is False and fault.almost_sure.witness is not None
+    assert fault.kappa == attempts and fault.strategy[:2] == ("recovered", "back")
+    assert fault.resumed is False
+    assert not found["again"].alone and found["again"].kappa == 0
+    give_up = found["give_up"]
+    assert give_up.kappa == -1 and give_up.possible.holds is False and not give_up.alone
+
+
+def test_recovery_that_is_never_given_up_survives_any_number_of_errors() -> None:
+    task = arm(0, give_up=False)
+    again = replace(task.transitions["again"], inputs=task.transitions["again"].inputs[:1])
+    outputs = tuple(o for o in again.outputs if o.place == "recover")
+    again = replace(again, outputs=outputs)
+    found = judged(replace(task, transitions={**task.transitions, "again": again}))
+    fault = next(r for r in found.recoveries if r.error_exit == "fault")
+    assert fault.kappa is None and fault.almost_sure.holds
+
+
+def test_the_shipped_tasks_may_run() -> None:
+    for path in sorted(TASKS.glob("*.toml")):
+        found = judged(load(path))
+        assert found.x.complete
+        assert all(verdict.holds for verdict in found.verdicts().values()), path.stem
+
+
+def test_the_catching_task_survives_three_further_errors() -> None:
+    found = judged(load(TASKS / "catch_ball.toml"))
+    kappa = {r.error_exit: r.kappa for r in found.recoveries}
+    assert kappa["move_failed"] == kappa["catch_failed"] == kappa["home_failed"] == 3
+    assert kappa["not_located"] is None and kappa["give_up"] == -1
+    sure = {r.error_exit: r.almost_sure.holds for r in found.recoveries}
+    assert sure["not_located"] and not sure["move_failed"]
+    assert len(found.x) == 418
+
+
+def test_the_same_graph_comes_from_the_same_task() -> None:
+    task = load(TASKS / "catch_ball.toml")
+    one, other = execute(task), execute(task)
+    assert one.steps == other.steps and np.array_equal(one.target, other.target)
+
+
+@settings(max_examples=60, deadline=None)
+@given(state_machines(tokens=1), st.data())
+def test_almost_sure_attraction_is_the_value_one_of_the_decision_process(
+    net: Net, data: st.DataObject
+) -> None:
+    """Against an enumeration of all memoryless strategies.
+
+    A strategy leaves out free edges; all others are equally likely. A vertex wins if and only if
+    under some strategy every vertex that is reached can still reach the goal.
+    """
+    space = explore(net)
+    edges, n = len(space.target), len(space)
+    assume(0 < edges <= 9)
+    free = np.array(data.draw(st.lists(st.booleans(), min_size=edges, max_size=edges)))
+    goal = np.arange(n) == data.draw(st.integers(0, n - 1))
+    graph = Graph(n, space.source, space.target)
+    expected = np.zeros(n, dtype=bool)
+    choices = np.flatnonzero(free)
+    for pick in range(1 << len(choices)):
+        kept = ~free
+        kept[choices[[bool(pick >> k & 1) for k in range(len(choices))]]] = True
+        kept &= ~goal[space.source]
+        can = graph.backward(goal, kept)
+        for v in range(n):
+            reached = graph.forward([v], kept)
+            expected[v] |= bool(can[reached].all())
+    assert np.array_equal(graph.almost_sure(goal, free), expected)

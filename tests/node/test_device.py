@@ -1,0 +1,100 @@
+"""The base class of drivers: what it does by itself, and the keys of a device's table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from petrobot.services.comm.location_file import DeviceEntry, DirectoryError, parse
+from petrobot.services.device import Driver, key, read_keys
+from petrobot.services.node.drivers import make_driver
+
+CELL = """schema = 1
+[nodes.pc]
+host = "127.0.0.1"
+port = 7300
+"""
+
+
+class Scanner(Driver):
+    """A driver without cyclic work: nothing but what it does."""
+
+    port: str = key(text="serial port")
+    rate: float = key(9600, "baud")
+    tries: int = key(3)
+    loud = key(False)
+    codes: list[str] = key([])
+
+    def read(self) -> str:
+        """Return the newest code."""
+        return f"{self.port}@{self.rate}"
+
+
+class Broken(Driver):
+    """A driver whose device is not there."""
+
+    def __init__(self, config: Mapping[str, Any], ports: Any) -> None:
+        super().__init__(config, ports)
+        raise FileNotFoundError(2, "No such file or directory", "/dev/ttyUSB7")
+
+
+def made(driver: str, **config: Any) -> Driver:
+    """The driver of a device with this table."""
+    cell = parse(CELL, Path("services.toml"))
+    return make_driver(cell, DeviceEntry("it", "pc", f"{__name__}:{driver}", config), None)  # type: ignore[arg-type]
+
+
+def test_a_driver_needs_only_what_its_device_does() -> None:
+    scanner = made("Scanner", port="/dev/ttyUSB0", rate=19200)
+    assert isinstance(scanner, Scanner) and scanner.read() == "/dev/ttyUSB0@19200.0"
+    assert (scanner.tries, scanner.loud, scanner.codes) == (3, False, [])
+    assert scanner.period is None and scanner.state() == {} and scanner.stopped()
+    assert scanner.hold(0.0) == "held"
+    for method in (scanner.step, scanner.stop, scanner.release):
+        method(0.0)
+    scanner.close()
+    with pytest.raises(ValueError, match="takes no commands"):
+        scanner.command(0.0, {"go": 1})
+
+
+def test_two_devices_do_not_share_a_default() -> None:
+    first, second = (made("Scanner", port=name) for name in "ab")
+    assert isinstance(first, Scanner) and isinstance(second, Scanner)
+    first.codes.append("x")
+    assert second.codes == []
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        ({}, "port: is missing; expected a text (serial port)"),
+        ({"port": 3}, "port: expected a text (serial port), found 3"),
+        ({"port": "a", "rate": "fast"}, "rate: expected a number (baud), found 'fast'"),
+        ({"port": "a", "rate": True}, "rate: expected a number (baud), found True"),
+        ({"port": "a", "rate": float("nan")}, "rate: expected a number"),
+        ({"port": "a", "tries": 1.5}, "tries: expected a whole number, found 1.5"),
+        ({"port": "a", "tries": True}, "tries: expected a whole number, found True"),
+        ({"port": "a", "loud": 1}, "loud: expected true or false, found 1"),
+        ({"port": "a", "codes": "x"}, "codes: expected a list, found 'x'"),
+        ({"port": "a", "rat": 1}, "unknown key 'rat'; did you mean 'rate'?"),
+        ({"rat": 1}, "port: is missing; expected a text (serial port); unknown key 'rat'"),
+    ],
+)
+def test_a_wrong_key_is_refused_by_name(config: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError) as fault:
+        read_keys(Scanner, config)
+    assert words in str(fault.value)
+    with pytest.raises(DirectoryError, match=r"services\.toml: devices\.it: .*mend the keys"):
+        made("Scanner", **config)
+
+
+def test_keys_of_ports_are_no_faults() -> None:
+    assert read_keys(Scanner, {"port": "a", "source": "sim", "bitrate": 1})["port"] == "a"
+
+
+def test_a_device_that_is_not_there_is_not_a_wrong_key() -> None:
+    with pytest.raises(DirectoryError, match=r"cannot open its device.*check that it is connected"):
+        made("Broken")

@@ -1,0 +1,92 @@
+"""The robots in `examples/` are what the tutorial says, and run as it says."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.ports import free_ports
+
+ROOT = Path(__file__).parents[1]
+SORTER = ROOT / "examples" / "sorter"
+TUTORIAL = ROOT / "docs" / "tutorial.md"
+
+
+@pytest.fixture
+def sorter(tmp_path: Path) -> Path:
+    """A copy of the tutorial's robot, with ports that are free here."""
+    folder = shutil.copytree(SORTER, tmp_path / "sorter")
+    cell = folder / "services.toml"
+    text = cell.read_text(encoding="utf-8")
+    for written, free in zip(("7501", "7502"), free_ports(2), strict=True):
+        text = text.replace(written, str(free))
+    cell.write_text(text, encoding="utf-8")
+    return folder
+
+
+def petrobot(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a command in a folder as a user does."""
+    return subprocess.run(
+        [sys.executable, "-m", "petrobot.coordinator", *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT / "src")},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+def test_the_tutorial_shows_the_files_as_they_are() -> None:
+    """Each line of its code stands in the file that its section names, in this order."""
+    page = TUTORIAL.read_text(encoding="utf-8")
+    shown = 0
+    for section in re.split(r"^## ", page, flags=re.MULTILINE):
+        name = re.match(r"\d\. .*`(\S+)`\n", section)
+        for block in re.findall(r"```(?:python|toml)\n(.*?)```", section, re.DOTALL):
+            assert name is not None, section
+            lines = iter((SORTER / name[1]).read_text(encoding="utf-8").splitlines())
+            for line in filter(None, block.splitlines()):
+                assert line in lines, f"{name[1]}: {line}"
+                shown += 1
+    assert shown >= 30
+    files = [p.read_text(encoding="utf-8").splitlines() for p in SORTER.iterdir() if p.is_file()]
+    assert sum(1 for lines in files for line in lines if line.strip()) <= 130
+
+
+@pytest.mark.processes
+def test_it_runs_in_simulated_time(sorter: Path) -> None:
+    """The same seed gives the same run; parts that slip are gripped again."""
+    ran = [
+        petrobot(
+            sorter,
+            *("run", "sort.toml", "--mode", "lockstep", "--seed", seed, "--quiet", "--no-page"),
+            *("--json", f"{number}.json"),
+        )
+        for number, seed in enumerate("334")
+    ]
+    assert [each.returncode for each in ran] == [0, 0, 0], [each.stderr for each in ran]
+    first, again, other = (
+        json.loads((sorter / f"{n}.json").read_text(encoding="utf-8")) for n in range(3)
+    )
+    assert first["status"] == "success"
+    assert first["sim_s"] == again["sim_s"] != other["sim_s"]
+    assert re.fullmatch(
+        r"\d+ runs; (\d+) errors?, all recovered \[grip: slipped( \(\1\))?\]", first["happened"]
+    ), first["happened"]
+
+
+@pytest.mark.processes
+def test_it_runs_in_real_time(sorter: Path) -> None:
+    one_part = (
+        (sorter / "sort.toml").read_text(encoding="utf-8").replace("tokens = 5", "tokens = 1")
+    )
+    (sorter / "sort.toml").write_text(one_part, encoding="utf-8")
+    ran = petrobot(sorter, "run", "sort.toml", "--up", "--quiet", "--no-page")
+    assert ran.returncode == 0, ran.stdout + ran.stderr
