@@ -37,6 +37,7 @@ from petrobot.services.comm.location_file import load
 from tests.chaos.by_proxy import NODES
 from tests.chaos.shuttle_cell import ROOT, TASK, moves, shuttle_services
 from tests.ports import free_ports
+from tests.processes import children, kill
 from tests.waiting import beat
 
 MARK = "PETROBOT_STORM"
@@ -149,11 +150,8 @@ class Weather:
         return int(self._draw.choice(sorted(running.values()))) if running else 0
 
     def _worker(self) -> int:
-        node = self._node()
-        with contextlib.suppress(OSError):
-            children = Path(f"/proc/{node}/task/{node}/children").read_text().split()
-            return int(self._draw.choice(children)) if children else 0
-        return 0
+        workers = sorted(children(self._node()))
+        return int(self._draw.choice(workers)) if workers else 0
 
 
 class Storm:
@@ -371,8 +369,7 @@ async def _listens(port: int) -> bool:
 
 def _signal(process: int, number: signal.Signals) -> None:
     if process:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(process, number)
+        kill([process], number)
 
 
 def _link(state: str) -> None:

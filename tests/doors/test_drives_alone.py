@@ -4,8 +4,6 @@ themselves."""
 from __future__ import annotations
 
 import asyncio
-import os
-import signal
 import threading
 import warnings
 from importlib.resources import files
@@ -18,26 +16,11 @@ from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.services.comm.canopen.cia402 import DriveFault, DriveState, state_of
 from tests.doors.arm_cell import DRIVES, cell_in, ear_on
 from tests.doors.test_estop import LIMIT, Cell
+from tests.processes import below, kill
 
 pytestmark = pytest.mark.processes
 DRIVE_EDS = str(files("petrobot.services.comm.canopen.eds").joinpath("joint_drive.eds"))
 STATUSWORD, ERROR_CODE, POSITION = 0x6041, 0x603F, 0x6064
-
-
-def family(process: int) -> list[int]:
-    """A process and all that it has started, oldest first."""
-    parents: dict[int, list[int]] = {}
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                fields = (entry / "stat").read_text().rpartition(")")[2].split()
-            except OSError:
-                continue  # it has ended meanwhile
-            parents.setdefault(int(fields[1]), []).append(int(entry.name))
-    found = [process]
-    for one in found:
-        found += parents.get(one, [])
-    return found
 
 
 class Bench:
@@ -92,8 +75,8 @@ async def test_drives_stop_by_themselves_when_their_master_is_killed(tmp_path: P
             cell = Cell(tmp_path, directory, supervisor, ear)
             try:
                 await cell.sweep()
-                for process in family(supervisor.process_ids()["motion"]):
-                    os.kill(process, signal.SIGKILL)
+                node = supervisor.process_ids()["motion"]
+                kill([node, *below(node)])
                 channel = directory.devices["arm"].config["channel"]
                 states, codes, before, after = await asyncio.to_thread(left_alone, channel)
             finally:

@@ -21,6 +21,7 @@ from petrobot.services.comm.protocol.messages import Call, Hello
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 from tests.integration.test_resume_processes import nodes
 from tests.ports import free_ports
+from tests.processes import alive, below, children, kill
 from tests.waiting import beat
 
 pytestmark = pytest.mark.processes
@@ -69,35 +70,6 @@ def until(holds: Callable[[], bool], what: str) -> None:
         pause.wait(0.01)
 
 
-def below(process: int) -> set[int]:
-    """All processes that descend from this one."""
-    try:
-        children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
-    except OSError:
-        return set()
-    found = {int(child) for child in children}
-    return found.union(*(below(child) for child in found)) if found else found
-
-
-def alive(processes: set[int]) -> list[str]:
-    """Command lines of those that still run (a zombie does not)."""
-    found = []
-    for process in processes:
-        try:
-            state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
-            line = (
-                Path(f"/proc/{process}/cmdline")
-                .read_bytes()
-                .replace(b"\0", b" ")
-                .decode(errors="replace")
-            )
-        except OSError:
-            continue
-        if state not in "ZX":
-            found.append(f"{process} {state} {line}")
-    return found
-
-
 async def call(folder: Path, names: tuple[str, ...]) -> None:
     """Call these actions and services of the node, and wait until each says that it hangs."""
     directory = load(folder / "services.toml")
@@ -131,15 +103,13 @@ def hanging_cell(folder: Path) -> Iterator[tuple[int, int]]:
     launcher = nodes(folder)
     family = below(launcher.pid)
     try:
-        [node] = Path(f"/proc/{launcher.pid}/task/{launcher.pid}/children").read_text().split()
+        [node] = children(launcher.pid)
         asyncio.run(call(folder, ACTIONS))
         (folder / "servo").touch()
         until((folder / "servo.hung").exists, "the servo does not hang")
-        yield launcher.pid, int(node)
+        yield launcher.pid, node
     finally:
-        for process in {launcher.pid, *family, *below(launcher.pid)}:
-            if alive({process}):
-                os.kill(process, signal.SIGKILL)
+        kill({launcher.pid, *family, *below(launcher.pid)})
         launcher.wait(PATIENCE)
 
 
@@ -148,10 +118,10 @@ def test_a_node_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
     the interpreter held."""
     with hanging_cell(tmp_path) as (launcher, node):
         os.kill(launcher, signal.SIGSTOP)  # so that it starts no other, and reaps nothing
-        children = below(node)
-        assert len(children) >= 2 * 4, "each of them has its keeper"
+        family = below(node)
+        assert len(family) >= 2 * 4, "each of them has its keeper"
         os.kill(node, signal.SIGKILL)
-        until(lambda: not alive(children), f"left behind: {alive(children)}")
+        until(lambda: not any(map(alive, family)), f"left behind: {family}")
 
 
 def test_a_launcher_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
@@ -162,7 +132,7 @@ def test_a_launcher_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
         family = below(launcher)
         assert node in family and len(family) >= 1 + 2 * 4, "each worker has its keeper"
         os.kill(launcher, signal.SIGKILL)
-        until(lambda: not alive(family), f"left behind: {alive(family)}")
+        until(lambda: not any(map(alive, family)), f"left behind: {family}")
 
 
 def test_a_lock_step_node_ends_with_its_launcher(tmp_path: Path) -> None:
@@ -174,4 +144,4 @@ def test_a_lock_step_node_ends_with_its_launcher(tmp_path: Path) -> None:
     assert len(family) == 1
     os.kill(launcher.pid, signal.SIGKILL)
     launcher.wait(PATIENCE)
-    until(lambda: not alive(family), f"left behind: {alive(family)}")
+    until(lambda: not any(map(alive, family)), f"left behind: {family}")

@@ -7,13 +7,14 @@ import asyncio
 import os
 import signal
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.node.test_kills import passing
-from tests.node.test_processes import CELL, PATIENCE, Nodes, Operator, alive, operator_of, pids
+from tests.node.test_processes import CELL, PATIENCE, Nodes, Operator, operator_of, pids
+from tests.processes import alive, kill
 
 pytestmark = pytest.mark.processes
 DEADLINE = 1.0
@@ -34,9 +35,17 @@ WAYS = ("fork", "daemon", "program", "program with sockets")
 PLACES = ("leave_behind", "leave_behind_eye", "leave_behind_slide")
 
 
+@pytest.fixture(scope="module")
+def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nodes]:
+    """Both nodes, shared by the tests that must leave them in working order."""
+    running = Nodes(tmp_path_factory.mktemp("cell"), "left", "right", text=TEXT)
+    yield running
+    assert running.stop() == {"left": 0, "right": 0}
+
+
 @pytest.fixture
-async def nodes(tmp_path: Path) -> AsyncIterator[Nodes]:
-    """Both nodes, for this test alone."""
+def own_nodes(tmp_path: Path) -> Iterator[Nodes]:
+    """Both nodes, for one test that stops them or counts on fresh workers."""
     running = Nodes(tmp_path, "left", "right", text=TEXT)
     try:
         yield running
@@ -90,8 +99,9 @@ async def test_what_a_crashed_worker_left_ends_with_it(
 
 @pytest.mark.parametrize("way", ["worker killed", "node killed", "node stopped"])
 async def test_what_an_action_left_lives_as_long_as_its_worker(
-    nodes: Nodes, tmp_path: Path, way: str
+    own_nodes: Nodes, tmp_path: Path, way: str
 ) -> None:
+    nodes = own_nodes
     async with operator_of(nodes.directory, "left", "right") as operator:
         left, workers = [], []
         for how in WAYS:
@@ -103,8 +113,7 @@ async def test_what_an_action_left_lives_as_long_as_its_worker(
                 workers.append(end.values["pid"])
         assert all(map(alive, left)), "an action that ends well keeps what it has started"
         if way == "worker killed":
-            for worker in set(workers):
-                os.kill(worker, signal.SIGKILL)
+            kill(set(workers))
         elif way == "node stopped":
             assert await asyncio.to_thread(nodes.stop) == {"left": 0, "right": 0}
         else:
@@ -140,17 +149,23 @@ async def test_a_copy_that_returns_from_the_action_does_nothing_more(
     )
 
 
-async def test_a_stopped_worker_is_killed_at_the_deadline(operator: Operator) -> None:
-    for service, arguments, node, device in (
-        ("nap", {"seconds": 60.0}, "left", ""),
-        ("go", {"to": 90.0, "timeout": 60.0}, "left", "slide"),
-    ):
-        running = asyncio.create_task(operator.call(service, DEADLINE, **arguments))
-        await passing(0.3)
-        os.kill((await pids(operator, node, device))["actions"], signal.SIGSTOP)
-        end = await running
-        assert (end.cause, end.executed) == ("deadline", "yes") and "answered nothing" in end.text
-    assert (await operator.call("go", to=0.0)).status == "success"
+async def test_a_stopped_worker_is_killed_at_the_deadline(own_nodes: Nodes) -> None:
+    """On fresh nodes: the only worker there is the one that runs the action."""
+    async with operator_of(own_nodes.directory, "left", "right") as operator:
+        for service, arguments, node, device in (
+            ("nap", {"seconds": 60.0}, "left", ""),
+            ("go", {"to": 90.0, "timeout": 60.0}, "left", "slide"),
+        ):
+            running = asyncio.create_task(operator.call(service, 3.0 * DEADLINE, **arguments))
+            async with asyncio.timeout(60.0):
+                while "actions" not in (found := await pids(operator, node, device)):
+                    await passing(0.05)
+            await passing(0.3)  # until its action runs
+            os.kill(found["actions"], signal.SIGSTOP)
+            end = await running
+            assert (end.cause, end.executed) == ("deadline", "yes"), end
+            assert "answered nothing" in end.text
+        assert (await operator.call("go", 60.0, to=0.0, timeout=50.0)).status == "success"
 
 
 async def test_one_that_blocks_and_one_that_crashes_end_alone(operator: Operator) -> None:
@@ -193,18 +208,19 @@ async def test_at_the_limit_a_run_is_refused_and_says_so(operator: Operator) -> 
     )
 
 
-async def test_too_much_memory_ends_one_run_and_no_other(operator: Operator) -> None:
-    nap = asyncio.create_task(operator.call("nap", 20.0, seconds=1.0))
-    before = await operator.call("pid")
-    end = await operator.call("eat", 20.0, megabytes=4000)
-    assert (end.status, end.cause, end.executed) == ("error", "out_of_memory", "yes"), end
-    kept = await operator.call("keep_memory", 20.0)
-    assert (kept.status, kept.cause) == ("error", "out_of_memory"), kept
-    assert (await nap).status == "success"
-    assert (await operator.call("eat", megabytes=600)).values == {"bytes": 600 << 20}, (
-        "the memory of another run"
-    )
-    assert (await operator.call("pid")).values != before.values
+async def test_too_much_memory_ends_one_run_and_no_other(own_nodes: Nodes) -> None:
+    async with operator_of(own_nodes.directory, "left", "right") as operator:
+        nap = asyncio.create_task(operator.call("nap", 20.0, seconds=1.0))
+        before = await operator.call("pid")
+        end = await operator.call("eat", 20.0, megabytes=4000)
+        assert (end.status, end.cause, end.executed) == ("error", "out_of_memory", "yes"), end
+        kept = await operator.call("keep_memory", 20.0)
+        assert (kept.status, kept.cause) == ("error", "out_of_memory"), kept
+        assert (await nap).status == "success"
+        assert (await operator.call("eat", megabytes=600)).values == {"bytes": 600 << 20}, (
+            "the memory of another run"
+        )
+        assert (await operator.call("pid")).values != before.values
 
 
 async def test_hold_and_stop_reach_all_runs_without_a_device(operator: Operator) -> None:

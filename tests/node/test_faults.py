@@ -4,7 +4,6 @@ alone, is killed or frozen."""
 from __future__ import annotations
 
 import asyncio
-import os
 import signal
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +13,7 @@ import pytest
 
 from petrobot.services.comm.calls.caller import PeerLost
 from tests.node.test_processes import Nodes, Operator, operator_of, pids
+from tests.processes import kill
 
 pytestmark = pytest.mark.processes
 PERIOD = 0.02
@@ -46,8 +46,7 @@ async def test_a_device_stands_when_the_sender_of_its_stream_is_lost(
             # holds.
             leading = asyncio.create_task(operator.call("lead", seconds=60.0, speed=1000.0))
             await operator.until(lambda: _counted(operator, 10))
-            for victim in victims:
-                os.kill(victim, how)
+            kill(victims, how)
             await operator.until(lambda: _older(operator, 4 * PERIOD))
             stood = await slide(operator)
             await operator.until(lambda: _older(operator, 20 * PERIOD))
@@ -60,9 +59,8 @@ async def test_a_device_stands_when_the_sender_of_its_stream_is_lost(
             leading.cancel()
             following.cancel()
             await asyncio.gather(leading, following, return_exceptions=True)
-            for victim in victims:
-                if how is signal.SIGSTOP:
-                    os.kill(victim, signal.SIGCONT)
+            if how is signal.SIGSTOP:
+                kill(victims, signal.SIGCONT)
     finally:
         running.stop()
 

@@ -4,7 +4,6 @@ and takes runs."""
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import os
 import random
@@ -21,7 +20,9 @@ from typing import Any
 
 import pytest
 
-from tests.node.test_processes import ROOT, Nodes, Operator, alive, operator_of, pids
+from tests import processes
+from tests.node.test_processes import ROOT, Nodes, Operator, operator_of, pids
+from tests.processes import alive
 
 pytestmark = pytest.mark.processes
 RECOVERY = 60.0
@@ -74,9 +75,7 @@ async def kill(operator: Operator, chance: random.Random, tally: Tally) -> set[i
     chosen, how = chance.choice(VICTIMS), chance.choice(HOWS)
     victims = {found[name] for name in chosen if name in found}
     for name in how.split(", then "):
-        for victim in victims:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(victim, getattr(signal, name))
+        processes.kill(victims, getattr(signal, name))
         if name == "SIGSTOP":
             await passing(chance.uniform(0.0, 0.3))
     label = f"{how} of {' and '.join(chosen)}"
@@ -204,21 +203,14 @@ async def test_a_keeper_that_is_killed_or_frozen_costs_no_more_than_its_worker(
                 *(await pids(operator, "left", "slide")).values(),
                 *(await pids(operator, "left", "")).values(),
             }
-            keepers = [
-                int(one) for one in Path(f"/proc/{node}/task/{node}/children").read_text().split()
-            ]
+            keepers = processes.children(node)
             assert len(keepers) == len(workers) == 3 and workers.isdisjoint(keepers)
-            for keeper in keepers:
-                os.kill(keeper, getattr(signal, how))
+            processes.kill(keepers, getattr(signal, how))
             if how == "SIGSTOP":
                 hanging = [operator.call("hang", 1.0), operator.call("hang_moving", 1.0)]
                 assert [end.cause for end in await asyncio.gather(*hanging)] == ["deadline"] * 2
-                for victim in workers:
-                    with contextlib.suppress(ProcessLookupError):
-                        os.kill(victim, signal.SIGKILL)
-                for keeper in keepers:
-                    with contextlib.suppress(ProcessLookupError):
-                        os.kill(keeper, signal.SIGCONT)
+                processes.kill(workers)
+                processes.kill(keepers, signal.SIGCONT)
             await operator.until(partial(up, operator, workers), RECOVERY)
             assert (await operator.call("go", to=0.0)).status == "success"
             assert (await operator.call("add", a=1)).values == {"sum": 2}

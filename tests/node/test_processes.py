@@ -17,22 +17,25 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm.calls.caller import (
-    CallAccepted,
-    Caller,
-    CommandAnswered,
-    EventArrived,
-    Notice,
-)
+from petrobot.services.comm.calls.caller import Caller, Notice
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.location_file import Directory, parse
 from petrobot.services.comm.lockstep.mesh import Member
-from petrobot.services.comm.protocol.messages import Answer, Call, Command, Hello, Outcome
+from petrobot.services.comm.protocol.messages import (
+    Accept,
+    Answer,
+    Call,
+    Command,
+    Event,
+    Hello,
+    Outcome,
+)
 from tests.node.conftest import OUTSIDE
 from tests.node.test_lockstep import CALLS, Coordinator, World, trace_of
 from tests.node.test_lockstep import CELL as LOCKSTEP
 from tests.node.test_lockstep import Bench as LockstepBench
 from tests.ports import free_ports
+from tests.processes import alive, children
 from tests.waiting import Limit
 
 pytestmark = pytest.mark.processes
@@ -75,7 +78,10 @@ run = "toy_cell.actions:slow_service"
 [actions]
 go = {{ run = "toy_cell.actions:go", task = "move", device = "slide" }}
 follow = {{ run = "toy_cell.actions:follow", task = "move", device = "slide" }}
-hang_moving = {{ run = "toy_cell.actions:hang_moving", task = "move", device = "slide", deadline = 0.3 }}
+hang_moving.run = "toy_cell.actions:hang_moving"
+hang_moving.task = "move"
+hang_moving.device = "slide"
+hang_moving.deadline = 0.3
 crash_arm = {{ run = "toy_cell.actions:segfault", task = "move", device = "slide" }}
 lead = {{ run = "toy_cell.actions:lead", task = "see", device = "eye" }}
 eye_pid = {{ run = "toy_cell.actions:pid", task = "see", device = "eye" }}
@@ -142,8 +148,8 @@ class Operator:
         client, identity = self.clients[node], f"{verb} {self.numbers}"
         client.caller.command(client.now(), Command(identity, verb, target))
         client.flush()
-        answered = await self.heard(CommandAnswered, lambda notice: notice.answer.id == identity)
-        answer: Answer = answered.answer
+        answered = await self.heard(Answer, lambda notice: notice.id == identity)
+        answer: Answer = answered
         return answer
 
     async def until(self, holds: Callable[[], Awaitable[bool]], timeout: float = PATIENCE) -> None:
@@ -240,14 +246,6 @@ async def cycles(operator: Operator) -> int:
     return int(status.data["devices"]["slide"]["state"]["cycles"])
 
 
-def alive(pid: int) -> bool:
-    """Whether a process exists and is no zombie."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
 async def test_actions_services_and_memory_across_nodes(operator: Operator) -> None:
     assert (await operator.call("add", a=2, b=3)).values == {"sum": 5}
     end = await operator.call("relay", a=4)
@@ -271,13 +269,13 @@ async def test_events_progress_and_pulses(operator: Operator) -> None:
     right.caller.subscribe(right.now(), ["beat", "memory:sum"])
     right.flush()
     await operator.call("relay", a=1)
-    await operator.heard(EventArrived, lambda notice: notice.event.data.get("value") == 3)
-    await operator.heard(EventArrived, lambda notice: notice.event.name == "beat")
+    await operator.heard(Event, lambda notice: notice.data.get("value") == 3)
+    await operator.heard(Event, lambda notice: notice.name == "beat")
     call = Call(f"told {operator.boot}", "tell", {"name": "hello"}, seed=3)
     left = operator.clients["left"]
     left.caller.call(left.now(), call)
     left.flush()
-    event = (await operator.heard(EventArrived, lambda notice: notice.event.name == "hello")).event
+    event = await operator.heard(Event, lambda notice: notice.name == "hello")
     assert event.run == call.id and event.number >= 1
 
 
@@ -310,7 +308,7 @@ async def test_a_hanging_action_is_ended_at_its_deadline_while_the_node_answers(
 ) -> None:
     before = await pids(operator, "left", "")
     hanging = asyncio.create_task(operator.call("hang"))
-    await operator.heard(CallAccepted)
+    await operator.heard(Accept)
     answered, limit = 0, Limit("the end of the call that hangs")
     while not hanging.done() and limit.left():
         status = await operator.command("left", "status", "slide")
@@ -406,7 +404,7 @@ async def test_a_device_without_cycle_has_one_process(operator: Operator) -> Non
 async def test_cancel_hold_and_release(operator: Operator) -> None:
     left = operator.clients["left"]
     running = asyncio.create_task(operator.call("go", to=91.0, timeout=PATIENCE))
-    await operator.heard(CallAccepted)
+    await operator.heard(Accept)
     assert (await operator.command("left", "hold", "slide")).data["answers"] == {"slide": "held"}
     first = await operator.command("left", "status", "slide")
     await operator.call("nap", seconds=0.1)
@@ -442,7 +440,7 @@ async def test_an_orphaned_run_is_stopped(nodes: Nodes, operator: Operator) -> N
     assert await client.connected(PATIENCE)
     client.caller.call(client.now(), Call("orphan", "nap", {"seconds": 60.0}))
     client.flush()
-    await other.heard(CallAccepted)
+    await other.heard(Accept)
     await client.close()
 
     async def gone() -> bool:
@@ -463,7 +461,7 @@ async def test_sigterm_ends_a_node_and_all_its_processes(tmp_path: Path) -> None
         left = operator.clients["left"]
         left.caller.call(left.now(), call)
         left.flush()
-        await operator.heard(CallAccepted)
+        await operator.heard(Accept)
         assert await asyncio.to_thread(running.stop) == {"left": 0}
     assert not [name for name, pid in children.items() if alive(pid)]
 
@@ -476,7 +474,7 @@ async def test_kill_9_of_a_node_ends_its_processes(tmp_path: Path) -> None:
             "general": (await pids(operator, "left", ""))["actions"],
         }
         hanging = asyncio.create_task(operator.call("hang", 30.0))
-        await operator.heard(CallAccepted)
+        await operator.heard(Accept)
         running.processes["left"].kill()
         assert (await hanging).executed == "unknown"
 
@@ -588,8 +586,7 @@ def test_a_run_takes_wall_time_only_while_it_must(nodes: Nodes) -> None:
 def _cpu(nodes: Nodes) -> float:
     total = 0.0
     for process in nodes.processes.values():
-        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-        for pid in [str(process.pid), *children]:
+        for pid in {process.pid, *children(process.pid)}:
             fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
             total += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
     return total

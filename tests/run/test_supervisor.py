@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.run.supervisor import LaunchError, Program, Supervisor
+from tests.processes import alive, kill
 from tests.waiting import beat
 
 pytestmark = pytest.mark.processes
@@ -24,15 +25,6 @@ FAULTY = "import sys; print('no device at can0', file=sys.stderr); sys.exit(2)"
 def program(name: str, source: str, first: bool = False) -> Program:
     """A program that runs this text."""
     return Program(name, [sys.executable, "-c", source], first)
-
-
-def gone(process: int) -> bool:
-    """Whether there is no such process any more."""
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return True
-    return False
 
 
 def deaths(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -60,7 +52,7 @@ async def test_a_killed_program_is_started_again_and_all_end_with_the_supervisor
         assert (keeper.starts("a"), keeper.starts("b")) == (2, 1)
         assert keeper.process_ids()["b"] == before["b"]
         last = list(keeper.process_ids().values())
-    assert all(gone(process) for process in last)
+    assert not any(map(alive, last))
 
 
 async def test_one_that_keeps_dying_is_started_more_and_more_slowly(
@@ -115,7 +107,7 @@ async def test_those_that_others_need_are_ready_first(tmp_path: Path) -> None:
 async def test_one_that_does_not_end_when_asked_is_killed(tmp_path: Path) -> None:
     async with Supervisor([program("a", STUBBORN)], tmp_path) as keeper:
         process = keeper.process_ids()["a"]
-    assert gone(process)
+    assert not alive(process)
 
 
 async def test_what_a_dead_program_has_left_running_does_not_hide_its_death(
@@ -135,6 +127,5 @@ async def test_what_a_dead_program_has_left_running_does_not_hide_its_death(
                 while keeper.starts("a") < 2 or not keeper.process_ids():
                     await beat(0.01)
     finally:
-        for line in (tmp_path / "a.log").read_text().splitlines():
-            if line.isdigit():
-                os.kill(int(line), signal.SIGKILL)
+        lines = (tmp_path / "a.log").read_text().splitlines()
+        kill(int(line) for line in lines if line.isdigit())

@@ -1,5 +1,5 @@
-"""A campaign's table: the same whoever does the blocks, however many do, and however often it is
-interrupted."""
+"""A campaign's table is the same for any number of workers, in any order, and however often the
+campaign was interrupted."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ from petrobot.coordinator.studies.campaign.pool import LocalPool
 from petrobot.coordinator.studies.campaign.summary import Summary, comparisons, result_of
 from petrobot.coordinator.studies.campaign.table import TABLE, read_table
 from petrobot.coordinator.studies.campaign.worker import serve
+from tests.processes import alive
 from tests.studies.campaign.conftest import SERVICES, TASK, Conduct
 from tests.waiting import beat, until
 
@@ -480,7 +481,8 @@ def test_learned_show_judges_as_the_campaign_did(
 
 
 def test_a_damaged_estimates_file_says_that_it_can_be_made_again(conduct: Conduct) -> None:
-    """It is derived from the table; nobody's additions are wiped unasked."""
+    """The file is derived from the table, but it is not replaced without asking: it may hold
+    more."""
     campaign = conduct("a")
     path = Path(campaign.result()["estimates"])
     whole = EstimatesFile(path).read().estimates
@@ -495,7 +497,7 @@ def test_a_damaged_estimates_file_says_that_it_can_be_made_again(conduct: Conduc
 
 
 def test_a_cost_that_no_result_has_is_said(conduct: Conduct, tmp_path: Path) -> None:
-    """J is 1 - R then, which nobody would see."""
+    """J would be 1 - R then, without any sign of it."""
     task = tmp_path / "fetch.toml"
     task.write_text(
         TASK.read_text(encoding="utf-8").replace("value:force", "value:forse"), encoding="utf-8"
@@ -526,7 +528,5 @@ async def test_what_a_dead_worker_has_left_running_does_not_hide_its_death(
             await pool.run(order)
         assert pool.lost == 3
         left = int(mark.read_text())
-        while (
-            Path(f"/proc/{left}").exists() and " Z " not in Path(f"/proc/{left}/stat").read_text()
-        ):
+        while alive(left):
             await beat(0.01)

@@ -26,6 +26,7 @@ from petrobot.coordinator.studies.campaign.conduct import (
     line,
 )
 from petrobot.coordinator.studies.campaign.table import held, times
+from tests.processes import children
 from tests.studies.campaign.conftest import HERE, SERVICES, TASK
 from tests.waiting import Limit
 
@@ -269,7 +270,7 @@ def test_no_worker_outlives_a_killed_campaign(tmp_path: Path) -> None:
     )
     try:
         _until(lambda: _frozen_with_its_workers_at_work(campaign, tmp_path / "part"))
-        workers = [os.pidfd_open(pid) for pid in _children(campaign.pid)]
+        workers = [os.pidfd_open(pid) for pid in children(campaign.pid)]
         for worker in workers:
             signal.pidfd_send_signal(worker, signal.SIGSTOP)
     finally:
@@ -289,20 +290,11 @@ def _frozen_with_its_workers_at_work(campaign: subprocess.Popen[bytes], folder: 
     assert campaign.poll() is None
     campaign.send_signal(signal.SIGSTOP)
     os.waitid(os.P_PID, campaign.pid, os.WSTOPPED)
-    known, there = {int(row["worker"]) for row in times(folder)}, _children(campaign.pid)
+    known, there = {int(row["worker"]) for row in times(folder)}, children(campaign.pid)
     if len(there) == 2 and known.issuperset(there):
         return True
     campaign.send_signal(signal.SIGCONT)
     return False
-
-
-def _children(parent: int) -> list[int]:
-    return [
-        int(pid)
-        for pid in Path(f"/proc/{parent}/task/{parent}/children")
-        .read_text(encoding="ascii")
-        .split()
-    ]
 
 
 def _until(condition: Callable[[], bool]) -> None:
@@ -329,7 +321,7 @@ def _until(condition: Callable[[], bool]) -> None:
         (["campaign", *TOY, "--target", "0"], "0 is not a number of more than 0 and at most 1"),
         (["campaign", *TOY, "--target", "nan"], "nan is not a number of more than 0 and at most 1"),
         (["campaign", *TOY, "--set", "speed=1"], "no parameter 'speed'"),
-        (["campaign", str(TASK)], "may not run with"),
+        (["campaign", "catch_ball", *TOY[1:]], "may not run with"),
         (["campaign", "--resume", "nowhere"], "holds no campaign"),
         (["campaign"], "give a TASK"),
         (["campaign", *TOY, "--learned", "nowhere"], "not the result of a finished campaign"),
@@ -359,8 +351,8 @@ def test_bad_input(
 def test_two_at_once_do_not_write_one_table(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The second is told who is at it, and touches nothing; a lock whose holder is gone stands in
-    nobody's way."""
+    """The second process is told which one writes the folder, and touches nothing. A lock whose
+    holder has ended does not count."""
     folder = tmp_path / "one"
     campaign(folder, "--runs", "3")
     before = (folder / "table.csv").read_bytes()
