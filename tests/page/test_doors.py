@@ -250,7 +250,8 @@ async def test_silent_connections_are_closed(page: Page) -> None:
     page.gate.silent = 0.2
     reader, writer = await asyncio.open_connection("127.0.0.1", port_of(page))
     writer.write(b"GET / HTTP/1.1\r\nHost: 127")
-    assert await asyncio.wait_for(reader.read(), 60) == b""
+    with contextlib.suppress(ConnectionResetError):  # bytes that came too late for the page
+        assert await asyncio.wait_for(reader.read(), 60) == b""
     writer.close()
     assert isinstance(page.gate, Gate)
 

@@ -105,7 +105,13 @@ ARC_KINDS = {"INPUT": "normal", "OUTPUT": "normal", "INHIBITOR": "inhibitor"}
 def parse_pnpro(text: str | bytes, file: str = "pnpro") -> NetFile:
     """Read the net of a project. Raises NetFileError."""
     root = parse_tree(text, file)
-    nets = list(root.iter("gspn"))
+    # Measures and timed automata (DTA) lie beside a net and are not part of it; whatever else has
+    # arcs is a net, also under a name that is unknown here.
+    nets = [
+        one
+        for one in root.iter()
+        if one.tag == "gspn" or (one.tag != "dta" and one.find("edges") is not None)
+    ]
     if root.tag != "project" or len(nets) != 1:
         raise NetFileError(
             file,

@@ -16,7 +16,7 @@ from petrobot.coordinator.learning.selectors import cost_of
 from petrobot.coordinator.studies.campaign.block import LoadedPlan
 from petrobot.coordinator.studies.campaign.observed import regime_of
 from petrobot.coordinator.studies.campaign.plan import CampaignPlan
-from petrobot.coordinator.studies.campaign.policies import LearnedActions, policy_of
+from petrobot.coordinator.studies.campaign.policies import LearnedActions, learns, policy_of
 from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.report import charts
 from petrobot.coordinator.task import Status, Task
@@ -120,6 +120,8 @@ def learned_curves(
 ) -> None:
     """Replace shares of choices by the probabilities that the selectors had after each batch; does
     nothing for a campaign without learner."""
+    if not learns(plan.selector):
+        return
     bench = LoadedPlan.of(plan)
     policy = policy_of(plan, bench.task, bench.directory)
     if not isinstance(policy, LearnedActions):
