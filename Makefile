@@ -1,5 +1,7 @@
 # One command per verb. `make demo` and `make test` set up all they need by themselves.
-PYTHON ?= $(shell command -v python3.11 || command -v python3)
+FITS := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
+PYTHON ?= $(shell for one in python3.11 python3.12 python3.13 python3.14 python3; do \
+  $$one -c '$(FITS)' 2>/dev/null && { command -v $$one; break; }; done)
 VENV := .venv
 BIN := $(VENV)/bin
 RUNS ?= 4
@@ -9,19 +11,20 @@ ROUNDS ?= 20
 # them compiles the sources again, which takes as long as all the rest of its start.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test load proof lint bench clean
+.PHONY: help demo test suite load proof lint bench clean
 
 help:
 	@echo "make demo   set up, start the cell's nodes, catch $(RUNS) balls in real time, leave a report"
 	@echo "make test   set up, check style and types, run the tests (goal: 6 minutes on two idle cores)"
+	@echo "make suite  run the tests that need no browser (with PYTHON and VENV: another interpreter)"
 	@echo "make load   repeat the tests that start processes $(ROUNDS) times while every core is busy (hours)"
 	@echo "make proof  check every promised figure in full (hours; resumes where it stopped)"
 	@echo "make bench  measure speed beside others, as ratios"
 	@echo "make clean  remove the environment and all that was made"
 
 $(VENV)/.ready: pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
-	  { echo "petrobot needs CPython 3.11: set PYTHON=/path/to/python3.11"; exit 2; }
+	@'$(PYTHON)' -c '$(FITS)' 2>/dev/null || { \
+	  echo "petrobot needs CPython 3.11 to 3.14: set PYTHON=/path/to/python3.12"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test]"
 	@touch $@
@@ -36,6 +39,10 @@ lint: $(VENV)/.ready
 
 test: lint
 	$(BIN)/pytest -n 4 --dist worksteal -rs -m "not proof"
+
+# What another interpreter has to pass, too: make suite PYTHON=python3.13 VENV=.venv-3.13
+suite: $(VENV)/.ready
+	$(BIN)/pytest -n 4 --dist worksteal -rs -m "not proof and not browser"
 
 load: $(VENV)/.ready
 	$(BIN)/python -m tools.bench.under_load $(ROUNDS)

@@ -294,12 +294,11 @@ async def test_nodes_shows_the_expiry_of_the_certificate_in_use(
         answer = (await ask_all(parse(text, places), 5.0))["vision"]
         assert datetime.fromisoformat(answer["certificate_ends"]) == NOW + 12 * DAY
         capsys.readouterr()
-        assert (
-            await asyncio.to_thread(main, ["nodes", "--services", str(places), "--json", "-"]) == 0
-        )
+        asked = ["nodes", "--services", str(places), "--timeout", "30"]
+        assert await asyncio.to_thread(main, [*asked, "--json", "-"]) == 0
         shown = json.loads(capsys.readouterr().out)
         assert datetime.fromisoformat(shown["vision"]["certificate_ends"]) == NOW + 12 * DAY
-        assert await asyncio.to_thread(main, ["nodes", "--services", str(places)]) == 0
+        assert await asyncio.to_thread(main, asked) == 0
         words = capsys.readouterr().out
         assert "certificate" in words and "in 11" in words and "petrobot" in words
         answering.cancel()

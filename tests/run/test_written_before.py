@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.cli import main
+from tests.sim.conftest import needs_bullet
 
 FILES = Path(__file__).parent / "written_at_1eefa30"
 
@@ -34,6 +35,7 @@ def test_a_journal_replays_without_a_difference(
     assert "all as recorded" in capfd.readouterr().out
 
 
+@needs_bullet
 def test_a_killed_run_resumes_to_the_end_that_it_had_without_the_kill(tmp_path: Path) -> None:
     folder = tmp_path / "killed"
     folder.mkdir()
@@ -48,6 +50,7 @@ def test_a_killed_run_resumes_to_the_end_that_it_had_without_the_kill(tmp_path: 
     }
 
 
+@needs_bullet
 def test_an_estimates_file_is_shown_and_learned_into(tmp_path: Path) -> None:
     estimates = tmp_path / "lab.estimates"
     shutil.copy(FILES / "lab.estimates", estimates)

@@ -742,4 +742,4 @@ class _PnmlWriting:
 
 
 def _has(node: Element, tag: str) -> bool:
-    return any(children(node, tag))
+    return next(children(node, tag), None) is not None

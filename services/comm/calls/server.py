@@ -271,6 +271,7 @@ class Server:
         self._links: dict[str, _ServerLink] = {}
         self._opening: dict[_ServerLink, None] = {}
         self._all: set[_ServerLink] = set()
+        self._closed = False
         self._server: asyncio.Server | TlsListener | None = None
         self._knocks = FailedHandshakes(self.limits.handshakes, self.limits.handshakes_at_once)
         self._timer: asyncio.TimerHandle | None = None
@@ -286,6 +287,7 @@ class Server:
         """Listen. Raises KeyNeededError if other hosts could connect and there is no key, OSError
         if the address cannot be used."""
         require_key(self.callee.name, host, self.key or self.tls is not None)
+        self._closed = False
         self._loop = asyncio.get_running_loop()
         if self.tls is None:
             server = await self._loop.create_server(
@@ -317,6 +319,7 @@ class Server:
 
     async def close(self, text: str = "the node stops") -> None:
         """Say BYE to all callers and stop listening."""
+        self._closed = True
         if self._server is not None:
             self._server.close()
         for link in list(self._all):
@@ -389,6 +392,9 @@ class Server:
     def came(self, link: _ServerLink) -> None:
         """A connection is established. Above the limits the oldest connection without WELCOME is
         closed, which may be this one."""
+        if self._closed:  # it was accepted before, and is reported only now
+            link.cut("the node stops")
+            return
         if self.tls is None and not self.admits(link.address):
             link.cut("too many handshakes of its address have failed")
             self.count("knocks")
