@@ -16,9 +16,10 @@ import subprocess
 import sys
 from collections.abc import Callable
 
+from petrobot.services.comm.protocol.messages import Call
 from petrobot.services.host.parent_death import STOP_ROUTINE, until_ended
 from petrobot.services.worker.keeper import KILL_ORDER
-from petrobot.services.worker.pipe import Counter, Item, counter_memory, pipe_pair
+from petrobot.services.worker.pipe import Item, Permits, permit_counter, pipe_pair
 from petrobot.services.worker.process import BORN, SETUP, Setup
 
 _log = logging.getLogger(__name__)
@@ -54,12 +55,12 @@ class Child:
         self.pipe, pipe_end = pipe_pair()
         self._descriptors, descriptors_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         passed = [pipe_end, descriptors_end, *([link] if link else [])]
-        memory = counter_memory()
+        counter = permit_counter()
         numbers = [
             pipe_end.fileno(),
             descriptors_end.fileno(),
             link.fileno() if link else NONE,
-            memory,
+            counter,
         ]
         # Only what owns a device has something to do after the node's end: its stop routine.
         patience = int(STOP_ROUTINE) if setup.device and link is None else 0
@@ -79,12 +80,12 @@ class Child:
         except OSError:
             self.pipe.close()
             self._descriptors.close()
-            os.close(memory)
+            os.close(counter)
             raise
         finally:
             for end in passed:
                 end.close()
-        self._begun = Counter(memory)
+        self._permits = Permits(counter)
         self._worker = 0
         self._killed = ""
         self._let_go = False
@@ -104,15 +105,23 @@ class Child:
         return self.pipe.closed
 
     @property
-    def begun(self) -> int:
-        """How many of the runs that it was given it has begun. What it has not begun when it dies
-        was not executed."""
-        return self._begun.value
-
-    @property
     def code(self) -> int | None:
         """Its exit code, minus the number of the signal that ended it, None while it runs."""
         return self.process.poll()
+
+    def give(self, call: Call) -> None:
+        """Send it a call, with the permit to begin it."""
+        self._permits.give()
+        self.post(call)
+
+    def take_back(self) -> int:
+        """Take back the permits of the calls that it has not begun: it will not begin them, and
+        they are the last ones that it was given. Return how many these are; also after its
+        death."""
+        count = 0
+        while self._permits.take():
+            count += 1
+        return count
 
     def post(self, item: Item) -> None:
         """Send it an item; what does not fit now is sent when it reads."""
@@ -204,7 +213,7 @@ class Child:
                     await until_ended(self._worker)
         self._descriptors.close()
         self._ended(self)
-        self._begun.close()
+        self._permits.close()
 
     def _close_pipe(self) -> None:
         if not self._let_go:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -37,9 +37,11 @@ from petrobot.services.worker.context import Report
 from petrobot.services.worker.device_process import HALT, LINKED
 from petrobot.services.worker.pipe import Item, link_pair
 from petrobot.services.worker.process import (
+    DROPPED,
     FAILED,
     LINK_LOST,
     NO_MEMORY,
+    OUT_OF_MEMORY,
     READY,
     STREAM_AT,
     WANTED,
@@ -69,7 +71,11 @@ it waits `START_LIMIT`."""
 DRIVER_GONE = 0.25
 """Seconds before actions that have lost the link to their driver are started again: it has most
 likely died itself."""
-OUT_OF_MEMORY = "out_of_memory"
+PATIENCE = 0.005
+"""Seconds without the end of a run after which the calls that wait behind it in its process are
+taken back: it may take long. Also the longest that a call is expected to wait there."""
+HAND_OVER = 0.0001
+"""Seconds that a worker needs for a run beside the action itself, about."""
 DONE = {"hold": "held", "release": "released", CLEAR_EMERGENCY: "cleared", PICTURE: PICTURE}
 """What actions without a device answer to a command when no process of theirs has anything to do;
 `stopped` to all others."""
@@ -188,7 +194,16 @@ class WorkerHost:
         self._halts = 0
         self._pings = 0
         self._given = 0
-        """How many runs the worker was given."""
+        """How many runs the worker was given, without those that were taken back."""
+        self._withdrawn: set[str] = set()
+        """Runs that were taken back, until the worker says that it has seen that: before, it could
+        take the permit of another call for one of them."""
+        self._behind = False
+        """Whether calls may wait in its process behind another one."""
+        self._progress = -math.inf
+        """When its worker has last got something to do, or ended a run (s)."""
+        self._pace = HAND_OVER
+        """Seconds that a run keeps its worker, on average of the last ones."""
         self._commands: dict[str, str] = {}
         """Verb of each command that a process has not answered."""
         self._frozen = False
@@ -214,7 +229,12 @@ class WorkerHost:
     def ready(self) -> bool:
         """Whether a run would be taken at once: its processes are up, and none of them is known to
         end."""
-        return self._stage is HostStage.READY and not self.failed and self._takes_orders()
+        return (
+            self._stage is HostStage.READY
+            and not self.failed
+            and not self._withdrawn
+            and self._takes_orders()
+        )
 
     def _takes_orders(self) -> bool:
         return (
@@ -244,6 +264,13 @@ class WorkerHost:
     def busy(self) -> bool:
         """Whether it has taken a run that has not ended."""
         return bool(self._runs or self._lost)
+
+    def wait_of_next(self, now: float) -> float:
+        """For how long a call that it was given now would wait there for others, as far as its last
+        runs tell (s); infinite if it should not be given any."""
+        if not self.ready or (self._runs and now >= self._progress + PATIENCE):
+            return math.inf
+        return len(self._runs) * self._pace
 
     def pids(self) -> dict[str, int]:
         """Process ids: `actions`, and `driver` when that has a process of its own."""
@@ -316,6 +343,8 @@ class WorkerHost:
             self.failed = str(items[1])
         elif items[0] == WANTED:
             self._wanted(items[1])
+        elif items[0] == DROPPED:
+            self._take_dropped(items[1])
         else:
             raise ValueError(f"unknown word {items[0]!r:.80}")
 
@@ -345,6 +374,7 @@ class WorkerHost:
                 self._start_due()
         elif self._move(Happening.READY):
             self._worker, self._given, self.failed, self._died = child, 0, "", ""
+            self._withdrawn.clear()
             _log.info("process %d of %s is ready", child.pid, self._name())
             self._post_waiting(self._clock())
 
@@ -372,7 +402,7 @@ class WorkerHost:
         assert self._owner is not None
         self._worker = None
         self._died = f"the process of its actions died: {child.describe()}"
-        self._lose_runs(*_cause_of(child), child.begun)
+        self._lose_runs(*_cause_of(child), child)
         if self._move(Happening.ACTIONS_ENDED):
             self._halts += 1
             self._halt_due = self._clock() + STOP_LIMIT + MARGIN
@@ -393,14 +423,14 @@ class WorkerHost:
         self.streams = {}
         self._died = f"the process of its {'driver' if driver else 'action'} died: {why}"
         if driver:
-            self._lose_runs("device_died", DRIVER_DIED, worker.begun if worker is not None else 0)
+            self._lose_runs("device_died", DRIVER_DIED, worker)
             if worker is not None:
                 worker.kill()
         else:
             cause, text = _cause_of(child)
             if self.failed:
                 text = f"the process of its action died: {why}"
-            self._lose_runs(cause, text, child.begun)
+            self._lose_runs(cause, text, child)
         self._answer_commands()
         self._tell_lost(f"driver: {why}" if driver else "")
         if self._move(Happening.ALL_ENDED):
@@ -430,6 +460,10 @@ class WorkerHost:
             return
         self._deaths = 0  # the process has done what it is there for
         self._reports.append(end)
+        self._progress = self._clock()
+        self._pace += (end.seconds + HAND_OVER - self._pace) / 4
+        if end.cause == OUT_OF_MEMORY:
+            self.withdraw()
         alone = all(run.posted is None for run in self._runs.values())
         if end.cause == OUT_OF_MEMORY and alone and self._worker is not None:
             # What the run has kept would fail the next one, which may need little.
@@ -443,18 +477,57 @@ class WorkerHost:
         self._reports.append(Outcome(id_, Status.ERROR, {}, cause, text, Executed.NO))
         self._release_if_over()
 
-    def _lose_runs(self, cause: str, text: str, begun: int) -> None:
+    def withdraw(self) -> None:
+        """Take back the calls that its process has not begun: they wait again."""
+        self._behind = False
+        if self._worker is None or not (count := self._worker.take_back()):
+            return
+        self._given -= count
+        for id_, run in list(self._runs.items()):
+            if run.posted is not None and run.number > self._given:
+                self._withdrawn.add(id_)
+                self._wait_again(id_, run)
+
+    def _wait_again(self, id_: str, run: _Given) -> None:
+        """Its process will not begin this run: let it wait, or end as it was stopped."""
+        run.posted = None
+        if run.cause:
+            text = f"{run.text}; its process had not begun it".lstrip("; ")
+            self._end(id_, run.cause, text)
+
+    def _take_dropped(self, ids: Iterable[str]) -> None:
+        """Its process will not begin these runs: they were taken back, or would have to wait for
+        another run."""
+        for id_ in ids:
+            if id_ in self._withdrawn:
+                self._withdrawn.discard(id_)
+            elif (run := self._runs.get(id_)) is not None and run.posted is not None:
+                self._progress = -math.inf  # its present run takes long
+                self._wait_again(id_, run)
+        if self.ready:
+            for run in self._runs.values():
+                if not run.number:  # it came while the worker could not be given any
+                    self._post_call(self._clock(), run)
+
+    def hand_over(self) -> list[Call]:
+        """Return the calls that a process here was given and did not begin: another host may take
+        them."""
+        calls = [run.call for run in self._runs.values() if run.number and run.posted is None]
+        for call in calls:
+            del self._runs[call.id]
+        return calls
+
+    def _lose_runs(self, cause: str, text: str, worker: Child | None) -> None:
         """The process of the runs is gone: each that it had begun ends, with what is known of it.
         What it had not begun by then nobody has executed: it waits for the next process, or ends as
         it was stopped."""
+        begun = self._given - (worker.take_back() if worker is not None else 0)
+        self._withdrawn.clear()
         for id_, run in list(self._runs.items()):
             if run.posted is None:
                 continue
             if run.number > begun:
-                run.posted = None
-                if run.cause:
-                    text = f"{run.text}; its process had not begun it".lstrip("; ")
-                    self._end(id_, run.cause, text)
+                self._wait_again(id_, run)
                 continue
             del self._runs[id_]
             took = self._clock() - run.posted
@@ -497,11 +570,17 @@ class WorkerHost:
         assert self._worker is not None
         self._given += 1
         run.posted, run.number = now, self._given
-        self._worker.post(run.call)
+        if len(self._runs) == 1:
+            self._progress = now
+        else:
+            self._behind = not self._setup.device
+        self._worker.give(run.call)
 
     def _stop(self, now: float, run: _Given, cancel: Cancel) -> None:
         if run.cause:
             return
+        if not self._setup.device:
+            self.withdraw()
         cause, _, text = cancel.reason.partition(": ")
         cause = cause or "cancelled"
         if run.posted is None or self._worker is None:
@@ -528,12 +607,18 @@ class WorkerHost:
             self._give_start_up(now)
         if self._halt_due is not None and now >= self._halt_due:
             self._tell_lost("the device is not known to stand still")
+        if now >= self._patience_ends():
+            self.withdraw()
         for id_, run in list(self._runs.items()):
             if run.posted is None and now >= self._wait_limit(run):
                 why = self.failed or self._died or "it is being started"
                 self._end(id_, "not_ready", f"its process is not ready: {why}")
             elif run.cause:
                 self._chase(now, run)
+
+    def _patience_ends(self) -> float:
+        """When calls that wait in its process are taken back (s)."""
+        return self._progress + PATIENCE if self._behind else math.inf
 
     def _wait_limit(self, run: _Given) -> float:
         """Until when a run waits for its process."""
@@ -571,6 +656,7 @@ class WorkerHost:
             soonest = min(soonest, self._halt_due)
         if self._stage in STARTING:
             soonest = min(soonest, self._started + START_LIMIT)
+        soonest = min(soonest, self._patience_ends())
         for run in self._runs.values():
             due = self._due_of(run)
             if due < soonest:
@@ -677,6 +763,7 @@ class WorkerHost:
     def close(self, now: float) -> None:
         """Let the processes end in good order."""
         self._move(Happening.CLOSE)
+        self.withdraw()
         self._restart_at = None
         for child in self.children():
             child.leave()

@@ -23,13 +23,17 @@ from petrobot.services.comm.protocol.messages import (
 )
 from petrobot.services.device import PICTURE
 from petrobot.services.node.child import Child
-from petrobot.services.node.inline_host import HOLD, answer_of
-from petrobot.services.node.worker_host import DONE, Hosting, HostStage, WorkerHost
+from petrobot.services.node.inline_host import HOLD, answer_of, stopped_by
+from petrobot.services.node.worker_host import DONE, PATIENCE, Hosting, HostStage, WorkerHost
 from petrobot.services.worker.context import Report
+from petrobot.services.worker.remote import EMERGENCY_STOP
 from petrobot.services.worker.runner import Order
 
 KEPT = 2
 """Idle workers that stay however long nothing is to be done."""
+BUSY_AFTER = 0.5
+"""Seconds for which a call waits when there are as many workers as there may be, and all are busy:
+most runs end sooner."""
 IDLE_LIMIT = 30.0
 """Seconds after which an idle worker beyond these retires."""
 
@@ -47,7 +51,8 @@ class WorkerPool:
     """Implements `inline_host.Host` for actions without a device, with one `WorkerHost` for each
     worker.
 
-    `most` is how many workers there may be; a run beyond that is refused: `busy`, executed = no.
+    `most` is how many workers there may be; a run that finds none of them free within
+    `BUSY_AFTER` is refused: `busy`, executed = no.
     """
 
     def __init__(self, hosting: Hosting, most: int) -> None:
@@ -66,7 +71,11 @@ class WorkerPool:
         self._streams: dict[str, set[int]] = {}
         """Those that want to know where a stream is received."""
         self._commands: dict[str, _Gathered] = {}
+        self._waiting: dict[str, tuple[float, Call]] = {}
+        """Calls that no worker could take, and until when they wait for one (s)."""
         self._held = False
+        self._queued = False
+        """Whether a call was put behind another one since `due` was last asked for."""
         self._reports: list[Report] = []
         self.streams: Mapping[str, int] = {}
         """Actions without a device receive no stream."""
@@ -128,8 +137,8 @@ class WorkerPool:
 
     def _touch(self, number: int, plain_ends: bool) -> None:
         self._touched.add(number)
-        # With more workers than are kept, one may have to retire now.
-        self._hosting.changed(plain_ends and len(self._workers) <= KEPT)
+        # A call that waits for a free worker needs a whole step now.
+        self._hosting.changed(plain_ends and not self._waiting)
 
     def _idle(self) -> list[int]:
         """Workers without a run, the best first: ready ones, then those that start, then those that
@@ -158,18 +167,28 @@ class WorkerPool:
         elif isinstance(order, Cancel | Outcome):
             # The id of a call that a run makes is that of the run, a slash and a number.
             run = order.id if isinstance(order, Cancel) else order.id.rpartition("/")[0]
+            if isinstance(order, Cancel) and run in self._waiting:
+                self._stop_waiting(run, *order.reason.partition(": ")[::2])
             for number, worker in self._workers.items():
                 if run in worker.runs:
                     self._touched.add(number)
                     worker.take(now, order)
 
+    def _starting(self) -> bool:
+        """Whether a worker is being started: the calls that wait may have it."""
+        return any(w.stage is HostStage.ACTIONS_START for w in self._workers.values())
+
+    def _stop_waiting(self, id_: str, cause: str, text: str) -> None:
+        del self._waiting[id_]
+        self._reports.append(Outcome(id_, Status.ERROR, {}, cause, text, Executed.NO))
+
     def _begin(self, now: float, call: Call) -> None:
-        number = self._choose()
+        number = self._choose(now)
         if number is None:
-            self._reports.append(
-                Outcome(call.id, Status.ERROR, {}, "busy", self._full(), Executed.NO)
-            )
+            self._waiting.setdefault(call.id, (now + BUSY_AFTER, call))
+            self._queued = True
             return
+        self._waiting.pop(call.id, None)
         self._touched.add(number)
         if self._held:
             self._workers[number].command(now, HOLD)
@@ -181,14 +200,27 @@ class WorkerPool:
 
     @property
     def runs(self) -> list[str]:
-        """Ids of the runs that its workers have."""
-        return [run for worker in self._workers.values() for run in worker.runs]
+        """Ids of the runs that it has taken and that have not ended."""
+        return [*self._waiting, *(run for one in self._workers.values() for run in one.runs)]
 
-    def _choose(self) -> int | None:
-        """Number of the worker for the next run, started if need be; None at the limit."""
+    def _choose(self, now: float) -> int | None:
+        """Number of the worker for the next run, started if need be; None at the limit.
+
+        While runs are short, a call waits a moment behind others in one of the first workers: a
+        process that is awake takes many calls with one read, and its caches are warm. As soon as a
+        run takes longer, the calls behind it are taken back, and others run them.
+        """
+        best, shortest, found = 0, math.inf, 0
         for number, worker in self._workers.items():
-            if not worker.busy and worker.ready:
-                return number
+            wait = worker.wait_of_next(now)
+            if wait < shortest:
+                best, shortest = number, wait
+            found += wait < math.inf
+            if wait == 0.0 or (found >= KEPT and shortest < PATIENCE):
+                break
+        if shortest < PATIENCE:
+            self._queued |= shortest > 0.0
+            return best
         idle = self._idle()
         # One that waits to be started again is the last choice: it may have to wait long.
         if (not idle or self._rank(idle[0]) == 2) and len(self._workers) < self._most:
@@ -197,8 +229,9 @@ class WorkerPool:
 
     @property
     def news(self) -> bool:
-        """Whether it has something to report without a word of a process: that a run is refused."""
-        return bool(self._reports)
+        """Whether it needs a step before a process says anything: a run is refused, or calls wait
+        behind others."""
+        return bool(self._reports) or self._queued
 
     idle = False
     """Its processes may say something at any time."""
@@ -210,6 +243,14 @@ class WorkerPool:
         for number in tuple(self._touched):
             if number in self._workers:
                 self._workers[number].advance(now)
+        for number in tuple(self._touched):
+            if number in self._workers:
+                for call in self._workers[number].hand_over():
+                    self._begin(now, call)
+        for id_, (until, call) in list(self._waiting.items()):
+            self._begin(now, call)
+            if id_ in self._waiting and now >= until and not self._starting():
+                self._stop_waiting(id_, "busy", self._full())
         if self._leaving:
             self._leaving = [worker for worker in self._leaving if worker.children()]
         if self._idle_since or len(self._workers) > KEPT:
@@ -233,6 +274,7 @@ class WorkerPool:
 
     def due(self) -> float | None:
         """When `advance` has something to do at the latest (s)."""
+        self._queued = False
         if self._touched:
             self._gather_reports()
             for number in self._touched & self._workers.keys():
@@ -241,7 +283,10 @@ class WorkerPool:
             self._soonest = min(self._due.values(), default=math.inf)
         if self._reports:
             return self._hosting.clock()
-        return self._soonest if self._soonest < math.inf else None
+        soonest = self._soonest
+        if self._waiting and not self._starting():
+            soonest = min(soonest, *(until for until, _ in self._waiting.values()))
+        return soonest if soonest < math.inf else None
 
     def _learn_due(self, number: int) -> None:
         due = self._workers[number].due()
@@ -291,6 +336,9 @@ class WorkerPool:
         verb = command.verb
         if verb in ("hold", "release"):
             self._held = verb == "hold"
+        elif verb in ("stop", EMERGENCY_STOP):
+            for run in list(self._waiting):
+                self._stop_waiting(run, *stopped_by(verb).partition(": ")[::2])
         asked = {number for number, worker in self._workers.items() if worker.busy}
         if verb in ("status", PICTURE) or not asked:
             word, why = self.condition if verb == "status" else (DONE.get(verb, "stopped"), "")

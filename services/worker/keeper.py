@@ -106,7 +106,7 @@ def end_as(status: int) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Entry point of the process: `NODE PATIENCE PIPE DESCRIPTORS LINK BEGUN`, the last four as
+    """Entry point of the process: `NODE PATIENCE PIPE DESCRIPTORS LINK PERMITS`, the last four as
     `services.worker` takes them."""
     node, patience, sockets = int(arguments[0]), float(arguments[1]), arguments[2:]
     for ignored in _IGNORED:

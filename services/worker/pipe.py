@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import mmap
 import os
 import socket
-import struct
 import weakref
 from typing import Any
 
@@ -28,8 +26,6 @@ LARGEST = 64 << 20
 """Most bytes of one item, and of what waits to be read."""
 CHUNK = 1 << 16
 """Bytes read at once."""
-_NUMBER = struct.Struct("=Q")
-
 _BUFFER = memoryview(bytearray(CHUNK))
 """What all pipes of this process read into: what came is copied out before another one is read. A
 fresh buffer for each read would cost more than the read."""
@@ -169,36 +165,39 @@ def _item(unpacked: Any) -> Item | None:
         return [MALFORMED, str(fault)]
 
 
-class Counter:
-    """A number in memory that two processes share; it can be read after the death of the one that
-    counts."""
+class Permits:
+    """Permits to begin a call, shared by a node and one of its workers.
+
+    The node gives one with each call, and the worker takes one before it begins a call. The node
+    may take back what is left: the calls that were given last. The kernel counts the permits (an
+    eventfd), so each is taken once, by the worker or by the node, whatever either is doing; and
+    they can be read after the worker's death.
+    """
 
     def __init__(self, descriptor: int) -> None:
-        """Take over a descriptor of `counter_memory`."""
-        self._memory = mmap.mmap(descriptor, _NUMBER.size)
-        self._counted = 0
-        os.close(descriptor)
+        """Take over a descriptor of `permit_counter`."""
+        self._descriptor = descriptor
 
-    @property
-    def value(self) -> int:
-        """What was counted."""
-        return int(_NUMBER.unpack_from(self._memory)[0])
+    def give(self) -> None:
+        """Permit one more call. Do so before the call is sent."""
+        os.eventfd_write(self._descriptor, 1)
 
-    def count(self) -> None:
-        """One more."""
-        self._counted += 1
-        _NUMBER.pack_into(self._memory, 0, self._counted)
+    def take(self) -> bool:
+        """Take one permit; False if none is left."""
+        try:
+            os.eventfd_read(self._descriptor)
+        except BlockingIOError:
+            return False
+        return True
 
     def close(self) -> None:
-        """Let the memory go."""
-        self._memory.close()
+        """Let the counter go."""
+        os.close(self._descriptor)
 
 
-def counter_memory() -> int:
-    """A descriptor of memory for one `Counter` in each of two processes. Raises OSError."""
-    descriptor = os.memfd_create("counter")
-    os.ftruncate(descriptor, _NUMBER.size)
-    return descriptor
+def permit_counter() -> int:
+    """A descriptor of the counter of `Permits`. Raises OSError."""
+    return os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK | os.EFD_SEMAPHORE)
 
 
 class NewestLink:

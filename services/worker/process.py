@@ -2,9 +2,9 @@
 process of a cyclic driver.
 
 Forked by its keeper (`services/worker/keeper.py`) with the numbers of the inherited sockets PIPE
-DESCRIPTORS LINK (-1: none) and of the memory BEGUN, where it counts the runs that it begins. The
-node says over the pipe which it is to be. A process that makes its device's driver and finds it
-cyclic serves the driver alone.
+DESCRIPTORS LINK (-1: none) and of the counter PERMITS, from which it takes the permit of each call
+before it begins it. The node says over the pipe which it is to be. A process that
+makes its device's driver and finds it cyclic serves the driver alone.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import signal
 import socket
 import sys
 import time
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -49,13 +50,15 @@ from petrobot.services.worker.device_process import (
     take_priority,
 )
 from petrobot.services.worker.outlets import Sent, StreamOutlets
-from petrobot.services.worker.pipe import Counter, Item, NewestLink, Pipe, keep_from_copies
+from petrobot.services.worker.pipe import Item, NewestLink, Permits, Pipe, keep_from_copies
 from petrobot.services.worker.remote import DeviceCommand, DeviceState, RemoteDriver
 
 POLL = 0.002
 """Seconds between looks at what a run waits for, when it is more than time."""
 SETUP, BORN, READY, FAILED = "setup", "born", "ready", "failed"
-WANTED, STREAM_AT = "wanted", "stream_at"
+WANTED, STREAM_AT, DROPPED = "wanted", "stream_at", "dropped"
+OUT_OF_MEMORY = "out_of_memory"
+"""Cause of the end of a run that has used up the memory of its process."""
 LINK_LOST, NO_MEMORY = 90, 91
 """Exit codes: the driver's process is gone; not even the report of a run fits into the memory that
 is left."""
@@ -96,7 +99,7 @@ class Worker:
         setup: Setup,
         directory: Directory,
         node: Pipe,
-        begun: Counter,
+        permits: Permits,
         *,
         link: NewestLink | None = None,
         driver: Driver | None = None,
@@ -106,7 +109,7 @@ class Worker:
         self._node = node
         self._guard = guard
         self._barred = ""
-        self._begun = begun
+        self._permits = permits
         self._link = link
         self._ports = ports
         self._remote = RemoteDriver(self._post_command, time.monotonic) if link else None
@@ -125,6 +128,13 @@ class Worker:
             substitutes={name: script for name, script in scripted.items() if name in actions},
         )
         self._place.warm()
+        self._one_by_one = not setup.device
+        """Actions without a device run one at a time: what blocks or crashes the process then ends
+        no other run. The calls behind it have not begun, and the node gives them to another
+        worker."""
+        self._calls: deque[Call] = deque()
+        self._spent = False
+        """Whether a run has used up the memory: the next one needs a fresh process."""
         self._outlets = StreamOutlets(directory, f"{setup.node} {setup.device or 'actions'}")
         self._connecting = False
         # Faster than a selector; and an end that the user's code has closed is reported, and found
@@ -156,15 +166,42 @@ class Worker:
             now = time.monotonic()
             if self._guard is not None and now >= self._guard.due:
                 self._watch(now, self._guard)
-            self._place.advance(now)
-            if self._place.failed:
-                # Before the ends of its runs: no other run is to come here.
-                self._node.post([FAILED, self._place.failed])
-                self._report(now)
-                sys.exit(1)
-            self._report(now)
+            self._advance(now)
+            while self._calls and self._may_begin():
+                self._advance(time.monotonic())
+            if self._calls:
+                self._give_back()
         self._place.close(time.monotonic())
         self._outlets.close()
+
+    def _advance(self, now: float) -> None:
+        if self._calls and self._may_begin():
+            self._begin(now, self._calls.popleft())
+        self._place.advance(now)
+        if self._place.failed:
+            # Before the ends of its runs: no other run is to come here.
+            self._node.post([FAILED, self._place.failed])
+            self._report(now)
+            sys.exit(1)
+        self._report(now)
+
+    def _may_begin(self) -> bool:
+        return not (self._spent or self._place.runs)
+
+    def _begin(self, now: float, call: Call) -> None:
+        """Begin a call, unless the node has taken it back."""
+        if self._permits.take():
+            self._place.take(now, call)
+        else:
+            self._node.post([DROPPED, [call.id]])
+
+    def _give_back(self) -> None:
+        """Let others run the calls that would have to wait here. Those without a permit were taken
+        back already."""
+        for _ in self._calls:
+            self._permits.take()
+        self._node.post([DROPPED, [call.id for call in self._calls]])
+        self._calls.clear()
 
     def _watch(self, now: float, guard: Guard) -> None:
         """Stop device and runs without an order where nobody may be able to give one."""
@@ -199,8 +236,10 @@ class Worker:
 
     def _take_message(self, now: float, message: Message) -> None:
         if isinstance(message, Call):
-            self._begun.count()  # before it: what is not counted was certainly not executed
-            self._place.take(now, message)
+            if self._one_by_one:
+                self._calls.append(message)
+            else:
+                self._begin(now, message)
         elif isinstance(message, Cancel | Outcome):
             self._place.take(now, message)
         elif isinstance(message, Command):
@@ -211,6 +250,7 @@ class Worker:
     def _report(self, now: float) -> None:
         for report in self._place.reports():
             if not isinstance(report, Sent):
+                self._spent |= isinstance(report, Outcome) and report.cause == OUT_OF_MEMORY
                 post_report(self._node, report)
             elif self._outlets.send(now, report):
                 self._node.post([WANTED, report.stream])
@@ -245,7 +285,7 @@ def _first(node: Pipe) -> Setup:
 
 
 def serve(
-    node: Pipe, descriptors: socket.socket | None, link: NewestLink | None, begun: Counter
+    node: Pipe, descriptors: socket.socket | None, link: NewestLink | None, permits: Permits
 ) -> None:
     """Be what the node says. Faults of the driver go back to it as text."""
     node.post([BORN, os.getpid()])
@@ -276,10 +316,12 @@ def serve(
                 )
                 DeviceLoop(driver, ports, node, descriptors, guard).run()
                 return
-            worker = Worker(setup, directory, node, begun, driver=driver, ports=ports, guard=guard)
+            worker = Worker(
+                setup, directory, node, permits, driver=driver, ports=ports, guard=guard
+            )
             streams = ports.stream_ports()
         else:
-            worker, streams = Worker(setup, directory, node, begun, link=link), {}
+            worker, streams = Worker(setup, directory, node, permits, link=link), {}
         worker.await_device()
         node.post([READY, {"period": None, "streams": streams, "fifo": False}])
         worker.run()
@@ -299,12 +341,12 @@ def main(arguments: list[str]) -> None:
     pipe, descriptors, link = (
         socket.socket(fileno=int(a)) if int(a) >= 0 else None for a in arguments[:3]
     )
-    begun = Counter(int(arguments[3]))
+    permits = Permits(int(arguments[3]))
     assert pipe is not None
     node, driver_link = Pipe(pipe), NewestLink(link) if link is not None else None
     keep_from_copies(*([descriptors] if descriptors is not None else []))
     try:
-        serve(node, descriptors, driver_link, begun)
+        serve(node, descriptors, driver_link, permits)
     except MemoryError:
         os._exit(NO_MEMORY)
 

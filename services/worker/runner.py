@@ -580,7 +580,9 @@ class Runner:
         self._outlets.close(identity)
         del self._runs[identity]
         said = (result.status, result.values, result.cause, result.text, Executed.YES)
-        self._reports.append(Outcome(identity, *said, now - run.started, run.cpu, result.deferred))
+        # Not `now`: the action may have blocked since this step began.
+        took = self._clock() - run.started
+        self._reports.append(Outcome(identity, *said, took, run.cpu, result.deferred))
 
     def _hold(self, now: float, frozen: bool) -> None:
         """Freeze the runs, or let them go on with all their times moved by the pause."""

@@ -29,6 +29,7 @@ leave_behind_eye = {{ run = "toy_cell.actions:leave_behind", task = "see", devic
 leave_behind_slide = {{ run = "toy_cell.actions:leave_behind", task = "move", device = "slide" }}
 keep_memory = {{ run = "toy_cell.actions:keep_memory", task = "sum", node = "left" }}
 block = {{ run = "toy_cell.actions:block", task = "sum", node = "left" }}
+write_down = {{ run = "toy_cell.actions:write_down", task = "sum", node = "left" }}
 """
 )
 WAYS = ("fork", "daemon", "program", "program with sockets")
@@ -186,6 +187,42 @@ async def test_one_that_blocks_and_one_that_crashes_end_alone(operator: Operator
     assert [(await nap).status for nap in naps] == ["success"] * 3
 
 
+async def test_many_at_once_run_once_each_beside_what_blocks_crashes_and_waits(
+    operator: Operator, tmp_path: Path
+) -> None:
+    """Calls that come together wait behind each other in few workers, and none may be lost there,
+    run twice, or end because of the one before it."""
+    file = tmp_path / "lines"
+    bad: dict[int, tuple[str, float, dict[str, float]]] = {
+        5: ("block", DEADLINE, {"seconds": 30.0}),
+        20: ("segfault", 20.0, {}),
+        30: ("nap", 20.0, {"seconds": 1.0}),
+        40: ("segfault", 20.0, {}),
+        50: ("block", DEADLINE, {"seconds": 0.05}),
+    }
+    for batch in range(3):
+        calls = []
+        for number in range(80):
+            service, limit, arguments = bad.get(number, ("write_down", 20.0, {}))
+            line = f"{batch} {number}"
+            if service == "write_down":
+                calls.append(operator.call(service, limit, file=str(file), line=line))
+            else:
+                calls.append(operator.call(service, limit, **arguments))
+        ends = await asyncio.gather(*calls)
+        good = [end for number, end in enumerate(ends) if number not in bad]
+        assert {(end.status, end.cause) for end in good} == {("success", "")}
+        assert [(ends[n].status, ends[n].cause) for n in bad] == [
+            ("error", "deadline"),
+            ("error", "worker_died"),
+            ("success", ""),
+            ("error", "worker_died"),
+            ("success", ""),
+        ]
+    expected = [f"{batch} {n}" for batch in range(3) for n in range(80) if n not in bad]
+    assert sorted(file.read_text().split("\n")[:-1]) == sorted(expected)
+
+
 async def test_at_the_limit_a_run_is_refused_and_says_so(operator: Operator) -> None:
     naps = [asyncio.create_task(operator.call("nap", 60.0, seconds=8.0)) for _ in range(6)]
 
@@ -210,7 +247,7 @@ async def test_at_the_limit_a_run_is_refused_and_says_so(operator: Operator) -> 
 
 async def test_too_much_memory_ends_one_run_and_no_other(own_nodes: Nodes) -> None:
     async with operator_of(own_nodes.directory, "left", "right") as operator:
-        nap = asyncio.create_task(operator.call("nap", 20.0, seconds=1.0))
+        nap = asyncio.create_task(operator.call("nap", 20.0, seconds=4.0))
         before = await operator.call("pid")
         end = await operator.call("eat", 20.0, megabytes=4000)
         assert (end.status, end.cause, end.executed) == ("error", "out_of_memory", "yes"), end

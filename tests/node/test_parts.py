@@ -43,11 +43,11 @@ from petrobot.services.worker.device_process import LINKED, DeviceLoop
 from petrobot.services.worker.outlets import Outlets, Sent
 from petrobot.services.worker.pipe import (
     MALFORMED,
-    Counter,
     NewestLink,
+    Permits,
     Pipe,
-    counter_memory,
     link_pair,
+    permit_counter,
 )
 from petrobot.services.worker.remote import CyclicDriver, DeviceCommand, RemoteDriver
 from petrobot.services.worker.setpoints import SetpointReceiver
@@ -379,14 +379,15 @@ def test_bytes_that_are_no_record_are_refused() -> None:
     far.close()
 
 
-def test_a_counter_can_be_read_after_the_end_of_the_one_that_counts() -> None:
-    descriptor = counter_memory()
-    mine, its = Counter(os.dup(descriptor)), Counter(descriptor)
-    its.count()
-    its.count()
-    its.close()
-    assert mine.value == 2
-    mine.close()
+def test_each_permit_is_taken_once_also_after_the_end_of_the_worker() -> None:
+    descriptor = permit_counter()
+    node, worker = Permits(os.dup(descriptor)), Permits(descriptor)
+    for _ in range(3):
+        node.give()
+    assert worker.take()
+    worker.close()
+    assert [node.take() for _ in range(3)] == [True, True, False]
+    node.close()
 
 
 @pytest.mark.processes

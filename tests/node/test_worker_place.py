@@ -69,6 +69,7 @@ class FakeChild:
         self.closed = self.dead = False
         self.begun = 1 << 30
         """How many of its runs it says to have begun: all of them, unless a test says otherwise."""
+        self.given = 0
         self.link = link
         self.linked = link is not None
         self._drop(link)
@@ -82,6 +83,15 @@ class FakeChild:
 
     def post(self, item: Item) -> None:
         self.got.append(item)
+
+    def give(self, call: Call) -> None:
+        self.given += 1
+        self.post(call)
+
+    def take_back(self) -> int:
+        count = max(0, self.given - self.begun)
+        self.given -= count
+        return count
 
     def words(self) -> list[Any]:
         """Return what it was told beside the node's messages."""
