@@ -9,7 +9,7 @@ path along the search tree can be replayed by the engine as it is.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -75,6 +75,8 @@ class ExecutionGraph:
     """By action place that should hold one run: a state in which it holds more."""
     contests: dict[tuple[str, ...], int]
     """Conflicts that only the order in the file settles: a state in which it comes to that."""
+    index: Mapping[Hashable, int] = field(repr=False)
+    """By what the future of a state depends on: its number."""
 
     def __len__(self) -> int:
         return len(self.states)
@@ -137,6 +139,26 @@ class ExecutionGraph:
             state = came[0]
             found.append(came[1])
         return [Begin(), *reversed(found)]
+
+    def follow(self, state: int, cause: Cause) -> tuple[State, int, int]:
+        """Let the engine handle a stimulus in an expanded state. Return its state with the ids that
+        follow from there, the number of that state in the graph, and the edge; -1 if nothing
+        changes."""
+        before = self.states[state]
+        after, said = self.engine.handle(before, cause.stimulus)
+        orders = self.names.next_orders(before, self.orders[state], after)
+        number = self.index[self.names.key(after, orders), _endless(said)]
+        step = self._numbers.get(Step(cause.text, _fired(said)), -1)
+        return after, number, self._edges.get((state, number, step), -1)
+
+    @cached_property
+    def _numbers(self) -> dict[Step, int]:
+        return {step: i for i, step in enumerate(self.steps)}
+
+    @cached_property
+    def _edges(self) -> dict[tuple[int, int, int], int]:
+        ends = zip(self.source.tolist(), self.target.tolist(), self.label.tolist(), strict=True)
+        return {key: e for e, key in enumerate(ends)}
 
     def firings(self, state: int) -> tuple[str, ...]:
         """Return the transitions that fire on a shortest path to the state."""
@@ -213,6 +235,7 @@ class _Search:
             tuple(self.livelocks),
             self.crowded,
             self.contests,
+            self.index,
         )
 
     def _causes(self, i: int) -> Iterable[Cause]:
@@ -228,7 +251,7 @@ class _Search:
     ) -> int:
         after = self.names.next_orders(before, orders, state)
         reports = [i for i in said if isinstance(i, Report)]
-        endless = any(r.key == "timeless" for r in reports)
+        endless = _endless(said)
         key = (self.names.key(state, after), endless)
         number = self.index.setdefault(key, len(self.states))
         if number == len(self.states):
@@ -248,6 +271,10 @@ class _Search:
 
 def _fired(said: tuple[Instruction, ...]) -> tuple[str, ...]:
     return tuple(i.transition for i in said if isinstance(i, Fired))
+
+
+def _endless(said: tuple[Instruction, ...]) -> bool:
+    return any(isinstance(i, Report) and i.key == "timeless" for i in said)
 
 
 def _only(n: int, state: int) -> Mask:
