@@ -144,8 +144,15 @@ class Analysis:
     notes: tuple[str, ...]
     unjudged: str = ""
     """Tasks only: why there is no execution graph; empty if there is one."""
+    steps: int = STEPS
+    """The most stimuli and firings for the execution graph."""
     interrupted: bool = False
     """Whether Ctrl-C ended the analysis before everything was computed."""
+
+    @cached_property
+    def hand_notes(self) -> list[str]:
+        """What only the operator's tokens make possible; a third of the steps is used for it."""
+        return self.progress.hand_notes(self.steps // 3) if self.progress else []
 
     @property
     def ok(self) -> bool:
@@ -229,7 +236,7 @@ class Analysis:
             "sound": named["sound"].holds if "sound" in named else None,
             "execution": self.progress.size() if self.progress else None,
             "verdicts": {name: verdict.to_json() for name, verdict in named.items()},
-            "notes": list(self.notes),
+            "notes": [*self.notes, *self.hand_notes],
         }
         if structure:
             out["structure"] = self.structure.to_json()
@@ -337,7 +344,7 @@ class Analysis:
             else []
         )
         lines += self._number_lines()
-        return "\n".join(lines + [f"note: {note}" for note in self.notes])
+        return "\n".join(lines + [f"note: {note}" for note in (*self.notes, *self.hand_notes)])
 
     def _number_lines(self) -> list[str]:
         if self.run is not None:
@@ -518,6 +525,7 @@ def _analyse_task(
         numbers,
         tuple(notes),
         "" if progress is not None else why,
+        steps,
         CUT in notes,
     )
 
@@ -659,23 +667,25 @@ def _recovery_lines(progress: Progress) -> list[str]:
         told.append("durations and shares as the task file declares them, where not measured")
     return [
         *lines,
-        "  probability and mean time: a Markov chain on the execution graph, at most "
-        f"{odds.stages} phases in a duration",
+        "  probability and mean time: a Markov chain on the execution graph, with at most "
+        f"{odds.stages} phase{'s' * (odds.stages > 1)} for a duration",
         *(f"  assumed: {text}" for text in told),
     ]
 
 
 def _columns(texts: Sequence[str]) -> str:
-    widths = (5, 5, 12, 10, 16, 11, 0)
+    widths = (5, 5, 12, 10, 28, 11, 0)
     return "".join(f" {text:{w}}" for text, w in zip(texts, widths, strict=True)).rstrip()
 
 
 def _recovery_row(r: Recovery, odds: Odds) -> tuple[str, ...]:
-    named = {None: "any number", -1: "not recoverable", 0: "none tolerated"}
+    named = {None: "any number", -1: "not recoverable", 0: "no further error tolerated"}
+    if r.possible.holds:
+        named[-1] = "not recoverable for certain"
     p, time = odds.by_exit.get(r.error_exit, (None, None))
     path = " ".join(r.strategy) or ("(immediate)" if r.possible.holds and r.kappa != -1 else "-")
     return (
-        _word(r.possible.holds),
+        "some" if r.possible.holds is False and r.strategy else _word(r.possible.holds),
         _word(r.almost_sure.holds),
         "-" if p is None else _probability(p),
         "-" if not p else f"{time:.3g} s",

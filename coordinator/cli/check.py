@@ -180,7 +180,7 @@ def _text(name: str, analysis: Analysis | None, ok: bool) -> str:
             k: v for k, v in analysis.verdicts().items() if k != "safe"
         }  # a place may hold several tokens: they count
         told = [f"{key.replace('_', ' ')} {_word(v)}" for key, v in shown.items()]
-        lines += [f"{'note':8}{note}" for note in analysis.notes]
+        lines += [f"{'note':8}{note}" for note in (*analysis.notes, *analysis.hand_notes)]
         lines.append(f"{_size(analysis)}: {', '.join(told)}{_cut(analysis)}")
         lines += _reasons(analysis)
         if analysis.objections:

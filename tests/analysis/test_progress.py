@@ -13,7 +13,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from petrobot.coordinator.analysis.execution.chain import chain_of
-from petrobot.coordinator.analysis.execution.graph import execute
+from petrobot.coordinator.analysis.execution.graph import execute, with_operator
 from petrobot.coordinator.analysis.execution.progress import MENDED, NAMES, Progress, progress_of
 from petrobot.coordinator.analysis.may_run import Budget, may_run
 from petrobot.coordinator.analysis.net.graph import Graph
@@ -507,3 +507,53 @@ def test_almost_sure_attraction_is_the_value_one_of_the_decision_process(
             reached = graph.forward([v], kept)
             expected[v] |= bool(can[reached].all())
     assert np.array_equal(graph.almost_sure(goal, free), expected)
+
+
+# --- what only the operator's tokens make possible -----------------------------------------------
+
+
+def test_the_operators_hand_can_make_the_catching_task_stuck() -> None:
+    found = judged(load(TASKS / "catch_ball.toml"))
+    assert found.deadlock_free.holds
+    notes = found.hand_notes(20_000)
+    recovered = next(n for n in notes if "arm_recovered" in n)
+    assert recovered.startswith("only if the operator moves tokens: stuck with")
+    assert "forgive is barred by attempts, which holds 3" in recovered
+    command = "the operator adds a token to failed_attempts -> nothing"
+    assert recovered.count("the operator") == 2 and command in recovered
+    assert all("the operator adds" in note or "the operator takes" in note for note in notes)
+
+
+def test_each_state_after_the_operators_hand_can_be_replayed() -> None:
+    own = execute(arm(1))
+    x = with_operator(own, limit=20_000)
+    assert len(x) > len(own) and x.states[: len(own)] == own.states
+    for i in range(len(x)):
+        state = x.engine.initial()
+        for stimulus in x.stimuli(i):
+            state, _ = x.engine.handle(state, stimulus)
+        assert state == x.states[i]
+    dead = np.flatnonzero(x.dead)
+    assert len(dead) and not x.dead[: len(own)].any()
+    assert all(any(s.text.startswith("the operator") for s in x.path(int(i))) for i in dead)
+
+
+def test_a_conflict_that_needs_the_operators_token_is_a_note() -> None:
+    """Only the operator says that the cup is dirty; while the arm is away both wait for it."""
+    net: dict[str, dict[str, Any]] = {
+        "pick": {"in": "parts arm", "out": "act"},
+        "picked": {"in": "act:normal", "out": "arm"},
+        "lost": {"in": "act:error", "out": "arm"},
+        "clean": {"in": "dirty arm", "out": "wash"},
+        "washed": {"in": "wash:normal", "out": "arm"},
+        "unwashed": {"in": "wash:error", "out": "arm"},
+    }
+    task = make_task(
+        "parts=2 arm~=1 dirty/1 act! wash!", net, final="parts == 0 and arm == 1 and dirty == 0"
+    )
+    found = judged(task)
+    assert not found.contests and found.deadlock_free.holds
+    (note,) = found.hand_notes(20_000)
+    assert "pick and clean may both want the last token of arm" in note
+    path = "the operator adds a token to dirty -> nothing; act ends in success -> picked"
+    assert note.endswith(path)

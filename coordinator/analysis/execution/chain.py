@@ -41,10 +41,10 @@ from petrobot.coordinator.engine import (
 from petrobot.coordinator.engine.state import ACTIVE
 from petrobot.coordinator.task import Kind, Status
 
-SIZE = 10_000
-"""The most states of a chain; they take about half a second."""
-STAGES = (8, 4, 2, 1)
-"""Phases of a duration: as many as keep the chain within SIZE."""
+SIZE = 20_000
+"""The most states of a chain; they take about a second."""
+STAGES = 8
+"""The most phases of a duration; fewer where the chain would have more than SIZE states."""
 FIXED = 1e-9
 """Seconds for a timer of 0 s."""
 
@@ -180,12 +180,11 @@ def chain_of(
     Raises NoEstimate for what has neither a measured nor a declared number, and TooLarge.
     """
     builder = _Builder(x, measured or Measured(), size)
-    for stages in STAGES[:-1]:
-        try:
-            return builder.result(stages)
-        except TooLarge:
-            continue
-    return builder.result(STAGES[-1])
+    coarse = builder.result(1)
+    # With k phases a state with n clocks becomes at most k to the power of n.
+    clocks = np.array([len(clocks) for _, clocks in builder.states])
+    stages = next((k for k in range(STAGES, 1, -1) if float((1.0 * k**clocks).sum()) <= size), 1)
+    return builder.result(stages) if stages > 1 else coarse
 
 
 class _Builder:

@@ -17,7 +17,7 @@ from the graph as a Markov chain (`chain.py`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -27,7 +27,13 @@ from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.execution.causes import describe, explain, settled
 from petrobot.coordinator.analysis.execution.chain import TooLarge, chain_of
-from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, Step, execute
+from petrobot.coordinator.analysis.execution.graph import (
+    ExecutionGraph,
+    Step,
+    execute,
+    with_operator,
+)
+from petrobot.coordinator.analysis.execution.names import BY_HAND
 from petrobot.coordinator.analysis.limits import OutOfTime
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
@@ -79,7 +85,8 @@ class Recovery:
     """The fewest and the most goals that could be met just before the error and not after it; None:
     the task has no goal transitions, or meets its goal again and again."""
     strategy: tuple[str, ...]
-    """The fewest firings from the state just after the error back to the nominal flow."""
+    """The fewest firings from a state just after the error back to the nominal flow; empty if there
+    is no way."""
     alone: bool = True
     """Whether it can fire in the nominal flow; False: only while another error is handled."""
 
@@ -137,23 +144,51 @@ class Progress:
         """The conflicts that only the order in the file settles."""
         if self.free is None:
             return ()
-        compiled = self.x.engine.compiled
-        named = {t.name: t for t in compiled.transitions}
+        named = {t.name: t for t in self.x.engine.compiled.transitions}
         ours, theirs = self.verdicts(), self.free.verdicts()
         matters = {
             name: theirs[name].reason
             for name in NAMES
             if ours[name].holds and not theirs[name].holds
         }
-        found = []
-        for rivals in sorted(
-            self.free.x.contests, key=lambda names: [named[n].index for n in names]
-        ):
-            needs = [{p for p, _ in named[n].needs} | set(named[n].flags) for n in rivals]
-            shared = set.intersection(*needs) or {p for p, _ in named[rivals[0]].bars}
-            over = [s if isinstance(s, str) else compiled.net.places[s] for s in shared]
-            found.append(Contest(rivals, tuple(sorted(over)), matters))
-        return tuple(found)
+        order = sorted(self.free.x.contests, key=lambda names: [named[n].index for n in names])
+        return tuple(Contest(rivals, self._over(rivals), matters) for rivals in order)
+
+    def _over(self, rivals: Sequence[str]) -> tuple[str, ...]:
+        """Return the places and events of which the transitions want the same one."""
+        compiled = self.x.engine.compiled
+        wanting = [compiled.transitions[compiled.net.transition_index[name]] for name in rivals]
+        shared = set.intersection(*({p for p, _ in t.needs} for t in wanting))
+        places = {compiled.net.places[p] for p in shared or {p for p, _ in wanting[0].bars}}
+        return tuple(sorted(places | set.intersection(*(set(t.flags) for t in wanting))))
+
+    # --- what the operator's tokens make possible -----------------------------------------------
+
+    def hand_notes(self, limit: int) -> list[str]:
+        """Return the dead ends and conflicts that need tokens which the operator moves, in words,
+        from a second graph within a limit in stimuli and firings."""
+        own = self.x if self.free is None else self.free.x
+        if not own.complete:
+            return []
+        x = with_operator(own, limit=limit)
+        said = [
+            f"{' and '.join(rivals)} may both want the last token of "
+            f"{' and '.join(self._over(rivals))}; {_by(x, state)}"
+            for rivals, state in x.contests.items()
+            if rivals not in own.contests
+        ]
+        # One for the same commands and the same places: the control places are in his hand.
+        stuck: dict[tuple[str, ...], int] = {}
+        control = {p.name for p in own.names.task.places.values() if p.kind is Kind.CONTROL}
+        for i in sorted({settled(x, int(i)) for i in np.flatnonzero(x.dead)[:EXAMINED]}):
+            if i >= len(own):
+                commands = [s.text for s in x.path(i) if s.text.startswith(BY_HAND)]
+                stuck.setdefault((*commands, *(p for p in x.marked(i) if p not in control)), i)
+        said += [
+            f"stuck with {describe(x, i)}: {explain(x, i)}; {_by(x, i)}"
+            for i in list(stuck.values())[:GROUPS]
+        ]
+        return [f"only if the operator moves tokens: {text}" for text in said]
 
     # --- stuck, or for ever on its way ------------------------------------------------------
 
@@ -398,8 +433,9 @@ class Progress:
         held = [bool(w[after].all()) for w in nested]
         kappa = None if held[-1] else held.index(False) - 1
         inside = nested[-1 if kappa is None else max(kappa, 0)]
-        path = x.graph.path(int(after[0]), self._nominal, inside[x.target] & ~self._errors)
-        path = path or x.graph.path(int(after[0]), self._nominal) or []
+        start = int(after[np.argmax(back[after])])
+        path = x.graph.path(start, self._nominal, inside[x.target] & ~self._errors)
+        path = path or x.graph.path(start, self._nominal) or []
         when = "" if alone else ", while another error is being handled,"
         return Recovery(
             name,
@@ -641,6 +677,10 @@ class _Again:
                     words = f"no {nothing} again"
                 return first, f"after {describe(self.x, first)} {words}"
         return None
+
+
+def _by(x: ExecutionGraph, state: int) -> str:
+    return f"by: {'; '.join(map(str, x.path(state)))}"
 
 
 def _lack(kind: str, text: str) -> str:
