@@ -189,6 +189,10 @@ def analysed(text: str, filename: str, view: str = "ordinary") -> dict[str, Any]
         verdicts.append(
             {"name": f"recovery {recovery.error_exit}", "words": words, **verdict.to_json()}
         )
+    for shown in verdicts:
+        mended = analysis.progress and analysis.progress.mended.get(shown["name"])
+        if mended and mended.holds:
+            shown["reason"] += f"; it holds if {mended.assumption}"
     order = {False: 0, None: 1, True: 2}
     verdicts.sort(key=lambda verdict: order[verdict["holds"]])
     return {

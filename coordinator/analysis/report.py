@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -11,8 +11,8 @@ import numpy as np
 
 from petrobot.coordinator.analysis.execution.graph import STEPS, TooManyValues
 from petrobot.coordinator.analysis.execution.progress import (
-    MENDED,
     NAMES,
+    Odds,
     Progress,
     Recovery,
     progress_of,
@@ -144,8 +144,15 @@ class Analysis:
     notes: tuple[str, ...]
     unjudged: str = ""
     """Tasks only: why there is no execution graph; empty if there is one."""
+    steps: int = STEPS
+    """The most stimuli and firings for the execution graph."""
     interrupted: bool = False
     """Whether Ctrl-C ended the analysis before everything was computed."""
+
+    @cached_property
+    def hand_notes(self) -> list[str]:
+        """What only the operator's tokens make possible; a third of the steps is used for it."""
+        return self.progress.hand_notes(self.steps // 3) if self.progress else []
 
     @property
     def ok(self) -> bool:
@@ -229,13 +236,16 @@ class Analysis:
             "sound": named["sound"].holds if "sound" in named else None,
             "execution": self.progress.size() if self.progress else None,
             "verdicts": {name: verdict.to_json() for name, verdict in named.items()},
-            "notes": list(self.notes),
+            "notes": [*self.notes, *self.hand_notes],
         }
         if structure:
             out["structure"] = self.structure.to_json()
             out["notes"] += self.structure.gaps()
         if self.progress is not None:
-            out["recoveries"] = [_recovery(r) for r in self.progress.recoveries]
+            odds = self.progress.odds
+            out["recoveries"] = [_recovery(r, odds) for r in self.progress.recoveries]
+            out["no_probability"] = odds.missing
+            out["mended"] = {n: v.to_json() for n, v in self.progress.mended.items()}
         return out | self._numbers()
 
     def _numbers(self) -> dict[str, Any]:
@@ -312,6 +322,8 @@ class Analysis:
         lines += [f"executed: {self.progress.size_text()}", ""] if self.progress else [""]
         for name, verdict in self.verdicts().items():
             lines += _verdict_lines(name, verdict)
+            if self.progress is not None and name in self.progress.mended:
+                lines.append(_mended_line(self.progress.mended[name]))
         if self.progress is None:
             lines += [
                 f"  deadlock       {d.count} x: "
@@ -322,9 +334,7 @@ class Analysis:
             lines += [
                 f"  dead end       {d.count} x: {d.reason}" for d in self.progress.dead_ends[:SHOWN]
             ]
-            if self.progress.recoveries:
-                lines += ["", "error exits     possible  sure  further errors  run      recovery"]
-                lines += [_recovery_line(r) for r in self.progress.recoveries]
+            lines += _recovery_lines(self.progress)
         assumed = dict.fromkeys(
             v.assumption for v in self.verdicts().values() if v.holds and v.assumption
         )
@@ -334,7 +344,7 @@ class Analysis:
             else []
         )
         lines += self._number_lines()
-        return "\n".join(lines + [f"note: {note}" for note in self.notes])
+        return "\n".join(lines + [f"note: {note}" for note in (*self.notes, *self.hand_notes)])
 
     def _number_lines(self) -> list[str]:
         if self.run is not None:
@@ -497,7 +507,7 @@ def _analyse_task(
             # An unbounded net seldom has a finite execution graph, but its dead ends may be near.
             most = steps if found.bounded.holds is not False else min(steps, LOOK)
             try:
-                progress = progress_of(ordinary, most)
+                progress = progress_of(ordinary, most, measured)
                 notes += progress.notes
             except TooManyValues as fault:
                 why = str(fault)
@@ -515,6 +525,7 @@ def _analyse_task(
         numbers,
         tuple(notes),
         "" if progress is not None else why,
+        steps,
         CUT in notes,
     )
 
@@ -598,14 +609,17 @@ def _sizes(net: Net) -> dict[str, int]:
     return {"places": len(net.places), "transitions": len(net.transitions), "arcs": arcs}
 
 
-def _recovery(r: Recovery) -> Mapping[str, Any]:
+def _recovery(r: Recovery, odds: Odds) -> Mapping[str, Any]:
+    p, time = odds.by_exit.get(r.error_exit, (None, None))
     return {
         "error_exit": r.error_exit,
         "possible": r.possible.to_json(),
         "almost_sure": r.almost_sure.to_json(),
         "kappa": r.kappa,
         "while_another_is_handled": not r.alone,
-        "resumed": r.resumed,
+        "probability": p,
+        "mean_time": time if p else None,
+        "runs_lost": r.lost,
         "strategy": list(r.strategy),
     }
 
@@ -615,8 +629,7 @@ def _word(holds: bool | None) -> str:
 
 
 def _verdict_lines(name: str, verdict: PropertyVerdict) -> list[str]:
-    word = "if mended" if verdict.holds and verdict.assumption == MENDED else _word(verdict.holds)
-    lines = [f"  {name.replace('_', ' '):15}{word:9} {verdict.reason}"]
+    lines = [f"  {name.replace('_', ' '):15}{_word(verdict.holds):9} {verdict.reason}"]
     if verdict.witness is not None:
         firings = " ".join(verdict.witness.firings) or "(initial marking)"
         lines.append(
@@ -630,15 +643,61 @@ def _verdict_lines(name: str, verdict: PropertyVerdict) -> list[str]:
     return lines
 
 
-def _recovery_line(r: Recovery) -> str:
-    named = {None: "any number", -1: "not recoverable", 0: "none tolerated"}
-    kappa = named.get(r.kappa, str(r.kappa))
-    run = {True: "resumed", False: "lost", None: "-"}[r.resumed]
-    back = " ".join(r.strategy) or (
-        "(immediate)" if r.possible.holds and r.kappa != -1 else "(none)"
+def _mended_line(verdict: PropertyVerdict) -> str:
+    return f"{'':26}if somebody mends it: {_word(verdict.holds)}, {verdict.reason}"
+
+
+def _recovery_lines(progress: Progress) -> list[str]:
+    """Return the way back from each error exit; those that fire only while another error is
+    handled come last."""
+    found, odds = progress.recoveries, progress.odds
+    if not found:
+        return []
+    wide = max(14, *(len(r.error_exit) for r in found))
+    heads = ("back", "sure", "probability", "mean time", "further errors", "runs lost", "by")
+    lines = ["", f"{'error exits':{wide + 2}}{_columns(heads)}"]
+    for alone, title in ((True, ""), (False, "only while another error is being handled:")):
+        rows = [r for r in found if r.alone is alone]
+        lines += [title] if rows and title else []
+        lines += [f"  {r.error_exit:{wide}}{_columns(_recovery_row(r, odds))}" for r in rows]
+    if odds.missing:
+        return [*lines, f"  no probability: {odds.missing}"]
+    told = [text for text in odds.assumptions if not text.endswith(", not measured")]
+    if len(told) < len(odds.assumptions):
+        told.append("durations and shares as the task file declares them, where not measured")
+    return [
+        *lines,
+        "  probability and mean time: a Markov chain on the execution graph, with at most "
+        f"{odds.stages} phase{'s' * (odds.stages > 1)} for a duration",
+        *(f"  assumed: {text}" for text in told),
+    ]
+
+
+def _columns(texts: Sequence[str]) -> str:
+    widths = (5, 5, 12, 10, 28, 11, 0)
+    return "".join(f" {text:{w}}" for text, w in zip(texts, widths, strict=True)).rstrip()
+
+
+def _recovery_row(r: Recovery, odds: Odds) -> tuple[str, ...]:
+    named = {None: "any number", -1: "not recoverable", 0: "no further error tolerated"}
+    if r.possible.holds:
+        named[-1] = "not recoverable for certain"
+    p, time = odds.by_exit.get(r.error_exit, (None, None))
+    path = " ".join(r.strategy) or ("(immediate)" if r.possible.holds and r.kappa != -1 else "-")
+    return (
+        "some" if r.possible.holds is False and r.strategy else _word(r.possible.holds),
+        _word(r.almost_sure.holds),
+        "-" if p is None else _probability(p),
+        "-" if not p else f"{time:.3g} s",
+        named.get(r.kappa, str(r.kappa)),
+        "-" if r.lost is None else " to ".join(str(n) for n in dict.fromkeys(r.lost)),
+        path,
     )
-    verdicts = f"{_word(r.possible.holds):10}{_word(r.almost_sure.holds):6}"
-    return f"  {r.error_exit:14}{verdicts}{kappa:16}{run:9}{back}"
+
+
+def _probability(p: float) -> str:
+    """Return a probability with eight digits, or by how little it is short of 1."""
+    return f"1 - {1 - p:.1e}" if 0 < 1 - p < 5e-8 else f"{p:.8f}" if p % 1 else f"{p:.0f}"
 
 
 def heat(analysis: Analysis) -> dict[str, float]:

@@ -180,7 +180,7 @@ def _text(name: str, analysis: Analysis | None, ok: bool) -> str:
             k: v for k, v in analysis.verdicts().items() if k != "safe"
         }  # a place may hold several tokens: they count
         told = [f"{key.replace('_', ' ')} {_word(v)}" for key, v in shown.items()]
-        lines += [f"{'note':8}{note}" for note in analysis.notes]
+        lines += [f"{'note':8}{note}" for note in (*analysis.notes, *analysis.hand_notes)]
         lines.append(f"{_size(analysis)}: {', '.join(told)}{_cut(analysis)}")
         lines += _reasons(analysis)
         if analysis.objections:
@@ -190,10 +190,6 @@ def _text(name: str, analysis: Analysis | None, ok: bool) -> str:
 
 
 def _word(verdict: PropertyVerdict) -> str:
-    from petrobot.coordinator.analysis.execution.progress import MENDED
-
-    if verdict.holds and verdict.assumption == MENDED:
-        return "if mended"
     return {True: "yes", False: "NO", None: "unknown"}[verdict.holds]
 
 
@@ -223,7 +219,13 @@ def _reasons(analysis: Analysis) -> list[str]:
     from petrobot.coordinator.analysis.execution.progress import MENDED
 
     lines, against = list[str](), analysis.objections
-    refused = {n: v for n, v in analysis.verdicts().items() if v.holds is False and n != "safe"}
+    mended = analysis.progress.mended if analysis.progress else {}
+    mendable = [name for name, verdict in mended.items() if verdict.holds]
+    refused = {
+        n: v
+        for n, v in analysis.verdicts().items()
+        if v.holds is False and n != "safe" and n not in mendable
+    }
     for name in sorted(refused, key=lambda name: name not in against):
         verdict = refused[name]
         word = "error" if name in against else "warning"
@@ -233,6 +235,7 @@ def _reasons(analysis: Analysis) -> list[str]:
             lines.append(f"        by: {path or '(initial marking)'}")
     unknown = [v.reason for v in analysis.verdicts().values() if v.holds is None]
     lines += [f"{'warning':8}{reason}" for reason in dict.fromkeys(unknown)]
-    if any(v.holds and v.assumption == MENDED for v in analysis.verdicts().values()):
-        lines.append(f"{'note':8}if mended: {MENDED}")
+    if mendable:
+        reason = analysis.verdicts()[mendable[0]].reason
+        lines.append(f"{'note':8}{', '.join(mendable)}: {reason}; yes if {MENDED}")
     return lines

@@ -123,14 +123,16 @@ def test_the_catching_task_in_one_analysis() -> None:
     assert set(data) >= PROMISED | NUMBERS | {"recoveries", "forecast"}
     assert (
         data["bounded"]
-        and data["live"]
-        and data["reversible"]
+        and data["live"] is data["reversible"] is False
         and data["sound"]
         and data["deadlock"] is False
     )
-    assert data["execution"]["complete"] and {
-        v["holds"] for k, v in data["verdicts"].items() if k != "safe"
-    } == {True}
+    mended = {"live", "proper", "stable", "controllable"}
+    refused = {k for k, v in data["verdicts"].items() if v["holds"] is False}
+    assert data["execution"]["complete"] and refused == {"safe", *mended}
+    assert {k for k, v in data["mended"].items() if v["holds"]} == mended
+    fault = next(r for r in data["recoveries"] if r["error_exit"] == "move_failed")
+    assert fault["probability"] == pytest.approx(1 - 0.05**4) and fault["runs_lost"] == [1, 1]
     text = found.text()
     assert (
         "stable" in text
@@ -147,7 +149,9 @@ def test_the_catching_task_in_one_analysis() -> None:
     assert all(path[-1] == "give_up" for _, _, path in rest)
     assert (
         "sound, but P_complete is 6.31e-07 short of 1" in text
-        and "live           if mended" in text
+        and "live           NO" in text
+        and "if somebody mends it: yes, from every state" in text
+        and "0.99999375   6.16 s" in text
     )
 
 

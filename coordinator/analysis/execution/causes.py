@@ -20,8 +20,8 @@ MOST = 4
 
 def settled(x: ExecutionGraph, state: int) -> int:
     """Return the state in which a dead end comes to rest: the nearest one that nothing leaves."""
-    out = np.bincount(x.source, minlength=len(x)) == 0
-    edges = x.graph.path(state, out)
+    out = np.bincount(x.source[~x.by_hand], minlength=len(x)) == 0
+    edges = x.graph.path(state, out, ~x.by_hand)
     return int(x.target[edges[-1]]) if edges else state
 
 
@@ -51,16 +51,18 @@ def explain(x: ExecutionGraph, state: int) -> str:
     ended = {r.place for r in x.states[state].runs() if r.phase is Phase.DONE}
     firings = x.firings(state)
     waiting = [t for t in x.engine.compiled.transitions if _near(t, ended, draft.marking)]
-    told = []
+    told = list[tuple[tuple[int, bool], str]]()
     for t in waiting:
         found = obstacles(draft, t)
         if ended and all(_other_end(draft, one) for one in found):
             continue
         parts = [_cause(x, draft, firings, one) for one in found if not _other_end(draft, one)]
-        told.append(f"{t.name} {' and '.join(parts)}")
+        nearness = len(found), not any(one.kind == "full" for one in found)
+        told.append((nearness, f"{t.name} {' and '.join(parts)}"))
     more = f"; and {len(told) - MOST} more" if len(told) > MOST else ""
     if told:
-        return "; ".join(told[:MOST]) + more
+        told.sort(key=lambda one: one[0])  # first what comes nearest to firing
+        return "; ".join(text for _, text in told[:MOST]) + more
     if ended:
         return f"no transition takes what ended in {', '.join(sorted(ended))} that way"
     final = x.engine.compiled.task.final

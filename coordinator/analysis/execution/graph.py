@@ -9,7 +9,7 @@ path along the search tree can be replayed by the engine as it is.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -75,6 +75,10 @@ class ExecutionGraph:
     """By action place that should hold one run: a state in which it holds more."""
     contests: dict[tuple[str, ...], int]
     """Conflicts that only the order in the file settles: a state in which it comes to that."""
+    index: Mapping[Hashable, int] = field(repr=False)
+    """By what the future of a state depends on: its number."""
+    by_hand: Mask
+    """Which edges are commands of the operator; only `with_operator` makes such."""
 
     def __len__(self) -> int:
         return len(self.states)
@@ -118,16 +122,23 @@ class ExecutionGraph:
 
     @cached_property
     def dead(self) -> Mask:
-        """States that are no end, and from which neither a firing nor an end can be reached."""
+        """States that are no end, and from which neither a firing nor an end can be reached without
+        the operator."""
         alive = self.final | self.given_up
-        alive[self.source[self.fires]] = True
+        alive[self.source[self.fires & ~self.by_hand]] = True
         alive[self.expanded :] = True  # not examined
-        return ~self.graph.backward(alive)
+        return ~self.graph.backward(alive, ~self.by_hand)
 
     def path(self, state: int) -> list[Step]:
-        """Return a shortest path from the beginning to the state."""
-        edges = self.graph.path(0, _only(len(self), state)) or []
-        return [self.steps[self.label[e]] for e in edges]
+        """Return the path along which the state was found: a shortest one from the beginning, with
+        as few commands of the operator as possible."""
+        found = list[Step]()
+        while (came := self.came[state]) is not None:
+            first = int(self.graph.row[came[0]])
+            edge = first + int(np.argmax(self.target[first : self.graph.row[came[0] + 1]] == state))
+            found.append(self.steps[self.label[edge]])
+            state = came[0]
+        return found[::-1]
 
     def stimuli(self, state: int) -> list[Stimulus]:
         """Return stimuli, `Begin` first, by which the engine comes from its initial state to
@@ -137,6 +148,26 @@ class ExecutionGraph:
             state = came[0]
             found.append(came[1])
         return [Begin(), *reversed(found)]
+
+    def follow(self, state: int, cause: Cause) -> tuple[State, int, int]:
+        """Let the engine handle a stimulus in an expanded state. Return its state with the ids that
+        follow from there, the number of that state in the graph, and the edge; -1 if nothing
+        changes."""
+        before = self.states[state]
+        after, said = self.engine.handle(before, cause.stimulus)
+        orders = self.names.next_orders(before, self.orders[state], after)
+        number = self.index[self.names.key(after, orders), _endless(said)]
+        step = self._numbers.get(Step(cause.text, _fired(said)), -1)
+        return after, number, self._edges.get((state, number, step), -1)
+
+    @cached_property
+    def _numbers(self) -> dict[Step, int]:
+        return {step: i for i, step in enumerate(self.steps)}
+
+    @cached_property
+    def _edges(self) -> dict[tuple[int, int, int], int]:
+        ends = zip(self.source.tolist(), self.target.tolist(), self.label.tolist(), strict=True)
+        return {key: e for e, key in enumerate(ends)}
 
     def firings(self, state: int) -> tuple[str, ...]:
         """Return the transitions that fire on a shortest path to the state."""
@@ -156,13 +187,38 @@ def execute(
     With `free_choice` a conflict that nothing but the order in the file settles may go either way.
     Raises TooManyValues.
     """
-    return _Search(engine or Engine(task, policy=Policy(ask_undecided=free_choice))).run(limit)
+    engine = engine or Engine(task, policy=Policy(ask_undecided=free_choice))
+    return _Search(engine, Names(engine)).run(limit)
+
+
+def with_operator(x: ExecutionGraph, *, limit: int = STEPS) -> ExecutionGraph:
+    """Continue a complete execution graph with the operator's commands: tokens that he puts into or
+    takes out of control places, one at a time, within their capacities (without a capacity: up to
+    one more than at the beginning).
+
+    The states after one command come first, then those after two, and so on, until some are dead
+    ends or conflicts. The numbers of the given states stay the same.
+    """
+    search = _Search(
+        x.engine,
+        x.names,
+        dict(x.index),
+        list(x.states),
+        list(x.orders),
+        list(x.came),
+        {step: i for i, step in enumerate(x.steps)},
+        list(x.livelocks),
+        dict(x.crowded),
+        dict(x.contests),
+        [list(row) for row in (x.source, x.target, x.label)],
+    )
+    return search.with_operator(x, limit)
 
 
 @dataclass
 class _Search:
     engine: Engine
-    names: Names = field(init=False)
+    names: Names
     index: dict[Hashable, int] = field(default_factory=dict)
     states: list[State] = field(default_factory=list)
     orders: list[Orders] = field(default_factory=list)
@@ -171,48 +227,81 @@ class _Search:
     livelocks: list[int] = field(default_factory=list)
     crowded: dict[str, int] = field(default_factory=dict)
     contests: dict[tuple[str, ...], int] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.names = Names(self.engine)
+    edges: list[list[int]] = field(default_factory=lambda: [[], [], []])
+    """Sources, targets and labels."""
+    handled: int = 0
+    """Stimuli and firings so far."""
 
     def run(self, limit: int) -> ExecutionGraph:
         """Explore until nothing new is found or the limit is reached."""
         begun = self.engine.initial()
         state, said = self.engine.handle(begun, Begin())
-        first = _fired(said)
         self._found(begun, frozenset(), state, said, None)
-        source, target, label = list[int](), list[int](), list[int]()
-        handled = i = 0
-        while i < len(self.states) and handled < limit:
-            for cause in self._causes(i):
-                before = self.states[i]
-                state, said = self.engine.handle(before, cause.stimulus)
-                j = self._found(before, self.orders[i], state, said, (i, cause.stimulus))
-                step = Step(cause.text, _fired(said))
-                handled += 1 + len(step.firings)
-                if i != j or step.firings:
-                    source.append(i)
-                    target.append(j)
-                    label.append(self.steps.setdefault(step, len(self.steps)))
+        i = self._explore(0, limit)
+        return self._result(_fired(said), i, np.zeros(len(self.edges[0]), np.bool_), limit)
+
+    def with_operator(self, x: ExecutionGraph, limit: int) -> ExecutionGraph:
+        """Explore what the operator's commands add."""
+        by_hand, begin, end = [False] * len(x.source), 0, len(x)
+        found = x
+        while begin < end and self.handled < limit:
+            for i in range(begin, end):
+                if self.handled >= limit:
+                    break
+                self._follow(i, self.names.commands(self.states[i]))
+            by_hand += [True] * (len(self.edges[0]) - len(by_hand))
+            begin, end = end, self._explore(end, limit)
+            by_hand += [False] * (len(self.edges[0]) - len(by_hand))
+            found = self._result(x.first, end, np.array(by_hand, np.bool_), limit)
+            if found.dead[len(x) :].any() or len(found.contests) > len(x.contests):
+                break
+        return found
+
+    def _explore(self, i: int, limit: int) -> int:
+        """Follow the stimuli of the states from i on; return the first that was left out."""
+        while i < len(self.states) and self.handled < limit:
+            self._follow(i, self._causes(i))
             i += 1
-        complete = i == len(self.states)
+        return i
+
+    def _follow(self, i: int, causes: Iterable[Cause]) -> None:
+        source, target, label = self.edges
+        for cause in causes:
+            before = self.states[i]
+            state, said = self.engine.handle(before, cause.stimulus)
+            j = self._found(before, self.orders[i], state, said, (i, cause.stimulus))
+            step = Step(cause.text, _fired(said))
+            self.handled += 1 + len(step.firings)
+            if i != j or step.firings:
+                source.append(i)
+                target.append(j)
+                label.append(self.steps.setdefault(step, len(self.steps)))
+
+    def _result(
+        self, first: tuple[str, ...], expanded: int, by_hand: Mask, limit: int
+    ) -> ExecutionGraph:
+        complete = expanded == len(self.states)
+        source, target, label = (np.array(row, dtype=np.int32) for row in self.edges)
+        order = np.argsort(source, kind="stable")
         return ExecutionGraph(
             self.engine,
             self.names,
             tuple(self.states),
             tuple(self.orders),
             tuple(self.came),
-            np.array(source, dtype=np.int32),
-            np.array(target, dtype=np.int32),
-            np.array(label, dtype=np.int32),
+            source[order],
+            target[order],
+            label[order],
             tuple(self.steps),
             first,
-            i,
+            expanded,
             complete,
             "" if complete else f"more than {limit} stimuli and firings",
             tuple(self.livelocks),
             self.crowded,
             self.contests,
+            self.index,
+            by_hand[order],
         )
 
     def _causes(self, i: int) -> Iterable[Cause]:
@@ -228,7 +317,7 @@ class _Search:
     ) -> int:
         after = self.names.next_orders(before, orders, state)
         reports = [i for i in said if isinstance(i, Report)]
-        endless = any(r.key == "timeless" for r in reports)
+        endless = _endless(said)
         key = (self.names.key(state, after), endless)
         number = self.index.setdefault(key, len(self.states))
         if number == len(self.states):
@@ -250,10 +339,8 @@ def _fired(said: tuple[Instruction, ...]) -> tuple[str, ...]:
     return tuple(i.transition for i in said if isinstance(i, Fired))
 
 
-def _only(n: int, state: int) -> Mask:
-    mask = np.zeros(n, dtype=np.bool_)
-    mask[state] = True
-    return mask
+def _endless(said: tuple[Instruction, ...]) -> bool:
+    return any(isinstance(i, Report) and i.key == "timeless" for i in said)
 
 
 __all__ = ["STEPS", "ExecutionGraph", "Step", "TooManyValues", "execute"]

@@ -13,12 +13,14 @@ from itertools import product
 from typing import Any
 
 from petrobot.coordinator.engine import (
+    AddTokens,
     Choose,
     Chosen,
     Engine,
     EventOccurred,
     Mode,
     Phase,
+    RemoveTokens,
     Run,
     RunEnded,
     RunRaised,
@@ -40,6 +42,9 @@ RUN_FIELDS = ("status", "reason", "executed")
 """What conditions may ask of a run: `PLACE.status` and so on."""
 OUTCOMES = 256
 """The most combinations of values and reasons that one end of a run is tried with."""
+
+BY_HAND = "the operator"
+"""How the operator's commands begin in words."""
 
 Orders = frozenset[tuple[str, str]]
 """Pairs of armed timers, by their transitions: the first elapses before the second."""
@@ -64,7 +69,7 @@ class Names:
         """Collect them. Raises TooManyValues."""
         self.engine = engine
         compiled = engine.compiled
-        self._task = task = compiled.task
+        self.task = task = compiled.task
         conditions = [x.when for x in compiled.transitions if x.when is not None]
         parameters = dict(task.parameters)
         fixed = [with_values(c, parameters) for c in conditions]
@@ -204,13 +209,26 @@ class Names:
         late = {later for _, later in orders}
         for name, timer in sorted(state.timers.items()):
             if not timer.elapsed and name not in late:
-                after = self._task.transitions[name].after
+                after = self.task.transitions[name].after
                 yield Cause(TimerFired(timer.key), f"{after:g} s pass")
         for name in self._free:
             now = self.region(name, state.variables.get(name))
             for value in self._different(name):
                 if self.region(name, value) != now:
                     yield Cause(VariableChanged(name, value), f"{name} becomes {value!r}")
+
+    def commands(self, state: State) -> Iterator[Cause]:
+        """Yield the operator's moves of one token that the control places allow."""
+        if state.mode is not Mode.RUNNING or state.suspended is not None:
+            return
+        for place, held in zip(self.task.places.values(), state.marking, strict=True):
+            if place.kind is Kind.CONTROL:
+                room = place.tokens + 1 if place.capacity is None else place.capacity
+                if held < room:
+                    yield Cause(AddTokens(place.name), f"{BY_HAND} adds a token to {place.name}")
+                if held:
+                    text = f"{BY_HAND} takes a token out of {place.name}"
+                    yield Cause(RemoveTokens(place.name), text)
 
     def _of_run(self, run: Run, name: str) -> Iterator[Cause]:
         if run.phase is Phase.CHOOSING:
@@ -234,7 +252,7 @@ class Names:
                 yield Cause(StopConfirmed(run.id), f"{run.place} has stopped")
 
     def _events(self, state: State) -> Iterator[Cause]:
-        for event in self._task.events.values():
+        for event in self.task.events.values():
             if event.scope is not Scope.EXTERNAL or event.name not in self.engine.compiled.waiting:
                 continue
             kept = event.name in self.engine.compiled.kept
@@ -244,12 +262,12 @@ class Names:
 
     def _ends_of(self, place: str) -> list[tuple[RunEnded, str]]:
         """Return all ends of a run that something can tell apart, and how each reads."""
-        out = self._task.places[place].out
+        out = self.task.places[place].out
         read = {result: name for result, name in out.items() if name in self._known}
         statuses = [s for s in Status if s is not Status.FAILURE or place in self._status_read]
         reason = f"{place}.reason"
         reasons = self._different(reason) if reason in self._values else [""]
-        kinds = {name: self._task.variables[name].type for name in out.values()}
+        kinds = {name: self.task.variables[name].type for name in out.values()}
         asked = f"{place}.executed"
         done = self._different(asked) if asked in self._values else [Executed.YES.value]
         found: list[tuple[RunEnded, str]] = []
@@ -292,7 +310,7 @@ class Names:
         new = {n for n, t in after.timers.items() if not t.elapsed} - old
         kept = {(a, b) for a, b in orders if a in old and b in old}
         if new:
-            time = {n: self._task.transitions[n].after or 0.0 for n in old | new}
+            time = {n: self.task.transitions[n].after or 0.0 for n in old | new}
             kept |= {(a, b) for a in old for b in new if time[a] <= time[b]}
             kept |= {(a, b) for a in new for b in new if time[a] < time[b]}
         return frozenset(kept)

@@ -4,19 +4,20 @@ its end, does it recover from its errors.
 Notation: an *end* is a state in which the engine has finished with `final` or `final_error`; a
 *dead end* is a state that is no end and from which neither a firing nor an end can be reached. G
 are the nominal states: no place of an error branch is marked. A task ends, so live, proper, stable
-and controllable are judged with an edge from each end to the first state: first from those with
-`final` only, and where they do not hold so, also from those with `final_error`, which assumes that
-somebody mends what it leaves.
+and controllable are judged with an edge from each `final` state to the first state. What
+`final_error` leaves stays: only `mended` adds edges from there too, which assumes that somebody
+mends it.
 
 Recovery from an error exit is judged on the graph as it is, from the firings of the exit in a
 nominal state, and G absorbs. *Possible*: G can be reached from every state just after the exit.
 *Sure*: no state from which G is lost can be reached. *kappa*: the largest number of further errors
-after which G is still reached for certain.
+after which G is still reached for certain. The probability of the way back and its mean time come
+from the graph as a Markov chain (`chain.py`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -25,16 +26,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.execution.causes import describe, explain, settled
-from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, Step, execute
+from petrobot.coordinator.analysis.execution.chain import TooLarge, chain_of
+from petrobot.coordinator.analysis.execution.graph import (
+    ExecutionGraph,
+    Step,
+    execute,
+    with_operator,
+)
+from petrobot.coordinator.analysis.execution.names import BY_HAND
+from petrobot.coordinator.analysis.limits import OutOfTime
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
+from petrobot.coordinator.analysis.time.stochastic import Measured, NoEstimate
 from petrobot.coordinator.task import Kind
 from petrobot.coordinator.task.compiled_task import CompiledTransition
 
 FAIR = "every awaited event comes at some time, and a run may always end in each of its ways"
 """What progress needs of the world."""
 MENDED = "somebody mends what `final_error` leaves and starts the task again"
+AGAIN = {
+    "live": "from every state every transition can fire again",
+    "proper": "the next mission can begin from every state",
+    "stable": "the nominal flow is always reached again",
+    "controllable": "from every state each action can start again",
+}
+"""The verdicts from mission to mission, and what they say where they hold."""
 NEXT = "the next mission begins"
 NAMES = (
     "deadlock_free",
@@ -64,13 +81,28 @@ class Recovery:
     kappa: int | None
     """Further errors that the task certainly survives; None: any number; -1: G may not be reached
     even without a further error."""
-    resumed: bool | None
-    """True: the run can still meet its goal; False: it is lost; None: the task has no runs place or
-    no goal transitions."""
+    lost: tuple[int, int] | None
+    """The fewest and the most goals that could be met just before the error and not after it; None:
+    the task has no goal transitions, or meets its goal again and again."""
     strategy: tuple[str, ...]
-    """The fewest firings from the state just after the error back to the nominal flow."""
+    """The fewest firings from a state just after the error back to the nominal flow; empty if there
+    is no way."""
     alone: bool = True
     """Whether it can fire in the nominal flow; False: only while another error is handled."""
+
+
+@dataclass(frozen=True)
+class Odds:
+    """How probable the way back from each error exit is, and how long it takes."""
+
+    by_exit: Mapping[str, tuple[float, float]]
+    """Probability, and mean time (s) given that there is a way back (nan if there is none). Exits
+    that fire with probability 0 are not in it."""
+    stages: int
+    """The most phases by which a duration is approximated."""
+    assumptions: tuple[str, ...] = ()
+    missing: str = ""
+    """Why there are no numbers; empty if there are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +133,8 @@ class Progress:
 
     x: ExecutionGraph
     view: OrdinaryView
+    measured: Measured | None = None
+    """Numbers for `odds`; None: those that the task declares."""
     free: Progress | None = None
     """The same with conflicts that may go either way, where only the order in the file settles
     some; else None."""
@@ -110,23 +144,51 @@ class Progress:
         """The conflicts that only the order in the file settles."""
         if self.free is None:
             return ()
-        compiled = self.x.engine.compiled
-        named = {t.name: t for t in compiled.transitions}
+        named = {t.name: t for t in self.x.engine.compiled.transitions}
         ours, theirs = self.verdicts(), self.free.verdicts()
         matters = {
             name: theirs[name].reason
             for name in NAMES
             if ours[name].holds and not theirs[name].holds
         }
-        found = []
-        for rivals in sorted(
-            self.free.x.contests, key=lambda names: [named[n].index for n in names]
-        ):
-            needs = [{p for p, _ in named[n].needs} | set(named[n].flags) for n in rivals]
-            shared = set.intersection(*needs) or {p for p, _ in named[rivals[0]].bars}
-            over = [s if isinstance(s, str) else compiled.net.places[s] for s in shared]
-            found.append(Contest(rivals, tuple(sorted(over)), matters))
-        return tuple(found)
+        order = sorted(self.free.x.contests, key=lambda names: [named[n].index for n in names])
+        return tuple(Contest(rivals, self._over(rivals), matters) for rivals in order)
+
+    def _over(self, rivals: Sequence[str]) -> tuple[str, ...]:
+        """Return the places and events of which the transitions want the same one."""
+        compiled = self.x.engine.compiled
+        wanting = [compiled.transitions[compiled.net.transition_index[name]] for name in rivals]
+        shared = set.intersection(*({p for p, _ in t.needs} for t in wanting))
+        places = {compiled.net.places[p] for p in shared or {p for p, _ in wanting[0].bars}}
+        return tuple(sorted(places | set.intersection(*(set(t.flags) for t in wanting))))
+
+    # --- what the operator's tokens make possible -----------------------------------------------
+
+    def hand_notes(self, limit: int) -> list[str]:
+        """Return the dead ends and conflicts that need tokens which the operator moves, in words,
+        from a second graph within a limit in stimuli and firings."""
+        own = self.x if self.free is None else self.free.x
+        if not own.complete:
+            return []
+        x = with_operator(own, limit=limit)
+        said = [
+            f"{' and '.join(rivals)} may both want the last token of "
+            f"{' and '.join(self._over(rivals))}; {_by(x, state)}"
+            for rivals, state in x.contests.items()
+            if rivals not in own.contests
+        ]
+        # One for the same commands and the same places: the control places are in his hand.
+        stuck: dict[tuple[str, ...], int] = {}
+        control = {p.name for p in own.names.task.places.values() if p.kind is Kind.CONTROL}
+        for i in sorted({settled(x, int(i)) for i in np.flatnonzero(x.dead)[:EXAMINED]}):
+            if i >= len(own):
+                commands = [s.text for s in x.path(i) if s.text.startswith(BY_HAND)]
+                stuck.setdefault((*commands, *(p for p in x.marked(i) if p not in control)), i)
+        said += [
+            f"stuck with {describe(x, i)}: {explain(x, i)}; {_by(x, i)}"
+            for i in list(stuck.values())[:GROUPS]
+        ]
+        return [f"only if the operator moves tokens: {text}" for text in said]
 
     # --- stuck, or for ever on its way ------------------------------------------------------
 
@@ -223,67 +285,73 @@ class Progress:
     @cached_property
     def live(self) -> PropertyVerdict:
         """From everywhere every transition can fire again."""
-        names = [t.name for t in self.x.engine.compiled.transitions]
-        yes = "from every state every transition can fire again"
-        return self._again(
-            yes,
-            lambda again: again.without(
-                {n: frozenset({n}) for n in names}, "these never fire again"
-            ),
-        )
+        return self._again("live")
 
     @cached_property
     def proper(self) -> PropertyVerdict:
         """The first state can be reached again from everywhere."""
-        yes = "the next mission can begin from every state"
-
-        def judged(again: _Again) -> tuple[int, str] | None:
-            away = ~again.graph.backward([0])
-            if not away.any():
-                return None
-            first = int(np.argmax(away))
-            return first, f"from {describe(self.x, first)} the next mission can never begin"
-
-        return self._again(yes, judged)
+        return self._again("proper")
 
     @cached_property
     def stable(self) -> PropertyVerdict:
         """The nominal flow is always reached again."""
-        nominal = self._nominal
-
-        def judged(again: _Again) -> tuple[int, str] | None:
-            met = np.zeros(len(again.graph.bottom), dtype=np.bool_)
-            met[again.graph.components[nominal]] = True
-            lost = (again.graph.bottom & ~met)[again.graph.components]
-            if not lost.any():
-                return None
-            first = int(np.argmax(lost))
-            return first, f"the task can leave its nominal flow for good: {describe(self.x, first)}"
-
-        return self._again("the nominal flow is always reached again", judged)
+        return self._again("stable")
 
     @cached_property
     def controllable(self) -> PropertyVerdict:
         """From everywhere each action can be made to start again."""
-        yes = "from every state each action can start again"
-        starts = self.view.starts
-        return self._again(yes, lambda again: again.without(starts, "these never start again"))
+        return self._again("controllable")
 
-    def _again(
-        self, yes: str, judged: Callable[[_Again], tuple[int, str] | None]
-    ) -> PropertyVerdict:
-        x = self.x
-        if not x.complete:
+    @cached_property
+    def mended(self) -> dict[str, PropertyVerdict]:
+        """The verdicts from mission to mission that do not hold, judged again as if somebody mended
+        what `final_error` leaves and started the task again."""
+        if not self.x.complete or not self.x.given_up.any():
+            return {}
+        again = _Again(self.x, self.x.final | self.x.given_up)
+        found = {}
+        for name, yes in AGAIN.items():
+            if getattr(self, name).holds is False:
+                bad = self._judged(name, again)
+                found[name] = (
+                    PropertyVerdict(True, yes, assumption=MENDED)
+                    if bad is None
+                    else self._no(bad[1], bad[0])
+                )
+        return found
+
+    def _again(self, name: str) -> PropertyVerdict:
+        if not self.x.complete:
             return self._unknown("")
-        found = judged(_Again(x, x.final))
-        if found is None:
-            return PropertyVerdict(True, yes, assumption=self._fair)
-        if x.given_up.any():
-            mended = judged(_Again(x, x.final | x.given_up))
-            if mended is None:
-                return PropertyVerdict(True, yes, assumption=MENDED)
-            found = mended
-        return self._no(found[1], found[0])
+        found = self._judged(name, self._open)
+        if found is not None:
+            return self._no(found[1], found[0])
+        return PropertyVerdict(True, AGAIN[name], assumption=self._fair)
+
+    @cached_property
+    def _open(self) -> _Again:
+        return _Again(self.x, self.x.final)
+
+    def _judged(self, name: str, again: _Again) -> tuple[int, str] | None:
+        """Return a state in which a verdict fails and why, in words; None if it holds."""
+        x = self.x
+        if name == "live":
+            names = [t.name for t in x.engine.compiled.transitions]
+            return again.without({n: frozenset({n}) for n in names}, "fire", "transition fires")
+        if name == "controllable":
+            return again.without(self.view.starts, "start", "action starts")
+        if name == "proper":
+            away = ~again.graph.backward([0])
+            words = "the next mission can never begin after"
+        else:
+            met = np.zeros(len(again.graph.bottom), dtype=np.bool_)
+            met[again.graph.components[self._nominal]] = True
+            away = (again.graph.bottom & ~met)[again.graph.components]
+            words = "the task can leave its nominal flow for good: it stays in"
+        if not away.any():
+            return None
+        first = settled(x, int(np.argmax(away)))
+        return first, f"{words} {describe(x, first)}"
 
     # --- what the ordinary net can only estimate ------------------------------------------------
 
@@ -339,29 +407,35 @@ class Progress:
         found = []
         for t in self.x.engine.compiled.transitions:
             if t.name in self.view.error_exits:
-                edges = np.flatnonzero(self.x.firing([t.name]))
+                edges, alone = self._first_errors(t.name)
                 if len(edges):
-                    found.append(self._recovery(t.name, edges, back, caught, nested))
+                    found.append(self._recovery(t.name, edges, alone, back, caught, nested))
         return tuple(found)
+
+    def _first_errors(self, name: str) -> tuple[NDArray[np.int64], bool]:
+        """Return the edges by which an error exit fires in the nominal flow, and True; if there are
+        none, all by which it fires, and False."""
+        edges = np.flatnonzero(self.x.firing([name]))
+        first = edges[self._nominal[self.x.source[edges]]]
+        return (first, True) if len(first) else (edges, False)
 
     def _recovery(
         self,
         name: str,
         edges: NDArray[np.int64],
+        alone: bool,
         back: Mask,
         caught: Mask,
         nested: list[Mask],
     ) -> Recovery:
         x = self.x
-        first = edges[self._nominal[x.source[edges]]]
-        alone = bool(len(first))
-        edges = first if alone else edges
         after = np.unique(x.target[edges])
         held = [bool(w[after].all()) for w in nested]
         kappa = None if held[-1] else held.index(False) - 1
         inside = nested[-1 if kappa is None else max(kappa, 0)]
-        path = x.graph.path(int(after[0]), self._nominal, inside[x.target] & ~self._errors)
-        path = path or x.graph.path(int(after[0]), self._nominal) or []
+        start = int(after[np.argmax(back[after])])
+        path = x.graph.path(start, self._nominal, inside[x.target] & ~self._errors)
+        path = path or x.graph.path(start, self._nominal) or []
         when = "" if alone else ", while another error is being handled,"
         return Recovery(
             name,
@@ -378,7 +452,7 @@ class Progress:
                 "the task may never return",
             ),
             kappa,
-            self._resumed(after),
+            self._lost(edges),
             tuple(t for e in path for t in x.steps[x.label[e]].firings),
             alone,
         )
@@ -419,15 +493,48 @@ class Progress:
             allowed = np.ones(len(x), dtype=np.bool_)
             allowed[x.source[self._errors & ~reaching[x.target]]] = False
 
-    def _resumed(self, after: NDArray[np.int32]) -> bool | None:
-        """Return whether a goal can be met from all these states before a new run is taken; None
-        without goal transitions or a runs place."""
-        goals, takes = self.view.task.goal_transitions, self.view.run_starts
-        if not goals or not takes:
+    def _lost(self, edges: NDArray[np.int64]) -> tuple[int, int] | None:
+        """Return the fewest and the most goals that the edges make impossible."""
+        if self._goals is None:
             return None
-        before = np.zeros(len(self.x), dtype=np.bool_)
-        before[self.x.source[self.x.firing(goals)]] = True
-        return bool(self.x.graph.backward(before, ~self.x.firing(takes))[after].all())
+        gain, most = self._goals
+        left = gain[edges] + most[self.x.target[edges]]
+        lost = most[self.x.source[edges]] - left
+        return int(lost.min()), int(lost.max())
+
+    @cached_property
+    def _goals(self) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
+        """By edge, the goals that it meets; by state, the most goals that can still be met: the
+        longest path. None without goals, or where there is no most."""
+        x, goals = self.x, set(self.view.task.goal_transitions)
+        each = [sum(name in goals for name in step.firings) for step in x.steps]
+        gain = np.array(each or [0], dtype=np.int64)[x.label]
+        if not goals or gain[x.graph.inner].any():
+            return None
+        most = np.zeros(len(x), dtype=np.int64)
+        while True:
+            better = most.copy()
+            np.maximum.at(better, x.source, gain + most[x.target])
+            if np.array_equal(better, most):
+                return gain, most
+            most = better
+
+    @cached_property
+    def odds(self) -> Odds:
+        """How probable the way back from each error exit is, and how long it takes, by the numbers
+        that are measured or declared."""
+        if not self.recoveries:
+            return Odds({}, 0)
+        try:
+            chain = chain_of(self.x, self.measured)
+            found = {}
+            for r in self.recoveries:
+                back = chain.back(self._first_errors(r.error_exit)[0], self._nominal)
+                if back is not None:
+                    found[r.error_exit] = (1.0 if r.almost_sure.holds else back[0], back[1])
+            return Odds(found, chain.stages, chain.assumptions)
+        except (NoEstimate, TooLarge, OutOfTime, ArithmeticError, MemoryError) as why:
+            return Odds({}, 0, (), str(why) or "the memory was used up")
 
     # --- words -----------------------------------------------------------------------------------
 
@@ -456,7 +563,7 @@ class Progress:
         names = [t.name for t in self.x.engine.compiled.transitions]
         if not self.x.complete:
             return (None,) * len(names)
-        again = _Again(self.x, self.x.final | self.x.given_up)
+        again = self._open
         always = again.in_every_bottom()
         inner = np.unique(again.label[again.graph.inner]).tolist()
         often = set[str]().union(*(again.steps[n].firings for n in inner))
@@ -470,7 +577,7 @@ class Progress:
         """How many states can be reached again from every state; None if unknown."""
         if not self.x.complete:
             return None
-        graph = _Again(self.x, self.x.final | self.x.given_up).graph
+        graph = self._open.graph
         bottoms = np.flatnonzero(graph.bottom)
         return int((graph.components == bottoms[0]).sum()) if len(bottoms) == 1 else 0
 
@@ -513,7 +620,7 @@ class Progress:
         return PropertyVerdict(None, f"{text}; {more}" if more else text, complete=False)
 
 
-def progress_of(view: OrdinaryView, limit: int) -> Progress:
+def progress_of(view: OrdinaryView, limit: int, measured: Measured | None = None) -> Progress:
     """Return the verdicts on the execution graph of a task, within a limit in stimuli
     and firings.
 
@@ -521,8 +628,9 @@ def progress_of(view: OrdinaryView, limit: int) -> Progress:
     """
     free = execute(view.task, limit=limit, free_choice=True)
     if not free.contests:
-        return Progress(free, view)
-    return Progress(execute(view.task, limit=limit), view, Progress(free, view))
+        return Progress(free, view, measured)
+    settled_by_order = execute(view.task, limit=limit)
+    return Progress(settled_by_order, view, measured, Progress(free, view))
 
 
 class _Again:
@@ -549,19 +657,30 @@ class _Again:
             every = fired if every is None else every & fired
         return every or set()
 
-    def without(self, wanted: Mapping[str, frozenset[str]], words: str) -> tuple[int, str] | None:
+    def without(
+        self, wanted: Mapping[str, frozenset[str]], verb: str, nothing: str
+    ) -> tuple[int, str] | None:
         """Return a state from which some of the wanted never happen again, in words. Each wanted is
         a name with the transitions of which one must fire."""
         components = self.graph.components
         ours = components[self.graph.source]
-        for component in np.flatnonzero(self.graph.bottom).tolist():
+        _, entered = np.unique(components, return_index=True)
+        nearest = np.argsort(entered)
+        for component in nearest[self.graph.bottom[nearest]].tolist():
             labels = np.unique(self.label[(ours == component)]).tolist()
             fired = set[str]().union(*(self.steps[n].firings for n in labels))
             never = [name for name, some in wanted.items() if not fired & some]
             if never:
                 first = int(np.argmax(components == component))
-                return first, f"after {describe(self.x, first)} {words}: {', '.join(never)}"
+                words = f"these never {verb} again: {', '.join(never)}"
+                if len(never) == len(wanted):
+                    words = f"no {nothing} again"
+                return first, f"after {describe(self.x, first)} {words}"
         return None
+
+
+def _by(x: ExecutionGraph, state: int) -> str:
+    return f"by: {'; '.join(map(str, x.path(state)))}"
 
 
 def _lack(kind: str, text: str) -> str:

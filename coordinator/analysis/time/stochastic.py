@@ -76,6 +76,60 @@ class NoEstimate(ValueError):  # noqa: N818 - names what is missing
 
 
 @dataclass(frozen=True)
+class Numbers:
+    """What is measured or declared of a task, measured first."""
+
+    task: Task
+    measured: Measured
+    assumptions: list[str] = field(default_factory=list)
+    """What was assumed in the answers so far."""
+
+    def alternatives(self, place: Place) -> dict[str, float]:
+        """Return the probability of each alternative of a place."""
+        primitive = self.task.primitive_task_of(place.name)
+        known = self.measured.choice.get(primitive.name)
+        if known is None:
+            if len(primitive.alternatives) > 1:
+                self.assumptions.append(
+                    f"{primitive.name}: its alternatives are equally likely (no selector "
+                    "state given)"
+                )
+            return {action: 1.0 / len(primitive.alternatives) for action in primitive.alternatives}
+        return {
+            action: known[action] for action in primitive.alternatives if known.get(action, 0.0) > 0
+        }
+
+    def estimates(self, place: Place, action: str) -> Mapping[Status, Estimate]:
+        """Return share, mean (s) and cv by status. Raises NoEstimate."""
+        primitive = self.task.primitive_task_of(place.name)
+        for key in ((place.name, action), (primitive.name, action)):
+            if key in self.measured.runs:
+                return self.measured.runs[key]
+        if not primitive.estimates:
+            raise NoEstimate(
+                f"primitive_tasks.{primitive.name}: the duration of {action} is unknown: it was "
+                "neither measured nor declared; "
+                f"add [primitive_tasks.{primitive.name}.estimates] or give measurements"
+            )
+        self.assumptions.append(
+            f"{primitive.name}: estimates declared in the task file, not measured"
+        )
+        return primitive.estimates
+
+    def wait(self, event: str) -> float:
+        """Return the mean time (s) until an event comes. Raises NoEstimate."""
+        mean = self.measured.waits.get(event, self.task.events[event].mean_wait)
+        if mean is None:
+            raise NoEstimate(
+                f"events.{event}: its mean wait is unknown: neither measured nor declared; add "
+                "mean_wait = SECONDS"
+            )
+        if event not in self.measured.waits:
+            self.assumptions.append(f"{event}: mean wait declared in the task file, not measured")
+        return mean
+
+
+@dataclass(frozen=True)
 class StochasticView:
     """A task as a GSPN. The first places are those of the ordinary net, in its order."""
 
@@ -150,7 +204,8 @@ class _Derivation:
         self.servers: dict[str, int | None] = {}
         self.origin: dict[str, str] = {}
         self.statuses: dict[str, tuple[str, str, Status]] = {}
-        self.assumptions: list[str] = []
+        self.numbers = Numbers(task, measured)
+        self.assumptions = self.numbers.assumptions
         self.errors: dict[str, float] = {}
         self.possible: dict[str, set[Status]] = {}
         self.sources: dict[str, str] = {}
@@ -220,14 +275,14 @@ class _Derivation:
             self.places[f"{name}.server"] = place.servers
         self.possible[name], self.phases[name] = set(), []
         shared: dict[tuple[Status, PhaseType], list[tuple[str, float]]] = {}
-        alternatives = self._alternatives(place)
+        alternatives = self.numbers.alternatives(place)
         if alternatives and all(
             (name, action) in self.measured.preempted for action in alternatives
         ):
             self._causes(place, alternatives)
         for action, chosen in alternatives.items():
             self._choice(place, action, chosen)
-            known = {s: e for s, e in self._estimates(place, action).items() if e.share > 0}
+            known = {s: e for s, e in self.numbers.estimates(place, action).items() if e.share > 0}
             for status, estimate in known.items():
                 self._status(place, action, status, estimate, shared)
             if not known:  # no run ever ended by itself: it stays active until it is preempted
@@ -289,36 +344,6 @@ class _Derivation:
             if key in self.measured.runs:
                 return self.measured.sources.get(key, MEASURED)
         return DECLARED
-
-    def _alternatives(self, place: Place) -> dict[str, float]:
-        primitive = self.task.primitive_task_of(place.name)
-        known = self.measured.choice.get(primitive.name)
-        if known is None:
-            if len(primitive.alternatives) > 1:
-                self.assumptions.append(
-                    f"{primitive.name}: its alternatives are equally likely (no selector "
-                    "state given)"
-                )
-            return {action: 1.0 / len(primitive.alternatives) for action in primitive.alternatives}
-        return {
-            action: known[action] for action in primitive.alternatives if known.get(action, 0.0) > 0
-        }
-
-    def _estimates(self, place: Place, action: str) -> Mapping[Status, Estimate]:
-        primitive = self.task.primitive_task_of(place.name)
-        for key in ((place.name, action), (primitive.name, action)):
-            if key in self.measured.runs:
-                return self.measured.runs[key]
-        if not primitive.estimates:
-            raise NoEstimate(
-                f"primitive_tasks.{primitive.name}: the duration of {action} is unknown: it was "
-                "neither measured nor declared; "
-                f"add [primitive_tasks.{primitive.name}.estimates] or give measurements"
-            )
-        self.assumptions.append(
-            f"{primitive.name}: estimates declared in the task file, not measured"
-        )
-        return primitive.estimates
 
     def _choice(self, place: Place, action: str, chosen: float) -> None:
         name, served = place.name, place.servers is not None
@@ -514,19 +539,7 @@ class _Derivation:
         The mean of the maximum of independent exponentials, by inclusion and exclusion over all
         non-empty subsets: E[max] = sum of (-1)^(size + 1) / (sum of the rates in the subset).
         """
-        means = []
-        for event in t.events:
-            mean = self.measured.waits.get(event, self.task.events[event].mean_wait)
-            if mean is None:
-                raise NoEstimate(
-                    f"events.{event}: its mean wait is unknown: neither measured nor declared; add "
-                    "mean_wait = SECONDS"
-                )
-            if event not in self.measured.waits:
-                self.assumptions.append(
-                    f"{event}: mean wait declared in the task file, not measured"
-                )
-            means.append(mean)
+        means = [self.numbers.wait(event) for event in t.events]
         if len(means) > 1:
             self.assumptions.append(
                 f"{t.name}: the wait for all its events is approximated by one exponential"

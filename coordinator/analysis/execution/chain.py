@@ -1,0 +1,533 @@
+"""The execution graph as a Markov chain: how probable each edge is, and how long it takes.
+
+A state of the chain is a state of the execution graph with a clock for each active run and each
+armed timer. A run draws its action and its status when it starts, and then takes the phase-type
+duration of that status; a timer takes an Erlang duration; an awaited event and an internal event
+come after an exponential wait. Choices, draws and stops take no time. The numbers are those of the
+stochastic view (`time.stochastic`). What a run writes is not measured: values that lead to
+different firings are equally likely, unless the frequency of a condition was measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from petrobot.coordinator.analysis.execution.graph import ExecutionGraph
+from petrobot.coordinator.analysis.execution.names import Cause
+from petrobot.coordinator.analysis.limits import keep_time
+from petrobot.coordinator.analysis.net.graph import Graph, Mask, sum_by
+from petrobot.coordinator.analysis.time.gspn import Values
+from petrobot.coordinator.analysis.time.linear import SolveOrder, solve, stationary
+from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit
+from petrobot.coordinator.analysis.time.stochastic import Measured, NoEstimate, Numbers, is_cause
+from petrobot.coordinator.engine import (
+    Chosen,
+    EventOccurred,
+    Mode,
+    Run,
+    RunEnded,
+    RunRaised,
+    State,
+    StopConfirmed,
+    TimerFired,
+    VariableChanged,
+)
+from petrobot.coordinator.engine.state import ACTIVE
+from petrobot.coordinator.task import Kind, Status
+
+SIZE = 20_000
+"""The most states of a chain; they take about a second."""
+STAGES = 8
+"""The most phases of a duration; fewer where the chain would have more than SIZE states."""
+FIXED = 1e-9
+"""Seconds for a timer of 0 s."""
+
+Clock = tuple[str, int, float]
+"""What ends (a status, `by.` and a preempting transition, or a timer), the phases that are left,
+and the rate (1/s) of each."""
+Draw = list[tuple[float, Clock]]
+"""Clocks with their probabilities."""
+NEVER: Clock = ("never", 1, 0.0)
+
+
+class TooLarge(ValueError):  # noqa: N818 - a limit of the analysis
+    """The chain has more than SIZE states, even with one phase for each duration."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Outcome:
+    """Where a stimulus leads: the state, the number of the edge (-1 if it has none), by clock of
+    that state the clock of the state before that continues (-1 for a new one), and the share of
+    this outcome among those of the same stimulus."""
+
+    state: int
+    edge: int
+    kept: tuple[int, ...]
+    share: float = 1.0
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What can happen in a state of the execution graph."""
+
+    slots: tuple[tuple[str, str], ...]
+    """What has a clock: ("run", id) or ("timer", transition)."""
+    at_once: tuple[_Outcome, ...]
+    """What comes first and takes no time; else what follows."""
+    ends: dict[tuple[int, str], list[_Outcome]]
+    """By slot and what its clock ends in."""
+    events: list[tuple[float, _Outcome]]
+    """Exponential waits: rates (1/s)."""
+
+
+@dataclass(frozen=True)
+class ExecutionChain:
+    """The chain: edges with their probabilities, and mean times (s) by state."""
+
+    x: ExecutionGraph
+    graph: Graph
+    at: NDArray[np.int32]
+    """By state of the chain: its state of the execution graph."""
+    edge: NDArray[np.int32]
+    """By edge of the chain: its edge of the execution graph; -1 for a phase."""
+    probability: Values
+    sojourn: Values
+    stages: int
+    """The most phases of a duration."""
+    assumptions: tuple[str, ...]
+
+    @cached_property
+    def _weights(self) -> tuple[Values, Values]:
+        """By edge: how often it is taken in one mission run, and how often in the long run of a
+        task that never ends."""
+        graph, n = self.graph, self.graph.n
+        component, bottom = graph.components, graph.bottom
+        once = ~bottom[component]
+        order = np.argsort(graph.target, kind="stable")
+        source, target = graph.source[order], graph.target[order]
+        value = np.where(once[source] & once[target], self.probability[order], 0.0)
+        begin = np.zeros(n)
+        begin[0] = 1.0
+        turned = Graph(n, target, source)
+        visits = np.where(once, solve(SolveOrder.of(turned, once), value, begin), 0.0)
+        into = visits[graph.source] * self.probability
+        share = sum_by(component[graph.target], into * ~once[graph.target], len(bottom))
+        share[component[0]] += float(not once[0])
+        often = np.zeros(n)
+        for c in np.flatnonzero(bottom & (np.bincount(component) > 1)).tolist():
+            inside = np.flatnonzero(component == c)
+            number = np.full(n, -1)
+            number[inside] = np.arange(len(inside))
+            ours = component[graph.source] == c
+            rows, columns = number[graph.source[ours]], number[graph.target[ours]]
+            often[inside] = share[c] * stationary(
+                len(inside), rows, columns, self.probability[ours]
+            )
+        return into, often[graph.source] * self.probability
+
+    def back(self, exits: NDArray[np.int64], goal: Mask) -> tuple[float, float] | None:
+        """Return the probability that a state of `goal` is reached after one of the edges of the
+        execution graph is taken, and the mean time (s) until then, given that it is (nan if it
+        never is). None if the edges have the probability 0.
+
+        The edges count as often as a mission run takes them.
+        """
+        taken = np.isin(self.edge, exits)
+        if not taken.any():
+            return None
+        once, often = self._weights
+        weight = (often if often[taken].any() else once)[taken]
+        h, y = self._reach(goal)
+        to = self.graph.target[taken]
+        whole = float(weight.sum())
+        if not whole:  # reached with a probability too small to be computed
+            weight, whole = np.ones(len(to)), float(len(to))
+        p, time = float(weight @ h[to]) / whole, float(weight @ y[to]) / whole
+        return min(p, 1.0), time / p if p else float("nan")
+
+    def _reach(self, goal: Mask) -> tuple[Values, Values]:
+        """Return the probability of reaching the goal, and E[time; reached] (s), by state of the
+        chain: the first-step equations of `time.completion`."""
+        if self._known and np.array_equal(self._known[0][0], goal):
+            return self._known[0][1:]
+        graph, there = self.graph, goal[self.at]
+        inside = graph.backward(there) & ~there
+        plan, open_ = SolveOrder.of(graph, inside), inside[graph.source]
+        value = np.where(open_ & inside[graph.target], self.probability, 0.0)
+        direct = np.where(open_ & there[graph.target], self.probability, 0.0)
+        h = solve(plan, value, sum_by(graph.source, direct, graph.n))
+        y = solve(plan, value, np.where(inside, self.sojourn * h, 0.0))
+        h[there] = 1.0
+        self._known[:] = [(goal, h, y)]
+        return h, y
+
+    @cached_property
+    def _known(self) -> list[tuple[Mask, Values, Values]]:
+        return []
+
+
+def chain_of(
+    x: ExecutionGraph, measured: Measured | None = None, *, size: int = SIZE
+) -> ExecutionChain:
+    """Return the chain of a complete execution graph.
+
+    Raises NoEstimate for what has neither a measured nor a declared number, and TooLarge.
+    """
+    builder = _Builder(x, measured or Measured(), size)
+    coarse = builder.result(1)
+    # With k phases a state with n clocks becomes at most k to the power of n.
+    clocks = np.array([len(clocks) for _, clocks in builder.states])
+    stages = next((k for k in range(STAGES, 1, -1) if float((1.0 * k**clocks).sum()) <= size), 1)
+    return builder.result(stages) if stages > 1 else coarse
+
+
+class _Builder:
+    """Finds the states of the chain from the beginning, breadth first."""
+
+    def __init__(self, x: ExecutionGraph, measured: Measured, size: int) -> None:
+        self.x, self.measured, self.size = x, measured, size
+        self.task = x.engine.compiled.task
+        self.numbers = Numbers(self.task, measured)
+        self.refuse_unknown()
+        self.plans: dict[int, _Plan] = {}
+        self.causes = {
+            (a.place, t.name)
+            for t in filter(is_cause, self.task.transitions.values())
+            for a in t.inputs
+            if a.end is not None and self._covered(a.place)
+        }
+        """Preemptions that are measured as a cause by which a run ends."""
+
+    def refuse_unknown(self) -> None:
+        """Raise NoEstimate that names every place without an estimate."""
+        lacking = []
+        for place in self.task.places.values():
+            if place.kind is Kind.ACTION:
+                try:
+                    for action in self.numbers.alternatives(place):
+                        self.numbers.estimates(place, action)
+                except NoEstimate:
+                    lacking.append(f"`{place.name}`")
+        if lacking:
+            raise NoEstimate(f"no estimate for {', '.join(lacking)}")
+
+    def result(self, stages: int) -> ExecutionChain:
+        """Return the chain with so many phases in a duration. Raises NoEstimate and TooLarge."""
+        self.stages = stages
+        self.draws: dict[tuple[str, str], Draw] = {}
+        self.number: dict[tuple[int, tuple[Clock, ...]], int] = {}
+        self.states: list[tuple[int, tuple[Clock, ...]]] = []
+        self.edges: list[tuple[int, int, int, float]] = []
+        self.sojourn: list[float] = []
+        self.index(0, ())
+        if self.plan(0).slots:  # the chain begins in one state, without clocks, and draws them
+            for p, clocks in self.drawn(0, (), ()):
+                self.edges.append((0, self.index(0, clocks), -1, p))
+            self.sojourn.append(0.0)
+        i = len(self.sojourn)
+        while i < len(self.states):
+            if not i % 1000:
+                keep_time("recovery")
+            self.sojourn.append(self.leave(i))
+            i += 1
+        source, target, edge, probability = (
+            zip(*self.edges, strict=True) if self.edges else ((),) * 4
+        )
+        return ExecutionChain(
+            self.x,
+            Graph(len(self.states), np.array(source, np.int32), np.array(target, np.int32)),
+            np.array([state for state, _ in self.states], np.int32),
+            np.array(edge, np.int32),
+            np.array(probability, np.float64),
+            np.array(self.sojourn, np.float64),
+            stages,
+            tuple(dict.fromkeys(self.numbers.assumptions)),
+        )
+
+    def index(self, state: int, clocks: tuple[Clock, ...]) -> int:
+        """Return the number of a state of the chain."""
+        found = self.number.setdefault((state, clocks), len(self.states))
+        if found == len(self.states):
+            if found >= self.size:
+                raise TooLarge(f"its Markov chain has more than {self.size} states")
+            self.states.append((state, clocks))
+        return found
+
+    def leave(self, i: int) -> float:
+        """Add the edges of a state of the chain; return its mean time (s)."""
+        state, clocks = self.states[i]
+        plan = self.plan(state)
+        if plan.at_once:
+            self.add(i, clocks, [(1.0, list(plan.at_once))], 1.0)
+            return 0.0
+        phases: list[tuple[float, int]] = []
+        ends: list[tuple[float, list[_Outcome]]] = [(r, [o]) for r, o in plan.events]
+        for k, (what, left, rate) in enumerate(clocks):
+            if left > 1:
+                later = (*clocks[:k], (what, left - 1, rate), *clocks[k + 1 :])
+                phases.append((rate, self.index(state, later)))
+            elif rate and (outcomes := plan.ends.get((k, what))):
+                ends.append((rate, outcomes))
+        total = sum(rate for rate, _ in phases) + sum(rate for rate, _ in ends)
+        if not total:
+            return 0.0
+        self.edges += [(i, j, -1, rate / total) for rate, j in phases]
+        self.add(i, clocks, ends, total)
+        return 1.0 / total
+
+    def add(
+        self,
+        i: int,
+        clocks: tuple[Clock, ...],
+        ends: list[tuple[float, list[_Outcome]]],
+        total: float,
+    ) -> None:
+        """Add the edges of what ends, each with the draws of the clocks that start with it."""
+        for rate, outcomes in ends:
+            for one in outcomes:
+                for p, after in self.drawn(one.state, one.kept, clocks):
+                    j = self.index(one.state, after)
+                    self.edges.append((i, j, one.edge, p * one.share * rate / total))
+
+    def drawn(
+        self, state: int, kept: tuple[int, ...], clocks: tuple[Clock, ...]
+    ) -> Iterator[tuple[float, tuple[Clock, ...]]]:
+        """Yield the clocks with which a state can begin, with their probabilities."""
+        choices: list[Draw] = []
+        for k, slot in enumerate(self.plan(state).slots):
+            if k < len(kept) and kept[k] >= 0:
+                choices.append([(1.0, clocks[kept[k]])])
+            else:
+                choices.append(self.first(self.x.states[state], slot))
+        for combination in product(*choices):
+            p = 1.0
+            for share, _ in combination:
+                p *= share
+            yield p, tuple(clock for _, clock in combination)
+
+    # --- the numbers ---------------------------------------------------------------------------
+
+    def first(self, state: State, slot: tuple[str, str]) -> Draw:
+        """Return the clocks with which a run or a timer can start."""
+        kind, name = slot
+        if kind == "timer":
+            after = max(self.task.transitions[name].after or 0.0, FIXED)
+            return self.known((name, ""), [(1.0, name, fit(after, 0.0, stages=self.stages))])
+        run = state.run(name)
+        assert run is not None
+        key = (f"run {run.place}", run.device)
+        return self.draws[key] if key in self.draws else self.known(key, self.durations(run))
+
+    def known(self, key: tuple[str, str], laws: list[tuple[float, str, PhaseType]]) -> Draw:
+        """Return the clocks of a mixture of durations, remembered by a key."""
+        if key not in self.draws:
+            mixed: dict[Clock, float] = {}
+            for share, what, duration in laws:
+                for b in duration.branches:
+                    clock = (what, b.stages, b.rate)
+                    mixed[clock] = mixed.get(clock, 0.0) + share * b.probability
+            total = sum(mixed.values())
+            self.draws[key] = (
+                [(p / total, clock) for clock, p in mixed.items()] if total else [(1.0, NEVER)]
+            )
+        return self.draws[key]
+
+    def durations(self, run: Run) -> list[tuple[float, str, PhaseType]]:
+        """Return how a run can end, each with its probability and its duration."""
+        place = self.task.places[run.place]
+        devices = self.x.engine.compiled.devices
+        found = []
+        for action, chosen in self.numbers.alternatives(place).items():
+            if devices.get(action, "") != run.device:
+                continue
+            ends = {str(s): e for s, e in self.numbers.estimates(place, action).items()}
+            if self._covered(place.name):
+                caused = self.measured.preempted[place.name, action]
+                ends |= {f"by.{name}": e for name, e in caused.items()}
+            for what, e in ends.items():
+                if e.share > 0 and not e.mean > 0:
+                    raise NoEstimate(f"no mean duration of `{place.name}` that ends in {what}")
+                if e.share > 0:
+                    duration = fit(e.mean, (e.cv * e.mean) ** 2, stages=self.stages)
+                    found.append((chosen * e.share, what, duration))
+        return found
+
+    def _actions(self, place: str) -> list[str]:
+        return list(self.numbers.alternatives(self.task.places[place]))
+
+    def _covered(self, place: str) -> bool:
+        actions = self._actions(place)
+        return bool(actions) and all((place, a) in self.measured.preempted for a in actions)
+
+    def rate(self, event: str) -> float:
+        """Return the rate (1/s) at which an event comes."""
+        try:
+            return 1.0 / self.numbers.wait(event)
+        except NoEstimate as unknown:
+            raise NoEstimate(f"no mean_wait of the event `{event}`") from unknown
+
+    # --- what can happen in a state of the execution graph ---------------------------------------
+
+    def plan(self, i: int) -> _Plan:
+        """Return what can happen in a state."""
+        if i not in self.plans:
+            self.plans[i] = self._plan(i)
+        return self.plans[i]
+
+    def slots(self, state: State) -> tuple[tuple[str, str], ...]:
+        """Return what has a clock in a state, in an order that does not depend on ids."""
+        if state.mode is Mode.FINISHED:
+            return ()
+        drawn = {name for _, name in self.causes}
+        runs = [
+            ("run", run.id)
+            for place in self.x.engine.compiled.action_places
+            for run in state.tokens.get(place, ())
+            if run.phase in ACTIVE
+        ]
+        armed = sorted(n for n, t in state.timers.items() if not t.elapsed and n not in drawn)
+        timers = [("timer", name) for name in armed]
+        return (*runs, *timers)
+
+    def _plan(self, i: int) -> _Plan:
+        x, state = self.x, self.x.states[i]
+        slots = self.slots(state)
+        number = {slot: k for k, slot in enumerate(slots)}
+        ended = i >= x.expanded or i in x.livelocks
+        stimuli = () if ended else x.names.stimuli(state, x.orders[i])
+        made = [(cause, self.outcome(i, cause, number)) for cause in stimuli]
+        if first := self.at_once(state, made):
+            return _Plan(slots, first, {}, [])
+        ends: dict[tuple[int, str], list[_Outcome]] = {}
+        events: list[tuple[float, _Outcome]] = []
+        for cause, outcome in made:
+            stimulus = cause.stimulus
+            if isinstance(stimulus, RunEnded):
+                k = number["run", stimulus.run]
+                ends.setdefault((k, str(stimulus.status)), []).append(outcome)
+            elif isinstance(stimulus, TimerFired):
+                name = stimulus.key.rpartition("#")[0]
+                for k in self.slots_of_cause(state, name, number):
+                    ends[k, f"by.{name}"] = [outcome]
+                if ("timer", name) in number:
+                    ends[number["timer", name], name] = [outcome]
+            elif isinstance(stimulus, EventOccurred):
+                self.event(state, stimulus.event, outcome, number, ends, events)
+            elif isinstance(stimulus, RunRaised):
+                if outcome.state != i:
+                    events.append((self.rate(stimulus.event), outcome))
+            elif isinstance(stimulus, VariableChanged):
+                raise NoEstimate(f"no rate at which the variable `{stimulus.name}` changes")
+        shared = {key: self.shares(slots[key[0]][1], given) for key, given in ends.items()}
+        for k, what in list(shared):  # without a reader, failure is told as success
+            if what == Status.SUCCESS:
+                shared.setdefault((k, str(Status.FAILURE)), shared[k, what])
+        return _Plan(slots, (), shared, events)
+
+    def event(
+        self,
+        state: State,
+        event: str,
+        outcome: _Outcome,
+        number: dict[tuple[str, str], int],
+        ends: dict[tuple[int, str], list[_Outcome]],
+        events: list[tuple[float, _Outcome]],
+    ) -> None:
+        """Add an external event: as a cause that its run has drawn, or after a wait."""
+        compiled = self.x.engine.compiled
+        for t in compiled.waiting[event]:
+            name = compiled.transitions[t].name
+            drawn = self.slots_of_cause(state, name, number)
+            for k in drawn:
+                ends[k, f"by.{name}"] = [outcome]
+            awaits = all(state.marking[p] >= w for p, w in compiled.transitions[t].needs)
+            if awaits and not drawn and (not events or events[-1][1] is not outcome):
+                events.append((self.rate(event), outcome))
+
+    def slots_of_cause(
+        self, state: State, transition: str, number: dict[tuple[str, str], int]
+    ) -> list[int]:
+        """Return the runs that draw whether the transition preempts them."""
+        return [
+            number["run", run.id]
+            for run in state.runs()
+            if run.phase in ACTIVE and (run.place, transition) in self.causes
+        ]
+
+    def at_once(self, state: State, made: list[tuple[Cause, _Outcome]]) -> tuple[_Outcome, ...]:
+        """Return what takes no time: a draw by weight, else a choice of action, else a stop."""
+        draw = state.suspended
+        if draw is not None and draw.key:
+            total = sum(draw.weights) or 1.0
+            return tuple(
+                replace(outcome, share=weight / total)
+                for (_, outcome), weight in zip(made, draw.weights, strict=True)
+                if weight
+            )
+        chosen: dict[str, list[tuple[float, _Outcome]]] = {}
+        for cause, outcome in made:
+            if isinstance(cause.stimulus, Chosen):
+                run = state.run(cause.stimulus.key)
+                assert run is not None
+                share = self.share(run.place, cause.stimulus.alternative)
+                chosen.setdefault(run.id, []).append((share, outcome))
+        for options in chosen.values():
+            total = sum(share for share, _ in options)
+            return tuple(replace(o, share=share / total) for share, o in options if share)
+        for cause, outcome in made:
+            if isinstance(cause.stimulus, StopConfirmed):
+                return (outcome,)
+        return ()
+
+    def share(self, place: str, action: str) -> float:
+        """Return how probable it is that a run takes an action with the same device."""
+        devices = self.x.engine.compiled.devices
+        shares = self.numbers.alternatives(self.task.places[place])
+        mine = devices.get(action, "")
+        return sum(p for other, p in shares.items() if devices.get(other, "") == mine)
+
+    def shares(self, run: str, outcomes: list[_Outcome]) -> list[_Outcome]:
+        """Return what a run that ends in one status can lead to, with the shares: by the measured
+        frequencies of the conditions, else equal."""
+        different = {(o.state, o.edge < 0 or self.fired(o)): o for o in outcomes}
+        if len(different) == 1:
+            return [outcomes[0]]
+        weights = []
+        for one in different.values():
+            weight = 1.0
+            for name in self.fired(one):
+                weight *= self.measured.switches.get(name, 1.0)
+            weights.append(weight)
+        if not any(n in self.measured.switches for o in outcomes for n in self.fired(o)):
+            self.numbers.assumptions.append(
+                f"{run.rpartition('#')[0]}: what its runs write, and why they end, was not "
+                "measured; results that lead to different firings are equally likely"
+            )
+        total = sum(weights)
+        return [
+            replace(o, share=w / total)
+            for o, w in zip(different.values(), weights, strict=True)
+            if w
+        ]
+
+    def fired(self, outcome: _Outcome) -> tuple[str, ...]:
+        """Return the firings of an outcome."""
+        return () if outcome.edge < 0 else self.x.steps[self.x.label[outcome.edge]].firings
+
+    def outcome(self, i: int, cause: Cause, number: dict[tuple[str, str], int]) -> _Outcome:
+        """Let the engine handle the stimulus, and find its edge and the clocks that continue."""
+        before = self.x.states[i]
+        state, j, edge = self.x.follow(i, cause)
+        kept = tuple(
+            number.get((kind, name), -1)
+            if kind == "run" or before.timers.get(name) == state.timers[name]
+            else -1
+            for kind, name in self.slots(state)
+        )
+        return _Outcome(j, edge, kept)
