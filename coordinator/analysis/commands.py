@@ -22,6 +22,7 @@ from petrobot.coordinator.analysis.formats.netfile import (
     unit_rates,
 )
 from petrobot.coordinator.analysis.limits import OutOfTime, until
+from petrobot.coordinator.analysis.net.ends_net import ends_net
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.picture import graph_svg
 from petrobot.coordinator.analysis.net.space import EngineName, SearchLimits, explore
@@ -405,21 +406,28 @@ def convert_command(
     *,
     stages: int = 8,
     view: str | None = None,
+    exact: bool = False,
     measure: Measure | None = None,
 ) -> CommandResult:
     """Run `petrobot convert`: formats follow from the file endings; losses are listed.
 
     `view` of a task: "ordinary" or "gspn" (default: gspn for `.drn` and `.pnpro`, which are for
-    chains and GSPNs, or if there is `measure`).
+    chains and GSPNs, or if there is `measure`). `exact` writes the ends net in place of the
+    ordinary one.
     """
     assumed: list[str] = []
+    which = ""
     try:
         model = open_model(source, load_task)
+        if exact and (not isinstance(model, Task) or view == "gspn" or measure is not None):
+            told = "the ends net of a task without times; leave out --view and --estimates"
+            raise NetFileError("--exact", str(source), f"expected {told}", "or leave out --exact")
         if isinstance(model, Task):
             known = _measured(model, measure)
             timed = target.suffix.lower() in (".drn", ".pnpro") or measure is not None
-            wanted = view or ("gspn" if timed else "ordinary")
+            wanted = view or ("exact" if exact else "gspn" if timed else "ordinary")
             model, lost, assumed = _exported(model, wanted, known, stages)
+            which = f" ({WRITTEN[wanted]})"
         elif view == "gspn" and model.gspn is None:
             raise NetFileError(str(source), "rates", "the file has none", "convert it as it is")
         elif view == "ordinary" and model.gspn is not None:
@@ -437,10 +445,18 @@ def convert_command(
             {"error": str(error)},
         )
     lost += more
-    lines = [f"{source} -> {target}", *(f"not kept: {what}" for what in lost)]
+    lines = [f"{source} -> {target}{which}", *(f"not kept: {what}" for what in lost)]
     lines += [f"assumed: {what}" for what in assumed]
     data = {"source": str(source), "target": str(target), "not_kept": lost, "assumed": assumed}
     return CommandResult(OK, "\n".join(lines), data)
+
+
+WRITTEN = {
+    "ordinary": "the ordinary net; --exact writes the one with the ends of runs",
+    "exact": "the ends net: how a run ended is kept",
+    "gspn": "the stochastic view: rates and weights",
+}
+"""Which net of a task a file holds."""
 
 
 def _exported(
@@ -452,21 +468,23 @@ def _exported(
         return NetFile(timed.gspn.net, task.name, timed.gspn), [], list(timed.assumptions)
     flat = task.flat
     transitions = flat.transitions.values()
+    n = ends_net(task) if view == "exact" else None
     parts = {
-        "actions and the ends of their runs": any(
-            p.kind is Kind.ACTION for p in flat.places.values()
-        ),
-        "events": any(t.events for t in transitions),
-        "conditions": any(t.when is not None for t in transitions),
-        "timers": any(t.after is not None for t in transitions),
+        "actions and the ends of their runs": n is None
+        and any(p.kind is Kind.ACTION for p in flat.places.values()),
+        "events (they may come at any time)": any(t.events for t in transitions),
+        "conditions": n is None and any(t.when is not None for t in transitions),
+        "timers (they may elapse at any time)": any(t.after is not None for t in transitions),
         "priorities": any(t.priority for t in transitions),
         "weights of transitions": any(t.weight is not None for t in transitions),
-        "preemption (an ordinary arc instead)": any(
-            a.end in (End.PREEMPT, End.GOING) for t in transitions for a in t.inputs
-        ),
+        "preemption (an ordinary arc instead)": n is None
+        and any(a.end in (End.PREEMPT, End.GOING) for t in transitions for a in t.inputs),
+        "the order of runs and of the file, and steps of several transitions": n is not None,
     }
-    lost = [f"{part}: this is the ordinary view" for part, has in parts.items() if has]
-    return net_file_of(task), lost, []
+    lost = [part for part, has in parts.items() if has]
+    if n is None:
+        return net_file_of(task), lost, []
+    return NetFile(n.net, task.name), [*lost, *n.left_out], []
 
 
 def net_file_of(task: Task) -> NetFile:

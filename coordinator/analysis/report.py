@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from petrobot.coordinator.analysis.net.deadlocks import (
     minimal_siphons,
     minimal_traps,
 )
+from petrobot.coordinator.analysis.net.ends_net import EndsNet, ends_net, judged, proven
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
 from petrobot.coordinator.analysis.net.space import (
@@ -131,8 +132,8 @@ SHOWN = 20
 
 @dataclass(frozen=True)
 class Analysis:
-    """The result of `analyse`. For a task, `progress` judges its execution graph, and
-    `qualitative` its ordinary net: bounds come from there."""
+    """The result of `analyse`. For a task, `net` is its ordinary net, `progress` judges its
+    execution graph, and `qualitative` has the bounds that its ends net N gives."""
 
     name: str
     net: Net
@@ -148,6 +149,10 @@ class Analysis:
     """The most stimuli and firings for the execution graph."""
     interrupted: bool = False
     """Whether Ctrl-C ended the analysis before everything was computed."""
+    proven: Mapping[str, PropertyVerdict] = field(default_factory=dict)
+    """Tasks only: what N proves of progress, where the execution graph is not complete."""
+    ends: EndsNet | None = None
+    """Tasks only: N."""
 
     @cached_property
     def hand_notes(self) -> list[str]:
@@ -217,7 +222,7 @@ class Analysis:
             "engine": q.space.engine,
             "bounded": q.bounded.holds,
             "max_tokens_per_place": q.most,
-            "max_tokens_in_marking": q.space.most_tokens if q.space.complete else None,
+            "max_tokens_in_marking": self._most_in_marking(),
             "bounds": dict(zip(self.net.places, q.bounds, strict=True)),
             "safe": q.safe.holds,
             "deadlock": None if free is None else not free,
@@ -247,6 +252,16 @@ class Analysis:
             out["no_probability"] = odds.missing
             out["mended"] = {n: v.to_json() for n, v in self.progress.mended.items()}
         return out | self._numbers()
+
+    def _most_in_marking(self) -> int | None:
+        space = self.qualitative.space
+        if not space.complete:
+            return None
+        return (
+            space.most_tokens
+            if self.ends is None
+            else int(np.sum(self.ends.held(space), axis=0).max())
+        )
 
     def _numbers(self) -> dict[str, Any]:
         if self.run is not None:
@@ -289,25 +304,26 @@ class Analysis:
         """Return all verdicts by name. For a task those of progress come from the execution
         graph."""
         q = self.qualitative
-        structural = {
-            "deadlock_free": q.deadlock_free,
-            "quasi_live": q.quasi_live,
-            "live": q.live,
-            "reversible": q.reversible,
-        }
-        structural |= {"sound": q.sound} if q.sound is not None else {}
         out = {"bounded": q.bounded, "safe": q.safe}
         if self.progress is not None and self.progress.x.complete and q.bounded.holds is not True:
             finite = f"the task rests in {len(self.progress.x)} states only"
             out["bounded"] = PropertyVerdict(True, finite)
         if self.progress is None and not self.unjudged:
-            return out | structural
+            return out | {
+                "deadlock_free": q.deadlock_free,
+                "quasi_live": q.quasi_live,
+                "live": q.live,
+                "reversible": q.reversible,
+            }
         if self.progress is None:
             unknown = PropertyVerdict(None, f"unknown: {self.unjudged}", complete=False)
             judged = dict.fromkeys(NAMES, unknown)
         else:
             judged = self.progress.verdicts()
-        return out | {name: _beside(one, structural.get(name)) for name, one in judged.items()}
+        return out | {
+            name: one if one.holds is not None else self.proven.get(name, one)
+            for name, one in judged.items()
+        }
 
     def text(self) -> str:
         """Return the analysis as text for the terminal."""
@@ -317,6 +333,7 @@ class Analysis:
             f"{self.name}: {size['places']} places, {size['transitions']} transitions, "
             f"{size['arcs']} arcs; "
             f"{len(q.space)} markings, {q.space.edges} edges"
+            + (" with the ends of runs" if self.ends is not None else "")
             + ("" if q.space.complete else f" (partial: {q.space.reason})"),
         ]
         lines += [f"executed: {self.progress.size_text()}", ""] if self.progress else [""]
@@ -453,15 +470,15 @@ def _examined(
     limits: SearchLimits | None,
     engine: EngineName,
     notes: list[str],
-    final: Callable[[Marking], bool] | None = None,
+    judge: Callable[..., Qualitative] = examine,
 ) -> Qualitative:
-    """Return all verdicts; after Ctrl-C only the quick ones, and add a note."""
+    """Return all verdicts by `judge`; after Ctrl-C only the quick ones, and add a note."""
     space: Space | None = None
     reason = INTERRUPTED
     try:
         space, cover = _search(net, limits, engine)
         if space.reason != INTERRUPTED:
-            return examine(space, final=final, cover=cover)
+            return judge(space, cover=cover)
     except KeyboardInterrupt:
         space = space or explore(net, limits=SearchLimits(states=1))
     except MemoryError:
@@ -469,7 +486,7 @@ def _examined(
     except OutOfTime:
         space, reason = explore(net, limits=SearchLimits(states=LOOK)), "time limit"
     notes.append({INTERRUPTED: CUT, "memory limit": FULL}.get(reason, LATE))
-    return examine(replace(space, complete=False, reason=reason), final=final, in_haste=True)
+    return judge(replace(space, complete=False, reason=reason), in_haste=True)
 
 
 def _long_run(
@@ -498,9 +515,10 @@ def _analyse_task(
     engine: EngineName,
     steps: int,
 ) -> Analysis:
-    ordinary, notes = OrdinaryView(task), list[str]()
-    found = _examined(ordinary.net, limits, engine, notes, ordinary.is_end)
+    ordinary, n, notes = OrdinaryView(task), ends_net(task), list[str]()
+    found = _examined(n.net, limits, engine, notes, partial(judged, n))
     progress = numbers = None
+    shown: Mapping[str, PropertyVerdict] = {}
     why = "the analysis was interrupted"
     try:
         if not notes:
@@ -511,31 +529,27 @@ def _analyse_task(
                 notes += progress.notes
             except TooManyValues as fault:
                 why = str(fault)
+            if progress is None or not progress.x.complete:
+                shown = proven(n, found.space, ordinary)
         if view == "gspn" and CUT not in notes:
             numbers = _forecast(task, measured, stages, limits, notes)
     except KeyboardInterrupt:
         notes.append(CUT)
     return Analysis(
         task.name,
-        ordinary.net,
+        task.net,
         found,
         progress,
-        StructureReport(ordinary.net),
+        StructureReport(n.net),
         None,
         numbers,
         tuple(notes),
         "" if progress is not None else why,
         steps,
         CUT in notes,
+        shown,
+        n,
     )
-
-
-def _beside(judged: PropertyVerdict, structural: PropertyVerdict | None) -> PropertyVerdict:
-    """Return a verdict on the execution graph; where it is unknown, with what the ordinary net
-    says."""
-    if judged.holds is not None or structural is None or structural.holds is not False:
-        return judged
-    return replace(judged, reason=f"{judged.reason}; the ordinary net: {structural.reason}")
 
 
 def _forecast(

@@ -27,6 +27,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="which net of a task: the ordinary one, or the stochastic view with rates (default: "
         "gspn for .pnpro, .drn and with --estimates, else ordinary)",
     )
+    parser.add_argument(
+        "--exact",
+        action="store_true",
+        help="of a task: write the net that keeps how runs ended, and so has every path of the "
+        "execution",
+    )
     add_estimates_argument(parser)
     parser.add_argument(
         "--json", metavar="FILE", help="write what was not kept as JSON (- for standard output)"
@@ -44,6 +50,7 @@ def run(options: argparse.Namespace) -> int:
         options.target,
         load,
         view=options.view,
+        exact=options.exact,
         measure=measurements(options.estimates),
     )
     return give(found, options.json)

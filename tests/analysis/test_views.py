@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
-from petrobot.coordinator.analysis.net.qualitative import examine
 from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.analysis.time.completion import Completion, completion
 from petrobot.coordinator.analysis.time.gspn import Chain
@@ -47,7 +46,6 @@ from petrobot.coordinator.task import (
     Transition,
 )
 from petrobot.coordinator.task.conditions import parse
-from petrobot.coordinator.task.file import load
 
 SHIPPED = sorted((Path(__file__).parents[2] / "coordinator" / "tasks").glob("*.toml"))
 EXPONENTIAL = {
@@ -382,67 +380,3 @@ def test_tokens_of_action_places_are_active_or_finished_runs(task: Task) -> None
             own = space.tokens(index[place.name])
             parts = sum(space.tokens(index[f"{place.name}.{s}"]) for s in ("going", *Status))
             assert (own == parts).all()
-
-
-def test_operator_transitions_are_added_on_request() -> None:
-    task = one_step()
-    task = replace(task, places={**task.places, "idle": replace(task.places["idle"], capacity=2)})
-    view = OrdinaryView(task, operator=True)
-    assert view.net.transitions[-2:] == ("put.idle", "take.idle")
-    space = explore(view.net, limits=SearchLimits(states=100))
-    assert space.bounds[view.net.place_index["idle"]] == 2
-    assert space.number((0,) * len(view.net.places)) is not None
-
-
-# The shipped tasks.
-
-
-def catching() -> Task:
-    return load(next(p for p in SHIPPED if p.stem == "catch_ball"))
-
-
-def test_broken_variants_are_caught_with_witnesses() -> None:
-    task = catching()
-    lost = {
-        n: t
-        for n, t in task.transitions.items()
-        if n not in ("recovered", "recover_again", "give_up")
-    }
-    view = OrdinaryView(replace(task, transitions=lost))
-    stuck = examine(explore(view.net), final=view.is_end)
-    assert stuck.deadlock_free.holds is False and stuck.deadlock_free.witness is not None
-    assert (
-        list(view.net.replay(stuck.deadlock_free.witness.firings))[-1][
-            view.net.place_index["recover_arm"]
-        ]
-        == 1
-    )
-
-    twice = (Output("arm_free"), Output("camera_free"), Output("runs", 2))
-    leaking = replace(task.transitions["not_located"], outputs=twice)
-    view = OrdinaryView(replace(task, transitions={**task.transitions, "not_located": leaking}))
-    leak = examine(explore(view.net, limits=SearchLimits(states=3000)), final=view.is_end)
-    assert (
-        leak.bounded.holds is False
-        and leak.bounded.witness is not None
-        and "runs" in leak.bounded.reason
-    )
-    *_, before = view.net.replay(leak.bounded.witness.firings)
-    *_, after = view.net.replay(leak.bounded.witness.loop, before)
-    assert after[view.net.place_index["runs"]] > before[view.net.place_index["runs"]]
-
-    double = replace(
-        task.transitions["in_place"], outputs=(Output("catch_ball"), Output("arm_free"))
-    )
-    places = {**task.places, "arm_free": replace(task.places["arm_free"], capacity=None)}
-    view = OrdinaryView(
-        replace(task, places=places, transitions={**task.transitions, "in_place": double})
-    )
-    space = explore(view.net, limits=SearchLimits(states=20_000))
-    both = (space.tokens(view.net.place_index["arm_free"]) > 0) & (
-        space.tokens(view.net.place_index["catch_ball"]) > 0
-    )
-    assert both.any()
-    assert list(view.net.replay(space.path(int(np.argmax(both)))))[-1] == space.marking(
-        int(np.argmax(both))
-    )

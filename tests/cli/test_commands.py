@@ -284,13 +284,13 @@ def test_a_task_that_can_deadlock_is_refused(
 
 
 def test_analyse_and_convert(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The shipped task is sound; as PNML it is the same net."""
+    """The shipped task is sound; as PNML it is the same net, and the command says which one."""
     assert main(["analyse", "catch_ball", "--json", "-"]) == 0
     whole = json.loads(capsys.readouterr().out)
     assert (whole["bounded"], whole["deadlock"], whole["complete"]) == (True, False, True)
     target = tmp_path / "net.pnml"
-    assert main(["convert", "catch_ball", str(target)]) == 0
-    capsys.readouterr()
+    assert main(["convert", "catch_ball", str(target), "--exact"]) == 0
+    assert "the ends net" in capsys.readouterr().out
     main(["analyse", str(target), "--json", "-"])
     foreign = json.loads(capsys.readouterr().out)
     assert (foreign["states"], foreign["edges"]) == (whole["states"], whole["edges"])

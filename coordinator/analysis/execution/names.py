@@ -75,11 +75,11 @@ class Names:
         fixed = [with_values(c, parameters) for c in conditions]
         self._values = region_values(fixed, compiled.domains)
         self._literals, self._together = _compared(fixed)
-        self._asked = {field: set[str]() for field in RUN_FIELDS}
+        self.asked = {field: set[str]() for field in RUN_FIELDS}
         """By what a condition asks of a run: places whose ended runs differ by it, because an arc
         that takes them asks."""
         read = {name for c in fixed for name in c.names}
-        self._known = {n for n in read if n not in _run_names(task)}
+        self.known = {n for n in read if n not in _run_names(task)}
         """Names whose value counts beside the runs."""
         for x in compiled.transitions:
             for name in x.when.names if x.when is not None else ():
@@ -87,11 +87,11 @@ class Names:
                 arcs = [a for a in x.actions if a.name == place]
                 if field in RUN_FIELDS and place:
                     if any(a.end in (End.NORMAL, End.ERROR) or a.takes_done for a in arcs):
-                        self._asked[field].add(place)
+                        self.asked[field].add(place)
                     if not any(a.end in (End.NORMAL, End.ERROR) for a in arcs):
-                        self._known.add(name)
+                        self.known.add(name)
         self._status_read = {n.rpartition(".")[0] for n in read if n.endswith(".status")}
-        self._free = sorted(self._known & compiled.free)
+        self.free = sorted(self.known & compiled.free)
         self._mixed = {a.name for x in compiled.transitions for a in x.actions if a.takes_done}
         """Places where an arc takes ended and active runs, so that their common order counts."""
         self._waits = {
@@ -104,9 +104,9 @@ class Names:
             }
             for place in compiled.action_places
         }
-        self._ends = {place: self._ends_of(place) for place in compiled.action_places}
+        self.ends = {place: self._ends_of(place) for place in compiled.action_places}
         self.assumptions = tuple(
-            [f"{name} may take any value at any time" for name in self._free]
+            [f"{name} may take any value at any time" for name in self.free]
             + [
                 f"the parameter {n} is {v!r}"
                 for n, v in parameters.items()
@@ -150,8 +150,7 @@ class Names:
             orders,
             None if draw is None else (draw.pulse, draw.choices, draw.alternatives, draw.only),
             tuple(
-                self.region(name, state.variables.get(name, _MISSING))
-                for name in sorted(self._known)
+                self.region(name, state.variables.get(name, MISSING)) for name in sorted(self.known)
             ),
         )
 
@@ -161,19 +160,19 @@ class Names:
             phase = "active" if run.phase in ACTIVE else run.phase.value
             return (phase, run.device if run.phase is not Phase.QUEUED else "", raised)
         status = run.status
-        if run.place not in self._asked["status"] and status is Status.FAILURE:
+        if run.place not in self.asked["status"] and status is Status.FAILURE:
             status = Status.SUCCESS
         told = tuple(
             self.region(f"{run.place}.{field}", value)
             for field, value in (("reason", run.cause), ("executed", str(run.executed)))
-            if run.place in self._asked[field]
+            if run.place in self.asked[field]
         )
         order = ends.index(run.ended) if run.place in self._mixed else 0
         return ("done", status, told, raised, order)
 
     def region(self, name: str, value: Any) -> Hashable:
         """Return the region of a name's value: what the comparisons can tell of it."""
-        if name in self._together or value is _MISSING:
+        if name in self._together or value is MISSING:
             return (str(type(value).__name__), value if not isinstance(value, list | dict) else "")
         kind = (
             "bool"
@@ -211,9 +210,9 @@ class Names:
             if not timer.elapsed and name not in late:
                 after = self.task.transitions[name].after
                 yield Cause(TimerFired(timer.key), f"{after:g} s pass")
-        for name in self._free:
+        for name in self.free:
             now = self.region(name, state.variables.get(name))
-            for value in self._different(name):
+            for value in self.different(name):
                 if self.region(name, value) != now:
                     yield Cause(VariableChanged(name, value), f"{name} becomes {value!r}")
 
@@ -239,7 +238,7 @@ class Names:
                     known.add(device)
                     yield Cause(Chosen(run.id, action), f"{name} starts")
         elif run.phase in ACTIVE:
-            for end, text in self._ends[run.place]:
+            for end, text in self.ends[run.place]:
                 yield Cause(replace(end, run=run.id), f"{name} ends in {text}")
             for event in sorted(self._waits[run.place] - run.raised):
                 yield Cause(RunRaised(run.id, event), f"{name} raises {event}")
@@ -263,20 +262,20 @@ class Names:
     def _ends_of(self, place: str) -> list[tuple[RunEnded, str]]:
         """Return all ends of a run that something can tell apart, and how each reads."""
         out = self.task.places[place].out
-        read = {result: name for result, name in out.items() if name in self._known}
+        read = {result: name for result, name in out.items() if name in self.known}
         statuses = [s for s in Status if s is not Status.FAILURE or place in self._status_read]
         reason = f"{place}.reason"
-        reasons = self._different(reason) if reason in self._values else [""]
+        reasons = self.different(reason) if reason in self._values else [""]
         kinds = {name: self.task.variables[name].type for name in out.values()}
         asked = f"{place}.executed"
-        done = self._different(asked) if asked in self._values else [Executed.YES.value]
+        done = self.different(asked) if asked in self._values else [Executed.YES.value]
         found: list[tuple[RunEnded, str]] = []
         for status in statuses:
-            missing = [_MISSING] if status is Status.ERROR else []
-            choices = [self._different(name) + missing for name in read.values()]
+            missing = [MISSING] if status is Status.ERROR else []
+            choices = [self.different(name) + missing for name in read.values()]
             executed = done if status is Status.ERROR else [Executed.YES.value]
             for cause, was, *values in product(reasons, executed, *choices):
-                given = {r: v for r, v in zip(read, values, strict=True) if v is not _MISSING}
+                given = {r: v for r, v in zip(read, values, strict=True) if v is not MISSING}
                 told = [f"{read[r]} = {v!r}" for r, v in given.items()]
                 told += [f"reason {cause!r}"] if len(reasons) > 1 else []
                 told += [f"executed = {was}"] if len(executed) > 1 else []
@@ -289,7 +288,7 @@ class Names:
                 raise TooManyValues(f"a run of {place} can end with too many values of {names}")
         return found
 
-    def _different(self, name: str) -> list[Any]:
+    def different(self, name: str) -> list[Any]:
         """Return one value of each region of a name."""
         return list({self.region(name, value): value for value in self._values[name]}.values())
 
@@ -316,7 +315,7 @@ class Names:
         return frozenset(kept)
 
 
-_MISSING = type("Missing", (), {"__repr__": lambda _: "nothing"})()
+MISSING = type("Missing", (), {"__repr__": lambda _: "nothing"})()
 _SOME: Mapping[str, Any] = {"bool": False, "int": 0, "float": 0.0, "str": "", "any": None}
 """Values for variables that no condition reads."""
 

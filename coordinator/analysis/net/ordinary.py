@@ -1,39 +1,23 @@
-"""The ordinary view of a task: its net with the sets that the verdicts need.
+"""The sets of a task's places, transitions and markings that the verdicts need.
 
-The net is `Task.net` (docs/semantics.md, section 8).
+Its ordinary net is `Task.net` (docs/semantics.md, section 8).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 from petrobot.coordinator.task import End, Kind, Task
 from petrobot.coordinator.task.conditions import Expression
-from petrobot.coordinator.task.net import Marking, Net
+from petrobot.coordinator.task.net import Marking
 
 
 @dataclass(frozen=True)
 class OrdinaryView:
-    """A task as an ordinary net. With `operator`, control places that declare a capacity can be
-    filled and emptied."""
+    """Sets of places, transitions and markings of a task's ordinary net."""
 
     task: Task
-    operator: bool = False
-
-    @cached_property
-    def net(self) -> Net:
-        """The ordinary net, with `put.PLACE` and `take.PLACE` for the operator's hand if asked
-        for."""
-        net = self.task.net
-        return _with_operator(net, self._open_to_operator) if self.operator else net
-
-    @cached_property
-    def _open_to_operator(self) -> tuple[int, ...]:
-        places = self.task.flat.places.values()
-        return tuple(
-            i for i, p in enumerate(places) if p.kind is Kind.CONTROL and p.capacity is not None
-        )
 
     def _holds(self, predicate: Expression | None, marking: Marking) -> bool:
         return predicate is not None and predicate.holds(
@@ -94,19 +78,3 @@ class OrdinaryView:
             for name, changes in zip(net.transitions, net.compiled.changes, strict=True)
             if dict(changes).get(place, 0) < 0
         )
-
-
-def _with_operator(net: Net, places: tuple[int, ...]) -> Net:
-    count = len(places)
-    return replace(
-        net,
-        transitions=(
-            *net.transitions,
-            *(f"put.{net.places[p]}" for p in places),
-            *(f"take.{net.places[p]}" for p in places),
-        ),
-        consume=(*net.consume, *(() for _ in places), *(((p, 1),) for p in places)),
-        produce=(*net.produce, *(((p, 1),) for p in places), *(() for _ in places)),
-        inhibit=(*net.inhibit, *(() for _ in range(2 * count))),
-        priority=(*net.priority, *(0 for _ in range(2 * count))),
-    )

@@ -106,7 +106,7 @@ def examine(
     graph = Graph(len(space), space.source, space.target)
     if in_haste and cover is None:
         cover = Coverability(None, (None,) * len(space.net.places), space.reason, 0, False)
-    bounds, bounded, safe, cover = _boundedness(space, cover)
+    bounds, bounded, safe, cover = boundedness(space, cover)
     ends = space.where(final) if final else np.zeros(len(space), dtype=np.bool_)
     dead = space.dead[~ends[space.dead]]
     settled = space.complete or len(dead) or in_haste
@@ -153,7 +153,7 @@ def _unknown(space: Space, question: str = "") -> PropertyVerdict:
     return PropertyVerdict(None, f"{text}; {question}" if question else text, complete=False)
 
 
-def _boundedness(
+def boundedness(
     space: Space, cover: Coverability | None
 ) -> tuple[tuple[int | None, ...], PropertyVerdict, PropertyVerdict, Coverability | None]:
     """Return (bounds, bounded, safe, the coverability result that was used, if any).
@@ -186,7 +186,7 @@ def _boundedness(
         )
     cover = cover or settle_bounds(space.net, proven)
     pump = (cover.prefix, cover.pump, cover.grows) if cover.bounded is False else find_pump(space)
-    known = tuple(_lower(b, c) for b, c in zip(proven, cover.bounds, strict=True))
+    known = tuple(lower(b, c) for b, c in zip(proven, cover.bounds, strict=True))
     if pump is not None:
         prefix, again, grows = pump
         shown = Witness(prefix, _marked(space.net, prefix), again)
@@ -210,7 +210,7 @@ def _boundedness(
     return known, _unknown(space, cover.reason), _safe(space, False), cover
 
 
-def _lower(one: int | None, other: int | None) -> int | None:
+def lower(one: int | None, other: int | None) -> int | None:
     """Return the lower of two bounds; None means no bound."""
     return other if one is None else one if other is None else min(one, other)
 
