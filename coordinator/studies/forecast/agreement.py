@@ -1,8 +1,7 @@
 """Compare a measurement with a forecast that was registered before: predictive tests, equivalence
 tests, and the distribution of the time.
 
-Shares: a beta-binomial predictive distribution whose weight comes from the forecast's own
-uncertainty, with the Jeffreys prior. So a share of 1 that was forecast from n trials still allows a
+Shares: beta-binomial predictive limits; a share of 1 that was forecast from n trials still allows a
 miss in another n. Times: a normal distribution with the predictive deviation of the bootstrap. The
 significance levels of many comparisons are adjusted by the method of S. Holm, Scandinavian Journal
 of Statistics 6 (1979) 65-70. Equivalence: two one-sided tests at 5 % each, that is, the 90 %
@@ -17,11 +16,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from scipy.stats import binom, chi2_contingency, norm, t
+from scipy.stats import binom, chi2_contingency, kstwobign, norm, t
 
 from petrobot.coordinator.learning.statistics import wilson
+from petrobot.coordinator.studies.forecast.direct import SCORES
 from petrobot.coordinator.studies.forecast.history import Training, Values
-from petrobot.coordinator.studies.forecast.predict import GRID, SHARES, figures
+from petrobot.coordinator.studies.forecast.predict import SHARES, figures
 from petrobot.coordinator.studies.forecast.residual import measured, routing, ways_table
 from petrobot.coordinator.studies.forecast.shares import (
     holm,
@@ -30,8 +30,11 @@ from petrobot.coordinator.studies.forecast.shares import (
     share_weight,
 )
 
-FAMILY = ("R_goal", "P_complete", "mean", "q90")
-"""Figures that are tested together by Holm's method, in all regimes."""
+FAMILY = ("R_goal", "P_complete", "R_conj", "mean", "q90")
+"""Figures that are compared. They are tested together with the distributions of the time and the
+routing of all regimes, by Holm's method."""
+EQUIVALENT = ("R_goal", "P_complete", "mean", "q90")
+"""Figures whose equivalence makes a comparison equivalent."""
 LEVEL = 0.01
 MARGIN_SHARE = 0.02
 MARGIN_TIME = 0.05
@@ -47,25 +50,25 @@ def agreement(forecast: Mapping[str, Any], regimes: Mapping[str, Training]) -> d
             f"no regime in common: the campaign ran {', '.join(regimes)}, the forecast is of "
             f"{', '.join(forecast['regimes'])}"
         )
-    rows, controls, laws, ways = [], [], [], []
+    rows: list[dict[str, Any]] = []
+    controls, laws, ways = [], [], []
     for name in common:
         said, training = forecast["regimes"][name], regimes[name]
-        rows += [_row(name, figure, said, training) for figure in (*FAMILY, "R_conj")]
+        rows += [_row(name, figure, said, training) for figure in FAMILY]
         controls.append(_product(name, said, training))
         laws.append(_law(name, said, training))
         ways += _routing(name, said["routing"], routing(training))
-    family = [row for row in rows if row["figure"] in FAMILY and row["p"] is not None]
-    for row, p in zip(family, holm([row["p"] for row in family]), strict=True):
+    tested = [row for row in (*rows, *laws, *ways) if row["p"] is not None]
+    for row, p in zip(tested, holm([row["p"] for row in tested]), strict=True):
         row["p_holm"] = p
-    for row, p in zip(ways, holm([row["p"] for row in ways]), strict=True):
-        row["p_holm"] = p
+        row["agrees"] = p >= LEVEL
     return {
         "rows": rows,
         "negative_control": controls,
         "law": laws,
         "routing": ways,
-        "agrees": all(row["p_holm"] >= LEVEL for row in family),
-        "equivalent": all(row["equivalent"] for row in family),
+        "agrees": all(row["agrees"] for row in tested),
+        "equivalent": all(row["equivalent"] for row in rows if row["figure"] in EQUIVALENT),
         "product_rejected": [row["regime"] for row in controls if row["rejected"]],
     }
 
@@ -84,6 +87,7 @@ def _row(regime: str, figure: str, said: Mapping[str, Any], training: Training) 
         "runs": n,
         "p": None,
         "p_holm": None,
+        "agrees": None,
         "margin": None,
         "measured_90": None,
         "equivalent": False,
@@ -91,14 +95,18 @@ def _row(regime: str, figure: str, said: Mapping[str, Any], training: Training) 
     if found["value"] is None or row["measured"] is None:
         return row
     if figure in SHARES:
-        weight = share_weight(found["value"], found["sd"], said["runs"], said["training_trials"])
+        weight = (
+            found["weight"]
+            if "weight" in found
+            else share_weight(found["value"], found["sd"], said["runs"], said["training_trials"])
+        )
         row["interval"] = predictive_interval(found["value"], weight, n)
         row["p"] = share_p_value(found["value"], weight, round(value * n), n)
         low, high = wilson(round(value * n), n, EQUIVALENCE)
         row["margin"] = MARGIN_SHARE
     else:
         row["p"] = time_p_value(
-            found["value"], found["sd"], value, said["runs"], len(times), said["training_trials"]
+            found["value"], _curve(found), value, said["runs"], len(times), said["training_trials"]
         )
         low, high = mean_interval(times) if figure == "mean" else quantile_interval(times, 0.9)
         row["margin"] = round(MARGIN_TIME * found["value"], 6)
@@ -109,14 +117,36 @@ def _row(regime: str, figure: str, said: Mapping[str, Any], training: Training) 
     return row
 
 
-def time_p_value(value: float, sd: float, seen: float, runs: int, n: int, training: int) -> float:
-    """Return the two-sided p-value of a time of n new trials, given the predictive deviation for
+def _curve(found: Mapping[str, Any]) -> Values:
+    """Return the predictive distribution of a time at SCORES; files of older versions contain only
+    its standard deviation."""
+    if "curve" in found:
+        return np.array(found["curve"])
+    return np.asarray(found["value"] + found["sd"] * SCORES)
+
+
+def time_p_value(
+    value: float, curve: Values, seen: float, runs: int, n: int, training: int
+) -> float:
+    """Return the two-sided p-value of a time of n new trials, given the predictive distribution for
     `runs` of them. Both the sampling error and the training error shrink as n^-1/2."""
-    # sd belongs to `runs` new trials; rescale it to n: variance ~ 1 / new trials + 1 / training
-    scaled = sd * math.sqrt((1.0 / n + 1.0 / training) / (1.0 / runs + 1.0 / training))
-    if scaled <= 0.0:
-        return 1.0 if seen == value else 0.0
-    return float(2.0 * norm.sf(abs(seen - value) / scaled))
+    # The distribution belongs to `runs` new trials; rescale to n: variance ~ 1 / new + 1 / training
+    scale = math.sqrt((1.0 / n + 1.0 / training) / (1.0 / runs + 1.0 / training))
+    at = value + (seen - value) / scale
+    slack = 1e-6 * max(1.0, abs(value))  # figures are rounded to microseconds
+    if curve[0] - slack <= at <= curve[-1] + slack:
+        # where the distribution is flat (an atom), the score that is nearest to 0
+        low, high = _score(curve, at - slack), _score(curve, at + slack)
+        z = 0.0 if low <= 0.0 <= high else min(abs(low), abs(high))
+    else:
+        end, middle = (0 if at < value else -1), len(curve) // 2
+        slope = abs(curve[end] - curve[middle]) / SCORES[-1]
+        z = abs(at - curve[middle]) / slope if slope > 0 else math.inf
+    return float(2.0 * norm.sf(z))
+
+
+def _score(curve: Values, at: float) -> float:
+    return float(np.interp(at, curve, SCORES))
 
 
 def mean_interval(times: Values, level: float = EQUIVALENCE) -> tuple[float, float]:
@@ -155,25 +185,30 @@ def _product(regime: str, said: Mapping[str, Any], training: Training) -> dict[s
 
 
 def _law(regime: str, said: Mapping[str, Any], training: Training) -> dict[str, Any]:
-    """Compare the measured and the forecast distribution of the time by Kolmogorov's distance; the
-    bootstrap gives its 99 % quantile."""
+    """Compare the measured and the forecast distribution of the time by Kolmogorov's two-sample
+    test, in its asymptotic form; ties make it conservative."""
     played = measured(training)
     times = np.sort(played.time[~np.isnan(played.time)])
+    row: dict[str, Any] = {
+        "regime": regime,
+        "distance": None,
+        "limit": None,
+        "p": None,
+        "p_holm": None,
+        "agrees": None,
+    }
     if not len(times) or not said["law"]["s"]:
-        return {"regime": regime, "distance": None, "limit": said["distance_99"], "agrees": None}
-    grid = np.array(said["law"]["s"])
+        return row
+    grid, q = np.array(said["law"]["s"]), np.array(said["law"]["q"])
     at = np.searchsorted(times, grid, side="right") / len(times)
     below = np.searchsorted(times, grid, side="left") / len(times)
-    q = np.array(GRID)
     distance = float(np.max(np.maximum(q - at, 0.0) + np.maximum(below - q, 0.0)))
-    # the distance of a sample shrinks as n^-1/2; with more trials than forecast the limit stays,
-    # because the forecast's own error does not shrink
-    limit = said["distance_99"] * max(1.0, math.sqrt(said["runs"] / len(times)))
-    return {
-        "regime": regime,
+    known = said["law"].get("trials", said["training_trials"])
+    size = math.sqrt(known * len(times) / (known + len(times)))
+    return row | {
         "distance": round(distance, 4),
-        "limit": round(limit, 4),
-        "agrees": distance <= limit,
+        "limit": round(float(kstwobign.isf(LEVEL)) / size, 4),
+        "p": float(kstwobign.sf(distance * size)),
     }
 
 
@@ -192,6 +227,7 @@ def _routing(
                     "place": place,
                     "p": float(chi2_contingency(table).pvalue),
                     "p_holm": None,
+                    "agrees": None,
                 }
             )
     return rows

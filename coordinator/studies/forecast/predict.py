@@ -1,5 +1,5 @@
-"""The forecast of one regime: expected figures, predictive samples by a cluster bootstrap, and the
-product rule for comparison."""
+"""The forecast of one regime: figures straight from the training trials where they tell, else from
+the simulated net; and the product rule for comparison."""
 
 from __future__ import annotations
 
@@ -9,6 +9,14 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.studies.forecast.choices import choice_counts, choices_of
+from petrobot.coordinator.studies.forecast.direct import (
+    LEAST,
+    SCORES,
+    effective,
+    mean_figure,
+    quantile_figure,
+    trial_weights,
+)
 from petrobot.coordinator.studies.forecast.distributions import (
     Drawer,
     RunDistributions,
@@ -17,20 +25,32 @@ from petrobot.coordinator.studies.forecast.distributions import (
 from petrobot.coordinator.studies.forecast.history import Training, Values
 from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
 from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
-from petrobot.coordinator.studies.forecast.residual import doubts, residuals, routing
-from petrobot.coordinator.studies.forecast.shares import predictive_interval, share_weight
+from petrobot.coordinator.studies.forecast.residual import (
+    doubts,
+    measured,
+    order_doubts,
+    residuals,
+    routing,
+)
+from petrobot.coordinator.studies.forecast.shares import (
+    confidence_interval,
+    predictive_interval,
+    share_weight,
+)
 
 POINT = 40_000
-"""Trials simulated for the expected figures. The simulation error of a share is then below 0.25
-points (standard error sqrt(0.25 / 40000))."""
+"""Trials simulated for the expected figures of the simulated net. The simulation error of a share
+is then below 0.25 points (standard error sqrt(0.25 / 40000))."""
 REPLICATES = 200
 TOGETHER = 25_000
 """Trials simulated side by side."""
-LEVEL = 0.95
 SHARES = ("R_goal", "P_complete", "R_conj")
 TIMES = ("mean", "q90")
 GRID = tuple(float(q) for q in np.linspace(0.005, 0.995, 100))
 """Probabilities at which the distribution of the time is stored."""
+TRIALS, NET = "trials", "net"
+"""Where the figures come from: the training trials themselves, or the simulated net."""
+NO_FIGURE: dict[str, Any] = {"value": None, "interval": None, "confidence": None}
 
 
 @dataclass(frozen=True)
@@ -42,28 +62,188 @@ class Request:
     choices: Choices
     seed: int = 1
     replicates: int = REPLICATES
+    """Bootstrap samples of the simulated net."""
     point: int = POINT
+    """Trials that the simulated net plays for the expected figures."""
+    net: bool | None = None
+    """True: the figures come from the simulated net in any case. False: from it only where the
+    trials do not tell, and it is not compared with the training."""
 
 
-def figures(played: Played) -> dict[str, float]:
+def figures(played: Played, weights: Values | None = None) -> dict[str, float]:
     """Return the forecast figures of simulated or measured trials; times are nan if no trial
     completed."""
-    times = played.time[played.completed & ~np.isnan(played.time)]
+    w = np.ones(len(played.goals)) if weights is None else weights
+    kept = played.completed & ~np.isnan(played.time) & (w > 0)
+    times = played.time[kept]
     return {
-        "R_goal": float(np.mean(played.goals > 0)),
-        "P_complete": float(np.mean(played.completed)),
-        "R_conj": float(np.mean(played.all_success)),
-        "mean": float(np.mean(times)) if len(times) else float("nan"),
+        "R_goal": float(np.average(played.goals > 0, weights=w)),
+        "P_complete": float(np.average(played.completed, weights=w)),
+        "R_conj": float(np.average(played.all_success, weights=w)),
+        "mean": float(np.average(times, weights=w[kept])) if len(times) else float("nan"),
         "q90": float(np.quantile(times, 0.9)) if len(times) else float("nan"),
     }
 
 
 def predict(training: Training, request: Request) -> dict[str, Any]:
-    """Forecast further trials of a regime. Raises ValueError for a choice that was never
-    measured."""
-    structure, measured_runs = Structure.of(training.task), RunDistributions(training)
-    _refuse_unmeasured(training, measured_runs, request.choices)
+    """Forecast further trials of a regime. Raises ValueError for a choice of which nothing was
+    measured, and for a net that must be simulated but cannot be."""
+    counts, own = choice_counts(training), choices_of(training)
+    asked = sorted(
+        name for name, chosen in request.choices.items() if dict(chosen) != own.get(name)
+    )
+    _refuse_unmeasured(training, request.choices, asked)
+    weights = trial_weights(training, request.choices)
+    straight = training.whole and (not asked or effective(weights) >= LEAST) and not request.net
     random = np.random.default_rng(request.seed)
+    found = (
+        _from_trials(training, request, weights, random)
+        if straight
+        else _from_net(training, request, random)
+    )
+    return {
+        "training_trials": len(training.trials),
+        "training_runs": len(training.runs),
+        "whole": training.whole,
+        "runs": request.runs,
+        **found,
+        "product": product_rule(training, request.choices),
+        "dependence": dependences(training),
+        "routing": routing(training, request.choices),
+        "choice_runs": {name: sum(actions.values()) for name, actions in counts.items()},
+        "asked": asked,
+        "not_back": sum(t.completed and t.time is None for t in training.trials),
+        "notes": _never_entered(training),
+    }
+
+
+def _refuse_unmeasured(training: Training, choices: Choices, asked: list[str]) -> None:
+    """Raise ValueError for choices of which the training tells nothing."""
+    names, runs = training.vocabulary, training.runs
+    known = set(zip(runs.place.tolist(), runs.action.tolist(), strict=True))
+    entered = {place for place, _ in known}
+    for primitive in asked:
+        own = [
+            q
+            for q, place in enumerate(names.places)
+            if training.task.primitive_task_of(place).name == primitive
+        ]
+        if not any(q in entered for q in own):
+            raise ValueError(
+                f"{primitive}: no training run entered {_listed(names.places[q] for q in own)}, "
+                "so nothing can be said about other choices there; leave it out of the choices, "
+                "or train with trials that get there"
+            )
+        for q in own:
+            for action, probability in choices[primitive].items():
+                code = names.actions.index(action) + 1
+                if probability > 0 and q in entered and (q, code) not in known:
+                    raise ValueError(
+                        f"{primitive}: {action} was never run in {names.places[q]}, so nothing is "
+                        "known of it; train with --selector random"
+                    )
+
+
+def _listed(names: Any) -> str:
+    return ", ".join(names)
+
+
+def _never_entered(training: Training) -> list[str]:
+    """Note the action places that no training run entered, with what that is worth."""
+    entered = set(training.runs.place.tolist())
+    n = len(training.trials)
+    return [
+        f"no training run entered {place}: forecast with probability 0"
+        # the rule of three, exactly: (1 - p)^n = 5 %
+        + (f" (below {1.0 - 0.05 ** (1.0 / n):.2g} per trial, 95 %)" if training.whole else "")
+        for q, place in enumerate(training.vocabulary.places)
+        if q not in entered
+    ]
+
+
+# --- figures straight from the trials ---
+
+
+def _from_trials(
+    training: Training, request: Request, weights: Values, random: np.random.Generator
+) -> dict[str, Any]:
+    real = measured(training)
+    point, worth = figures(real, weights), effective(weights)
+    kept = real.completed & ~np.isnan(real.time) & (weights > 0)
+    times, own = real.time[kept], weights[kept]
+    runs = max(1, round(request.runs * point["P_complete"]))
+    enough = len(times) > 1
+    return {
+        "from": TRIALS,
+        "figures": {
+            **{name: _share(point[name], worth, request.runs) for name in SHARES},
+            "mean": mean_figure(times, own, runs, random) if enough else NO_FIGURE,
+            "q90": quantile_figure(times, own, runs, 0.9) if enough else NO_FIGURE,
+        },
+        "law": _law(times, own),
+        "doubts": order_doubts(training),
+        **_beside(training, request),
+    }
+
+
+def _share(value: float, weight: float, runs: int) -> dict[str, Any]:
+    return {
+        "value": round(value, 6),
+        "interval": predictive_interval(value, weight, runs),
+        "confidence": confidence_interval(value, weight),
+        "weight": round(weight, 3),
+    }
+
+
+def _law(times: Values, weights: Values) -> dict[str, Any]:
+    """Return the distribution of the time as quantiles, and how many trials it is worth."""
+    if not len(times):
+        return {"q": list(GRID), "s": [], "trials": 0.0}
+    order = np.argsort(times)
+    reached = np.cumsum(weights[order]) / weights.sum()
+    at = np.searchsorted(reached, np.array(GRID) - 1e-12)
+    s = (
+        np.quantile(times, GRID)
+        if (weights == weights[0]).all()
+        else times[order][np.minimum(at, len(times) - 1)]
+    )
+    return {"q": list(GRID), "s": _rounded(s), "trials": round(effective(weights), 3)}
+
+
+def _beside(training: Training, request: Request) -> dict[str, Any]:
+    """Return how well the simulated net repeats the training: it decides nothing here."""
+    if request.net is False:
+        return _net_told([], None, 0.0, [])
+    try:
+        structure, measured_runs = Structure.of(training.task), RunDistributions(training)
+        played = _replayed(training, structure, measured_runs, request)
+    except ValueError as fault:
+        return _net_told([], None, 0.0, [f"the net was not simulated: {fault}"])
+    return _net_told(
+        residuals(training, played), measured_runs, played.endless / len(played.goals), []
+    )
+
+
+def _net_told(
+    residual: list[dict[str, Any]],
+    measured_runs: RunDistributions | None,
+    endless: float,
+    assumptions: list[str],
+) -> dict[str, Any]:
+    return {
+        "residual": residual,
+        "contexts": measured_runs.count if measured_runs is not None else 0,
+        "splits": measured_runs.splits() if measured_runs is not None else [],
+        "endless": round(endless, 6),
+        "assumptions": assumptions,
+    }
+
+
+# --- figures of the simulated net ---
+
+
+def _from_net(training: Training, request: Request, random: np.random.Generator) -> dict[str, Any]:
+    structure, measured_runs = Structure.of(training.task), RunDistributions(training)
     even = np.ones((1, len(training.trials)))
     residual = (
         residuals(training, _replayed(training, structure, measured_runs, request))
@@ -73,57 +253,42 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
     whole = _played(
         training, structure, measured_runs, request, even, np.zeros(request.point, np.int64), random
     )
-    samples, distances = _bootstrap(training, structure, measured_runs, request, whole, random)
-    point = figures(whole)
+    samples = _bootstrap(training, structure, measured_runs, request, random)
+    point, n = figures(whole), len(training.trials)
     times = whole.time[whole.completed]
+    law = _law(times, np.ones(len(times)))
     return {
-        "training_trials": len(training.trials),
-        "runs": request.runs,
+        "from": NET,
         "figures": {
-            name: _figure(name, point[name], samples[name], request, len(training.trials))
-            for name in (*SHARES, *TIMES)
+            **{name: _net_share(point[name], samples[name], request.runs, n) for name in SHARES},
+            **{name: _net_time(point[name], samples[name], request.runs, n) for name in TIMES},
         },
-        "product": product_rule(training, request.choices),
-        "law": {"q": list(GRID), "s": _rounded(np.quantile(times, GRID)) if len(times) else []},
-        "distance_99": round(float(np.quantile(distances, 0.99)), 6),
-        "contexts": measured_runs.count,
-        "splits": measured_runs.splits(),
-        "dependence": dependences(training),
-        "residual": residual,
-        "doubts": doubts(residual, whole, request.point),
-        "routing": routing(training, request.choices),
-        "choice_runs": {
-            name: sum(actions.values()) for name, actions in choice_counts(training).items()
-        },
-        "asked": sorted(
-            name
-            for name, chosen in request.choices.items()
-            if dict(chosen) != choices_of(training).get(name)
+        "law": {**law, "trials": float(n)},
+        "doubts": doubts(residual, whole, request.point) + order_doubts(training),
+        **_net_told(
+            residual, measured_runs, whole.endless / request.point, list(structure.assumptions)
         ),
-        "not_back": sum(t.completed and t.time is None for t in training.trials),
-        "endless": round(whole.endless / request.point, 6),
-        "assumptions": list(structure.assumptions),
     }
 
 
-def _refuse_unmeasured(
-    training: Training, measured_runs: RunDistributions, choices: Choices
-) -> None:
-    names = training.vocabulary
-    for q, place in enumerate(names.places):
-        primitive = training.task.primitive_task_of(place).name
-        for action, probability in choices.get(primitive, {}).items():
-            measured_there = any(key[0] == q for key in measured_runs.contexts)
-            if (
-                probability > 0
-                and measured_there
-                and (q, names.actions.index(action) + 1) not in measured_runs.contexts
-            ):
-                raise ValueError(
-                    f"{primitive}: {action} was never run in {place}, so nothing is known of "
-                    "it; train "
-                    "with --selector random"
-                )
+def _net_share(value: float, samples: Values, runs: int, training: int) -> dict[str, Any]:
+    sd = float(samples.std(ddof=1)) if len(samples) > 1 else 0.0
+    return _share(value, share_weight(value, sd, runs, training), runs)
+
+
+def _net_time(value: float, samples: Values, runs: int, training: int) -> dict[str, Any]:
+    known = samples[~np.isnan(samples)]
+    if not len(known) or np.isnan(value):
+        return NO_FIGURE
+    sd = float(known.std(ddof=1)) if len(known) > 1 else 0.0
+    # variance of a figure of new trials ~ 1 / training + 1 / new trials
+    alone = sd / np.sqrt(1.0 + training / runs)
+    return {
+        "value": round(value, 6),
+        "interval": _rounded(value + sd * np.array([SCORES[3], -SCORES[3]])),
+        "confidence": _rounded(value + alone * np.array([SCORES[3], -SCORES[3]])),
+        "curve": [round(float(x), 9) for x in value + sd * SCORES],
+    }
 
 
 def _played(
@@ -171,11 +336,9 @@ def _bootstrap(
     structure: Structure,
     measured_runs: RunDistributions,
     request: Request,
-    whole: Played,
     random: np.random.Generator,
-) -> tuple[dict[str, Values], Values]:
-    """Return the figures of `runs` new trials for resampled training trials, and the distance of
-    each distribution of the time from the whole one.
+) -> dict[str, Values]:
+    """Return the figures of `runs` new trials for resampled training trials.
 
     Trials are resampled as a whole (cluster bootstrap), because the runs of one trial depend on
     each other.
@@ -183,8 +346,6 @@ def _bootstrap(
     n = len(training.trials)
     at_once = max(1, TOGETHER // request.runs)
     found: dict[str, list[float]] = {name: [] for name in (*SHARES, *TIMES)}
-    distances: list[float] = []
-    reference = np.sort(whole.time[whole.completed])
     for begin in range(0, request.replicates, at_once):
         count = min(at_once, request.replicates - begin)
         weights = random.multinomial(n, np.full(n, 1.0 / n), size=count).astype(np.float64)
@@ -197,35 +358,7 @@ def _bootstrap(
             )
             for name, value in figures(one).items():
                 found[name].append(value)
-            distances.append(distance(one.time[one.completed], reference))
-    return {name: np.array(values) for name, values in found.items()}, np.array(distances)
-
-
-def distance(sample: Values, reference: Values) -> float:
-    """Return Kolmogorov's distance between a sample and a (large, sorted) reference."""
-    if not len(sample) or not len(reference):
-        return 1.0
-    ordered = np.sort(sample)
-    at = np.searchsorted(reference, ordered, side="right") / len(reference)
-    below = np.searchsorted(reference, ordered, side="left") / len(reference)
-    steps = np.arange(len(ordered) + 1) / len(ordered)
-    return float(max(np.max(np.abs(at - steps[1:])), np.max(np.abs(below - steps[:-1]))))
-
-
-def _figure(
-    name: str, value: float, samples: Values, request: Request, training: int
-) -> dict[str, Any]:
-    known = samples[~np.isnan(samples)]
-    if not len(known):
-        return {"value": None, "interval": None, "sd": None}
-    sd = float(known.std(ddof=1)) if len(known) > 1 else 0.0
-    if name in SHARES:
-        interval = predictive_interval(
-            value, share_weight(value, sd, request.runs, training), request.runs, LEVEL
-        )
-    else:
-        interval = _rounded(np.quantile(known, ((1 - LEVEL) / 2, (1 + LEVEL) / 2)))
-    return {"value": round(value, 6), "interval": interval, "sd": round(sd, 8)}
+    return {name: np.array(values) for name, values in found.items()}
 
 
 def product_rule(training: Training, choices: Choices) -> dict[str, Any]:

@@ -24,15 +24,16 @@ from petrobot.coordinator.task import Task
 from petrobot.services.host.json_text import finite, json_text
 from petrobot.services.host.whole_file import make_folder, write_whole
 
-SCHEMA = 1
+SCHEMA = 2
+"""1: times with a standard deviation only, everything from the simulated net; still read."""
 METHOD = (
-    "Generalised semi-Markov simulation of the net: measured competing risks of each run, in "
-    "contexts told apart by "
-    "chi-square tests, with their measured durations (no phase-type fit); predictive "
-    "intervals by a cluster bootstrap over "
-    "training trials, with the noise of the new runs. Beside it the exact solution of the "
-    "stochastic view (GSPN): phase-type "
-    "durations, statuses of one trial independent of each other."
+    "Where the training chose as the new trials will, or often enough so: figures straight from "
+    "the training trials (exact binomial intervals, bootstrap-t for the mean, fractional order "
+    "statistics for the quantile). Else generalised semi-Markov simulation of the net with "
+    "measured competing risks of each run, in contexts that chi-square tests distinguish, and a "
+    "cluster bootstrap over training trials. `interval` is predictive, for the new trials; "
+    "`confidence` is of the true figure. Beside both the exact solution of the stochastic view "
+    "(GSPN): phase-type durations, statuses of one trial independent of each other."
 )
 LARGEST = 50_000
 """Largest number of markings for which the stochastic view is solved."""
@@ -101,8 +102,8 @@ def read(path: Path) -> dict[str, Any]:
     try:
         found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         body = {key: value for key, value in found.items() if key != "sha256"}
-        if found["schema"] != SCHEMA:
-            raise ForecastError(f"{path}: schema: expected {SCHEMA}, got {found['schema']!r}")
+        if found["schema"] not in (1, SCHEMA):
+            raise ForecastError(f"{path}: schema: expected 1 or {SCHEMA}, got {found['schema']!r}")
         said = found["sha256"]
     except OSError as fault:
         raise _no_forecast(path, fault.strerror or str(fault)) from fault

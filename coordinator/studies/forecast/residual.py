@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2_contingency, ttest_ind
+from scipy.stats import chi2_contingency, spearmanr, ttest_ind
 
 from petrobot.coordinator.studies.forecast.history import Training, Values
 from petrobot.coordinator.studies.forecast.play import Choices, Played
@@ -134,6 +134,39 @@ def ways_table(before: Mapping[str, int], after: Mapping[str, int]) -> np.ndarra
     """Return the contingency table (2, ways) of two counts of outgoing transitions of a place."""
     ways = sorted({*before, *after})
     return np.array([[counts.get(way, 0) for way in ways] for counts in (before, after)])
+
+
+ORDER_LEVEL = 0.001
+"""Significance level, after Holm, at which trials depend on their order."""
+ORDER = 0.1
+"""Rank correlation from which such a dependence matters."""
+
+
+def order_doubts(training: Training) -> list[str]:
+    """Return in words whether trials depend on their order: a trend, or a dependence of each trial
+    on the one before (rank correlations, Holm). All forecasts assume that trials are independent
+    and alike."""
+    if not training.whole:
+        return []
+    real, found = measured(training), []
+    done = ~np.isnan(real.time)
+    for name, values in (("time", real.time[done]), ("goal", (real.goals > 0).astype(np.float64))):
+        if len(values) < 20 or values.std() == 0:
+            continue
+        order = np.arange(len(values), dtype=np.float64)
+        tests = [("changes with the order of the trials", order, values)]
+        if values[1:].std() > 0 and values[:-1].std() > 0:
+            tests.append(("depends on the trial before", values[:-1], values[1:]))
+        for words, one, other in tests:
+            test = spearmanr(one, other)
+            found.append((f"{name} {words}", float(test.statistic), float(test.pvalue)))
+    together = holm([p for _, _, p in found])
+    return [
+        f"the training's {words} (rank correlation {r:+.2f}, p = {p:.1e}), but a forecast assumes "
+        "that trials are independent and alike; train again in a steady state"
+        for (words, r, _), p in zip(found, together, strict=True)
+        if p < ORDER_LEVEL and abs(r) > ORDER
+    ]
 
 
 def doubts(residual: Sequence[Mapping[str, Any]], played: Played, trials: int) -> list[str]:

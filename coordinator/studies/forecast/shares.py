@@ -1,8 +1,9 @@
 """Tests of shares: the predictive distribution of a share of new trials, and Holm's adjustment.
 
-The distribution is beta-binomial around the forecast. Its weight is the number of trials that would
-give the forecast's own uncertainty, with the Jeffreys prior: a share of 1 that was forecast from n
-trials still allows a miss in another n.
+A share that is worth `weight` trials is compared with a share of new trials as the hypergeometric
+test compares two samples (A. R. Thatcher, J. Royal Statistical Society B 26 (1964) 176-192): each
+limit is a beta-binomial quantile, and the interval holds at least its level for every true share.
+So a share of 1 that was forecast from n trials still allows a miss in another n.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import betabinom
+from scipy.stats import beta, betabinom
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -37,19 +38,27 @@ def share_weight(value: float, sd: float, runs: int, training: int) -> float:
     return float(training) if noise <= 0.0 or own <= noise / training else max(2.0, noise / own)
 
 
-def _beta(value: float, weight: float) -> tuple[float, float]:
-    return value * weight + 0.5, (1.0 - value) * weight + 0.5
+def confidence_interval(value: float, weight: float, level: float = 0.95) -> list[float]:
+    """Return the interval of the true share (C. J. Clopper and E. S. Pearson, Biometrika 26 (1934)
+    404-413); it holds at least its level."""
+    yes, no, tail = value * weight, (1.0 - value) * weight, (1 - level) / 2
+    low = float(beta.ppf(tail, yes, no + 1)) if yes > 0 else 0.0
+    high = float(beta.isf(tail, yes + 1, no)) if no > 0 else 1.0
+    return [round(low, 6), round(high, 6)]
 
 
 def predictive_interval(value: float, weight: float, n: int, level: float = 0.95) -> list[float]:
     """Return the interval in which a share of n new trials is expected."""
-    a, b = _beta(value, weight)
-    low, high = betabinom.ppf([(1 - level) / 2, (1 + level) / 2], n, a, b)
-    return [round(float(low) / n, 6), round(float(high) / n, 6)]
+    yes, no, tail = value * weight, (1.0 - value) * weight, (1 - level) / 2
+    low = float(betabinom.ppf(tail, n, yes, no + 1)) if yes > 0 else 0.0
+    high = float(betabinom.ppf(1 - tail, n, yes + 1, no)) if no > 0 else float(n)
+    return [round(low / n, 6), round(high / n, 6)]
 
 
 def share_p_value(value: float, weight: float, count: int, n: int) -> float:
-    """Return the two-sided p-value of `count` successes among n new trials."""
-    a, b = _beta(value, weight)
-    below, above = float(betabinom.cdf(count, n, a, b)), float(betabinom.sf(count - 1, n, a, b))
+    """Return the two-sided p-value of `count` successes among n new trials; it is at most 5 % where
+    the count lies outside the 95 % predictive interval."""
+    yes, no = value * weight, (1.0 - value) * weight
+    below = float(betabinom.cdf(count, n, yes, no + 1)) if yes > 0 else 1.0
+    above = float(betabinom.sf(count - 1, n, yes + 1, no)) if no > 0 else 1.0
     return min(1.0, 2.0 * min(below, above))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from petrobot.coordinator.studies.forecast.predict import TRIALS
 from petrobot.coordinator.studies.forecast.residual import NEGLIGIBLE
 
 WORDS = {
@@ -30,14 +31,18 @@ def forecast_text(made: Mapping[str, Any]) -> str:
     """Return a forecast as text for a terminal."""
     lines = [f"{made['task']}: forecast of {made['registered_at']}"]
     for name, said in made["regimes"].items():
-        lines.append(
-            f"  regime {name or '-'}: {said['runs']} runs, from {said['training_trials']} trials"
+        known = (
+            f"{said['training_trials']} trials"
+            if said["whole"]
+            else f"{said['training_runs']} runs of an estimates file"
         )
+        how = "straight from them" if said["from"] == TRIALS else "by simulating the net"
+        lines.append(f"  regime {name or '-'}: {said['runs']} new trials, from {known}, {how}")
         for figure, found in said["figures"].items():
             if found["value"] is not None:
-                low, high = found["interval"]
                 lines.append(
-                    f"    {WORDS[figure]:20}{found['value']:.4f}  95 % [{low:.4f}, {high:.4f}]"
+                    f"    {WORDS[figure]:20}{_digits(found['value'])}  95 % of new trials "
+                    f"{_bounds(found['interval'])}, of the truth {_bounds(found['confidence'])}"
                 )
         lines += _exact_lines(said.get("gspn", {}))
         lines.append(
@@ -50,26 +55,39 @@ def forecast_text(made: Mapping[str, Any]) -> str:
                     f"    {found['places'][0]} and {found['places'][1]} depend on each "
                     f"other: p = {found['p']:.1e}"
                 )
-        lines.append(f"    {said['contexts']} contexts; {_worst(said['residual'])}")
+        lines.append(f"    simulated net: {said['contexts']} contexts; {_worst(said)}")
         if 0.0005 < said["endless"] <= NEGLIGIBLE:
             lines.append(f"    note: {said['endless']:.1%} of the simulated trials never end")
-        lines += [f"    note: {note}" for note in said["assumptions"]]
+        lines += [f"    note: {note}" for note in (*said["notes"], *said["assumptions"])]
         lines += [f"    DOUBTFUL: {doubt}" for doubt in said["doubts"]]
     return "\n".join(lines)
+
+
+def _digits(value: float) -> str:
+    """Return a number with four decimals, or with four digits if it is small."""
+    return f"{value:.4f}" if value == 0 or abs(value) >= 0.001 else f"{value:.3e}"
+
+
+def _bounds(interval: Sequence[float]) -> str:
+    return f"[{_digits(interval[0])}, {_digits(interval[1])}]"
 
 
 def _exact_lines(gspn: Mapping[str, Any]) -> list[str]:
     if "markings" not in gspn:
         return [f"    stochastic view: {gspn['why']}"] if gspn else []
-    shown = ", ".join(f"{WORDS[k]} {gspn[k]:.4f}" for k in WORDS if gspn.get(k) is not None)
+    shown = ", ".join(f"{WORDS[k]} {_digits(gspn[k])}" for k in WORDS if gspn.get(k) is not None)
     return [f"    stochastic view, {gspn['markings']} markings: {shown}"]
 
 
-def _worst(residual: Sequence[Mapping[str, Any]]) -> str:
+def _worst(said: Mapping[str, Any]) -> str:
+    residual = said["residual"]
     if not residual:
-        return "from an estimates file: no trials to compare with"
+        return "from an estimates file: no trials to compare with" if not said["whole"] else "none"
     worst = min(residual, key=lambda row: row["p"])
-    return f"simulated against training trials: smallest p {worst['p']:.2f} ({worst['of']})"
+    text = f"smallest p {worst['p']:.2f} ({worst['of']}) against the training trials"
+    # the figures do not come from it, so a difference is not a doubt about them
+    warning = ", so a forecast by simulation would be doubtful"
+    return text + (warning if worst["p_holm"] < 0.01 and said["from"] == TRIALS else "")
 
 
 def rows_of(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
@@ -92,22 +110,15 @@ def rows_of(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 
 def _agrees(row: Mapping[str, Any]) -> str:
-    p = row["p"] if row["p_holm"] is None else row["p_holm"]
-    return "" if p is None else "yes" if p >= 0.01 else "NO"
+    return "" if row["agrees"] is None else "yes" if row["agrees"] else "NO"
 
 
 def _p(row: Mapping[str, Any]) -> str:
-    if row["p"] is None:
-        return ""
-    return (
-        f"{row['p']:.3f} (alone)"
-        if row["p_holm"] is None
-        else f"{row['p']:.3f} ({row['p_holm']:.3f})"
-    )
+    return "" if row["p"] is None else f"{row['p']:.3f} ({row['p_holm']:.3f})"
 
 
 def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.4f}"
+    return "" if value is None else _digits(value)
 
 
 def _interval(value: Sequence[float] | None) -> str:
@@ -143,13 +154,12 @@ def agreement_text(found: Mapping[str, Any]) -> str:
             verdict = "agrees" if law["agrees"] else "DISAGREES"
             lines.append(
                 f"distribution of the time, regime {law['regime'] or '-'}: "
-                f"distance {law['distance']} "
-                f"of {law['limit']}: {verdict}"
+                f"distance {law['distance']}, p = {_p(law)}: {verdict}"
             )
-    odd = [row for row in found["routing"] if row["p_holm"] < 0.01]
+    odd = [row for row in found["routing"] if not row["agrees"]]
     lines += [
-        f"outgoing transitions of {row['place']} differ, regime {row['regime'] or '-'}: "
-        f"p = {row['p_holm']:.1e}"
+        f"outgoing transitions of {row['place']}, regime {row['regime'] or '-'}: "
+        f"p = {row['p_holm']:.1e}: DISAGREES"
         for row in odd
     ]
     for regime, doubts in found["doubts"].items():
@@ -165,7 +175,7 @@ def agreement_text(found: Mapping[str, Any]) -> str:
     if not found["same_task_file"]:
         lines.append("note: the task file has changed between training and these runs")
     lines.append(
-        "agrees" if found["agrees"] else "DISAGREES: at least one figure differs at 1 % (Holm)"
+        "agrees" if found["agrees"] else "DISAGREES: at least one test differs at 1 % (Holm)"
     )
     return "\n".join(lines)
 
@@ -194,7 +204,11 @@ def agreement_markdown(found: Mapping[str, Any]) -> str:
         "",
     ]
     lines += _markdown([("regime", "product", "measured", "p", "verdict"), *control_rows(found)])
-    lines += ["", "Distribution of the time (Kolmogorov's distance, limit at 1 %):", ""]
+    lines += [
+        "",
+        "Distribution of the time (Kolmogorov's distance; limit: at 1 % for this test alone):",
+        "",
+    ]
     laws = [
         (law["regime"] or "-", _number(law["distance"]), _number(law["limit"]))
         for law in found["law"]

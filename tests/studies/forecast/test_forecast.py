@@ -18,7 +18,7 @@ from petrobot.coordinator.studies.forecast.agreement import agreement, quantile_
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.distributions import RunDistributions, dependences
 from petrobot.coordinator.studies.forecast.history import ForecastError, Training
-from petrobot.coordinator.studies.forecast.predict import Request, distance, figures, predict
+from petrobot.coordinator.studies.forecast.predict import Request, figures, predict
 from petrobot.coordinator.studies.forecast.registered import read, register, write
 from petrobot.coordinator.studies.forecast.residual import measured
 from petrobot.coordinator.studies.forecast.shares import (
@@ -33,18 +33,20 @@ RUNS = 400
 
 
 def forecast(task: Task, trials: list[Trial], **given_: Any) -> dict[str, Any]:
-    """A forecast from trials with their own choices."""
+    """A forecast from trials with their own choices; `net`: by simulation."""
     training = Training.of(task, trials)
-    return predict(
-        training,
-        Request(RUNS, given_.pop("choices", choices_of(training)), replicates=60, point=20_000),
-    )
+    choices, net = given_.pop("choices", choices_of(training)), given_.pop("net", None)
+    return predict(training, Request(RUNS, choices, replicates=60, point=20_000, net=net))
 
 
-def test_marginals_of_the_training_are_kept(pair: Task, make_trials: Make) -> None:
-    """Whatever depends on whatever: the net composes the laws to what was measured."""
+@pytest.mark.parametrize("net", [None, True])
+def test_marginals_of_the_training_are_kept(
+    pair: Task, make_trials: Make, net: bool | None
+) -> None:
+    """However runs depend on each other: the simulated net, too, composes what was measured."""
     trials = make_trials(1500, np.random.default_rng(1))
-    found, own = forecast(pair, trials)["figures"], figures(measured(Training.of(pair, trials)))
+    found = forecast(pair, trials, net=net)["figures"]
+    own = figures(measured(Training.of(pair, trials)))
     for name in ("R_goal", "P_complete", "R_conj"):
         assert found[name]["value"] == pytest.approx(own[name], abs=0.015)
     for name in ("mean", "q90"):
@@ -59,7 +61,7 @@ def test_dependence_is_found_unfolded_and_the_product_is_not_the_truth(
     trials = make_trials(1500, np.random.default_rng(2))
     training = Training.of(pair, trials)
     assert dependences(training)[0]["p"] < 1e-6
-    made = forecast(pair, trials)
+    made = forecast(pair, trials, net=True)
     assert ("second", "outcome", "outcome of first") in {
         (s["place"], s["of"], s["by"]) for s in made["splits"]
     }
@@ -108,7 +110,7 @@ def test_unfolding_keeps_the_spread_of_the_time(pair: Task, make_trials: Make) -
     real = measured(training)
     met = real.goals > 0
     assert np.std(real.time[met]) < 0.05
-    made = forecast(pair, trials)
+    made = forecast(pair, trials, net=True)
     assert made["residual"][-1]["p"] > 0.001
     new = Training.of(pair, make_trials(RUNS, np.random.default_rng(10)))
     law = agreement({"regimes": {"": made}}, {"": new})["law"][0]
@@ -211,17 +213,6 @@ def test_quantile_interval_holds_its_quantile() -> None:
         for low, high in (quantile_interval(random.random(300), 0.9) for _ in range(200))
     )
     assert 165 <= hits <= 198
-
-
-def test_distance_is_kolmogorovs() -> None:
-    """Against scipy's."""
-    from scipy.stats import ks_2samp
-
-    random = np.random.default_rng(2)
-    one, reference = random.random(40), np.sort(random.random(500) ** 1.2)
-    assert distance(one, reference) == pytest.approx(
-        float(ks_2samp(one, reference).statistic), abs=1e-12
-    )
 
 
 # --- registered files -------------------------------------------------------------------------

@@ -195,7 +195,9 @@ def test_what_another_end_preempts_is_forecast_as_it_happens(
     from the training's."""
     task = loads(text, "scan.toml")
     training = Training.of(task, trials_of(make, 3000, 1))
-    made = predict(training, Request(400, choices_of(training), replicates=40, point=20_000))
+    made = predict(
+        training, Request(400, choices_of(training), replicates=40, point=20_000, net=True)
+    )
     found, own = made["figures"], figures(measured(training))
     assert found["R_goal"]["value"] == pytest.approx(goal, abs=0.03)
     assert found["R_conj"]["value"] == pytest.approx(conj, abs=0.03)
@@ -234,7 +236,9 @@ def test_a_watch_that_never_ends_by_itself_is_played_and_solved() -> None:
     task = loads(ONE_WAY, "scan.toml")
     trials = [one_way(np.random.default_rng(seed), 1e9) for seed in range(400)]
     training = Training.of(task, trials)
-    made = predict(training, Request(100, choices_of(training), replicates=20, point=4000))
+    made = predict(
+        training, Request(100, choices_of(training), replicates=20, point=4000, net=True)
+    )
     assert made["figures"]["P_complete"]["value"] == 1.0
     assert made["figures"]["R_goal"]["value"] == pytest.approx(
         np.mean([t.goals for t in trials]), abs=0.02
@@ -275,7 +279,9 @@ out = ["idle"]
         for t, ended in runs
     ]
     training = Training.of(loads(text, "scan.toml"), trials)
-    made = predict(training, Request(100, choices_of(training), replicates=20, point=4000))
+    made = predict(
+        training, Request(100, choices_of(training), replicates=20, point=4000, net=True)
+    )
     assert any("watch" in doubt and "longer" in doubt for doubt in made["doubts"]), made["doubts"]
 
 
@@ -365,9 +371,9 @@ out = ["idle"]
     for trial in trials:
         trial.runs[0].cancelled = trial.runs[0].taken == "rung"
     training = Training.of(loads(text, "scan.toml"), trials)
-    made = predict(training, Request(100, choices_of(training), replicates=20, point=4000))[
-        "figures"
-    ]
+    made = predict(
+        training, Request(100, choices_of(training), replicates=20, point=4000, net=True)
+    )["figures"]
     assert made["R_goal"]["value"] == pytest.approx(0.5, abs=0.03)
     assert made["mean"]["value"] == pytest.approx(1.5, abs=0.03)
 
@@ -408,7 +414,9 @@ after = 1.0
         trials.append(trial)
     training = Training.of(loads(text, "scan.toml"), trials)
     assert set(training.waits["dog"][0].round(9)) == {1.02}
-    made = predict(training, Request(400, choices_of(training), replicates=20, point=20_000))
+    made = predict(
+        training, Request(400, choices_of(training), replicates=20, point=20_000, net=True)
+    )
     own = figures(measured(training))
     for name in ("R_goal", "R_conj"):
         assert made["figures"][name]["value"] == pytest.approx(own[name], abs=0.02)

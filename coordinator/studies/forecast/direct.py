@@ -1,0 +1,190 @@
+"""Figures of further trials straight from the training trials: no model of the net, so branches
+with a common cause, loops and hidden conditions need no assumption but that trials are independent
+and alike.
+
+A forecast of other choices weights each trial by how much more often those choices would have led
+to it (importance weights: Horvitz and Thompson, J. Am. Stat. Assoc. 47 (1952) 663-685).
+
+- Shares: exact binomial intervals and predictive ones (shares.py); both hold at least their level.
+- Mean: bootstrap-t (P. Hall, The Bootstrap and Edgeworth Expansion, Springer 1992), because it
+  corrects the skewness of long-tailed times.
+- Quantile: fractional order statistics (A. D. Hutson, Statistics and Probability Letters 42 (1999)
+  331-338), whose levels depend on no distribution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta, norm
+
+from petrobot.coordinator.studies.forecast.choices import choices_of
+from petrobot.coordinator.studies.forecast.history import Training, Values
+
+LEVEL = 0.95
+PIVOTS = 2000
+"""Bootstrap samples of the mean."""
+AT_ONCE = 2_000_000
+"""Largest number of drawn times that are kept at the same time."""
+MANY = 4000
+"""Number of new trials beyond which their mean is drawn from the normal distribution."""
+SCORES: Values = np.array([-3.0, -2.6, -2.2, norm.ppf(0.025), -1.6, -1.2, -0.8, -0.4, 0.0])
+SCORES = np.concatenate([SCORES, -SCORES[-2::-1]])
+"""Normal scores at which predictive distributions of times are stored."""
+LEAST = 50
+"""Least number of training trials, weighted, for a forecast of other choices."""
+
+Choices = Mapping[str, Mapping[str, float]]
+
+
+def trial_weights(training: Training, choices: Choices) -> Values:
+    """Return how much more often each training trial would occur with other choices: the product of
+    (probability now / share in the training) over its runs."""
+    known = choices_of(training)
+    ratio = {
+        name: {a: choices[name].get(a, 0.0) / share for a, share in shares.items()}
+        for name, shares in known.items()
+        if name in choices and dict(choices[name]) != shares
+    }
+    weights = np.ones(len(training.trials))
+    if ratio:
+        primitive = training.task.primitive_task_of
+        for i, trial in enumerate(training.trials):
+            for run in trial.runs:
+                weights[i] *= ratio.get(primitive(run.place).name, {}).get(run.action, 1.0)
+    return weights
+
+
+def effective(weights: Values) -> float:
+    """Return the number of equally weighted trials that would be worth as much (Kish)."""
+    whole = float(weights.sum())
+    return whole * whole / float(weights @ weights) if whole > 0 else 0.0
+
+
+# --- means ---
+
+
+def mean_figure(
+    times: Values, weights: Values, runs: int, random: np.random.Generator
+) -> dict[str, Any]:
+    """Forecast the mean of the times of `runs` further trials.
+
+    The bootstrap repeats both what was measured (trials drawn again) and what will be (new trials),
+    and keeps the difference of their means in units of its own standard error.
+    """
+    n, equal = len(times), bool((weights == weights[0]).all())
+    bounds = np.cumsum(weights) / weights.sum()
+    mean, error, spread = _moments(times[None], weights[None])
+    of_truth, of_new = [], []
+    centre = float(mean[0])
+    for begin in range(0, PIVOTS, each := max(1, AT_ONCE // max(n, min(runs, MANY)))):
+        count = min(each, PIVOTS - begin)
+        index = random.integers(n, size=(count, n))
+        m, e, s = _moments(times[index], weights[index])
+        if runs > MANY:
+            new = centre + float(spread[0]) / np.sqrt(runs) * random.standard_normal(count)
+        else:
+            at = (
+                random.integers(n, size=(count, runs))
+                if equal
+                else np.searchsorted(bounds[:-1], random.random((count, runs)), side="right")
+            )
+            new = times[at].mean(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            of_truth.append((centre - m) / e)
+            of_new.append((new - m) / np.hypot(e, s / np.sqrt(runs)))
+    truth, fresh = (np.concatenate(x) for x in (of_truth, of_new))
+    alone = float(error[0])
+    both = float(np.hypot(error[0], spread[0] / np.sqrt(runs)))
+    levels = norm.cdf(SCORES)
+    return _figure(
+        centre,
+        centre + both * _quantiles(fresh, levels),
+        centre + alone * _quantiles(truth, _BOTH),
+    )
+
+
+def _moments(times: Values, weights: Values) -> tuple[Values, Values, Values]:
+    """Return weighted mean, its standard error, and the standard deviation, for each row."""
+    n, whole = times.shape[1], weights.sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = (weights * times).sum(axis=1) / whole
+        off = (times - mean[:, None]) ** 2
+        correct = n / (n - 1) if n > 1 else np.inf
+        error = np.sqrt(correct * (weights**2 * off).sum(axis=1)) / whole
+        spread = np.sqrt(correct * (weights * off).sum(axis=1) / whole)
+    return mean, error, spread
+
+
+def _quantiles(pivots: Values, levels: Values) -> Values:
+    known = pivots[np.isfinite(pivots)]  # a sample of equal times has no standard error
+    return np.quantile(known, levels) if len(known) else np.zeros(len(levels))
+
+
+# --- quantiles ---
+
+
+def quantile_figure(times: Values, weights: Values, runs: int, q: float) -> dict[str, Any]:
+    """Forecast a quantile of the times of `runs` further trials."""
+    order = np.argsort(times)
+    law = _Law(times[order], weights[order])
+    rank = q * (runs - 1) + 1  # of the order statistic that numpy.quantile returns
+    new = beta(rank, runs - rank + 1)
+    n = effective(weights)
+
+    middle = q * (n + 1)
+    # Ranks that reach seven standard errors to both sides, so that every score lies between them.
+    reach = 7.0 * np.sqrt(q * (1 - q) * (n + 1) * (1.0 + n / runs)) + 3.0
+    ranks = np.linspace(max(1e-3, middle - reach), min(n + 1 - 1e-3, middle + reach), 80)
+    # P(true quantile, or quantile of the new trials, <= order statistic of this rank)
+    known = beta.sf(q, ranks, n + 1 - ranks)
+    own = beta.ppf((np.arange(100)[:, None] + 0.5) / 100, ranks, n + 1 - ranks)
+    below = new.cdf(own).mean(axis=0)
+    return _figure(
+        float(law.at(np.array([(q * (n - 1) + 1) / (n + 1)]))[0]),
+        law.at(_inverse(ranks, below, SCORES) / (n + 1)),
+        law.at(_inverse(ranks, known, norm.ppf(_BOTH)) / (n + 1)),
+    )
+
+
+def _inverse(ranks: Values, probability: Values, scores: Values) -> Values:
+    """Return the ranks at which an increasing probability has these normal scores."""
+    own = norm.ppf(np.clip(probability, 1e-12, 1 - 1e-12))
+    kept = np.concatenate([[True], np.diff(own) > 0])
+    return np.asarray(np.interp(scores, own[kept], ranks[kept]))
+
+
+class _Law:
+    """Weighted order statistics, interpolated; beyond the longest time an exponential tail with the
+    mean excess of the upper half."""
+
+    def __init__(self, times: Values, weights: Values) -> None:
+        n = effective(weights)
+        # plotting positions i / (n + 1) for equal weights
+        self._position = np.cumsum(weights) / weights.sum() * n / (n + 1)
+        self._times = times
+        middle = float(np.quantile(times, 0.5))
+        upper = times[times > middle]
+        self._excess = float(upper.mean() - middle) if len(upper) else 0.0
+
+    def at(self, position: Values) -> Values:
+        """Return the times at positions in (0, 1)."""
+        inside = np.interp(position, self._position, self._times)
+        last = self._position[-1]
+        beyond = np.log((1.0 - last) / np.minimum(1.0 - last, 1.0 - position))
+        return np.asarray(inside + self._excess * beyond)
+
+
+_BOTH = np.array([(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+
+
+def _figure(value: float, curve: Values, confidence: Values) -> dict[str, Any]:
+    low, high = (float(np.interp(norm.ppf(p), SCORES, curve)) for p in _BOTH)
+    return {
+        "value": round(value, 6),
+        "interval": [round(low, 6), round(high, 6)],
+        "confidence": [round(float(x), 6) for x in confidence],
+        "curve": [round(float(x), 9) for x in curve],
+    }
