@@ -101,14 +101,16 @@ def scripted_actions(mock: Path | None, directory: Directory) -> Substitutes | N
 
 def with_runs(task: Task, runs: int | None) -> tuple[Task, int]:
     """The task with so many tokens in its runs place (None: as many as the file says); gives that
-    number too."""
+    number too. A recorded expansion gets them as well."""
     place = task.places.get(task.runs_place) if task.runs_place else None
     if place is None:
         return task, 1
     runs = place.tokens if runs is None else runs
     capacity = None if place.capacity is None else max(place.capacity, runs)
     return replace(
-        task, places={**task.places, place.name: replace(place, tokens=runs, capacity=capacity)}
+        task,
+        places={**task.places, place.name: replace(place, tokens=runs, capacity=capacity)},
+        expansion=task.expansion and with_runs(task.expansion, runs)[0],
     ), runs
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -114,11 +114,18 @@ def _source(header: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def task_of(journal: Journal) -> Task:
-    """The task that a journal ran, with the number of runs that it was given. Raises TaskFileError,
-    KeyError."""
+    """The task that a journal ran, with the number of runs that it was given.
+
+    Its flat net is the recorded one, so that a later petrobot, which may expand short forms in
+    another way, derives the same run again. Journals without one are expanded now. Raises
+    TaskFileError, KeyError.
+    """
     from petrobot.coordinator.launch import with_runs
 
     task = loads(journal.header["task"], f"{journal.path} (task)")
+    if (expanded := journal.header.get("expanded")) is not None:
+        flat = loads(expanded, f"{journal.path} (expanded task)", flat=True)
+        task = replace(task, expansion=flat)
     runs = journal.header.get("runs")
     return with_runs(task, runs)[0] if runs is not None else task
 

@@ -65,6 +65,7 @@ from petrobot.coordinator.run.realtime import RealtimeMission, credentials_of
 from petrobot.coordinator.run.recording import JournalStore, RetracingStore, clock_reading
 from petrobot.coordinator.run.timeline import Timeline
 from petrobot.coordinator.task import Task
+from petrobot.coordinator.task.file import dumps
 from petrobot.services.comm.location_file import (
     FIRST_PHYSICS,
     Directory,
@@ -273,10 +274,12 @@ def _new(
     origin = 0.0 if lockstep else asyncio.get_running_loop().time()
     store = None
     if folder is not None:
+        task, runs = with_runs(setting.task, setting.runs)
         given = {
+            "expanded": dumps(task.flat),
             "services_path": str(directory.source.resolve()),
             "seed": setting.seed,
-            "runs": with_runs(setting.task, setting.runs)[1],
+            "runs": runs,
             "parameters": {**setting.task.parameters, **setting.parameters},
             "clock": clock_reading(origin),
             "durable": request.durable,

@@ -27,13 +27,13 @@ from petrobot.coordinator.engine import (
     point_from_plain,
     to_plain,
 )
-from petrobot.coordinator.launch import Setting, with_runs
+from petrobot.coordinator.launch import Setting
 from petrobot.coordinator.learning.session import fixed_by_user, session_of
+from petrobot.coordinator.operator.history import task_of
 from petrobot.coordinator.run.interfaces import FirstAlternative, Observer
 from petrobot.coordinator.run.journal import Journal, JournalError, read_journal
 from petrobot.coordinator.run.recording import STIMULUS, RecordedStep, replay
 from petrobot.coordinator.task import Kind, Status, Task
-from petrobot.coordinator.task.file import loads
 from petrobot.services.comm.location_file import Directory, parse
 
 AGAIN = "again"
@@ -73,7 +73,7 @@ def read_recorded(path: Path) -> Recorded:
             raise JournalError(
                 f"{path}: its header has no {key!r}; it is not the journal of a mission run"
             )
-    task, _ = with_runs(loads(then["task"], f"{path} (task)"), then["runs"])
+    task = task_of(journal)
     directory = parse(then["services"], Path(then["services_path"]))
     devices = {a.name: a.device for a in directory.actions.values() if a.device}
     return Recorded(journal, task, directory, Engine(task, devices))

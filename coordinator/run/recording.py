@@ -200,6 +200,9 @@ def _compare(
     where = f"{path}: record {number} ({data['stimulus'].get('kind')})"
     if written != state.marking:
         net = engine.compiled.net
+        if len(written) != len(net.places):
+            text = f"the net had {len(written)} places, and has {len(net.places)} now"
+            raise ReplayError(f"{where}: {text}")
         raise ReplayError(
             f"{where}: marking was {net.describe(written)}, is now {net.describe(state.marking)}"
         )

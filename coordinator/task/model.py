@@ -65,11 +65,15 @@ class Task:
     one at hand."""
     errors_to: str = ""
     """Place that receives the errors of action places without an `error` arc; empty: none."""
+    expansion: Task | None = field(default=None, compare=False, repr=False)
+    """The flat task as a journal recorded it, which is what ran; None: `expand` makes it."""
+    is_flat: bool = field(default=False, compare=False, repr=False)
+    """Whether the task was read as a flat one: nothing in it is written in short."""
 
     @cached_property
     def flat(self) -> Task:
         """The task with all that is written in short expanded; itself if nothing is."""
-        return expand(self)
+        return self if self.is_flat else self.expansion or expand(self)
 
     @cached_property
     def net(self) -> Net:

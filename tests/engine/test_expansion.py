@@ -599,3 +599,13 @@ def test_faults_name_key_and_remedy(text: str, old: str, new: str, key: str, wor
         loads(changed)
     assert any(f.key == key for f in error.value.faults), [str(f) for f in error.value.faults]
     assert words in str(error.value)
+
+
+@pytest.mark.parametrize("text", [SHORT, TRIES])
+def test_a_flat_task_can_be_written_and_read(text: str) -> None:
+    """As a journal keeps it: with the origin of each element, and flat in itself."""
+    flat = loads(text).flat
+    again = loads(dumps(flat), flat=True)
+    assert again == flat and again.flat is again and again.net == flat.net
+    with pytest.raises(TaskFileError, match=r"expanded_from|cannot be a name"):
+        loads(dumps(flat))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,9 @@ from petrobot.coordinator.cli import main
 from petrobot.coordinator.run.folder import JOURNAL, RESULT, SEMANTICS
 from petrobot.coordinator.run.journal import JournalWriter, read_journal
 from petrobot.coordinator.run.recording import ReplayError, RetracingStore
+from petrobot.coordinator.task import Task, model
+from petrobot.coordinator.task.expansion import expand
+from petrobot.coordinator.task.file import load, loads
 from tests.run.test_runfolder import SCRIPT, SERVICES
 
 TASK = Path(__file__).parents[1] / "chaos" / "shuttle.toml"
@@ -115,3 +119,57 @@ def test_a_journal_of_a_newer_petrobot_is_refused(
     said = capsys.readouterr().err
     assert f"semantics: expected at most {SEMANTICS}, found {SEMANTICS + 1}" in said
     assert "Traceback" not in said
+
+
+SORTER = Path(__file__).parents[2] / "examples" / "sorter"
+SLIPS = """
+schema = 1
+[[actions.grip]]
+status = "error"
+cause = "slipped"
+[[actions.grip]]
+[actions.scan]
+values = { code = "left" }
+[actions.move]
+"""
+
+
+def fewer_tries(task: Task) -> Task:
+    """As a petrobot would expand the sorter's task that gives up after the first try."""
+    places = {name: replace(place, tries=1) for name, place in task.places.items()}
+    return expand(replace(task, places=places))
+
+
+@pytest.mark.parametrize("resumed", [False, True])
+def test_a_run_keeps_the_expansion_that_it_ran_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, resumed: bool
+) -> None:
+    """The header holds the flat task: a petrobot that expands short forms in another way replays
+    and resumes the run as it was; only a journal without it is expanded again."""
+    (tmp_path / "mock.toml").write_text(SLIPS)
+    given = ["run", str(SORTER / "sort.toml"), "--mode", "lockstep", "--quiet", "--runs", "3"]
+    given += ["--journal", str(tmp_path / "runs"), "--mock", str(tmp_path / "mock.toml")]
+    assert main(given) == 0
+    [folder] = (tmp_path / "runs").iterdir()
+    header = dict(read_journal(folder / JOURNAL).header)
+    recorded, now = loads(header["expanded"], flat=True), load(SORTER / "sort.toml").flat
+    assert recorded.flat is recorded and recorded.places["parts"].tokens == 3
+    assert recorded.transitions == now.transitions and recorded.final == now.final
+    assert {**recorded.places, "parts": now.places["parts"]} == now.places
+
+    monkeypatch.setattr(model, "expand", fewer_tries)
+    if resumed:
+        expected = kill_at(folder, 7)
+        assert main(["resume", str(folder), "--quiet", "--no-page"]) == 0
+        result = json.loads((folder / RESULT).read_text())
+        result.pop("wall_s")
+        assert result == expected
+    assert main(["replay", str(folder)]) == 0
+
+    whole = read_journal(folder / JOURNAL)
+    del header["expanded"]
+    (folder / JOURNAL).unlink()
+    with closing(JournalWriter(folder / JOURNAL, header)) as writer:
+        for record in whole.records:
+            writer.append(record.kind, record.data)
+    assert main(["replay", str(folder)]) == 1

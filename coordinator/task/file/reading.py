@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Mapping
+from dataclasses import replace
 from enum import StrEnum
 from math import isfinite
 from pathlib import Path
@@ -58,10 +59,13 @@ class Table:
     """A table, its key in the file and the list that collects faults. Wrong or missing values read
     as their default."""
 
-    def __init__(self, data: Mapping[str, Any], key: str, faults: list[Fault]) -> None:
+    def __init__(
+        self, data: Mapping[str, Any], key: str, faults: list[Fault], flat: bool = False
+    ) -> None:
         self.data = data
         self.key = key
         self.faults = faults
+        self.flat = flat
         self.asked: set[str] = set()
 
     def fault(self, name: str, text: str, remedy: str = "") -> None:
@@ -137,7 +141,8 @@ class Table:
 
     def table(self, name: str) -> Table:
         """A table in this one; an absent one is empty."""
-        return Table(self.plain(name), f"{self.key}.{name}" if self.key else name, self.faults)
+        key = f"{self.key}.{name}" if self.key else name
+        return Table(self.plain(name), key, self.faults, self.flat)
 
     def tables(self, name: str) -> dict[str, Table]:
         """A table of tables."""
@@ -145,7 +150,7 @@ class Table:
         found: dict[str, Table] = {}
         for key, value in outer.data.items():
             if isinstance(value, dict):
-                found[key] = Table(value, f"{outer.key}.{key}", self.faults)
+                found[key] = Table(value, f"{outer.key}.{key}", self.faults, self.flat)
             else:
                 outer.fault(key, f"expected a table, got {value!r}", f"write [{outer.key}.{key}]")
         return found
@@ -202,9 +207,13 @@ def load(path: str | Path) -> Task:
     return loads(text, str(path))
 
 
-def loads(text: str, source: str = "task") -> Task:
+def loads(text: str, source: str = "task", *, flat: bool = False) -> Task:
     """The task in a TOML text; `source` names it in errors. Raises TaskFileError with every
-    fault."""
+    fault.
+
+    `flat`: the text is a flat task that petrobot wrote (`dumps(task.flat)`): its names may have
+    dots, its elements say what they were made from, and it was judged before.
+    """
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -218,12 +227,13 @@ def loads(text: str, source: str = "task") -> Task:
             source, [Fault("TOML", "nested too deeply", "flatten it")], [0]
         ) from error
     faults: list[Fault] = []
-    task = _task(Table(data, "", faults))
-    faults = faults or list(task_faults(task))
+    task = _task(Table(data, "", faults, flat))
+    if not flat:
+        faults = faults or list(task_faults(task))
     if faults:
         lines = key_lines(text)
         raise TaskFileError(source, faults, [line_of(f.key, lines) for f in faults])
-    return task
+    return replace(task, is_flat=True) if flat else task
 
 
 def _task(root: Table) -> Task:
@@ -347,6 +357,7 @@ def _place(name: str, t: Table) -> Place:
         holds=t.texts("holds", single=True),
         subnet=t.text("subnet", ""),
         macro=t.text("macro", ""),
+        expanded_from=t.text("expanded_from", "") if t.flat else "",
         label=t.text("label", ""),
         x=t.maybe_number("x"),
         y=t.maybe_number("y"),
@@ -386,6 +397,7 @@ def _transition(name: str, t: Table) -> Transition:
         sets=_sets(t.table("set")),
         error_branch=t.flag("error_branch"),
         macro=t.text("macro", ""),
+        expanded_from=t.text("expanded_from", "") if t.flat else "",
         label=t.text("label", ""),
         x=t.maybe_number("x"),
         y=t.maybe_number("y"),

@@ -16,6 +16,7 @@ from petrobot.coordinator.launch import Setting, lockstep_cell, lockstep_id, wit
 from petrobot.coordinator.run.folder import header
 from petrobot.coordinator.run.journal import JournalWriter
 from petrobot.coordinator.run.recording import JournalStore
+from petrobot.coordinator.task.file import dumps
 from petrobot.services.action import Status
 from petrobot.services.comm.location_file import parse
 from petrobot.services.scripted import Line
@@ -83,10 +84,12 @@ def make(name: str, folder: Path) -> Path:
     task, path = load_task(task_name), folder / f"{name}.journal"
     text = services_text(task)
     setting = Setting(task, runs=runs)
+    started, tokens = with_runs(task, runs)
     given = {
+        "expanded": dumps(started.flat),
         "services_path": "services.toml",
         "seed": setting.seed,
-        "runs": with_runs(task, runs)[1],
+        "runs": tokens,
     }
     source = task_path(task_name).read_text(encoding="utf-8")
     parameters = {
