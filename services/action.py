@@ -18,7 +18,17 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    import numpy as np
+    from typing_extensions import TypeVar
+
+    Device = TypeVar("Device", covariant=True, default=Any)
+else:
+    from typing import TypeVar
+
+    Device = TypeVar("Device", covariant=True)
 
 Plain = None | bool | int | float | str | bytes | Sequence["Plain"] | Mapping[str, "Plain"]
 
@@ -98,9 +108,26 @@ class Wait:
         return self.ready() if verdict is None else verdict
 
 
-class Context(Protocol):
+class CallFailed(Exception):  # noqa: N818 - what happened, not a class of errors
+    """A service that the action depends on answered ERROR; `result` says how."""
+
+    def __init__(self, service: str, result: Result) -> None:
+        super().__init__(f"{service}: {result.status} {result.cause} {result.text}".rstrip())
+        self.result = result
+
+
+class CommandRefused(Exception):  # noqa: N818 - as above
+    """The driver refused a command, or did not take it in time; the text says why. An action that
+    does not catch it ends in ERROR, cause `command_refused`."""
+
+
+class Context(Protocol[Device]):
     """What a run may use besides its arguments. Times are seconds on the cell's clock; durations
-    cross the wire, times never."""
+    cross the wire, times never.
+
+    `Context[Scanner]` says which driver `ctx.device` is, for editors and type checkers;
+    `Context[Remote]` is that of a cyclic driver.
+    """
 
     @property
     def now(self) -> float:
@@ -112,9 +139,16 @@ class Context(Protocol):
         """This run's id."""
 
     @property
-    def device(self) -> Any:
+    def device(self) -> Device:
         """The handle of the action's device: its driver, or a `Remote` of it when the driver is
         cyclic; None without a device."""
+
+    async def command(self, body: Mapping[str, Any], timeout: float = 1.0) -> None:
+        """Send a command to the device's driver, and wait until the driver has taken it.
+
+        Raises CommandRefused if the driver refuses it (its words), or if it has not taken it after
+        `timeout` seconds.
+        """
 
     def wait(self, ready: Callable[[], bool], timeout: float | None = None) -> Wait:
         """Awaitable: True as soon as `ready()` holds, False after `timeout` seconds."""
@@ -145,16 +179,24 @@ class Context(Protocol):
     async def call(
         self, service: str, /, deadline: float | None = None, **arguments: Any
     ) -> Result:
-        """Call any network service by its name, wherever it is."""
+        """Call any network service by its name, wherever it is; return its result, whatever its
+        status. Raises ValueError or TypeError for arguments that cannot be sent."""
 
-    async def get(self, name: str) -> Any:
-        """Read a global-memory variable (None if it was never written)."""
+    async def get(self, name: str, default: Any = None) -> Any:
+        """Read a global-memory variable; `default` if it was never written. Raises CallFailed if
+        the memory cannot be reached."""
+
+    async def get_versioned(self, name: str, default: Any = None) -> tuple[Any, int]:
+        """Read a global-memory variable with its version, for `compare_and_set`; (`default`, 0) if
+        it was never written. Raises CallFailed as `get`."""
 
     async def put(self, name: str, value: Any) -> int:
-        """Write a global-memory variable; gives its new version."""
+        """Write a global-memory variable; return its new version. Raises CallFailed if the memory
+        cannot be reached or is full, or the value too large."""
 
     async def compare_and_set(self, name: str, version: int, value: Any) -> bool:
-        """Write a global-memory variable if its version is still the given one."""
+        """Write a global-memory variable if its version is still the given one (0: never written);
+        return whether it was written. Raises CallFailed as `put`."""
 
-    def random(self, purpose: str) -> Any:
-        """A numpy Generator keyed by (seed, run, purpose): the same draws on every host."""
+    def random(self, purpose: str) -> np.random.Generator:
+        """Return the random generator of (seed, run, purpose): the same draws on every host."""

@@ -12,12 +12,15 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Mapping
 from copy import copy
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from petrobot.services.comm.canopen.bus import CanBus
 from petrobot.services.comm.location_file.reading import nearest
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.comm.streams.image import ImageSource
+
+if TYPE_CHECKING:
+    import numpy as np
 
 _log = logging.getLogger(__name__)
 
@@ -63,6 +66,14 @@ class Ports(Protocol):
 
     def raise_event(self, name: str, **data: Any) -> None:
         """Raise an external event (numbered and kept until the coordinator has it)."""
+
+    def random(self, purpose: str) -> np.random.Generator:
+        """Return the random generator of (seed of the mission run, device, purpose).
+
+        The seed comes with the first action of the mission run, so ask for the generator where you
+        draw and do not keep it; before any mission run the seed is 0. Raises ValueError while the
+        driver is being made.
+        """
 
     def file(self, path: str) -> bytes:
         """A file named in services.toml, relative to it."""

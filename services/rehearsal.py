@@ -12,9 +12,10 @@ from petrobot.services.comm.calls.events import VERDICT_EVENTS, RunVerdict
 from petrobot.services.comm.location_file import MEMORY_CALLS, ActionEntry
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.comm.protocol.messages import Call, Cancel, Event, Feedback, Outcome
+from petrobot.services.device import Driver
 from petrobot.services.node.inline_host import InlineHost
 from petrobot.services.node.memory import GlobalMemory
-from petrobot.services.worker.context import Report
+from petrobot.services.worker.context import Draws, Report
 from petrobot.services.worker.outlets import Sent
 
 NAME, RUN = "action", "rehearsal"
@@ -60,13 +61,14 @@ def rehearse(
 ) -> Rehearsal:
     """Run an action to its end in ticks of 4 ms of simulated time; takes milliseconds of real time.
 
-    `device` is a driver (`services.device.Driver`; a cyclic one is stepped), or whatever the action
-    uses as `ctx.device`. `services` answer its calls by name (the global memory is there anyway),
+    `device` is a driver (`Driver`; a cyclic one is stepped, and one that was made with ports None
+    gets ports with a clock, `random` and `raise_event`), or whatever the action uses as
+    `ctx.device`. `services` answer its calls by name (the global memory is there anyway),
     `streams` gives the periods of those it publishes to (s). `world(now)` is called each tick
     before the action, to let something happen. With `cancel_after` it is cancelled then. Raises
     StillRunningError when it has not ended after `limit` seconds.
     """
-    stage = _Stage(action, device, services or {}, streams or {})
+    stage = _Stage(action, device, services or {}, streams or {}, seed)
     stage.place.take(0.0, Call(RUN, NAME, arguments, seed=seed))
     for tick in range(round(limit / TICK) + 1):
         stage.now = tick * TICK
@@ -96,6 +98,26 @@ class _Prop:
         return True
 
 
+class _StagePorts:
+    """What a driver may reach in a rehearsal."""
+
+    def __init__(self, stage: _Stage, seed: int) -> None:
+        self._stage = stage
+        self.random = Draws("device", seed).random
+
+    @property
+    def now(self) -> float:
+        """The rehearsal's clock (s)."""
+        return self._stage.now
+
+    def raise_event(self, name: str, **data: Any) -> None:
+        """Note the event in the rehearsal's `events`."""
+        self._stage.played.events.append((self.now, name, data))
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"a rehearsal has no ports.{name}; make the driver with ports that do")
+
+
 class _Stage:
     """A place for one run, with services around it."""
 
@@ -105,9 +127,12 @@ class _Stage:
         device: Any,
         services: Mapping[str, Callable[..., Result]],
         streams: Mapping[str, float],
+        seed: int,
     ) -> None:
         self.now = 0.0
         self.played = Rehearsal(error("still_running"), 0.0)
+        if isinstance(device, Driver) and getattr(device, "ports", self) is None:
+            device.ports = _StagePorts(self, seed)
         self._services = services
         driver = device if hasattr(device, "stopped") and hasattr(device, "period") else None
         self.place = InlineHost(

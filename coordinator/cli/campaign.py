@@ -357,6 +357,13 @@ def text_of(result: dict[str, Any]) -> str:
             lines += [
                 f"  {'':{wide}}{remark}" for remark in _remarks(result["judged"].get(task, {}))
             ]
+    for seeds in result.get("copies", ()):
+        shown = ", ".join(map(str, seeds[:4])) + (", ..." if len(seeds) > 4 else "")
+        lines.append(
+            f"  warning: the blocks with the seeds {shown} are copies of each other, to the "
+            "microsecond: they count as one observation. Let actions and drivers draw with "
+            "ctx.random and ports.random"
+        )
     speed = result["times_real_time_per_core"]
     lines.append(
         f"  {result['sim_s']:.1f} s simulated in {result['wall_s']:.1f} s: {speed} x real "

@@ -1,9 +1,10 @@
-"""Write a working skeleton with its test: of an action (a Python file), or of a task (a net of one
-action with an error branch)."""
+"""Write a working skeleton with its test: of a whole robot (a folder that runs), of an action or a
+driver (a Python file), or of a task (a net of one action with an error branch)."""
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import keyword
 import re
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 from petrobot.coordinator.cli import CommandError
 from petrobot.services.host.whole_file import make_folder, write_whole
 
-EXAMPLE = "petrobot new action close_gripper --folder mylab"
+EXAMPLE = "petrobot new robot sorter"
 
 ACTION = '''\
 """The primitive action {name}: say here what it is for."""
@@ -163,9 +164,223 @@ def test_an_error_is_recovered(tmp_path):
 '''
 
 
+DRIVER = '''\
+"""The device {name}: say here what it is."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from petrobot import Driver, Ports, key
+
+
+class {Class}(Driver):
+    """Moves along one axis; this one is simulated. A real one would open its port in `__init__` and
+    write to its motor in `step`."""
+
+    period = 0.01  # s between two steps; without it the driver has no `step`, and nothing moves
+    speed: float = key(0.5, "m/s")
+    length: float = key(1.0, "m, from end to end")
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        super().__init__(config, ports)
+        self.at = self.goal = 0.0  # m
+        self.paused = False
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        """`{"to": metres}`."""
+        to = body.get("to")
+        if not isinstance(to, int | float) or not 0.0 <= to <= self.length:
+            raise ValueError(f"to: expected 0 to {self.length} m, found {to!r}")
+        self.goal = float(to)
+
+    def step(self, now: float) -> None:
+        if not self.paused:
+            most = self.speed * self.period
+            self.at += max(-most, min(most, self.goal - self.at))
+
+    def state(self) -> Mapping[str, Any]:
+        return {"at": self.at, "arrived": self.stopped()}
+
+    def stop(self, now: float) -> None:
+        self.goal = self.at
+
+    def stopped(self) -> bool:
+        return self.at == self.goal
+
+    def hold(self, now: float) -> str:
+        self.paused = True
+        return "held"
+
+    def release(self, now: float) -> None:
+        self.paused = False
+'''
+
+DRIVER_TEST = '''\
+"""Tests of {name} on a simulated clock."""
+
+from {module} import {Class}
+from petrobot import Context, Remote, Result, rehearse, success
+
+
+async def drive(ctx: Context[Remote], *, to: float) -> Result:
+    await ctx.command({"to": to})
+    await ctx.wait(lambda: ctx.device.state["arrived"])
+    return success()
+
+
+def test_it_arrives():
+    device = {Class}({"speed": 0.5}, None)
+    assert 0.9 < rehearse(drive, device=device, to=0.5).seconds < 1.1 and device.at == 0.5
+
+
+def test_it_refuses_what_is_out_of_reach():
+    assert rehearse(drive, device={Class}({}, None), to=2.0).result.cause == "command_refused"
+'''
+
+ROBOT_ACTIONS = '''
+
+async def move(ctx: Context[Remote], *, to: float) -> Result:
+    """Move to a position (m)."""
+    await ctx.command({"to": to})
+    if not await ctx.wait(lambda: ctx.device.state["arrived"], 5.0):
+        return error("blocked", f"did not reach {to} m within 5 s")
+    return success(at=ctx.device.state["at"])
+
+
+async def grip(ctx: Context[Remote], *, slips: float = 0.2) -> Result:
+    """Close the gripper on a part; some slip out."""
+    await ctx.sleep(0.3)
+    if ctx.random("grip").random() < slips:
+        return error("slipped", "the part slipped out")
+    return success()
+'''
+
+ROBOT_TASK = """\
+# {name}: carries parts from one end of its axis to the other. Draw it: petrobot show {name}.toml
+schema = 1
+
+[task]
+name = "{name}"
+goal = "Each part lies at the other end"
+goal_transitions = ["delivered"]
+runs_place = "parts"
+final = "parts == 0"
+final_error = "broken > 0"
+
+[errors]
+to = "broken"                # where every error goes that has no branch of its own
+
+[primitive_tasks.move]
+goal = "The axis is where it shall be"
+alternatives = ["move"]      # names of actions in services.toml
+deadline = 8.0               # s
+error_causes = { blocked = "something is in the way" }
+
+[primitive_tasks.grip]
+goal = "The part is in the gripper"
+alternatives = ["grip"]
+deadline = 2.0
+error_causes = { slipped = "the part slipped out" }
+
+[places]
+parts = { kind = "control", tokens = 3 }     # the operator may change it
+axis = { kind = "resource", tokens = 1 }
+broken = {}
+fetch = { kind = "action", task = "move", args = { to = 0.2 }, holds = "axis" }
+grip = { kind = "action", task = "grip", tries = 3, holds = "axis" }
+carry = { kind = "action", task = "move", args = { to = 0.8 }, holds = "axis" }
+
+[transitions]
+start = { in = ["parts", "!broken"], out = ["fetch"] }
+there = { in = ["fetch:normal"], out = ["grip"] }
+gripped = { in = ["grip:normal"], out = ["carry"] }
+lost = { in = ["grip:error"] }               # this part is given up, the next one is fetched
+delivered = { in = ["carry:normal"] }
+"""
+
+ROBOT_SERVICES = """\
+schema = 1
+
+[nodes.pc]                   # one process on one computer; more computers: more nodes
+host = "127.0.0.1"
+port = 7501
+
+[devices.axis]
+node = "pc"
+driver = "{name}:Axis"
+speed = 0.5                  # keys of the driver
+
+[actions.move]
+run = "{name}:move"
+device = "axis"
+
+[actions.grip]
+run = "{name}:grip"
+device = "axis"
+"""
+
+ROBOT_TEST = '''\
+"""Tests of {name}: its actions on a simulated clock, and its task in lock step."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from {name} import Axis, grip, move
+from petrobot import rehearse
+
+HERE = Path(__file__).parent
+
+
+def petrobot(*arguments):
+    command = [sys.executable, "-m", "petrobot.coordinator", *arguments]
+    return subprocess.run(command, cwd=HERE, capture_output=True, text=True)
+
+
+def test_it_moves():
+    axis = Axis({"speed": 0.5}, None)
+    played = rehearse(move, device=axis, to=0.5)
+    assert played.result.status == "success" and 0.9 < played.seconds < 1.1
+
+
+def test_what_is_out_of_reach_is_refused():
+    assert rehearse(move, device=Axis({}, None), to=9.0).result.cause == "command_refused"
+
+
+def test_a_part_may_slip():
+    assert rehearse(grip, device=Axis({}, None), slips=1.0).result.cause == "slipped"
+
+
+def test_the_task_may_run():
+    checked = petrobot("check", "{name}.toml")
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+
+
+def test_the_task_runs_to_its_end():
+    ran = petrobot("run", "{name}.toml", "--mode", "lockstep", "--seed", "1", "--json", "-")
+    assert ran.returncode == 0, ran.stderr
+    assert json.loads(ran.stdout)["status"] == "success"
+'''
+
+ROBOT_PYPROJECT = """\
+[project]
+name = "{name}"
+version = "0.1.0"
+requires-python = ">=3.11"
+dependencies = ["petrobot"]
+
+[tool.setuptools]
+py-modules = ["{name}"]
+
+[tool.pytest.ini_options]
+pythonpath = ["."]
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    parser.add_argument("what", choices=("action", "task"))
+    parser.add_argument("what", choices=("robot", "driver", "action", "task"))
     parser.add_argument("name", help="its name, such as close_gripper")
     parser.add_argument(
         "--folder", type=Path, default=Path(), help="folder to write to (default: this folder)"
@@ -174,7 +389,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write the files. Existing files are never overwritten."""
-    name = options.name
+    name, folder = options.name, options.folder
     if keyword.iskeyword(name):
         raise CommandError(2, f"{name!r} is a keyword of Python: choose another name")
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
@@ -182,34 +397,80 @@ def run(options: argparse.Namespace) -> int:
             2,
             f"{name!r} cannot be the name: use small letters, digits and _, a letter first",
         )
-    folder: Path = options.folder
-    if options.what == "action":
-        module = f"{folder.name}.{name}" if folder.name else name
-        files = {folder / f"{name}.py": ACTION, folder.parent / f"test_{name}.py": ACTION_TEST}
-        if not folder.name:
-            files = {Path(f"{name}.py"): ACTION, Path(f"test_{name}.py"): ACTION_TEST}
-        hint = (
-            f'place it in services.toml:\n  [actions.{name}]\n  run = "{module}:{name}"\n '
-            ' task = "..."\n  node = "..."'
-        )
-    else:
-        module = ""
-        files = {folder / f"{name}.toml": TASK, folder / f"test_{name}.py": TASK_TEST}
-        hint = f"draw it: petrobot show {folder / name}.toml --errors --out {name}.svg"
-    _write(
-        {
-            path: text.format(name=name, module=module)
-            if path.suffix == ".py" and "test" not in path.name
-            else _filled(text, name, module)
-            for path, text in files.items()
-        }
-    )
+    make = {"robot": _robot, "driver": _driver, "action": _action, "task": _task}[options.what]
+    files, hint = make(name, folder)
+    _write(files)
     print("\n".join([*(f"wrote {path}" for path in files), hint]))
     return 0
 
 
-def _filled(text: str, name: str, module: str) -> str:
-    return text.replace("{name}", name).replace("{module}", module)
+def _robot(name: str, folder: Path) -> tuple[dict[Path, str], str]:
+    if importlib.util.find_spec(name) is not None:
+        text = f"a Python module named {name!r} is there already and would hide the robot's own"
+        raise CommandError(2, f"{text}; choose another name")
+    project = folder / name
+    code = _filled(DRIVER + ROBOT_ACTIONS, name, device="axis")
+    code = code.replace("The device axis: say here what it is.", f"The robot {name}.")
+    code = code.replace(
+        "import Driver, Ports, key", "import Context, Driver, Ports, Remote, Result"
+    )
+    code = code.replace("Remote, Result\n", "Remote, Result, error, key, success\n", 1)
+    texts = {
+        "pyproject.toml": ROBOT_PYPROJECT,
+        "services.toml": ROBOT_SERVICES,
+        f"{name}.toml": ROBOT_TASK,
+        f"test_{name}.py": ROBOT_TEST,
+    }
+    files = {project / file: _filled(text, name) for file, text in texts.items()}
+    hint = (
+        f"cd {project}, then:\n  petrobot check {name}.toml\n"
+        f"  petrobot run {name}.toml --mode lockstep   # simulated time\n"
+        f"  petrobot run {name}.toml --up              # real time\n"
+        "  pytest"
+    )
+    return {project / f"{name}.py": code, **files}, hint
+
+
+def _driver(name: str, folder: Path) -> tuple[dict[Path, str], str]:
+    module, paths = _python(name, folder)
+    texts = (_filled(DRIVER, name, module), _filled(DRIVER_TEST, name, module))
+    hint = (
+        f'place it in services.toml:\n  [devices.{name}]\n  driver = "{module}:{_class(name)}"\n'
+        '  node = "..."'
+    )
+    return dict(zip(paths, texts, strict=True)), hint
+
+
+def _action(name: str, folder: Path) -> tuple[dict[Path, str], str]:
+    module, paths = _python(name, folder)
+    texts = (ACTION.format(name=name), _filled(ACTION_TEST, name, module))
+    hint = (
+        f'place it in services.toml:\n  [actions.{name}]\n  run = "{module}:{name}"\n '
+        ' task = "..."\n  node = "..."'
+    )
+    return dict(zip(paths, texts, strict=True)), hint
+
+
+def _task(name: str, folder: Path) -> tuple[dict[Path, str], str]:
+    files = {folder / f"{name}.toml": TASK, folder / f"test_{name}.py": TASK_TEST}
+    hint = f"draw it: petrobot show {folder / name}.toml --errors --out {name}.svg"
+    return {path: _filled(text, name) for path, text in files.items()}, hint
+
+
+def _python(name: str, folder: Path) -> tuple[str, tuple[Path, Path]]:
+    """The import name of a new module in a package `folder`, its file and that of its test."""
+    if not folder.name:
+        return name, (Path(f"{name}.py"), Path(f"test_{name}.py"))
+    return f"{folder.name}.{name}", (folder / f"{name}.py", folder.parent / f"test_{name}.py")
+
+
+def _class(name: str) -> str:
+    return "".join(word.capitalize() for word in name.split("_"))
+
+
+def _filled(text: str, name: str, module: str = "", device: str = "") -> str:
+    filled = text.replace("{name}", device or name).replace("{module}", module)
+    return filled.replace("{Class}", _class(device or name))
 
 
 def _write(files: dict[Path, str]) -> None:

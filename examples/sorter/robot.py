@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from petrobot import Context, Driver, Ports, Result, error, failure, key, success
+from petrobot import Context, Driver, Ports, Remote, Result, error, failure, key, success
 
 STATIONS = {"home": 0.0, "belt": 0.2, "left": 0.5, "right": 0.8}  # m along the rail
 
@@ -51,30 +51,28 @@ class Scanner(Driver):
 
     unreadable: float = key(0.1, "share of the codes that cannot be read")
 
-    def read(self, ctx: Context) -> str | None:
-        draws = ctx.random("code")
+    def read(self) -> str | None:
+        draws = self.ports.random("code")
         return None if draws.random() < self.unreadable else str(draws.choice(["left", "right"]))
 
 
-async def move(ctx: Context, *, to: str) -> Result:
+async def move(ctx: Context[Remote], *, to: str) -> Result:
     """Move the arm to a station."""
-    number = ctx.device.send({"to": to})
-    if not await ctx.wait(lambda: ctx.device.handled >= number, 1.0) or ctx.device.refused:
-        return error("refused", ctx.device.refused or "the arm does not answer")
+    await ctx.command({"to": to})
     if not await ctx.wait(lambda: ctx.device.state["arrived"], 5.0):
         return error("blocked", f"the arm did not reach {to} within 5 s")
     return success()
 
 
-async def grip(ctx: Context, *, slips: float = 0.2) -> Result:
+async def grip(ctx: Context[Remote], *, slips: float = 0.2) -> Result:
     """Close the gripper on a part; some slip out."""
     await ctx.sleep(0.3)
     slipped = ctx.random("grip").random() < slips
     return error("slipped", "the part slipped out") if slipped else success()
 
 
-async def scan(ctx: Context) -> Result:
+async def scan(ctx: Context[Scanner]) -> Result:
     """Read the part's barcode: it names the bin."""
     await ctx.sleep(0.1)
-    code = ctx.device.read(ctx)
+    code = ctx.device.read()
     return success(code=code) if code else failure("unreadable", "put it aside", code="left")

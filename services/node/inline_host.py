@@ -99,8 +99,11 @@ class InlineHost:
         streams: Mapping[str, float] | None = None,
         substitutes: Mapping[str, Callable[..., Any]] | None = None,
         virtual: bool = False,
+        reseed: Callable[[int], None] | None = None,
     ) -> None:
+        """`reseed` receives the seed of each call, for the draws of the driver."""
         self._actions = actions
+        self._reseed = reseed
         self._driver = driver
         self._cyclic = CyclicDriver(driver) if driver is not None and driver.period else None
         self._remote = RemoteDriver(self._post, clock)
@@ -144,6 +147,8 @@ class InlineHost:
             text = f"its device does not work: {self.failed}"
             self._told.append(Outcome(order.id, Status.ERROR, {}, "not_ready", text, Executed.NO))
             return
+        if self._reseed is not None and isinstance(order, Call):
+            self._reseed(order.seed)
         held = self._runner.held and bool(self._runner.runs)
         self._runner.take(now, order)
         if held and not self._runner.runs:

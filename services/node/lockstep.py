@@ -4,7 +4,7 @@ envelopes."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.location_file import DeviceEntry, Directory
@@ -39,9 +39,12 @@ from petrobot.services.node.inline_host import Host, InlineHost
 from petrobot.services.node.node import GENERAL, Node
 from petrobot.services.node.watchdog import Watchdog
 from petrobot.services.worker.callables import describe
-from petrobot.services.worker.context import checked
+from petrobot.services.worker.context import Draws, checked
 from petrobot.services.worker.runner import Hung
 from petrobot.services.worker.setpoints import SetpointReceiver
+
+if TYPE_CHECKING:
+    import numpy as np
 
 # What a driver may reach in a lock-step cell: bus, images and streams in memory, on the other side
 # envelopes.
@@ -96,6 +99,7 @@ class LockstepPorts:
         self._wish = 0
         self._streams: dict[str, SetpointReceiver] = {}
         self._raised: list[tuple[str, Mapping[str, Any]]] = []
+        self.draws = Draws(device.name)
         self._lives_at = ""
 
     @property
@@ -135,6 +139,10 @@ class LockstepPorts:
         raised = plain(name, "name"), plain(data, "data")
         checked(Event(raised[0], self._device.name, 1, raised[1]))
         self._raised.append(raised)
+
+    def random(self, purpose: str) -> np.random.Generator:
+        """Return the generator of (seed, device, purpose)."""
+        return self.draws.random(purpose)
 
     def file(self, path: str) -> bytes:
         """A file named in services.toml, relative to it."""
@@ -227,13 +235,15 @@ class LockstepNode:
         return self._now
 
     def _place(self, device: str) -> Host:
-        directory, driver = self._directory, None
+        directory, driver, reseed = self._directory, None, None
         if device != GENERAL:
             entry = directory.devices[device]
             ports = self._ports[device] = LockstepPorts(
                 directory, entry, self._clock, self._out.append
             )
             driver = make_driver(directory, entry, ports)
+            ports.draws.reseed(0)
+            reseed = ports.draws.reseed
         return InlineHost(
             {
                 a.name: a
@@ -245,6 +255,7 @@ class LockstepNode:
             streams={s.name: s.period for s in directory.streams.values()},
             substitutes=self._substitutes,
             virtual=True,
+            reseed=reseed,
         )
 
     # --- party --------------------------------------------------------------------------------

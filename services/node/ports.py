@@ -4,7 +4,7 @@ of streams."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from petrobot.services.comm.canopen.bus import CanBus
 from petrobot.services.comm.location_file import DeviceEntry, Directory
@@ -13,8 +13,11 @@ from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.comm.streams.image import ImageSource
 from petrobot.services.comm.streams.stream import Incoming, StreamReceiver
 from petrobot.services.comm.tls.credentials import credentials
-from petrobot.services.worker.context import checked
+from petrobot.services.worker.context import Draws, checked
 from petrobot.services.worker.setpoints import SetpointReceiver
+
+if TYPE_CHECKING:
+    import numpy as np
 
 CAN_KEYS = ("interface", "channel", "bitrate")
 
@@ -39,6 +42,7 @@ class ProcessPorts:
         self._incoming: dict[str, Incoming] = {}
         self._receiver: StreamReceiver | None = None
         self._raised: list[tuple[str, Mapping[str, Any]]] = []
+        self.draws = Draws(device.name)
 
     @property
     def now(self) -> float:
@@ -102,6 +106,10 @@ class ProcessPorts:
         raised = plain(name, "name"), plain(data, "data")
         checked(Event(raised[0], self._device.name, 1, raised[1]))
         self._raised.append(raised)
+
+    def random(self, purpose: str) -> np.random.Generator:
+        """Return the generator of (seed, device, purpose)."""
+        return self.draws.random(purpose)
 
     def file(self, path: str) -> bytes:
         """A file named in services.toml, relative to it."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from petrobot.services.action import Result, Status, Wait
+from petrobot.services.action import CallFailed, CommandRefused, Result, Status, Wait
 from petrobot.services.comm.calls.events import RunVerdict, mission_of, verdict_event
 from petrobot.services.comm.protocol.codec import NAME_LENGTH, ProtocolError, encode
 from petrobot.services.comm.protocol.messages import (
@@ -32,14 +32,6 @@ with a word as `answer` in its data. Sent: a set point leaves (in lock step only
 
 if TYPE_CHECKING:
     import numpy as np
-
-
-class CallFailed(Exception):  # noqa: N818 - what happened, not a class of errors
-    """A service that the action depends on answered FAILURE or ERROR; `result` says how."""
-
-    def __init__(self, service: str, result: Result) -> None:
-        super().__init__(f"{service}: {result.status} {result.cause} {result.text}".rstrip())
-        self.result = result
 
 
 def never() -> bool:
@@ -80,6 +72,40 @@ def checked_result(identity: str, returned: Any, where: str = "result") -> Resul
     return result
 
 
+class Draws:
+    """The random generators of one owner (a run, a device) by purpose, keyed by (seed, owner,
+    purpose)."""
+
+    def __init__(self, owner: str, seed: int | None = None) -> None:
+        self._owner = owner
+        self._seed = seed
+        self._generators: dict[str, np.random.Generator] = {}
+
+    def reseed(self, seed: int) -> None:
+        """Draw anew if the seed is another one: that of the mission run whose action begins."""
+        if seed != self._seed:
+            self._seed = seed
+            self._generators.clear()
+
+    def random(self, purpose: str) -> np.random.Generator:
+        """Return the generator of a purpose; asking again continues with the same one.
+
+        Raises ValueError before there is a seed.
+        """
+        if self._seed is None:
+            raise ValueError(
+                f"random({purpose!r}): a driver is made before the seed is known; draw where it is "
+                "needed, in `step`, `command` or a method of its own"
+            )
+        if purpose not in self._generators:
+            key = f"{self._seed}\0{self._owner}\0{purpose}".encode()
+            import numpy as np  # here: most actions draw nothing, and importing it takes 0.1 s
+
+            words = np.frombuffer(hashlib.sha256(key).digest(), dtype="<u4")
+            self._generators[purpose] = np.random.default_rng([int(w) for w in words])
+        return self._generators[purpose]
+
+
 class RunContext:
     """Implements `services.action.Context` for one run of a `Runner`."""
 
@@ -101,7 +127,7 @@ class RunContext:
         self._children = 0
         self._answers: dict[str, Result] = {}
         self._waiting: set[str] = set()
-        self._generators: dict[str, np.random.Generator] = {}
+        self._draws = Draws(call.id, call.seed)
 
     @property
     def now(self) -> float:
@@ -190,9 +216,29 @@ class RunContext:
                 self._report(Cancel(child, "its run no longer waits"))
         return self._answers.pop(child)
 
-    async def get(self, name: str) -> Any:
-        """Read a global-memory variable (None if it was never written). Raises CallFailed."""
-        return (await self._memory("memory.get", name=name)).values.get("value")
+    async def command(self, body: Mapping[str, Any], timeout: float = 1.0) -> None:
+        """Send a command to the device's driver, and wait until the driver has taken it. Raises
+        CommandRefused."""
+        device = self._device
+        if not hasattr(device, "send"):
+            raise CommandRefused("this action has no cyclic driver that takes commands")
+        number = device.send(body)
+        if not await self.wait(lambda: device.handled >= number, timeout):
+            raise CommandRefused(f"the driver did not take {dict(body)} within {timeout:g} s")
+        if refused := device.refused:
+            raise CommandRefused(refused)
+
+    async def get(self, name: str, default: Any = None) -> Any:
+        """Read a global-memory variable; `default` if it was never written. Raises CallFailed."""
+        return (await self.get_versioned(name, default))[0]
+
+    async def get_versioned(self, name: str, default: Any = None) -> tuple[Any, int]:
+        """Read a variable with its version, 0 and `default` if it was never written. Raises
+        CallFailed."""
+        values = (await self._memory("memory.get", name=name)).values
+        # A stand-in for the memory in a test may leave the version out.
+        version = values.get("version", 1)
+        return (values.get("value"), int(version)) if version else (default, 0)
 
     async def put(self, name: str, value: Any) -> int:
         """Write a global-memory variable; gives its new version. Raises CallFailed."""
@@ -213,14 +259,9 @@ class RunContext:
         return result
 
     def random(self, purpose: str) -> np.random.Generator:
-        """A generator keyed by (seed, run, purpose); asking again goes on with the same one."""
-        if purpose not in self._generators:
-            key = f"{self._call.seed}\0{self.run}\0{purpose}".encode()
-            import numpy as np  # here: most actions draw nothing, and importing it takes 0.1 s
-
-            words = np.frombuffer(hashlib.sha256(key).digest(), dtype="<u4")
-            self._generators[purpose] = np.random.default_rng([int(w) for w in words])
-        return self._generators[purpose]
+        """Return the generator of (seed, run, purpose); asking again continues with the same
+        one."""
+        return self._draws.random(purpose)
 
     def answer(self, outcome: Outcome) -> bool:
         """Accept the result of a call that this run has made; False if it does not wait for it."""

@@ -28,6 +28,7 @@ from petrobot.services.worker.remote import (
     CLEAR_EMERGENCY,
     EMERGENCY_STOP,
     NODE_SILENT,
+    SEED,
     CyclicDriver,
     DeviceCommand,
 )
@@ -222,7 +223,10 @@ class DeviceLoop:
         if self._worker is None:
             return
         for number, verb, body in self._worker.read():
-            self._cyclic.take(now, DeviceCommand(number, verb, body))
+            if verb == SEED:
+                self._ports.draws.reseed(body["seed"])
+            else:
+                self._cyclic.take(now, DeviceCommand(number, verb, body))
         if self._worker.closed:
             self._driver.stop(now)
             self._worker.socket.close()

@@ -119,6 +119,9 @@ class Worker:
             if (a.node, a.device) == (setup.node, setup.device)
         }
         scripted = load_script(setup.mock) if setup.mock else {}
+        reseed = self._remote.reseed if self._remote else None
+        if ports is not None:
+            reseed = ports.draws.reseed
         self._place = InlineHost(
             actions,
             clock=time.monotonic,
@@ -126,6 +129,7 @@ class Worker:
             remote=self._remote,
             streams={s.name: s.period for s in directory.streams.values()},
             substitutes={name: script for name, script in scripted.items() if name in actions},
+            reseed=reseed,
         )
         self._place.warm()
         self._one_by_one = not setup.device
@@ -302,6 +306,7 @@ def serve(
                 directory, directory.devices[setup.device], time.monotonic, setup.tickets
             )
             driver = make_driver(directory, directory.devices[setup.device], ports)
+            ports.draws.reseed(0)
             guard = Guard(setup.device, latch_of(directory.source, setup.node))
             if driver.period and descriptors is not None:
                 node.post(

@@ -3,6 +3,7 @@ inline and across processes."""
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from petrobot.services.worker.callables import describe, words_of
 
 _log = logging.getLogger(__name__)
 
-COMMAND, STOP = "command", "stop"
+COMMAND, STOP, SEED = "command", "stop", "seed"
 EMERGENCY_STOP, CLEAR_EMERGENCY = "emergency_stop", "clear_emergency"
 """An operator's verbs: stop at once and obey no action any more; obey actions again (nothing moves
 by that alone)."""
@@ -83,6 +84,7 @@ class RemoteDriver:
         self._post = post
         self._clock = clock
         self._sent = 0
+        self._seed: int | None = None
         self._seen = 0
         """Number of the last refused command whose refusal an action has looked at."""
         self._taken = DeviceState()
@@ -146,6 +148,14 @@ class RemoteDriver:
     def age(self) -> float:
         """Seconds since that state was published (inf before the first)."""
         return self._clock() - self._arrived
+
+    def reseed(self, seed: int) -> None:
+        """Tell the driver the seed of the mission run whose action begins."""
+        if seed != self._seed:
+            # A driver that takes nothing now is told at the next action.
+            with contextlib.suppress(ConnectionError):
+                self._post(DeviceCommand(self._sent, SEED, {"seed": seed}))
+                self._seed = seed
 
     def stop(self, now: float) -> None:
         """Call the driver's stop routine."""

@@ -14,7 +14,7 @@ from functools import partial
 from math import inf
 from typing import Any, Protocol
 
-from petrobot.services.action import Cancelled, Result, Status, Wait
+from petrobot.services.action import Cancelled, CommandRefused, Result, Status, Wait
 from petrobot.services.comm.location_file import ActionEntry, resolve
 from petrobot.services.comm.protocol.messages import Call, Cancel, Command, Executed, Outcome
 from petrobot.services.comm.protocol.plain import plain
@@ -452,7 +452,10 @@ class Runner:
                 cause = "hung" if isinstance(fault, Hung) else "exception"
                 if isinstance(fault, MemoryError):
                     cause = "out_of_memory"
-                self._give_up(now, run, cause, self._with_refusal(run, describe(fault)))
+                words = describe(fault)
+                if isinstance(fault, CommandRefused):
+                    cause, words = "command_refused", str(fault)
+                self._give_up(now, run, cause, self._with_refusal(run, words))
                 log_fault(_log, fault, "run %s of %s raised", run.call.id, run.call.service)
             elif not isinstance(fault, Cancelled):
                 log_fault(_log, fault, "run %s raised while it cleaned up", run.call.id)

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from petrobot.services.action import (
+        CallFailed,
         Cancelled,
+        CommandRefused,
         Context,
         Result,
         Status,
@@ -25,7 +27,9 @@ if TYPE_CHECKING:
     from petrobot.services.rehearsal import Rehearsal, rehearse
 
 __all__ = [
+    "CallFailed",
     "Cancelled",
+    "CommandRefused",
     "Context",
     "Driver",
     "Ports",

@@ -72,6 +72,10 @@ class YardPorts:
     def raise_event(self, name: str, **data: Any) -> None:
         """Ignore the event: no task waits for it."""
 
+    def random(self, purpose: str) -> np.random.Generator:
+        """Draws of the device, from a fixed seed."""
+        return np.random.default_rng([*purpose.encode()])
+
     def file(self, path: str) -> bytes:
         """The rover's numbers."""
         return ROVER_FILE.read_bytes()

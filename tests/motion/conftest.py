@@ -174,6 +174,10 @@ class Rig:
     def raise_event(self, name: str, **data: Any) -> None:
         self.events.append(name)
 
+    def random(self, purpose: str) -> np.random.Generator:
+        """Draws of the device, from a fixed seed."""
+        return np.random.default_rng([*purpose.encode()])
+
     def file(self, path: str) -> bytes:
         raise AssertionError(path)
 

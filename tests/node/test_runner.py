@@ -11,11 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.action import Cancelled, Context, Result, error, failure, success
+from petrobot.services.action import CallFailed, Cancelled, Context, Result, error, failure, success
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.comm.protocol.messages import Call, Cancel, Event, Feedback, Outcome
 from petrobot.services.node.inline_host import HOLD, RELEASE
-from petrobot.services.worker.context import CallFailed
 from petrobot.services.worker.outlets import Sent
 from petrobot.services.worker.runner import GRACE, STOP_LIMIT, Runner
 from tests.node.conftest import Bench, Clock, Device

@@ -178,6 +178,10 @@ class BenchPorts:
     def images(self) -> Any:
         return self._bench.images
 
+    def random(self, purpose: str) -> np.random.Generator:
+        """Draws of the device, from a fixed seed."""
+        return np.random.default_rng([*purpose.encode()])
+
     def file(self, path: str) -> bytes:
         return self._files[path]
 
@@ -232,7 +236,13 @@ class BenchContext:
     ) -> Result:
         raise AssertionError("vision calls no service")
 
-    async def get(self, name: str) -> Any:
+    async def command(self, body: Mapping[str, Any], timeout: float = 1.0) -> None:
+        raise NotImplementedError
+
+    async def get_versioned(self, name: str, default: Any = None) -> tuple[Any, int]:
+        raise NotImplementedError
+
+    async def get(self, name: str, default: Any = None) -> Any:
         raise AssertionError("vision reads no variables")
 
     async def put(self, name: str, value: Any) -> int:

@@ -123,6 +123,8 @@ class Summary:
     options: Mapping[str, Any] = field(default_factory=dict)
     """Options of the campaign's plan: target reliability and rho, if they were given."""
     mission_s: dict[int, float] = field(default_factory=dict)
+    seen: dict[int, tuple[str, int, Any]] = field(default_factory=dict)
+    """By block: its regime, its seed, and a digest of what happened in it."""
 
     @classmethod
     def of(
@@ -144,11 +146,28 @@ class Summary:
         self.whole.add(row)
         self.by_regime.setdefault(row.regime, TrialCounts()).add(row)
         self.mission_s[row.block] = row.mission_s
+        self._see(row)
         for run in row.trial.runs if row.trial is not None else ():
             primitive = self.task.primitive_task_of(run.place).name
             actions = self.chosen.setdefault(primitive, {})
             actions[run.action] = actions.get(run.action, 0) + 1
         add_row(self.estimates, self.task, row, self.salt)
+
+    def _see(self, row: TrialRow) -> None:
+        """Add to the digest of a block what its seed may change: which runs there were, how they
+        ended, and when."""
+        runs = () if row.trial is None else row.trial.runs
+        told = [(r.place, r.action, r.begun, r.took, r.status, r.cause) for r in runs]
+        _, _, before = self.seen.get(row.block, ("", 0, 0))
+        self.seen[row.block] = (row.regime, row.seed, hash((before, row.k, tuple(told))))
+
+    def copies(self) -> list[list[int]]:
+        """Return the seeds of blocks in one regime that are copies of each other, as they are when
+        nothing draws from the seed."""
+        groups: dict[tuple[str, Any], set[int]] = {}
+        for regime, seed, digest in self.seen.values():
+            groups.setdefault((regime, digest), set()).add(seed)
+        return [sorted(seeds) for seeds in groups.values() if len(seeds) > 1]
 
     def asked(self) -> dict[str, Question]:
         """Return by what the actions of each primitive task are judged."""
@@ -193,6 +212,7 @@ class Summary:
             },
             "judged": {name: self._judged(name, judged) for name, judged in found.items()},
             "sim_s": round(sum(self.mission_s.values()), 6),
+            "copies": self.copies(),
         }
 
 

@@ -530,3 +530,20 @@ async def test_what_a_dead_worker_has_left_running_does_not_hide_its_death(
         left = int(mark.read_text())
         while alive(left):
             await beat(0.01)
+
+
+def test_blocks_that_are_copies_are_warned_of(conduct: Conduct, tmp_path: Path) -> None:
+    """Where nothing draws, each seed gives the same runs: the result says so, and names the
+    seeds."""
+    assert conduct("chance").result()["copies"] == []
+    script = tmp_path / "script.toml"
+    actions = {
+        a
+        for p in conduct("names", runs=1).bench.task.primitive_tasks.values()
+        for a in p.alternatives
+    }
+    lines = [f"[actions.{name}]\nseconds = 0.5\n" for name in sorted(actions)]
+    script.write_text("schema = 1\n" + "".join(lines), encoding="utf-8")
+    result = conduct("copies", mock=str(script), digests={}).result()
+    assert len(result["copies"]) == 2 and all(len(seeds) == 2 for seeds in result["copies"])
+    assert "copies of each other" in text_of(result)

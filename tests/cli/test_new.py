@@ -1,0 +1,111 @@
+"""`petrobot new`: what it writes runs as it is."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from petrobot.coordinator.cli import main
+from tests.ports import free_ports
+
+ROOT = Path(__file__).parents[2]
+
+
+def python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a module of Python in a folder, as a user who has installed petrobot does."""
+    return subprocess.run(
+        [sys.executable, "-m", *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT / "src")},
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+
+
+def on_free_port(folder: Path) -> None:
+    """Write a port that is free on this host into the location file."""
+    (port,) = free_ports(1)
+    cell = folder / "services.toml"
+    cell.write_text(cell.read_text(encoding="utf-8").replace("7501", str(port)), encoding="utf-8")
+
+
+@pytest.mark.processes
+def test_a_new_robot_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In an empty folder: it may run, its own tests pass, and it runs in real time; seeds differ,
+    and nothing that it needs lies elsewhere."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "robot", "carrier"]) == 0
+    folder = tmp_path / "carrier"
+    assert {path.name for path in folder.iterdir()} == {
+        "carrier.py",
+        "carrier.toml",
+        "services.toml",
+        "test_carrier.py",
+        "pyproject.toml",
+    }
+    on_free_port(folder)
+    tested = python(folder, "pytest", "-q", "-p", "no:cacheprovider")
+    assert tested.returncode == 0 and "5 passed" in tested.stdout, tested.stdout + tested.stderr
+    run = ("petrobot.coordinator", "run", "carrier.toml", "--quiet", "--no-page")
+    lasted = []
+    for seed in ("3", "4"):
+        ran = python(folder, *run, "--mode", "lockstep", "--seed", seed, "--json", "-")
+        assert ran.returncode == 0, ran.stderr
+        lasted.append(json.loads(ran.stdout)["sim_s"])
+    assert lasted[0] != lasted[1]
+    ran = python(folder, *run, "--up", "--runs", "1")
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+@pytest.mark.processes
+def test_a_new_driver_can_be_placed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In place of the robot's own driver, by the table that the command prints."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "robot", "carrier"]) == 0
+    monkeypatch.chdir(tmp_path / "carrier")
+    capsys.readouterr()
+    assert main(["new", "driver", "slow_axis"]) == 0
+    assert '[devices.slow_axis]\n  driver = "slow_axis:SlowAxis"' in capsys.readouterr().out
+    cell = Path("services.toml")
+    text = cell.read_text(encoding="utf-8")
+    cell.write_text(text.replace("carrier:Axis", "slow_axis:SlowAxis"), encoding="utf-8")
+    for command in (
+        ("pytest", "-q", "-p", "no:cacheprovider", "test_slow_axis.py"),
+        ("petrobot.coordinator", "check", "carrier.toml"),
+        ("petrobot.coordinator", "run", "carrier.toml", "--mode", "lockstep", "--quiet"),
+    ):
+        ran = python(Path.cwd(), *command)
+        assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (["robot", "json"], "a Python module named 'json' is there already"),
+        (["robot", "Arm"], "use small letters, digits and _, a letter first"),
+        (["driver", "class"], "'class' is a keyword of Python"),
+        (["robot", "kept"], "exists already; choose another name or --folder"),
+    ],
+)
+def test_what_cannot_be_made_is_refused(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    given: list[str],
+    says: str,
+) -> None:
+    """Nothing is written then."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "kept.toml").write_text("mine")
+    assert main(["new", *given]) == 2
+    assert says in capsys.readouterr().err
+    assert [p.name for p in tmp_path.rglob("*") if p.is_file()] == ["kept.toml"]

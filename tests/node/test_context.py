@@ -1,0 +1,172 @@
+"""What actions and drivers may use: commands that cannot be forgotten, the global memory, and
+random draws keyed by the mission run's seed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from petrobot import CommandRefused, Context, Driver, Remote, Result, rehearse, success
+from petrobot.services.comm.location_file import DirectoryError, parse
+from petrobot.services.node.drivers import make_driver
+from petrobot.services.node.lockstep import LockstepPorts
+from petrobot.services.worker.context import Draws
+from petrobot.services.worker.remote import COMMAND, SEED, DeviceCommand, RemoteDriver
+
+
+class Door(Driver):
+    """Opens by `share`; `stuck` takes no command."""
+
+    period = 0.02
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        if body["share"] > 1:
+            raise ValueError(f"share: expected at most 1, found {body['share']}")
+        self.share = body["share"] + 0.1 * self.ports.random("wind").random()
+
+    def state(self) -> Mapping[str, Any]:
+        return {"share": getattr(self, "share", None)}
+
+
+async def open_door(ctx: Context[Remote], *, share: float) -> Result:
+    await ctx.command({"share": share})
+    return success(share=ctx.device.state["share"])
+
+
+async def try_door(ctx: Context[Remote], *, share: float) -> Result:
+    try:
+        await ctx.command({"share": share})
+    except CommandRefused as refused:
+        return success(refused=str(refused))
+    return success()
+
+
+def door() -> Door:
+    return Door({}, None)  # type: ignore[arg-type]  # a rehearsal gives it ports
+
+
+def test_an_accepted_command_has_been_taken_when_the_action_continues() -> None:
+    """The state that the action reads then is one after the command."""
+    played = rehearse(open_door, device=door(), share=0.5)
+    assert played.result.status == "success" and 0.5 <= played.result.values["share"] < 0.6
+
+
+def test_a_refused_command_cannot_be_forgotten() -> None:
+    """It ends the action with the driver's words, unless the action catches it."""
+    ended = rehearse(open_door, device=door(), share=3).result
+    assert (ended.status, ended.cause) == ("error", "command_refused")
+    assert ended.text == "share: expected at most 1, found 3"
+    caught = rehearse(try_door, device=door(), share=3).result
+    assert caught.status == "success" and caught.values == {"refused": ended.text}
+
+
+def test_a_command_that_nobody_takes_is_an_error() -> None:
+    """Without a driver that takes commands, and with one that takes none in time."""
+    assert "no cyclic driver" in rehearse(open_door, device=object(), share=0).result.text
+
+    class Silent:
+        handled, refused = 0, ""
+        state: Mapping[str, Any] = {}
+
+        def send(self, body: Mapping[str, Any]) -> int:
+            return 1
+
+    played = rehearse(open_door, device=Silent(), share=0)
+    assert played.result.cause == "command_refused" and 0.99 < played.seconds < 1.1
+    assert played.result.text == "the driver did not take {'share': 0} within 1 s"
+
+
+async def counts(ctx: Context) -> Result:
+    first = await ctx.get("n", default=7)
+    missing = await ctx.get_versioned("n", 7)
+    version = await ctx.put("n", first + 1)
+    value, now = await ctx.get_versioned("n")
+    late = await ctx.compare_and_set("n", 0, 99)
+    swapped = await ctx.compare_and_set("n", now, value + 1)
+    none = await ctx.put("none", None)
+    return success(
+        first=first,
+        missing=list(missing),
+        version=version,
+        late=late,
+        swapped=swapped,
+        value=await ctx.get("n"),
+        none=[none, await ctx.get("none", default=5)],
+    )
+
+
+def test_the_global_memory_has_defaults_and_versions() -> None:
+    assert rehearse(counts).result.values == {
+        "first": 7,
+        "missing": [7, 0],
+        "version": 1,
+        "late": False,
+        "swapped": True,
+        "value": 9,
+        "none": [1, None],  # written as None is not the same as never written
+    }
+
+
+def test_a_drivers_draws_are_those_of_the_seed() -> None:
+    shares = [rehearse(open_door, device=door(), share=0, seed=s).result.values for s in (3, 4, 3)]
+    assert shares[0] == shares[2] != shares[1]
+
+
+def test_draws_begin_again_with_another_seed() -> None:
+    draws = Draws("arm")
+    with pytest.raises(ValueError, match="made before the seed is known; draw where it is needed"):
+        draws.random("wind")
+    seen = []
+    for seed in (3, 3, 4, 3):
+        draws.reseed(seed)
+        seen.append(draws.random("wind").random())
+    assert len(set(seen[:3])) == 3  # the same seed again continues
+    assert seen[3] == seen[0]
+    other = Draws("hand", 3)
+    assert other.random("wind").random() not in seen
+
+
+class Hasty(Driver):
+    """Draws while it is being made."""
+
+    def __init__(self, config: Mapping[str, Any], ports: Any) -> None:
+        super().__init__(config, ports)
+        self.start = ports.random("start").random()
+
+
+def test_a_driver_that_draws_while_it_is_made_is_refused(tmp_path: Path) -> None:
+    """Every seed would give the same draw, and a campaign would run copies."""
+    text = (
+        'schema = 1\n[nodes.pc]\nhost = "127.0.0.1"\nport = 7501\n'
+        '[devices.door]\nnode = "pc"\ndriver = "tests.node.test_context:Hasty"\n'
+    )
+    directory = parse(text, tmp_path / "services.toml")
+    entry = directory.devices["door"]
+    ports = LockstepPorts(directory, entry, lambda: 0.0, lambda envelope: None)
+    with pytest.raises(DirectoryError, match=r"random\('start'\): a driver is made before"):
+        make_driver(directory, entry, ports)
+
+
+def test_a_driver_in_another_process_is_told_each_new_seed() -> None:
+    """Once, between the commands, without being counted as one."""
+    posted: list[DeviceCommand] = []
+    remote = RemoteDriver(posted.append, lambda: 0.0)
+    remote.reseed(3)
+    assert remote.send({}) == 1
+    remote.reseed(3)
+    remote.reseed(4)
+    assert remote.send({}) == 2
+    assert [(c.number, c.verb, c.body) for c in posted] == [
+        (0, SEED, {"seed": 3}),
+        (1, COMMAND, {}),
+        (1, SEED, {"seed": 4}),
+        (2, COMMAND, {}),
+    ]
+
+    def gone(command: DeviceCommand) -> None:
+        raise ConnectionError
+
+    RemoteDriver(gone, lambda: 0.0).reseed(3)  # its process is made again, and is told then
