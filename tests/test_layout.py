@@ -112,8 +112,6 @@ IMPURE_IMPORTS = {
     "random",
     "secrets",
 }
-TRACED = "sim.catching.arm_dynamics", "exec"
-"""Executes a function whose text it has made itself of names and floats."""
 FORBIDDEN_IMPORTS = {"pickle", "marshal", "shelve", "dill", "cloudpickle"}
 ROBOT_WORDS = {"throw", "throws", "puma", "ball", "camera", "cup", "track", "rover", "catch"}
 
@@ -179,7 +177,6 @@ def test_pure_rooms_stay_pure_and_nothing_is_unpickled() -> None:
             if isinstance(node, ast.Call)
             and isinstance(node.func, ast.Name)
             and node.func.id in ("eval", "exec")
-            and (name, node.func.id) != TRACED
         ]
     assert not wrong, "\n".join(wrong)
 

@@ -12,13 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.host.numba_kernels import packed
+from petrobot.services.host.numba_kernels import packed, plain
 from petrobot.sim.catching.arm_dynamics import (
     OwnArmDynamics,
-    bias_torques,
+    general_torques,
+    is_puma,
     mass_numbers,
+    puma_bias,
     regrouped,
-    traced,
 )
 from petrobot.sim.catching.arm_motion import Six
 from petrobot.sim.catching.physics import BULLET, ArmDynamics, arm_dynamics
@@ -156,17 +157,41 @@ def sixes(rng: np.random.Generator, most: float) -> Six:
     return six(rng.uniform(-most, most, 6))
 
 
-@pytest.mark.parametrize("case", range(4))
-def test_traced_code_gives_the_same_bits_as_the_algorithm(arm: PumaModel, case: int) -> None:
-    """Of the shipped arm (case 0) and of arms that have no zero anywhere."""
+def any_puma(arm: PumaModel, rng: np.random.Generator) -> PumaModel:
+    """An arm with the geometry of a PUMA whose other numbers are all drawn: none is zero."""
+    drawn = any_arm(arm, rng)
+    d, a = drawn.d, drawn.a
+    return replace(
+        drawn,
+        d=(d[0], 0.0, d[2], d[3], 0.0, 0.0),
+        a=(0.0, a[1], a[2], 0.0, 0.0, 0.0),
+        alpha=arm.alpha,
+        twists=arm.twists,
+    )
+
+
+@pytest.mark.parametrize("case", range(6))
+def test_the_algorithms_without_their_zeros_agree_with_the_whole_ones(
+    arm: PumaModel, case: int
+) -> None:
+    """The shipped arm (case 0), arms with the geometry of a PUMA (1, 2) and any arms: bias and mass
+    matrix within 1e-12 of the general recursion, in plain Python and compiled to the same bits."""
     rng = np.random.default_rng(case)
-    arm = any_arm(arm, rng) if case else arm
-    numbers = regrouped(arm, LOAD)
-    bias, mass = traced(GRAVITY, numbers)
-    for _ in range(300):
+    if case:
+        arm = (any_puma if case < 3 else any_arm)(arm, rng)
+    numbers, own = regrouped(arm, LOAD), OwnArmDynamics(arm, GRAVITY, LOAD)
+    assert is_puma(numbers) == (case < 3)
+    kept = packed(puma_bias, numbers)
+    for _ in range(100):
         q, qd = sixes(rng, 3.2), sixes(rng, 4.0)
-        assert bias(q, qd) == bias_torques(q, qd, GRAVITY, packed(bias_torques, numbers))
-        assert mass(q) == mass_numbers(q, packed(bias_torques, numbers))
+        bias = np.array(general_torques(q, qd, QZ, GRAVITY, numbers))
+        assert np.abs(own.bias(q, qd) - bias).max() <= 1e-12 * max(1.0, np.abs(bias).max())
+        mass = own.mass_matrix(q)
+        columns = [general_torques(q, QZ, six(unit), 0.0, numbers) for unit in np.eye(6)]
+        assert np.abs(mass - columns).max() <= 1e-12 * max(1.0, np.abs(mass).max())
+        if is_puma(numbers):
+            assert plain(puma_bias)(q, qd, GRAVITY, numbers) == puma_bias(q, qd, GRAVITY, kept)
+        assert tuple(plain(mass_numbers)(q, numbers)) == tuple(mass_numbers(q, kept))
 
 
 @settings(max_examples=40, deadline=None)
