@@ -190,8 +190,8 @@ def test_the_algorithms_without_their_zeros_agree_with_the_whole_ones(
         columns = [general_torques(q, QZ, six(unit), 0.0, numbers) for unit in np.eye(6)]
         assert np.abs(mass - columns).max() <= 1e-12 * max(1.0, np.abs(mass).max())
         if is_puma(numbers):
-            assert plain(puma_bias)(q, qd, GRAVITY, numbers) == puma_bias(q, qd, GRAVITY, kept)
-        assert tuple(plain(mass_numbers)(q, numbers)) == tuple(mass_numbers(q, kept))
+            assert plain(puma_bias)(q, qd, GRAVITY, kept) == puma_bias(q, qd, GRAVITY, kept)
+        assert plain(mass_numbers)(q, kept) == mass_numbers(q, kept)
 
 
 @settings(max_examples=40, deadline=None)
