@@ -25,8 +25,8 @@ FLOORS = {
     "B+bouncy": 0.9,
     "C+miscalibrated": 0.65,
     "C+latency400": 0.65,
-    "C+arm30": 0.0,
-    "B+latency400": 0.0,
+    "C+arm30": 0.45,
+    "B+latency400": 0.9,
     "C+springy": 0.2,
 }
 """Least Wilson bound of the share caught, for both back ends: nominal regimes, and those in which
