@@ -348,6 +348,9 @@ def text_of(result: dict[str, Any]) -> str:
         lines.append(
             f"  {name or '-':{wide}}{goal}P_complete {part['P_complete'] or 0.0:.4f}{times}"
         )
+        for table, sums in part.get("counts", {}).items():
+            counted = ", ".join(f"{column} {number}" for column, number in sums.items())
+            lines.append(f"  {'':{wide}}{table}: {counted}")
     for task, actions in result["chosen"].items():
         if len(actions) > 1:
             shown = ", ".join(

@@ -35,9 +35,13 @@ class TrialCounts:
     all_success: int = 0
     times: list[float] = field(default_factory=list)
     """Durations of the completed trials (s)."""
+    counts: dict[str, dict[str, int]] = field(default_factory=dict)
+    """Sums of the whole numbers that the task's score gives for each trial, by table and column:
+    of all things counted, not of the first one of each trial."""
 
     def add(self, row: TrialRow) -> None:
         """Count a trial."""
+        self._add_up(row)
         if row.trial is None:
             self.not_begun += 1
             return
@@ -47,6 +51,13 @@ class TrialCounts:
         self.all_success += row.trial.all_success
         if row.trial.completed and row.trial.time is not None:
             self.times.append(row.trial.time)
+
+    def _add_up(self, row: TrialRow) -> None:
+        for key, value in row.score.items():
+            table, _, column = key.partition(".")
+            if type(value) is int and table != "score" and column != "n":
+                sums = self.counts.setdefault(table, {})
+                sums[column] = sums.get(column, 0) + value
 
     def to_plain(self, has_goal: bool) -> dict[str, Any]:
         """Return plain data; R_goal is None for a task without goal transitions."""
@@ -61,6 +72,7 @@ class TrialCounts:
             "R_conj": _share(self.all_success, self.runs),
             "mean": round(float(np.mean(self.times)), 6) if self.times else None,
             "q90": round(float(np.quantile(self.times, 0.9)), 6) if self.times else None,
+            "counts": {table: dict(sums) for table, sums in self.counts.items()},
         }
 
 

@@ -239,6 +239,11 @@ class CampaignReport:
                 "R_conj": part["R_conj"],
                 "mean time (s)": part["mean"],
                 "90 % of times below (s)": part["q90"],
+                **{
+                    f"{counted}: {column}": number
+                    for counted, sums in part["counts"].items()
+                    for column, number in sums.items()
+                },
             }
             for name, part in parts
         ]

@@ -32,8 +32,15 @@ from petrobot.coordinator.studies.campaign.plan import (
     write_manifest,
 )
 from petrobot.coordinator.studies.campaign.pool import LocalPool
-from petrobot.coordinator.studies.campaign.summary import Summary, comparisons, result_of
+from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.campaign.summary import (
+    Summary,
+    TrialCounts,
+    comparisons,
+    result_of,
+)
 from petrobot.coordinator.studies.campaign.table import TABLE, read_table
+from petrobot.coordinator.studies.campaign.trials import Trial
 from petrobot.coordinator.studies.campaign.worker import serve
 from tests.processes import alive
 from tests.studies.campaign.conftest import SERVICES, TASK, Conduct
@@ -547,3 +554,22 @@ def test_blocks_that_are_copies_are_warned_of(conduct: Conduct, tmp_path: Path) 
     result = conduct("copies", mock=str(script), digests={}).result()
     assert len(result["copies"]) == 2 and all(len(seeds) == 2 for seeds in result["copies"])
     assert "copies of each other" in text_of(result)
+
+
+def test_the_summary_adds_up_what_the_score_counts_for_each_trial() -> None:
+    """Whole numbers of every trial, by regime and together; no truth values, no numbers of rows, no
+    plain results of a task with one trial. A trial that did not begin counts what it counted."""
+    rows = [
+        TrialRow(
+            1, "A", 1, 1, 0, 1.0, Trial(1, 0.0), {"eggs.n": 1, "eggs.laid": 3, "hen.ok": True}
+        ),
+        TrialRow(2, "A", 1, 2, 0, 1.0, None, {"eggs.n": 2, "eggs.laid": 1, "score.seed": 7}),
+        TrialRow(3, "B", 1, 1, 1, 1.0, Trial(1, 0.0), {"eggs.n": 1, "eggs.laid": 5, "eggs.w": 0.5}),
+    ]
+    whole, by_regime = TrialCounts(), {"A": TrialCounts(), "B": TrialCounts()}
+    for row in rows:
+        whole.add(row)
+        by_regime[row.regime].add(row)
+    assert whole.to_plain(False)["counts"] == {"eggs": {"laid": 9}}
+    assert by_regime["A"].to_plain(False)["counts"] == {"eggs": {"laid": 4}}
+    assert by_regime["B"].to_plain(False)["counts"] == {"eggs": {"laid": 5}}
