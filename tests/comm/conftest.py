@@ -1,4 +1,4 @@
-"""Strategies and helpers that the tests of the wire share."""
+"""Hypothesis strategies and fixtures shared by the tests of the node protocol."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _FIELDS: dict[str, st.SearchStrategy[Any]] = {
 
 
 def messages_of(kinds: Iterable[type[Any]]) -> st.SearchStrategy[Any]:
-    """Any message of these kinds."""
+    """Return a strategy for any message of these kinds."""
     return st.one_of(
         [
             st.builds(
@@ -65,13 +65,14 @@ KINDS: list[type[Any]] = list(get_args(Message))
 
 @pytest.fixture(scope="session")
 def messages() -> st.SearchStrategy[Any]:
-    """Any message of any kind (ticks without envelopes), small enough for its kind's limit."""
+    """Return a strategy for messages of every kind (ticks without envelopes), within size
+    limits."""
     return messages_of(cls for cls in KINDS if LIMITS[cls.KIND] >= 2048 or cls is Tick)
 
 
 @pytest.fixture(scope="session")
 def plain_data() -> st.SearchStrategy[Any]:
-    """Any plain data."""
+    """Return a strategy for any plain data."""
     return _plain
 
 
@@ -84,7 +85,7 @@ def new_pair(key: bytes | None) -> tuple[Connection, Connection]:
 
 
 def greet(client: Connection, server: Connection) -> bytes:
-    """Lead both to open; gives all that the client sent."""
+    """Shake hands between both connections; return all bytes that the client sent."""
     said = client.send(Hello(2, 2, "coordinator", "coord", "b0", 1))
     hello = server.receive_data(said)
     limit = Limit("the client's hello", steps=10)
@@ -100,14 +101,14 @@ def greet(client: Connection, server: Connection) -> bytes:
 
 @pytest.fixture
 def pair() -> Callable[[bytes | None], tuple[Connection, Connection]]:
-    """Makes a client's and a server's connection that have not spoken yet, with a key or
-    without."""
+    """Return a function that makes a client and a server connection before the handshake, with
+    a key or without one."""
     return new_pair
 
 
 @pytest.fixture
 def open_pair() -> Callable[[bytes | None], tuple[Connection, Connection]]:
-    """Makes a client's and a server's connection that are open to each other."""
+    """Return a function that makes a client and a server connection after the handshake."""
 
     def make(key: bytes | None) -> tuple[Connection, Connection]:
         client, server = new_pair(key)
@@ -119,20 +120,20 @@ def open_pair() -> Callable[[bytes | None], tuple[Connection, Connection]]:
 
 @pytest.fixture
 def shake_hands() -> Callable[[Connection, Connection], bytes]:
-    """Leads two connections to open."""
+    """Return the function that shakes hands between two connections."""
     return greet
 
 
 @pytest.fixture(params=[None, KEY], ids=["plain", "sealed"])
 def key(request: pytest.FixtureRequest) -> bytes | None:
-    """Without a key and with one."""
+    """No key, then a key."""
     found: bytes | None = request.param
     return found
 
 
 @pytest.fixture
 async def node(key: bytes | None) -> AsyncIterator[Node]:
-    """A node with a key or without."""
+    """A node, with a key and without."""
     one = Node(key=key)
     await one.server.start("127.0.0.1", 0)
     yield one

@@ -1,4 +1,4 @@
-"""Both ends on real sockets, as the tests of server and client make and watch them."""
+"""A server and a client on real sockets that record what they receive."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _callee(name: str = "motion") -> Callee:
 
 
 class Node:
-    """A server and what it was ordered to do."""
+    """A server that records the orders it receives."""
 
     def __init__(self, **options: Any) -> None:
         self.orders: list[Order] = []
@@ -51,7 +51,7 @@ class Node:
         self.ordered.set()
 
     async def order(self, kind: type[Any]) -> Any:
-        """The next order of this kind."""
+        """Wait for the next order of this kind."""
         async with asyncio.timeout(60.0):
             while not any(isinstance(order, kind) for order in self.orders):
                 self.ordered.clear()
@@ -63,7 +63,7 @@ class Node:
 
 
 class Coordinator:
-    """A client and what it was told."""
+    """A client that records the notices it receives."""
 
     def __init__(self, host: str, port: int, hello: m.Hello = HELLO, **options: Any) -> None:
         self.notices: list[Notice] = []
@@ -79,7 +79,7 @@ class Coordinator:
         self.told.set()
 
     async def notice(self, kind: type[Any], number: int = 1) -> Any:
-        """The so-manieth notice of this kind."""
+        """Wait until `count` notices of this kind have arrived, and return the last of them."""
         async with asyncio.timeout(60.0):
             while (
                 len(found := [notice for notice in self.notices if isinstance(notice, kind)])
@@ -95,8 +95,8 @@ class Coordinator:
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    """Wait until it holds: looked at again whenever a server, a client or a heart has done
-    something."""
+    """Wait until the condition holds; check it after every step of a server, a client or a
+    heartbeat."""
     stirred = asyncio.Event()
     with pytest.MonkeyPatch.context() as patch:
         for owner, name in (
@@ -122,32 +122,32 @@ def _and_then(method: Callable[..., Any], do: Callable[[], None]) -> Callable[..
 
 
 def frame(message: m.Message, server: str = "motion") -> bytes:
-    """A message as it goes over the wire to `server` without a key: HELLO of the opening, all
-    others of an open connection."""
+    """Return a message's bytes on the wire to `server`, without a key. HELLO is framed as in the
+    handshake, any other message as on an open connection."""
     if isinstance(message, m.Hello):
         return Connection(Side.CLIENT, server).send(message)
     return framed(encode(message))
 
 
 def framed(body: bytes) -> bytes:
-    """A body as a frame of an open connection without a key."""
+    """Frame a body as on an open connection without a key."""
     return head(len(body) + 4) + body + zlib.crc32(body).to_bytes(4, "big")
 
 
 def head(length: int) -> bytes:
-    """The first four bytes of a frame."""
+    """Return the first four bytes of a frame."""
     return length.to_bytes(4, "big")
 
 
 def welcome(hello: bytes, name: str = "motion") -> bytes:
-    """What a server of this name answers to these bytes of a HELLO."""
+    """Return the answer of a server of this name to these bytes of a HELLO."""
     server = Connection(Side.SERVER, name)
     server.receive_data(hello)
     return server.send(m.Welcome(2, name, "n1", ("echo",)))
 
 
 async def read_all(reader: asyncio.StreamReader) -> bytes:
-    """All until the other end hangs up."""
+    """Read until the other end closes the connection."""
     with contextlib.suppress(ConnectionError):
         return await reader.read()
     return b""

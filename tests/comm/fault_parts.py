@@ -1,5 +1,5 @@
-"""Other processes that are killed, frozen or cut off: a node, a sender of set points, and the cable
-between.
+"""Processes for the fault tests to kill, freeze or cut off: a node, a sender of set points, and a
+relay that stands for the cable between two processes.
 
 python -m tests.comm.fault_parts node [PORT BOOT]      # prints its port
 python -m tests.comm.fault_parts sender PORT PERIOD
@@ -32,16 +32,16 @@ STREAM = "points"
 
 
 class LinkFault(Enum):
-    """What befalls the other side."""
+    """A fault of the other side."""
 
     KILLED = "killed"
     FROZEN = "frozen"
     CUT = "cut off"
-    """Its cable is cut: no byte comes through, and no word that the connection is over."""
+    """Its cable is cut: no byte arrives, and no message that the connection has ended."""
 
 
 class Cable:
-    """Carries bytes between who connects to `port` and the other end, until it is cut."""
+    """Relay bytes between a client of `port` and the other end, until the relay is cut."""
 
     def __init__(self, far: int) -> None:
         self.far = far
@@ -53,12 +53,12 @@ class Cable:
         self._thread.start()
 
     def cut(self) -> None:
-        """From now on nothing comes through, and both ends stay open."""
+        """Stop relaying; both connections stay open."""
         self._cut = True
         self._wake.send(b"x")
 
     def close(self) -> None:
-        """Let all ends go."""
+        """Close all connections."""
         self._wake.close()
         self._thread.join()
 
@@ -84,7 +84,7 @@ class Cable:
         try:
             far = socket.create_connection((HOST, self.far))
         except OSError:
-            near.close()  # nobody is there any more
+            near.close()  # The other end has closed its connection.
         else:
             pairs |= {near: far, far: near}
 
@@ -103,7 +103,7 @@ class Cable:
 
 
 def inflict(fault: LinkFault, process: subprocess.Popen[str], cable: Cable) -> None:
-    """Let it befall the process, or the cable to it."""
+    """Cause the fault in the process, or in the cable to it."""
     if fault is LinkFault.CUT:
         cable.cut()
     else:
@@ -112,7 +112,7 @@ def inflict(fault: LinkFault, process: subprocess.Popen[str], cable: Cable) -> N
 
 @contextmanager
 def part(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """One of the processes below, ended at the end whatever befell it."""
+    """Start one of the processes below; end it on exit, whatever its state."""
     command = [sys.executable, "-m", "tests.comm.fault_parts", *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
     try:
@@ -123,13 +123,13 @@ def part(*arguments: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def first_line(process: subprocess.Popen[str]) -> str:
-    """The first thing that it says."""
+    """Return the first line of its output."""
     assert process.stdout is not None
     return process.stdout.readline().strip()
 
 
 async def be_node(port: int, boot: str) -> None:
-    """A node whose action `move` goes on until it is cancelled."""
+    """Run a node whose action `move` runs until it is cancelled."""
 
     def obey(now: float, orders: list[Order]) -> None:
         for order in orders:
@@ -146,8 +146,7 @@ async def be_node(port: int, boot: str) -> None:
 
 
 def be_sender(port: int, period: float) -> None:
-    """Sends one set point a period by absolute deadline, and stands by it: the number of periods
-    since the beginning."""
+    """Send one set point per period (at absolute times): the number of periods since the start."""
     sender = StreamSender("vision", STREAM, period, HOST, port, receiver="motion")
     due, number = time.monotonic(), 0
     while True:

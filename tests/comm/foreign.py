@@ -1,8 +1,8 @@
-"""A client of the node protocol that knows nothing but docs/protocol.md: sockets and the standard
-library, no line of services.
+"""A client of the node protocol written from docs/protocol.md alone: sockets and the standard
+library, without any code of petrobot.
 
-Its msgpack is its own, too (https://github.com/msgpack/msgpack/blob/master/spec.md): what it needs
-of it, written out.
+It has its own msgpack, too, as far as needed
+(https://github.com/msgpack/msgpack/blob/master/spec.md).
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ COMMAND, ANSWER, PING, PONG, TICK, BYE, CHALLENGE, PROOF, STREAM_OPEN, SET_POINT
     13, 24
 )
 LIMIT = 60.0
-"""Seconds that anything may take."""
+"""Longest wait for anything (s)."""
 
 
 def pack(value: Any) -> bytes:
-    """msgpack of plain data."""
+    """Encode plain data as msgpack."""
     if value is None or isinstance(value, bool):
         return {None: b"\xc0", False: b"\xc2", True: b"\xc3"}[value]
     if isinstance(value, float):
@@ -85,7 +85,7 @@ _SIZED |= {0xDC: (2, "array"), 0xDD: (4, "array"), 0xDE: (2, "map"), 0xDF: (4, "
 
 
 class Unpacking:
-    """Reads msgpack."""
+    """Decode msgpack."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.at = data, 0
@@ -96,7 +96,7 @@ class Unpacking:
         return self.data[self.at - size : self.at]
 
     def value(self) -> Any:
-        """The next value."""
+        """Return the next value."""
         head = self._bytes(1)[0]
         if head < 0x80 or head >= 0xE0:
             return head if head < 0x80 else head - 256
@@ -127,11 +127,11 @@ class Unpacking:
 
 
 def unpack(body: bytes) -> list[Any]:
-    """The array of a body, whole: a fixarray whose first element is a positive fixint."""
+    """Decode a whole body: a fixarray whose first element is a positive fixint."""
     assert 0x91 <= body[0] <= 0x9F and body[1] < 0x80, body[:2].hex()
     reading = Unpacking(body)
     found = reading.value()
-    assert reading.at == len(body), "something follows the message"
+    assert reading.at == len(body), "bytes follow the message"
     assert isinstance(found, list)
     return found
 
@@ -145,17 +145,17 @@ class Foreign:
         self.key = key
         self.seal_out = self.seal_in = b""
         self.sent = self.heard = 0
-        """Frames sealed in each direction."""
+        """Number of frames sealed in each direction."""
         self.is_open = False
         self.proven = False
-        """Whether the refusal of the opening was sealed."""
+        """Whether the refusal of the handshake was sealed."""
         self.skipped: list[list[Any]] = []
-        """What came while something else was waited for."""
+        """Messages that arrived while it waited for another one."""
 
     # --- frames
 
     def frame(self, body: bytes) -> bytes:
-        """A body with its length, and with its seal or check once the connection is open."""
+        """Frame a body: its length, and on an open connection its seal or check."""
         if not self.is_open:
             return struct.pack(">I", len(body)) + body
         if self.seal_out:
@@ -183,7 +183,7 @@ class Foreign:
         return data
 
     def body(self) -> bytes:
-        """The next frame's body, its seal or check looked at."""
+        """Return the next frame's body after checking its seal or check."""
         body = self._exactly(int.from_bytes(self._exactly(4), "big"))
         if not self.is_open:
             return body
@@ -200,22 +200,23 @@ class Foreign:
         return body
 
     def hear(self) -> list[Any]:
-        """The next message that is no heartbeat; a PING is answered as the page says. Raises
-        TimeoutError."""
+        """Return the next message that is not a heartbeat; answer a PING as the page says.
+
+        Raises TimeoutError."""
         until = time.monotonic() + LIMIT
         while time.monotonic() < until:
             message = unpack(self.body())
             if message[0] == PING:
                 with contextlib.suppress(
                     ConnectionError
-                ):  # it may have hung up: its REFUSE follows
+                ):  # The node may have closed the connection; its REFUSE follows.
                     self.say(PONG, message[1])
             elif message[0] != PONG:
                 return message
         raise TimeoutError(f"nothing but heartbeats for {LIMIT} s; before came {self.skipped[-5:]}")
 
     def expect(self, kind: int, *start: Any) -> list[Any]:
-        """The next message of a kind whose fields begin so. Raises TimeoutError."""
+        """Return the next message of a kind whose fields begin so. Raises TimeoutError."""
         until = time.monotonic() + LIMIT
         while True:
             for message in self.skipped:
@@ -238,7 +239,8 @@ class Foreign:
         versions: Sequence[int] = (2, 2),
         node: str = "hub",
     ) -> list[Any]:
-        """HELLO to WELCOME; gives WELCOME, or the REFUSE that came in its place."""
+        """Shake hands from HELLO to WELCOME; return WELCOME, or the REFUSE that came in its
+        place."""
         check = secrets.token_bytes(32) if self.key is not None else bytes(4)
         auth = bytes([len(check)]) + node.encode() + check
         hello = pack([HELLO, *versions, role, name, boot, epoch, directory, auth])
@@ -281,5 +283,5 @@ class Foreign:
         return hmac.new(self.key, data, hashlib.sha256).digest()
 
     def close(self) -> None:
-        """Hang up without a word."""
+        """Close the connection without a message."""
         self.socket.close()

@@ -1,4 +1,4 @@
-"""What a lock-step cell passes on within a process is what another process would have received."""
+"""Lock step: a value passed on within a process equals what another process would receive."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def _image() -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     return np.arange(48, dtype=np.uint8).reshape(6, 8)
 
 
-def test_what_its_sender_may_still_write_to_is_copied() -> None:
+def test_data_that_its_sender_may_still_write_to_is_copied() -> None:
     image = _image().copy()
     sent = as_received("image", {"pixels": image})["pixels"]
     image[0, 0] = 99
@@ -21,7 +21,7 @@ def test_what_its_sender_may_still_write_to_is_copied() -> None:
     assert not sent.flags.writeable
 
 
-def test_a_locked_image_is_passed_on_as_it_is() -> None:
+def test_a_read_only_image_is_passed_on_without_a_copy() -> None:
     image = _image().copy()
     image.flags.writeable = False
     sent = as_received("image", {"pixels": image})["pixels"]
@@ -30,7 +30,7 @@ def test_a_locked_image_is_passed_on_as_it_is() -> None:
     assert np.array_equal(sent, there) and sent.dtype == there.dtype and not there.flags.writeable
 
 
-def test_a_locked_window_of_what_can_be_written_to_is_copied() -> None:
+def test_a_read_only_view_of_writable_data_is_copied() -> None:
     image = _image().copy()
     window = image[1:4, 2:5]
     window.flags.writeable = False
@@ -40,7 +40,7 @@ def test_a_locked_window_of_what_can_be_written_to_is_copied() -> None:
 
 
 @pytest.mark.parametrize("array", [np.zeros(3, np.int32), np.zeros((1, 1, 1, 1, 1), np.uint8)])
-def test_what_no_envelope_carries_is_refused_locked_or_not(
+def test_data_that_no_envelope_carries_is_refused_read_only_or_not(
     array: np.ndarray[tuple[int, ...], np.dtype[np.generic]],
 ) -> None:
     for locked in (False, True):

@@ -1,5 +1,4 @@
-"""Peers that do not behave, on real sockets: cut or refused, and good callers are served
-throughout."""
+"""Misbehaving peers on real sockets: they are cut off or refused while good callers are served."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ from tests.comm.ends import HELLO, Coordinator, Node, frame, read_all, until, we
 from tests.waiting import Limit
 
 
-async def test_a_peer_that_is_silent_is_cut(open_node: Node) -> None:
+async def test_a_silent_peer_is_cut_off(open_node: Node) -> None:
     reader, writer = await asyncio.open_connection(*open_node.server.address)
     writer.write(frame(HELLO))
     async with asyncio.timeout(60.0):
@@ -29,7 +28,7 @@ async def test_a_peer_that_is_silent_is_cut(open_node: Node) -> None:
     assert open_node.server.connected == ()
 
 
-async def test_a_node_that_is_silent_is_lost_at_once(open_node: Node) -> None:
+async def test_a_silent_node_is_lost_at_once(open_node: Node) -> None:
     async def frozen(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(welcome(await reader.read(1000)))
         await read_all(reader)
@@ -48,7 +47,7 @@ async def test_a_node_that_is_silent_is_lost_at_once(open_node: Node) -> None:
 @pytest.mark.parametrize(
     "said", [b"", b"\x00", frame(HELLO)[:-1]], ids=["nothing", "a byte", "half a hello"]
 )
-async def test_a_slow_handshake_is_cut(open_node: Node, said: bytes) -> None:
+async def test_a_slow_handshake_is_cut_off_off(open_node: Node, said: bytes) -> None:
     reader, writer = await asyncio.open_connection(*open_node.server.address)
     writer.write(said)
     async with asyncio.timeout(60.0):
@@ -66,7 +65,7 @@ async def test_idle_connections_do_not_keep_a_good_caller_out(open_node: Node) -
     await coordinator.client.close()
 
 
-async def test_one_that_does_not_read_is_cut_and_its_memory_given_back(open_node: Node) -> None:
+async def test_a_peer_that_does_not_read_is_cut_off_and_its_memory_freed(open_node: Node) -> None:
     reader, writer = await asyncio.open_connection(*open_node.server.address)
     writer.write(frame(HELLO))
     payload = {"b": bytes(1 << 18)}
@@ -82,7 +81,7 @@ async def test_one_that_does_not_read_is_cut_and_its_memory_given_back(open_node
 
 
 def _malformed(random_: random.Random) -> bytes:
-    """A connection's worth of bytes that is no good."""
+    """Return one connection's malformed bytes."""
     good = bytearray(
         frame(HELLO) if random_.random() < 0.5 else frame(m.Call("1", "echo", {"x": [1, 2]}))
     )

@@ -1,5 +1,5 @@
-"""The called end by itself: whom it welcomes, what it refuses, what it remembers, when it stops a
-run."""
+"""Server side of the node protocol, without sockets: which clients it welcomes, which calls it
+refuses, which results it keeps, and when it stops a run."""
 
 from __future__ import annotations
 
@@ -61,13 +61,15 @@ def test_a_run_from_call_to_acknowledged_result() -> None:
     assert outcome == m.Outcome("1", "success", {"p": [1, 2]}, "", "", Executed.YES, 0.5, 0.1)
     assert _said(callee) == [m.Accept("1"), m.Feedback("1", 1.0, {"n": [1]}), outcome]
     callee.receive(1.0, "coord", call)
-    assert _said(callee) == [outcome] and callee.orders() == [], "a known id is answered, not run"
+    assert _said(callee) == [outcome] and callee.orders() == [], (
+        "a call with a known id is answered, not run again"
+    )
     callee.receive(1.1, "coord", m.ResultAck("1"))
     callee.receive(1.2, "coord", call)
     assert _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN) and callee.orders() == []
 
 
-def test_a_known_id_that_still_runs_is_accepted_again() -> None:
+def test_a_call_with_the_id_of_an_active_run_is_accepted_again() -> None:
     callee = _callee()
     for _ in range(2):
         callee.receive(0.0, "coord", m.Call("1", "move", epoch=3))
@@ -93,7 +95,7 @@ def test_refusals(call: m.Call, local: bool, cause: str, executed: Executed) -> 
     assert callee.orders() == []
 
 
-def test_a_local_service_is_not_even_shown_to_another_host() -> None:
+def test_a_local_service_is_hidden_from_other_hosts() -> None:
     callee = Callee("motion", "n1", OFFERS)
     welcome = callee.link_up(0.0, "coord", COORD, local=False)
     assert isinstance(welcome, m.Welcome) and "tune" not in welcome.offers
@@ -115,14 +117,14 @@ def test_a_refused_call_stays_refused() -> None:
     assert [type(message) for message in _said(callee)] == [m.Accept]
 
 
-def test_busy_is_said_by_the_runner() -> None:
+def test_the_runner_reports_busy() -> None:
     callee = _callee()
     callee.receive(0.0, "coord", m.Call("1", "move", epoch=3))
     callee.finish(0.0, m.Outcome("1", "error", cause="busy", executed=Executed.NO))
     assert _outcome(callee) == ("error", "busy", Executed.NO)
 
 
-def test_a_device_takes_orders_from_the_holder_of_its_lease_alone() -> None:
+def test_a_device_accepts_calls_only_from_the_holder_of_its_lease() -> None:
     other = m.Hello(2, 2, "coordinator", "other", "o1")
     callee = _callee(COORD, other, m.Hello(2, 2, "node", "vision", "v1"))
     callee.receive(0.0, "coord", m.Call("1", "move", epoch=3))
@@ -131,7 +133,7 @@ def test_a_device_takes_orders_from_the_holder_of_its_lease_alone() -> None:
     assert _outcome(callee) == ("error", "device_needs_coordinator", Executed.NO)
     callee.link_down(1.0, "coord")
     callee.receive(9.0, "other", m.Call("3", "move"))
-    assert _outcome(callee)[1] == "device_leased", "its run still goes on"
+    assert _outcome(callee)[1] == "device_leased", "its run is still active"
     callee.finish(9.1, m.Outcome("1", "error", cause="cancelled"))
     callee.receive(9.2, "other", m.Call("4", "move"))
     assert _said(callee) == [m.Accept("4")]
@@ -149,7 +151,7 @@ def test_a_lease_outlives_a_short_break_of_the_link() -> None:
     assert _said(callee) == [m.Accept("3")]
 
 
-def test_an_id_of_another_caller_is_not_answered_with_his_result() -> None:
+def test_a_caller_never_receives_the_result_of_another_caller() -> None:
     callee = _callee(COORD, m.Hello(2, 2, "coordinator", "other", "o1"))
     callee.receive(0.0, "coord", m.Call("1", "get", epoch=3))
     _said(callee)
@@ -194,7 +196,9 @@ def test_an_orphan_is_stopped_after_its_time_unless_its_caller_comes_back() -> N
     callee.advance(3.9)
     assert callee.orders() == []
     callee.advance(4.0)
-    assert callee.orders() == [m.Cancel("1", "orphan")], "track has no orphan time and goes on"
+    assert callee.orders() == [m.Cancel("1", "orphan")], (
+        "track has no orphan time and keeps running"
+    )
     callee.finish(4.1, m.Outcome("1", "error", cause="cancelled"))
     _said(callee)
     welcome = callee.link_up(5.0, "coord", COORD)
@@ -203,7 +207,7 @@ def test_an_orphan_is_stopped_after_its_time_unless_its_caller_comes_back() -> N
     assert _outcome(callee) == ("error", "orphan", Executed.YES)
 
 
-def test_cancel_against_completion() -> None:
+def test_a_cancel_races_with_the_end_of_its_run() -> None:
     callee = _callee()
     for id_ in "12":
         callee.receive(0.0, "coord", m.Call(id_, "track", epoch=3))
@@ -215,7 +219,9 @@ def test_cancel_against_completion() -> None:
     ]
     _said(callee)
     callee.finish(0.2, m.Outcome("1", "success", {"p": 1}))
-    assert _outcome(callee) == ("success", "", Executed.YES), "it had ended before"
+    assert _outcome(callee) == ("success", "", Executed.YES), (
+        "the run had ended before the cancel arrived"
+    )
     callee.finish(0.2, m.Outcome("2", "error", cause="cancelled"))
     assert _outcome(callee) == ("error", "cancelled", Executed.YES)
     callee.receive(0.3, "coord", m.Cancel("2", "again"))
@@ -224,7 +230,7 @@ def test_cancel_against_completion() -> None:
     )
 
 
-def test_a_cancel_that_overtakes_its_call_keeps_it_from_beginning() -> None:
+def test_a_call_whose_cancel_arrived_first_is_never_started() -> None:
     callee = _callee()
     callee.receive(0.0, "coord", m.Cancel("1", "not wanted"))
     callee.receive(0.1, "coord", m.Call("1", "track", epoch=3))
@@ -253,7 +259,7 @@ def test_another_caller_cannot_cancel_a_run() -> None:
         (m.Hello(2, 2, "coordinator", "new", "c9", 1, ""), ""),
     ],
 )
-def test_who_is_welcome(hello: m.Hello, code: str) -> None:
+def test_clients_that_are_welcomed_and_refused(hello: m.Hello, code: str) -> None:
     callee = _callee()
     answer = callee.link_up(1.0, hello.name, hello)
     assert (answer.code if isinstance(answer, m.Refuse) else "") == code
@@ -265,7 +271,7 @@ def test_another_directory_may_be_allowed() -> None:
     callee = Callee("motion", "n1", OFFERS, directory="d1", any_directory=True)
     welcome = callee.link_up(0.0, "new", m.Hello(2, 2, "client", "new", "c", 0, "d2"))
     assert isinstance(welcome, m.Welcome) and welcome.directory == "d1", (
-        "it still says which one it has"
+        "the welcome still names its own location file"
     )
 
 
@@ -275,7 +281,7 @@ def test_a_caller_that_was_not_welcomed_runs_nothing() -> None:
     assert _outcome(callee) == ("error", "not_welcome", Executed.NO)
 
 
-def test_results_are_forgotten_by_number_and_by_time_ids_are_not() -> None:
+def test_results_are_forgotten_by_number_and_by_age_but_ids_are_not() -> None:
     callee = _callee(keeping=Retention(results=10.0, result_count=2))
     for n in range(3):
         callee.receive(float(n), "coord", m.Call(str(n), "get", epoch=3))
@@ -297,8 +303,8 @@ def _called_and_acknowledged(callee: Callee, *ids: str) -> None:
 
 
 def test_ids_that_count_up_are_never_forgotten() -> None:
-    """Neither by number nor by age: a day and twice as many calls as an id was remembered for
-    before."""
+    """Neither by number nor by age: tried with a day, and with twice the number of calls after
+    which ids were once forgotten."""
     callee = _callee(keeping=Retention(id_groups=100))
     _called_and_acknowledged(callee, *(f"m/work#{n}" for n in range(1, 400_000)))
     callee.advance(86_400.0)
@@ -306,7 +312,7 @@ def test_ids_that_count_up_are_never_forgotten() -> None:
         callee.receive(86_400.0, "coord", m.Call(f"m/work#{n}", "get", epoch=3))
         assert _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN)
     callee.receive(86_400.0, "coord", m.Call("m/work#400000", "get", epoch=3, again=True))
-    assert _outcome(callee)[0] == "success", "it has never been here, and the node knows that"
+    assert _outcome(callee)[0] == "success", "the call never arrived, and the node knows that"
 
 
 def test_a_node_that_has_forgotten_ids_runs_no_call_that_may_be_among_them() -> None:
@@ -315,22 +321,22 @@ def test_a_node_that_has_forgotten_ids_runs_no_call_that_may_be_among_them() -> 
     for service in ("get", "move"):
         again = m.Call(f"{service}/work-2", service, epoch=3, again=True)
         assert callee.answer_inline(0.0, "coord", again) is None
-        for _ in range(2):  # and it is remembered that it was answered so
+        for _ in range(2):  # The node also remembers this answer.
             callee.receive(0.0, "coord", again)
             assert (
                 _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN)
                 and callee.orders() == []
             )
     callee.receive(0.0, "coord", m.Call("work-3", "get", epoch=3))
-    assert _outcome(callee)[0] == "success", "a first call is not among them"
+    assert _outcome(callee)[0] == "success", "a first call is not among the forgotten ids"
     callee.receive(0.0, "coord", m.Cancel("work-1"))
     assert _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN), (
-        "nothing is said not to have run"
+        "the answer must not claim that the call did not run"
     )
     refused = m.Call("work-4", "move", epoch=2, again=True)
     callee.receive(0.0, "coord", refused)
     assert _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN), (
-        "nor is it refused as not executed"
+        "it is not refused as not executed either"
     )
 
 
@@ -358,7 +364,7 @@ def test_ids_in_groups_are_the_ids(ids: list[tuple[str, int]]) -> None:
     assert known.complete
 
 
-def test_what_cannot_be_sent_is_an_error_of_the_action() -> None:
+def test_a_result_that_cannot_be_sent_is_an_error_of_the_action() -> None:
     callee = _callee()
     callee.receive(0.0, "coord", m.Call("1", "track", epoch=3))
     outcome = callee.finish(1.0, m.Outcome("1", "success", {"image": object()}))
@@ -370,7 +376,7 @@ def test_what_cannot_be_sent_is_an_error_of_the_action() -> None:
     assert "values.image" in outcome.text
 
 
-def test_commands_go_to_the_node_and_their_answers_back() -> None:
+def test_commands_reach_the_node_and_their_answers_return() -> None:
     callee = _callee()
     command = m.Command("k1", "hold", "arm")
     callee.receive(0.0, "coord", command)
@@ -379,8 +385,8 @@ def test_commands_go_to_the_node_and_their_answers_back() -> None:
     assert callee.messages() == [("coord", m.Answer("k1", True, {"arm": "held"}))]
 
 
-def test_a_restarted_caller_counts_its_commands_anew() -> None:
-    """The answer that its former process got is no answer to the command of the same id now."""
+def test_a_restarted_caller_may_use_the_ids_of_its_commands_again() -> None:
+    """The answer to its former process does not answer a new command with the same id."""
     callee = _callee()
     command = m.Command("k1", "hold", "arm")
     callee.receive(0.0, "coord", command)
@@ -395,7 +401,7 @@ def test_a_restarted_caller_counts_its_commands_anew() -> None:
     assert callee.orders() == [command] and callee.messages() == []
 
 
-def test_reports_about_what_does_not_go_on_are_the_nodes_own_fault() -> None:
+def test_a_report_about_an_inactive_run_is_an_error_of_the_node_itself() -> None:
     callee = _callee()
     with pytest.raises(ValueError, match="no active run"):
         callee.finish(0.0, m.Outcome("1", "success"))
@@ -407,12 +413,12 @@ def test_reports_about_what_does_not_go_on_are_the_nodes_own_fault() -> None:
         callee.answer(0.0, "k1", True)
 
 
-def test_a_service_answered_on_the_spot_is_answered_once_by_either_way() -> None:
+def test_a_service_answered_at_once_is_answered_exactly_once() -> None:
     callee = _callee()
     outcome = callee.answer_inline(1.0, "coord", m.Call("1", "get", epoch=3))
     assert outcome == m.Outcome("1", "success", {"at": 1.0}) and not callee.has_work
     callee.keep(1.0, "coord", outcome)
-    assert callee.soonest == 1.0 + Retention().results, "it is not kept for ever"
+    assert callee.soonest == 1.0 + Retention().results, "the result is not kept for ever"
     for call in (
         m.Call("1", "get", epoch=3),
         m.Call("2", "track", epoch=3),
@@ -425,8 +431,8 @@ def test_a_service_answered_on_the_spot_is_answered_once_by_either_way() -> None
 
 
 @pytest.mark.parametrize("role", ["client", "coordinator"])
-def test_callers_that_came_and_went_do_not_fill_the_memory(role: str) -> None:
-    """Also coordinators that died without a word, whose subscriptions outlive their links."""
+def test_former_callers_do_not_fill_the_memory(role: str) -> None:
+    """This includes coordinators that died without BYE, whose subscriptions outlive their links."""
     callee = Callee("motion", "n1", OFFERS)
     for n in range(2_000):
         name = f"client{n}"
@@ -458,8 +464,10 @@ def test_the_deadline_of_a_held_run_stands_still(target: str) -> None:
 @pytest.mark.parametrize(
     "answers", [{"arm": "cannot hold"}, {"camera": "held"}, {"motion": "held"}, {}]
 )
-def test_the_deadline_of_a_run_that_goes_on_is_kept_during_a_pause(answers: dict[str, str]) -> None:
-    """A device that cannot hold, and a hold that another device answered."""
+def test_the_deadline_of_a_run_that_is_not_held_still_counts_during_a_pause(
+    answers: dict[str, str],
+) -> None:
+    """Either its device cannot hold, or another device answered the hold."""
     callee = _callee(COORD)
     callee.receive(0.0, "coord", m.Call("1", "move", {}, 2.0, 3))
     callee.receive(0.5, "coord", m.Command("h", "hold"))
@@ -470,7 +478,7 @@ def test_the_deadline_of_a_run_that_goes_on_is_kept_during_a_pause(answers: dict
 
 
 def test_a_held_run_is_still_an_orphan_without_its_caller() -> None:
-    """A pause is no reason to go on without anybody."""
+    """A pause does not let a run continue without its caller."""
     callee = _callee(COORD)
     callee.receive(0.0, "coord", m.Call("1", "move", {}, 2.0, 3))
     callee.receive(0.5, "coord", m.Command("h", "hold"))
@@ -481,10 +489,11 @@ def test_a_held_run_is_still_an_orphan_without_its_caller() -> None:
     assert callee.orders() == [m.Cancel("1", "orphan")]
 
 
-def test_a_repeated_command_is_not_carried_out_again() -> None:
-    """While it waits for its answer nothing happens. Afterwards the same answer is said.
+def test_a_repeated_command_is_carried_out_once() -> None:
+    """While the command waits for its answer, a repetition does nothing. Afterwards it gets the
+    same answer.
 
-    Another caller may use an id again once it is answered, but not before.
+    Another caller may use the id again after the answer, but not before.
     """
     callee = _callee(COORD, m.Hello(2, 2, "client", "other", "o1"))
     callee.messages()
@@ -509,8 +518,8 @@ def test_a_repeated_command_is_not_carried_out_again() -> None:
 
 
 def test_an_offer_for_some_roles_is_refused_to_others() -> None:
-    """Such as the ticket of a set-point stream: for nodes and coordinators, not for whoever may
-    only look."""
+    """For example the ticket of a set-point stream: nodes and coordinators get it, clients that may
+    only look do not."""
     offers = {
         "stream:points": Offer(
             inline=lambda _, call: m.Outcome(call.id, "success"), roles=frozenset(("node",))

@@ -1,4 +1,4 @@
-"""The calling end by itself: what each fault ends a call with, and when."""
+"""Client side of the node protocol, without sockets: how and when a fault ends a call."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from petrobot.services.comm.protocol.plain import NotPlainError
 
 
 class _Waiter:
-    """Who waits for the end of a call."""
+    """A future that waits for the end of a call."""
 
     def __init__(self, enough: bool = False) -> None:
         self.enough = enough
@@ -57,7 +57,7 @@ def _ends(notices: list[Notice]) -> list[tuple[str, str, Executed]]:
     ]
 
 
-def test_a_call_goes_out_with_epoch_and_boot_and_its_arguments_in_plain_types() -> None:
+def test_a_call_carries_epoch_boot_and_its_arguments_as_plain_data() -> None:
     caller = _caller()
     caller.call(0.0, CALL)
     assert caller.messages(0.0) == [m.Call("1", "move", {"to": [1, 2]}, 2.0, 3, "n1")]
@@ -76,7 +76,7 @@ def test_a_run_from_accept_to_acknowledged_result() -> None:
         result,
     ]
     caller.messages(0.1)
-    assert caller.due() is None, "a result that is not safe yet is not acknowledged"
+    assert caller.due() is None, "a result is acknowledged only once it is stored"
     caller.acknowledge(0.2, "1")
     assert caller.due() == pytest.approx(0.25)
     assert caller.messages(0.24) == []
@@ -84,7 +84,7 @@ def test_a_run_from_accept_to_acknowledged_result() -> None:
     assert caller.due() is None
 
 
-def test_acknowledgements_travel_together() -> None:
+def test_acknowledgements_are_sent_in_one_message() -> None:
     caller = _caller(auto_ack=True)
     for n in range(64):
         caller.call(0.0, m.Call(str(n), "move"))
@@ -93,7 +93,7 @@ def test_acknowledgements_travel_together() -> None:
     assert sent == [m.ResultAck("0", tuple(str(n) for n in range(1, 64)))]
 
 
-def test_a_repeated_result_is_acknowledged_again_and_told_once() -> None:
+def test_a_repeated_result_is_acknowledged_again_and_reported_once() -> None:
     caller = _caller(auto_ack=True)
     caller.call(0.0, CALL)
     caller.receive(0.0, m.Outcome("1", "success"))
@@ -104,7 +104,7 @@ def test_a_repeated_result_is_acknowledged_again_and_told_once() -> None:
 
 
 @pytest.mark.parametrize("owns_boot", [False, True], ids=["any boot", "a boot of before"])
-def test_a_call_that_never_leaves_was_not_executed_unless_it_may_have_left_before(
+def test_a_call_that_was_never_sent_ends_as_not_executed_unless_an_earlier_process_may_have_sent_it(
     owns_boot: bool,
 ) -> None:
     call = m.Call("1", "move", boot="n0" if owns_boot else "")
@@ -125,9 +125,9 @@ def test_a_call_that_never_leaves_was_not_executed_unless_it_may_have_left_befor
 
 
 @pytest.mark.parametrize("refused", [False, True], ids=["not there", "refuses"])
-def test_who_tries_again_at_once_waits_a_little(refused: bool) -> None:
-    """A task that repeats what failed must not go round as fast as the machine can: two calls end
-    in each tenth of a second."""
+def test_a_call_retried_at_once_waits_a_little(refused: bool) -> None:
+    """A task that repeats a failed action must not loop as fast as the machine can: at most two
+    calls end in each tenth of a second."""
     caller, cause = _caller(up=False), "refused" if refused else "unreachable"
     if refused:
         caller.link_refused(0.0, m.Refuse("keys", "copy the key"))
@@ -148,7 +148,7 @@ def test_who_tries_again_at_once_waits_a_little(refused: bool) -> None:
     assert 18 <= len(ended) <= 22
 
 
-def test_a_call_that_waits_to_be_tried_again_leaves_when_the_peer_is_there() -> None:
+def test_a_call_waiting_for_its_retry_is_sent_when_the_peer_is_connected() -> None:
     caller = _caller(up=False)
     caller.call(1.0, CALL)
     caller.call(1.01, m.Call("2", "move"))
@@ -159,7 +159,7 @@ def test_a_call_that_waits_to_be_tried_again_leaves_when_the_peer_is_there() -> 
     assert _ends(caller.notices()) == []
 
 
-def test_a_call_made_while_the_link_is_away_leaves_when_it_is_back_even_to_another_boot() -> None:
+def test_a_call_made_while_the_link_is_down_is_sent_when_it_is_back_even_to_another_boot() -> None:
     caller = _caller()
     caller.link_down(1.0, "cut")
     caller.call(1.5, CALL)
@@ -204,7 +204,7 @@ def test_the_same_boot_is_sent_the_call_again_under_its_id_with_its_cancel() -> 
     assert caller.notices()[1:] == [_welcome(runs=("1",))]
 
 
-def test_another_boot_is_never_sent_what_the_first_was() -> None:
+def test_a_call_sent_to_one_boot_is_never_sent_to_another() -> None:
     caller = _caller()
     caller.call(0.0, CALL)
     caller.messages(0.0)
@@ -214,7 +214,7 @@ def test_another_boot_is_never_sent_what_the_first_was() -> None:
     assert _ends(caller.notices()) == [("1", "rebooted", Executed.UNKNOWN)]
 
 
-def test_no_accept_in_time_ends_and_cancels_the_call() -> None:
+def test_a_call_without_accept_in_time_is_ended_and_cancelled() -> None:
     caller = _caller()
     caller.call(0.0, CALL)
     caller.messages(0.0)
@@ -252,7 +252,7 @@ def test_a_cancelled_call_that_never_ends_is_given_up() -> None:
     assert _ends(caller.notices()) == [("1", "no_answer", Executed.UNKNOWN)]
 
 
-def test_quick_calls_leave_nothing_behind() -> None:
+def test_short_calls_leave_no_state_behind() -> None:
     caller = _caller()
     caller.begin(0.0, "first", "get", {}, waiter=_Waiter())
     caller.take_outcomes(0.0, [m.Outcome("first", "success")])
@@ -263,7 +263,7 @@ def test_quick_calls_leave_nothing_behind() -> None:
 
 
 @pytest.mark.parametrize("lost", [False, True])
-def test_who_waits_no_more_is_told_nothing_and_the_result_is_acknowledged_all_the_same(
+def test_a_waiter_that_gave_up_is_not_notified_but_the_result_is_still_acknowledged(
     lost: bool,
 ) -> None:
     caller, waiter = _caller(), _Waiter(enough=True)
@@ -278,7 +278,7 @@ def test_who_waits_no_more_is_told_nothing_and_the_result_is_acknowledged_all_th
     assert not any(isinstance(notice, Outcome) for notice in caller.notices())
 
 
-def test_very_many_results_at_once_are_acknowledged_in_messages_that_may_be_sent() -> None:
+def test_many_results_at_once_are_acknowledged_in_messages_within_the_size_limit() -> None:
     caller = _caller()
     ids = [f"{n:0255}" for n in range(1_000)]
     waiter = _Waiter()
@@ -287,12 +287,14 @@ def test_very_many_results_at_once_are_acknowledged_in_messages_that_may_be_sent
     caller.messages(0.0)
     caller.take_outcomes(0.1, [m.Outcome(id_, "success") for id_ in (*ids, ids[0])])
     acks = [message for message in caller.messages(0.1) if isinstance(message, m.ResultAck)]
-    assert [outcome.id for outcome in waiter.told] == ids, "each once, also one that came twice"
+    assert [outcome.id for outcome in waiter.told] == ids, (
+        "each is acknowledged once, even one that came twice"
+    )
     assert [id_ for ack in acks for id_ in (ack.id, *ack.more)] == ids
     assert all(len(encode(ack)) <= LIMITS[m.ResultAck.KIND] for ack in acks)
 
 
-def test_the_owner_says_how_long_stopping_may_take() -> None:
+def test_the_owner_sets_how_long_stopping_may_take() -> None:
     caller = _caller()
     caller.call(0.0, m.Call("1", "move"))
     caller.receive(0.1, m.Accept("1"))
@@ -305,7 +307,9 @@ def test_the_owner_says_how_long_stopping_may_take() -> None:
 
 
 @pytest.mark.parametrize("cancelled", [False, True])
-def test_a_held_run_is_not_waited_for_until_it_goes_on_or_is_cancelled(cancelled: bool) -> None:
+def test_the_wait_for_a_held_run_starts_again_when_it_continues_or_is_cancelled(
+    cancelled: bool,
+) -> None:
     """A deadline of 2 s and 5 s of patience, held from 1 s to 11 s: given up at 17 s; cancelled at
     11 s: at 16 s."""
     caller = _caller()
@@ -327,7 +331,7 @@ def test_a_held_run_is_not_waited_for_until_it_goes_on_or_is_cancelled(cancelled
     assert _ends(caller.notices()) == [("1", "no_answer", Executed.UNKNOWN)]
 
 
-def test_a_call_cancelled_before_it_leaves_ends_at_once() -> None:
+def test_a_call_cancelled_before_it_is_sent_ends_at_once() -> None:
     caller = _caller(up=False)
     caller.connecting(0.0)
     caller.call(0.0, CALL)
@@ -337,7 +341,7 @@ def test_a_call_cancelled_before_it_leaves_ends_at_once() -> None:
     assert caller.messages(0.2) == []
 
 
-def test_a_call_of_before_a_restart_is_cancelled_before_it_is_sent_again() -> None:
+def test_a_call_from_before_a_restart_is_cancelled_before_it_is_sent_again() -> None:
     caller = _caller(up=False)
     caller.connecting(0.0)
     caller.call(0.0, m.Call("1", "move", boot="n1"))
@@ -346,7 +350,7 @@ def test_a_call_of_before_a_restart_is_cancelled_before_it_is_sent_again() -> No
     assert [type(message) for message in caller.messages(0.2)] == [m.Call, m.Cancel]
 
 
-def test_a_run_given_up_is_stopped_when_its_node_is_back_and_its_end_is_late() -> None:
+def test_a_run_given_up_is_stopped_when_its_node_is_back_and_its_late_end_is_reported() -> None:
     caller = _caller()
     caller.call(0.0, CALL)
     caller.messages(0.0)
@@ -360,7 +364,7 @@ def test_a_run_given_up_is_stopped_when_its_node_is_back_and_its_end_is_late() -
     assert caller.messages() == [m.ResultAck("1")]
 
 
-def test_after_a_restart_the_owner_settles_what_the_node_still_keeps() -> None:
+def test_after_a_restart_the_owner_acknowledges_results_that_the_node_still_keeps() -> None:
     caller = _caller()
     caller.acknowledge(0.0, "done before")
     caller.disown(0.0, "given up before")
@@ -382,7 +386,7 @@ def test_the_children_of_a_call_are_cancelled_with_it() -> None:
     ]
 
 
-def test_commands_are_answered_come_what_may() -> None:
+def test_every_command_is_answered_even_after_a_fault() -> None:
     caller = _caller()
     for id_ in "abc":
         caller.command(0.0, m.Command(id_, "hold"))
@@ -403,7 +407,7 @@ def test_commands_are_answered_come_what_may() -> None:
 
 
 @pytest.mark.parametrize("auto_ack", [True, False])
-def test_each_event_of_a_source_arrives_once_and_is_acknowledged_when_it_is_safe(
+def test_each_event_of_a_source_arrives_once_and_is_acknowledged_when_it_is_stored(
     auto_ack: bool,
 ) -> None:
     caller = _caller(auto_ack=auto_ack)
@@ -424,10 +428,10 @@ def test_each_event_of_a_source_arrives_once_and_is_acknowledged_when_it_is_safe
     caller.link_up(1.0, _welcome("n2"))
     caller.notices()
     caller.receive(1.0, events[0])
-    assert caller.notices() == [events[0]], "another boot counts anew"
+    assert caller.notices() == [events[0]], "another boot counts from 0 again"
 
 
-def test_a_pulse_is_told_each_time() -> None:
+def test_every_pulse_is_reported() -> None:
     caller = _caller()
     pulse = m.Event("tick", "timer", 0)
     caller.receive(0.0, pulse)
@@ -435,7 +439,7 @@ def test_a_pulse_is_told_each_time() -> None:
     assert caller.notices() == [pulse] * 2 and caller.messages() == []
 
 
-def test_lock_step_says_hello_by_itself() -> None:
+def test_in_lock_step_the_client_sends_hello_by_itself() -> None:
     caller = _caller(up=False)
     caller.open(0.0)
     caller.call(0.0, CALL)
@@ -446,7 +450,7 @@ def test_lock_step_says_hello_by_itself() -> None:
     assert caller.notices()[-1] == PeerLost("done")
 
 
-def test_bad_calls_are_refused_where_they_are_made() -> None:
+def test_bad_calls_are_refused_by_the_caller_itself() -> None:
     caller = _caller()
     with pytest.raises(NotPlainError, match=r"arguments\.to"):
         caller.call(0.0, m.Call("1", "move", {"to": object()}))

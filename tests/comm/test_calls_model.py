@@ -1,5 +1,5 @@
-"""Caller and callee over a link that loses, repeats and delays, with reboots of both: at most once,
-and every call ends."""
+"""Caller and callee over a link that loses, repeats and delays messages, with restarts of both:
+every action runs at most once, and every call ends."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class ModelRun:
 
 @dataclass
 class World:
-    """A coordinator that writes down what it did, a node that runs what it is ordered to, and a
-    link between them."""
+    """A coordinator with a journal, a node that runs the actions ordered, and a link between
+    them."""
 
     now: float = 0.0
     epoch: int = 1
@@ -70,7 +70,7 @@ class World:
         self.finished.add(call.id)
         return m.Outcome(call.id, "success", call.arguments)
 
-    # What happens to the world.
+    # Events of the world.
 
     def call(self, service: str, seconds: float, deadline: float | None) -> None:
         call = m.Call(f"c{next(self.numbers)}", service, {"seconds": seconds}, deadline)
@@ -93,8 +93,8 @@ class World:
         self.caller.link_up(self.now, answer)
 
     def cut(self, lost: int, final: bool = False) -> None:
-        """Break the link; the newest messages of each direction are lost, the CALLs among them may
-        still turn up later."""
+        """Break the link. The newest messages of each direction are lost; lost CALLs may still
+        arrive later."""
         if not self.linked:
             return
         self.linked = False
@@ -110,7 +110,7 @@ class World:
         self.caller.link_down(self.now, "cut", final=final)
 
     def repeat(self, which: int) -> None:
-        """A CALL that was sent before arrives again."""
+        """Deliver an earlier CALL again."""
         if self.stale and self.linked:
             self.callee.receive(self.now, COORD, self.stale[which % len(self.stale)])
 
@@ -121,8 +121,8 @@ class World:
         self.callee = self._new_callee()
 
     def restart_coordinator(self) -> None:
-        """kill -9 of the coordinator: what it wrote down is all that is left, and is asked for
-        again under its ids."""
+        """Kill the coordinator (kill -9): only its journal is left, and it makes the calls in it
+        again under their ids."""
         self.cut(1000)
         self.epoch += 1
         self.caller = self._new_caller()
@@ -133,8 +133,8 @@ class World:
                 self.caller.call(self.now, replace(call, boot=boot, again=True))
 
     def flood(self, calls: int) -> None:
-        """Another client calls, under ids that have nothing in common. No CALL of ours is on its
-        way for that long."""
+        """Let another client call under unrelated ids. No CALL of ours is in transit for that
+        long."""
         self.stale.clear()
         self.callee.link_up(self.now, "flood", m.Hello(2, 2, "client", "flood", "f1"))
         for _ in range(calls):
@@ -149,7 +149,7 @@ class World:
             self.now = min(end, self.now + 0.1)
             self.turn(delay)
 
-    # What follows from it.
+    # Consequences.
 
     def turn(self, delay: float) -> None:
         self._finish_runs()
@@ -170,7 +170,8 @@ class World:
                 self._settle(notice.runs)
 
     def _settle(self, runs: tuple[str, ...]) -> None:
-        """What the node still keeps of calls that are written down as ended."""
+        """Acknowledge the results that the node still keeps of calls that the journal has as
+        ended."""
         for id_ in runs:
             if id_ in self.ended and self.ended[id_].executed is Executed.UNKNOWN:
                 self.caller.disown(self.now, id_)
@@ -266,7 +267,7 @@ def _check(world: World) -> None:
     for id_, outcome in world.ended.items():
         if outcome.executed is Executed.NO:
             assert not world.started[id_], (
-                f"{id_} is said not to have run ({outcome.cause}), but it did"
+                f"{id_} ended as not executed ({outcome.cause}), but it did"
             )
         if outcome.status == "success":
             assert (
@@ -278,12 +279,12 @@ def _check(world: World) -> None:
     for outcome in world.late:
         known = world.ended[outcome.id]
         assert known == outcome or known.executed is Executed.UNKNOWN, (
-            "only an unknown end may be told better later"
+            "only an unknown result may be corrected later"
         )
     assert not world.callee.running() and not world.caller.under_way()
     answer = world.callee.link_up(world.now, COORD, world.caller.hello)
     assert isinstance(answer, m.Welcome)
-    assert answer.runs == (), "a result was never acknowledged"
+    assert answer.runs == (), "a result was not acknowledged"
 
 
 @settings(max_examples=150)

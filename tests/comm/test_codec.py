@@ -1,4 +1,4 @@
-"""Messages as bytes: the very bytes, the way back, and what is refused."""
+"""Messages as bytes: the exact bytes, decoding, and what is refused."""
 
 from __future__ import annotations
 
@@ -114,7 +114,9 @@ def test_frame_byte_by_byte(message: m.Message, frame: str) -> None:
 
 
 @given(st.data())
-def test_every_message_comes_back(messages: st.SearchStrategy[Any], data: st.DataObject) -> None:
+def test_every_message_is_decoded_as_it_was_encoded(
+    messages: st.SearchStrategy[Any], data: st.DataObject
+) -> None:
     message = data.draw(messages)
     assert decode(encode(message)) == message
 
@@ -241,7 +243,7 @@ def test_wrong_fields_are_refused(fields: list[Any], says: str) -> None:
         ),
     ],
 )
-def test_trailing_fields_may_be_left_out_and_a_duration_may_be_whole(
+def test_trailing_fields_may_be_left_out_and_a_duration_may_be_an_integer(
     fields: list[Any], message: m.Message
 ) -> None:
     found = decode(msgpack.packb(fields))
@@ -278,7 +280,7 @@ _odd: st.SearchStrategy[Any] = st.sampled_from(
     st.integers(1, 9),
     st.sampled_from([0, 300]),
 )
-def test_the_quick_way_says_what_the_table_says(
+def test_the_fast_decoder_agrees_with_the_table(
     kind: int, odd: list[Any], use: list[bool], length: int, padding: int
 ) -> None:
     usual = CALL if kind == 4 else [7, "c1", "success", {}, "", "", "yes", 0.0, 0.0]
@@ -293,7 +295,7 @@ def test_the_quick_way_says_what_the_table_says(
 
 
 @given(st.one_of(messages_of([m.Call]), messages_of([m.Outcome])))
-def test_the_quick_way_writes_what_the_table_writes(message: m.Message) -> None:
+def test_the_fast_encoder_agrees_with_the_table(message: m.Message) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(codec, "WRITERS", {})
         by_table = encode(message)
@@ -301,21 +303,23 @@ def test_the_quick_way_writes_what_the_table_writes(message: m.Message) -> None:
     assert decode(by_table) == message
 
 
-def test_a_call_made_again_has_one_field_more_and_any_other_none() -> None:
+def test_only_a_repeated_call_has_the_additional_field() -> None:
     first, again = (m.Call("c1", "track", again=again) for again in (False, True))
     assert encode(again) == b"\x9a" + encode(first)[1:] + b"\xc3" and encode(first)[0] == 0x99
     assert (decode(encode(first)), decode(encode(again))) == (first, again)
 
 
-def test_a_provisional_result_has_one_field_more_and_any_other_none() -> None:
-    """So a side that does not know the field yet takes every result that is sure, byte for byte as
+def test_only_a_provisional_result_has_the_additional_field() -> None:
+    """A peer that does not know the field still reads every final result, byte for byte as
     before."""
     sure, open_ = (
         m.Outcome("c1", "success", seconds=1.0, deferred=deferred) for deferred in (False, True)
     )
     assert encode(open_) == b"\x9a" + encode(sure)[1:] + b"\xc3" and encode(sure)[0] == 0x99
     assert (decode(encode(sure)), decode(encode(open_))) == (sure, open_)
-    assert decode(b"\x9a" + encode(sure)[1:] + b"\xc2") == sure, "written out by whoever does"
+    assert decode(b"\x9a" + encode(sure)[1:] + b"\xc2") == sure, (
+        "another implementation may write the field out"
+    )
     with pytest.raises(ProtocolError, match="deferred: expected a bool, found a int"):
         decode(b"\x9a" + encode(sure)[1:] + b"\x01")
 
@@ -367,9 +371,9 @@ def test_many_empty_containers_do_not_fill_the_memory(container: bytes) -> None:
     ],
     ids=["arrays", "values", "values in two", "a map"],
 )
-def test_what_takes_long_to_read_is_neither_sent_nor_taken(value: Any) -> None:
-    """Its sender is told, so that only its own call ends; who sends it nevertheless loses the
-    connection."""
+def test_a_value_that_takes_long_to_read_is_neither_sent_nor_accepted(value: Any) -> None:
+    """Its sender gets an error, so that only its own call ends; a peer that sends it nevertheless
+    loses the connection."""
     with pytest.raises(ProtocolError, match=r"too_large: a Call: more than"):
         encode(m.Call("c", "s", {"v": value}))
     with pytest.raises(ProtocolError, match=r"malformed: .*more than"):
@@ -383,7 +387,7 @@ def test_a_value_of_the_global_memory_fits() -> None:
         assert decode(encode(call)).arguments["value"] == value  # type: ignore[union-attr]
 
 
-def test_what_is_no_plain_data_is_not_encoded() -> None:
+def test_only_plain_data_is_encoded() -> None:
     for value in (object(), {1, 2}, 2**64, np.zeros(2)):
         with pytest.raises(ProtocolError, match="unencodable"):
             encode(m.Call("c1", "track", {"a": value}))
@@ -424,7 +428,7 @@ def test_plain_copies_and_simplifies() -> None:
         ({"p": _nested(DEPTH + 1)}, f"nested deeper than {DEPTH} levels"),
     ],
 )
-def test_plain_says_what_is_wrong_and_where(value: Any, says: str) -> None:
+def test_plain_names_the_fault_and_its_position(value: Any, says: str) -> None:
     with pytest.raises(NotPlainError) as fault:
         plain(value, "arguments")
     assert says in str(fault.value)
@@ -434,7 +438,7 @@ def test_plain_says_what_is_wrong_and_where(value: Any, says: str) -> None:
     st.sampled_from(["u1", "<f8"]),
     st.lists(st.integers(0, 4), max_size=4),
 )
-def test_arrays_come_back_read_only(dtype: str, shape: list[int]) -> None:
+def test_decoded_arrays_are_read_only(dtype: str, shape: list[int]) -> None:
     array = np.arange(math.prod(shape), dtype=dtype).reshape(shape)
     found = unpack_array(pack_array(array))
     assert found.dtype == array.dtype and found.shape == array.shape and (found == array).all()

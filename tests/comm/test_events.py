@@ -1,4 +1,4 @@
-"""Latched events on their way to several callers, over lost links."""
+"""Latched events sent to several callers over links that break."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_a_latched_event_waits_for_a_coordinator_that_is_away() -> None:
     assert _heard(callee, "coord") == [("caught", 1)]
 
 
-def test_a_latched_event_raised_before_anybody_asked_is_kept() -> None:
+def test_a_latched_event_raised_before_any_subscription_is_kept() -> None:
     callee = _node("coord")
     callee.raise_event(0.0, "caught", latched=True)
     callee.receive(0.1, "coord", m.Subscribe(("caught",)))
@@ -47,7 +47,7 @@ def test_a_latched_event_raised_before_anybody_asked_is_kept() -> None:
     assert _heard(callee, "coord") == []
 
 
-def test_an_acknowledgement_covers_only_what_its_sender_asked_for() -> None:
+def test_an_acknowledgement_covers_only_the_subscriptions_of_its_sender() -> None:
     callee = _node("coord")
     callee.receive(0.0, "coord", m.Subscribe(("a",)))
     for name in ("a", "b", "a"):
@@ -87,7 +87,7 @@ def test_an_event_of_a_run_goes_to_its_caller_and_is_gone_with_the_run() -> None
     assert _heard(callee, "coord") == []
 
 
-def test_one_that_leaves_in_good_order_is_sent_nothing_when_it_is_back() -> None:
+def test_a_caller_that_left_with_bye_receives_no_old_events_when_it_is_back() -> None:
     callee = _node("coord")
     callee.receive(0.0, "coord", m.Subscribe(("caught",)))
     callee.receive(0.1, "coord", m.Bye("done"))
@@ -98,7 +98,7 @@ def test_one_that_leaves_in_good_order_is_sent_nothing_when_it_is_back() -> None
     assert _heard(callee, "coord") == [("caught", 1)]
 
 
-def test_what_nobody_fetches_gives_way_and_is_counted() -> None:
+def test_events_that_no_caller_fetches_are_dropped_and_counted() -> None:
     board = EventBoard()
     for _ in range(KEPT + 3):
         board.raise_event(m.Event("caught", "barrier", 0), True, "")

@@ -1,5 +1,5 @@
-"""Certificates that end: read without a package for X.509, said once, made anew by the command,
-refused in words."""
+"""Certificates that expire: their end is read without an X.509 package, warned about once, renewed
+by the command, and named as the reason of a refused connection."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ HELLO = m.Hello(2, 2, "client", "asking", "a1")
 
 @pytest.fixture(autouse=True)
 def new_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing has been said yet."""
+    """Start with no warning given yet."""
     monkeypatch.setattr(expiry, "_said", set())
     monkeypatch.setattr(expiry, "_remedies", {})
 
@@ -51,13 +51,15 @@ def new_process(monkeypatch: pytest.MonkeyPatch) -> None:
 def made(
     folder: Path, left: timedelta, parties: tuple[str, ...] = ("coordinator", "vision")
 ) -> Path:
-    """A cell's certificates of which there is so much left; the authority's lasts longer."""
+    """Make a cell's certificates that expire after `left`; the authority's lasts longer."""
     make_certificates(folder, parties, NOW - LIFE + left)
     return folder
 
 
 @pytest.mark.parametrize("left", [LIFE, timedelta(days=31), timedelta(0), -timedelta(days=400)])
-def test_the_end_is_read_as_cryptography_reads_it(tmp_path: Path, left: timedelta) -> None:
+def test_the_expiry_time_equals_what_the_package_cryptography_reads(
+    tmp_path: Path, left: timedelta
+) -> None:
     for file in made(tmp_path, left).glob("*.pem"):
         assert (
             ends_of(file.read_text())
@@ -65,7 +67,7 @@ def test_the_end_is_read_as_cryptography_reads_it(tmp_path: Path, left: timedelt
         )
 
 
-def test_a_certificate_beyond_2049_tells_its_time_in_full(tmp_path: Path) -> None:
+def test_a_certificate_beyond_2049_has_a_four_digit_year(tmp_path: Path) -> None:
     make_certificates(tmp_path, ["vision"], datetime(2048, 6, 1, tzinfo=UTC))
     assert ends_of((tmp_path / "vision.pem").read_text()) == datetime(2048, 6, 1, tzinfo=UTC) + LIFE
     assert ends_of((tmp_path / "ca.pem").read_text()).year == 2058
@@ -73,7 +75,7 @@ def test_a_certificate_beyond_2049_tells_its_time_in_full(tmp_path: Path) -> Non
 
 @pytest.fixture(scope="module")
 def real(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """The DER bytes of a certificate."""
+    """Return the DER bytes of a certificate."""
     folder = tmp_path_factory.mktemp("real")
     make_certificates(folder, ["vision"])
     return ssl.PEM_cert_to_DER_cert((folder / "vision.pem").read_text())
@@ -85,10 +87,11 @@ def real(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     at=st.integers(0, 200),
     byte=st.integers(0, 255),
 )
-def test_spoilt_certificates_are_a_value_error_or_a_time(
+def test_a_damaged_certificate_gives_a_value_error_or_a_time(
     real: bytes, body: bytes, cut: int, at: int, byte: int
 ) -> None:
-    """Cut off it is always refused; changed it may still be one; nothing else ever leaves."""
+    """A truncated certificate is always refused; a changed one may still be valid. No other
+    exception is raised."""
     for spoilt in (body, real[:cut], b"\x30\x82" + body):
         with pytest.raises(ValueError, match="expected a PEM certificate"):
             ends_of(ssl.DER_cert_to_PEM_cert(spoilt))
@@ -102,7 +105,7 @@ def test_spoilt_certificates_are_a_value_error_or_a_time(
     "text",
     ["", "x" * 30, "-----BEGIN CERTIFICATE-----", "-----BEGIN CERTIFICATE-----\n!\n-----END"],
 )
-def test_what_is_no_certificate_is_a_value_error(text: str) -> None:
+def test_bytes_that_are_not_a_certificate_are_a_value_error(text: str) -> None:
     with pytest.raises(ValueError, match="expected a PEM certificate"):
         ends_of(text)
 
@@ -119,7 +122,9 @@ def test_what_is_no_certificate_is_a_value_error(text: str) -> None:
         (-timedelta(days=3), "expired on "),
     ],
 )
-def test_what_is_said_a_month_before_and_after(tmp_path: Path, left: timedelta, says: str) -> None:
+def test_warnings_a_month_before_the_end_and_after_it(
+    tmp_path: Path, left: timedelta, says: str
+) -> None:
     file = made(tmp_path, left) / "vision.pem"
     text = ending(file, NOW, "do this")
     assert (
@@ -130,7 +135,7 @@ def test_what_is_said_a_month_before_and_after(tmp_path: Path, left: timedelta, 
     assert not says or text.startswith(f"{file}: this certificate")
 
 
-def test_each_end_is_said_once_and_with_the_files_remedy(
+def test_each_expiry_is_warned_about_once_with_file_and_remedy(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = made(tmp_path / "keys", timedelta(days=9))
@@ -145,7 +150,7 @@ def test_each_end_is_said_once_and_with_the_files_remedy(
         "`petrobot keys --tls keys`" in said[0] and "copy vision.pem and vision.key here" in said[0]
     )
     expiry.look_again(NOW + 8 * DAY)
-    assert capsys.readouterr().err == "", "it was said"
+    assert capsys.readouterr().err == "", "the warning was given before"
     expiry.look_again(NOW + 10 * DAY)
     expiry.look_again(NOW + 11 * DAY)
     assert capsys.readouterr().err.count("this certificate expired on") == 1
@@ -154,7 +159,7 @@ def test_each_end_is_said_once_and_with_the_files_remedy(
     assert "make a new authority" in said[0] and "another folder" in said[0]
 
 
-def test_nothing_is_said_of_certificates_that_last_nor_without_any(
+def test_no_warning_for_certificates_that_last_or_without_certificates(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Credentials("vision", None, made(tmp_path, LIFE)).server()
@@ -173,7 +178,7 @@ def test_a_certificate_may_be_replaced_while_its_process_runs(
     assert capsys.readouterr().err == ""
 
 
-def test_the_command_makes_anew_what_ends_soon_and_nothing_else(tmp_path: Path) -> None:
+def test_the_command_renews_only_certificates_that_expire_soon(tmp_path: Path) -> None:
     folder = made(tmp_path, 20 * DAY, ("vision",))
     make_certificates(folder, ["motion"], NOW - 100 * DAY)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
@@ -186,13 +191,15 @@ def test_the_command_makes_anew_what_ends_soon_and_nothing_else(tmp_path: Path) 
         "vision.pem",
         "vision.key",
     }
-    assert set(after) == set(before), "no half-made file is left"
+    assert set(after) == set(before), "no temporary file is left"
     assert ends_of(after["vision.pem"].decode()) == NOW + LIFE
     assert (folder / "vision.key").stat().st_mode & 0o777 == 0o600
-    assert Credentials("vision", None, folder).server() is not None, "key and certificate fit"
+    assert Credentials("vision", None, folder).server() is not None, (
+        "key and certificate belong together"
+    )
 
 
-def test_no_certificate_outlives_the_authority_and_one_that_ends_is_replaced_as_a_whole(
+def test_no_certificate_outlives_its_authority_and_an_expiring_authority_renews_all(
     tmp_path: Path,
 ) -> None:
     make_certificates(tmp_path, ["vision"], NOW)
@@ -221,7 +228,7 @@ async def node(folder: Path) -> AsyncIterator[Server]:
         await server.close()
 
 
-async def test_a_node_that_lives_long_looks_each_day(
+async def test_a_long_running_node_checks_every_day(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("petrobot.services.comm.calls.server.DAY", 0.001)
@@ -239,10 +246,10 @@ async def test_a_node_that_lives_long_looks_each_day(
 
 
 @pytest.mark.parametrize(("node_left", "own_left"), [(-DAY, LIFE), (LIFE, -DAY)])
-async def test_ended_certificates_are_named_as_the_reason(
+async def test_an_expired_certificate_is_named_as_the_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], node_left: timedelta, own_left: timedelta
 ) -> None:
-    """Whichever end's it is, the caller reads of it, and its own is named with its file."""
+    """The caller is told whichever end's certificate has expired; for its own, with the file."""
     folder = made(tmp_path / "keys", max(node_left, own_left), ())
     make_certificates(folder, ["vision"], NOW - LIFE + node_left)
     make_certificates(folder, ["coordinator"], NOW - LIFE + own_left)
@@ -267,10 +274,11 @@ async def test_ended_certificates_are_named_as_the_reason(
         )
 
 
-async def test_nodes_shows_when_the_certificate_ends_that_a_node_really_shows(
+async def test_nodes_shows_the_expiry_of_the_certificate_in_use(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What was renewed on disk but not taken up by the running node is still shown as ending."""
+    """A certificate renewed on disk but not yet loaded by the running node is still shown as
+    expiring."""
     folder = made(tmp_path / "keys", 12 * DAY)
     async with asyncio.timeout(60.0), node(folder) as server:
         make_certificates(folder, ["vision"], NOW)
@@ -300,7 +308,7 @@ async def test_nodes_shows_when_the_certificate_ends_that_a_node_really_shows(
 
 
 async def _answer(server: Server) -> None:
-    """Answer every command as a node without devices does."""
+    """Answer every command like a node without devices."""
     commanded: asyncio.Queue[Any] = asyncio.Queue()
 
     def take(now: float, orders: list[Order]) -> None:

@@ -1,8 +1,7 @@
-"""Real processes killed (kill -9), frozen (SIGSTOP) and cut off: what is known of them, in which
-order, and what holds.
+"""Real processes killed (kill -9), frozen (SIGSTOP) and cut off: what the other side is notified
+of, in which order, and what stays true.
 
-How long it takes stands in tools/bench/faults.py; here is what must be so however busy the machine
-is.
+tools/bench/faults.py measures the times; the tests here hold however busy the machine is.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ LIMIT = 60.0
 
 
 class Told:
-    """A coordinator's client and all that it was told, in order."""
+    """A coordinator's client that records all notices, in order."""
 
     def __init__(self, port: int) -> None:
         self.notices: list[Notice] = []
@@ -42,7 +41,7 @@ class Told:
         self.changed.set()
 
     async def until(self, kind: type[Any], number: int = 1) -> Any:
-        """The so-manieth notice of a kind."""
+        """Wait until `count` notices of a kind have arrived, and return the last of them."""
         async with asyncio.timeout(LIMIT):
             while len(found := [one for one in self.notices if isinstance(one, kind)]) < number:
                 self.changed.clear()
@@ -50,11 +49,11 @@ class Told:
         return found[number - 1]
 
     def order(self) -> list[str]:
-        """The kinds of all notices, in order."""
+        """Return the kinds of all notices, in order."""
         return [type(one).__name__ for one in self.notices]
 
     async def begin(self) -> None:
-        """A run that goes on at the node."""
+        """Start a run that stays active at the node."""
         assert await self.client.connected(LIMIT)
         self.caller.call(self.client.now(), m.Call("1", "move"))
         self.client.flush()
@@ -88,13 +87,13 @@ async def test_a_node_that_is_lost_is_named_and_its_run_ends_once_with_unknown(
 
 
 async def test_the_run_of_a_killed_node_ends_as_soon_as_its_port_refuses() -> None:
-    """It does not wait for the 2 s that a broken link has to come back; a process that takes the
-    port is another boot, which is not sent the call again."""
+    """It does not wait for the 2 s that a broken link has to come back. A process that then opens
+    the port is another boot and does not receive the call again."""
     with part("node") as process:
         port = int(await asyncio.to_thread(first_line, process))
         told = Told(port)
         await told.begin()
-        # Far longer than anything waits here: only the refusing port can end the run.
+        # Longer than any wait here: only the refusing port can end the run.
         told.caller._patience = told.caller._absence._patience = Patience(reconnect=2 * LIMIT)
         process.kill()
         ended = await told.until(Outcome)
@@ -116,13 +115,13 @@ async def test_the_run_of_a_killed_node_ends_as_soon_as_its_port_refuses() -> No
         await told.until(Accept, 2)
         await told.client.close()
     assert told.order().count("Outcome") >= 2, (
-        "the first two once each; the third goes on until its caller leaves"
+        "the first two once each; the third runs until its caller leaves"
     )
 
 
-async def test_a_broken_link_to_a_node_that_lives_keeps_its_run() -> None:
-    """The connection is reset, the port still takes connections: the same boot is found again, and
-    the run goes on."""
+async def test_a_broken_link_to_a_live_node_keeps_its_run() -> None:
+    """The connection is reset but the port still accepts connections: the client finds the same
+    boot again, and the run continues."""
     with part("node") as process:
         told = Told(int(await asyncio.to_thread(first_line, process)))
         await told.begin()
@@ -144,19 +143,19 @@ async def test_a_node_that_thaws_is_back_and_stops_the_run_that_was_given_up() -
         process.send_signal(signal.SIGCONT)
         back = await told.until(Welcome, 2)
         assert back.boot == (await told.until(Welcome)).boot and back.runs == ("1",), (
-            "it never noticed, and the run goes on"
+            "the node did not notice, and the run is active"
         )
         late = (await told.until(LateResult)).outcome
         assert (late.id, late.cause, late.executed) == ("1", "cancelled", Executed.YES), (
-            "recorded, and moves nothing"
+            "recorded, but nothing fires"
         )
         assert told.order().count("Outcome") == 1
         await told.client.close()
 
 
 class Watch:
-    """A sink that notes when values came and when they were withdrawn, on the receiver's clock
-    (s)."""
+    """A sink that records when values arrived and when they were withdrawn (s, receiver's
+    clock)."""
 
     def __init__(self) -> None:
         self.arrived: list[float] = []
@@ -171,29 +170,28 @@ class Watch:
 
     @property
     def valid(self) -> bool:
-        """Whether the last value counts."""
+        """Return whether the last value is valid."""
         return bool(self.arrived) and (not self.withdrawn or self.arrived[-1] > self.withdrawn[-1])
 
 
 def poll_until(
     receiver: StreamReceiver, watch: Watch, holds: Callable[[], bool], period: float
 ) -> None:
-    """Poll as a servo loop does. At no poll may a value count that came longer ago than three
-    periods."""
+    """Poll like a servo loop. No poll may find a valid value older than three periods."""
     end = time.monotonic() + LIMIT
     while not holds():
         select.select([], [], [], period / 10)
         watch.now = time.monotonic()
         receiver.poll()
         assert not watch.valid or watch.now - watch.arrived[-1] <= 3 * period, (
-            "too old, and it still counts"
+            "a value is too old but still valid"
         )
-        assert watch.now < end, "it did not come to pass"
+        assert watch.now < end, "the condition did not become true in time"
 
 
 @pytest.mark.parametrize("fault", LinkFault, ids=lambda one: one.value)
 @pytest.mark.parametrize("period", [0.004, 0.04])
-def test_no_set_point_older_than_three_periods_counts_when_its_sender_is_lost(
+def test_no_set_point_older_than_three_periods_is_valid_when_its_sender_is_lost(
     fault: LinkFault, period: float
 ) -> None:
     watch = Watch()
@@ -206,7 +204,7 @@ def test_no_set_point_older_than_three_periods_counts_when_its_sender_is_lost(
         last = len(watch.arrived)
         ends = watch.now + 10 * period
         poll_until(receiver, watch, lambda: watch.now > ends, period)
-        assert not watch.valid, "and it stays so"
+        assert not watch.valid, "the set point stays invalid"
         if fault is LinkFault.FROZEN:
             process.send_signal(signal.SIGCONT)
             poll_until(receiver, watch, lambda: len(watch.arrived) > last and watch.valid, period)
