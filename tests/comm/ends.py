@@ -79,7 +79,7 @@ class Coordinator:
         self.told.set()
 
     async def notice(self, kind: type[Any], number: int = 1) -> Any:
-        """Wait until `count` notices of this kind have arrived, and return the last of them."""
+        """Wait for the `number`-th notice of this kind and return it."""
         async with asyncio.timeout(60.0):
             while (
                 len(found := [notice for notice in self.notices if isinstance(notice, kind)])

@@ -41,7 +41,7 @@ class Told:
         self.changed.set()
 
     async def until(self, kind: type[Any], number: int = 1) -> Any:
-        """Wait until `count` notices of a kind have arrived, and return the last of them."""
+        """Wait for the `number`-th notice of a kind and return it."""
         async with asyncio.timeout(LIMIT):
             while len(found := [one for one in self.notices if isinstance(one, kind)]) < number:
                 self.changed.clear()

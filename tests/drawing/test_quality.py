@@ -1,5 +1,5 @@
-"""Automatic drawings are good enough to publish: measured on random nets outside the development
-set."""
+"""Automatic drawings are good enough to publish: measured on random nets that were not used in
+development."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def sorting() -> Task:
 
 
 def directory(task: Task) -> Directory:
-    """Every alternative on one node."""
+    """A directory with every alternative on one node."""
     actions = "".join(
         f'[actions.{a}]\nrun = "scripted:nothing"\ntask = "{p.name}"\nnode = "node"\n'
         for p in task.primitive_tasks.values()
@@ -62,7 +62,7 @@ def directory(task: Task) -> Directory:
 
 
 def scripts() -> dict[str, Callable[..., Any]]:
-    """What each action does."""
+    """Return what each action does."""
     return {name: Scripted(lines) for name, lines in LINES.items()}
 
 
@@ -76,8 +76,8 @@ def run(
     store: Store | None = None,
     first: Sequence[Stimulus] = (),
 ) -> Mission:
-    """Run to the end, at most an hour of simulated time; `first` is what the operator says before
-    the beginning."""
+    """Run to the end, at most an hour of simulated time; `first` holds the operator's commands
+    before the start."""
     setting = Setting(task, parameters or {}, runs, seed, selector or FirstAlternative())
     cell, party = lockstep_cell(directory(task), setting, scripts())
     if store is not None:

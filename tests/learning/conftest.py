@@ -27,7 +27,7 @@ OBSERVATIONS = st.lists(COUNTED | CENSORED | MISSING, max_size=25)
 
 
 def tally_of(seen: list[Observation], salt: str = "") -> Tally:
-    """The tally of some runs."""
+    """Return the tally of some runs."""
     tally = Tally()
     for one in seen:
         tally = tally.adding(one, salt)

@@ -1,4 +1,4 @@
-"""Tallies: what each kind of end changes, merging, corrections, intervals and quantiles."""
+"""Tallies: what each kind of result changes, merging, corrections, intervals and quantiles."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NUMBERS = st.lists(st.floats(-1e3, 1e3), max_size=30)
 
 
 def of(numbers: list[float]) -> Moments:
-    """Moments of some numbers."""
+    """Return the moments of some numbers."""
     out = Moments()
     for x in numbers:
         out = out.adding(x)
@@ -39,7 +39,7 @@ def of(numbers: list[float]) -> Moments:
 
 
 def close(one: Moments, other: Moments) -> bool:
-    """Equal up to rounding."""
+    """Return whether two moments are equal up to rounding."""
     return one.n == other.n and np.allclose(
         [one.mean, one.variance], [other.mean, other.variance], atol=1e-6
     )
@@ -47,7 +47,7 @@ def close(one: Moments, other: Moments) -> bool:
 
 @given(NUMBERS, NUMBERS)
 def test_moments_are_those_of_numpy_and_merge(one: list[float], other: list[float]) -> None:
-    """Mean and variance by themselves, and of two streams together."""
+    """Mean and variance of one stream, and of two merged streams."""
     both = of(one).merged(of(other))
     assert close(both, of(one + other))
     if len(one + other) > 1:
@@ -57,8 +57,8 @@ def test_moments_are_those_of_numpy_and_merge(one: list[float], other: list[floa
 
 
 @given(NUMBERS, st.floats(-1e3, 1e3))
-def test_a_number_can_be_taken_back(numbers: list[float], x: float) -> None:
-    """Adding and removing leaves what was."""
+def test_a_number_can_be_removed_again(numbers: list[float], x: float) -> None:
+    """Adding and then removing a number restores the moments."""
     assert close(of(numbers).adding(x).without(x), of(numbers))
 
 
@@ -90,10 +90,11 @@ def test_moments_survive_large_offsets() -> None:
         "never began",
     ],
 )
-def test_what_an_end_changes(
+def test_the_numbers_that_each_result_changes(
     seen: Observation, runs: int, reliability: float, availability: float, censored: int
 ) -> None:
-    """R counts executed, uncensored runs; what never executed lowers the availability alone."""
+    """R counts executed, uncensored runs; a run that never executed lowers only the
+    availability."""
     tally = Tally().adding(seen)
     assert tally.runs == runs
     assert tally.reliability == pytest.approx(reliability, nan_ok=True)
@@ -107,8 +108,8 @@ def test_what_an_end_changes(
 def test_tallies_merge_like_sets_of_runs(
     a: list[Observation], b: list[Observation], c: list[Observation]
 ) -> None:
-    """Commutative, associative, and what one counter would have counted (up to rounding of the
-    sums)."""
+    """Merging is commutative and associative, and gives what a single counter would have counted
+    (up to rounding of the sums)."""
     x, y, z = tally_of(a, "a"), tally_of(b, "b"), tally_of(c, "c")
     assert merge_tallies(x, y).counts == merge_tallies(y, x).counts
     assert merge_tallies(x, y).sample == merge_tallies(y, x).sample
@@ -130,8 +131,8 @@ def test_tallies_merge_like_sets_of_runs(
 
 
 @given(OBSERVATIONS)
-def test_a_tally_is_plain_data_and_back(seen: list[Observation]) -> None:
-    """Through JSON, exactly; and its keys are sorted, so equal tallies have equal texts."""
+def test_a_tally_survives_conversion_to_plain_data(seen: list[Observation]) -> None:
+    """JSON keeps a tally exactly, and its keys are sorted, so equal tallies have equal texts."""
     tally = tally_of(seen)
     text = json.dumps(tally.to_plain())
     assert Tally.of_plain(json.loads(text)) == tally
@@ -143,7 +144,7 @@ def test_a_tally_is_plain_data_and_back(seen: list[Observation]) -> None:
 def test_a_deferred_verdict_changes_r_once(
     seen: list[Observation], deferred: Observation, status: Status
 ) -> None:
-    """The corrected tally counts as if the status had been so from the beginning."""
+    """The corrected tally counts as if the run had ended with the corrected status."""
     assert deferred.status is not None
     corrected = tally_of([*seen, deferred]).correcting(deferred, status, "seen later")
     expected = tally_of(
@@ -160,7 +161,7 @@ def test_a_deferred_verdict_changes_r_once(
     assert corrected.runs == expected.runs
 
 
-def test_a_verdict_on_nothing_is_refused() -> None:
+def test_a_verdict_without_a_matching_run_is_refused() -> None:
     """No run of that status and cause was counted."""
     with pytest.raises(KeyError):
         Tally().correcting(Observation(Status.SUCCESS, 1.0), Status.FAILURE)
@@ -173,7 +174,7 @@ def test_a_verdict_on_nothing_is_refused() -> None:
     [("wall", 2.0), ("cpu", 0.2), ("count", 1.0), ("value:images", 5.0), ("value:energy", 0.0)],
 )
 def test_cost_by_measure(measure: str, mean: float) -> None:
-    """Each declared measure over the counted runs; an unknown value has no numbers."""
+    """Every declared measure is kept over the counted runs; an unknown value has no numbers."""
     seen = [
         Observation(Status.SUCCESS, 1.0, cpu_seconds=0.1, values={"images": 4.0}),
         Observation(Status.FAILURE, 3.0, "late", cpu_seconds=0.3, values={"images": 6.0}),
@@ -185,11 +186,11 @@ def test_cost_by_measure(measure: str, mean: float) -> None:
 
 
 @given(OBSERVATIONS, st.lists(st.none() | st.integers(0, 9), min_size=25, max_size=25))
-def test_a_count_is_what_runs_report_and_else_one(
+def test_a_cost_counted_in_tries_is_the_reported_number_or_one(
     seen: list[Observation], counts: list[int | None]
 ) -> None:
-    """Summed in a tally as the learners take it run by run; what was preempted and counts none has
-    no cost."""
+    """The tally sums what learners receive run by run; a preempted run that counts no tries has no
+    cost."""
     told = [
         replace(one, values={} if n is None else {"count": float(n)})
         for one, n in zip(seen, counts, strict=False)
@@ -204,9 +205,8 @@ def test_a_count_is_what_runs_report_and_else_one(
 
 
 @given(st.integers(0, 60), st.integers(0, 60), st.sampled_from([0.8, 0.9, 0.95]))
-def test_intervals_are_the_known_ones(successes: int, others: int, level: float) -> None:
-    """Wilson and Clopper-Pearson as scipy has them; the exact interval is never the shorter at its
-    ends' coverage."""
+def test_intervals_equal_those_of_scipy(successes: int, others: int, level: float) -> None:
+    """Wilson and Clopper-Pearson intervals as in scipy; the exact interval is never shorter."""
     n = successes + others
     if n == 0:
         assert wilson(0, 0) == clopper_pearson(0, 0) == (0.0, 1.0)
@@ -230,13 +230,13 @@ def test_exact_intervals_cover(p: float) -> None:
 
 @given(st.lists(st.floats(0, 100), min_size=1, max_size=60), st.floats(0, 1))
 def test_quantiles_interpolate(numbers: list[float], q: float) -> None:
-    """As numpy's."""
+    """Quantiles interpolate like those of numpy."""
     assert quantile(numbers, q) == pytest.approx(float(np.quantile(numbers, q)), abs=1e-9)
 
 
 def test_the_sample_stays_bounded_and_uniform() -> None:
-    """Of 5,000 durations 0 to 1, `SIZE` are kept, and their law is uniform (Kolmogorov-Smirnov at
-    1e-3)."""
+    """Of 5,000 durations in [0, 1], `SIZE` are kept, and they are distributed uniformly
+    (Kolmogorov-Smirnov test at 1e-3)."""
     sample = Sample()
     for i in range(5000):
         sample = sample.adding(f"x/{i}", i / 5000, None, "success")
@@ -262,7 +262,7 @@ def test_samples_merge_in_any_order(parts: list[list[int]]) -> None:
 
 
 def plain_of(*seen: Observation) -> dict[str, Any]:
-    """Plain data of the tally of some runs, as a file holds it."""
+    """Return the tally of some runs as plain data, as a file holds it."""
     plain: dict[str, Any] = json.loads(json.dumps(tally_of(list(seen)).to_plain()))
     return plain
 
@@ -297,10 +297,10 @@ def plain_of(*seen: Observation) -> dict[str, Any]:
         ({"sample": [[i, 1.0, -1.0, "success"] for i in range(3)]}, "3 runs in the sample"),
     ],
 )
-def test_numbers_that_no_runs_could_have_left_are_refused(
+def test_numbers_that_no_sequence_of_runs_can_produce_are_refused(
     change: dict[str, Any], said: str
 ) -> None:
-    """One bad number, merged, would spoil the figures of everything that it is added to."""
+    """One bad number, once merged, would falsify all figures that it is added to."""
     run = Observation(Status.SUCCESS, 1.0)
     assert Tally.of_plain(plain_of(run, run)).runs == 2
     with pytest.raises(ValueError, match=re.escape(said)):
@@ -308,10 +308,10 @@ def test_numbers_that_no_runs_could_have_left_are_refused(
 
 
 @given(OBSERVATIONS, COUNTED, st.sampled_from(Status), OBSERVATIONS)
-def test_whatever_runs_leave_is_taken_back(
+def test_every_tally_of_real_runs_is_accepted(
     seen: list[Observation], deferred: Observation, status: Status, others: list[Observation]
 ) -> None:
-    """Corrected and merged, too: the check refuses nothing that is true."""
+    """This includes corrected and merged tallies: the check refuses no valid tally."""
     tally = merge_tallies(
         tally_of([*seen, deferred]).correcting(deferred, status, "seen later"),
         tally_of(others, "other"),

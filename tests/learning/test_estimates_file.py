@@ -1,4 +1,4 @@
-"""The estimates file: what survives, what merges, what stays forgotten, and how a bad file is
+"""The estimates file: what is kept, what merges, what stays reset, and how a bad file is
 refused."""
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ OTHER = TallyKey("place", "place_soft")
 
 
 def gained(good: int, key: TallyKey = KEY, salt: str = "") -> Estimates:
-    """So many successes of one action, and as many firings."""
+    """Return what was learned from `good` successes of one action and as many firings."""
     tally = tally_of(
         [Observation(Status.SUCCESS, 0.1 * (i + 1), cpu_seconds=0.01) for i in range(good)], salt
     )
@@ -39,22 +39,23 @@ def gained(good: int, key: TallyKey = KEY, salt: str = "") -> Estimates:
 
 
 def file_of(path: Path, good: int, key: TallyKey = KEY) -> EstimatesFile:
-    """A file with an origin of its own."""
+    """Make a file with its own origin."""
     file = EstimatesFile(path)
     file.add(gained(good, key, path.name), {})
     return file
 
 
 def known(file: EstimatesFile) -> tuple[Any, Any]:
-    """What can be compared of a file's estimates: all but the order of sums."""
+    """Return a file's estimates in a form that can be compared: everything except the order of
+    sums."""
     kept = file.read()
     tallies = {k: (t.counts, t.changes, t.sample) for k, t in kept.estimates.tallies.items()}
     return tallies, {k: f.fired for k, f in kept.estimates.flows.items()}
 
 
-def test_what_was_added_is_there_again(tmp_path: Path) -> None:
-    """Sums of several sessions, selectors' states, the generation; a file that is not there holds
-    nothing."""
+def test_everything_added_is_read_again(tmp_path: Path) -> None:
+    """This covers sums of several sessions, selector states and the generation; a missing file
+    reads as empty."""
     path = tmp_path / "deep" / "learned.db"
     assert EstimatesFile(path).read() == FileContents()
     selector = make("ucb1", ("pick_fast", "pick_slow"))
@@ -74,8 +75,8 @@ def test_what_was_added_is_there_again(tmp_path: Path) -> None:
     max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(seen=OBSERVATIONS.filter(len))
-def test_tallies_come_back_exactly(seen: list[Observation], tmp_path: Path) -> None:
-    """Whatever was observed."""
+def test_tallies_are_read_exactly_as_written(seen: list[Observation], tmp_path: Path) -> None:
+    """This holds for any observations."""
     path = tmp_path / "exact.db"
     path.unlink(missing_ok=True)
     tally = tally_of(seen)
@@ -84,7 +85,8 @@ def test_tallies_come_back_exactly(seen: list[Observation], tmp_path: Path) -> N
 
 
 def test_merging_counts_every_run_once(tmp_path: Path) -> None:
-    """In any order and however often: three machines' files all come to the same."""
+    """Files of three machines, merged in any order and any number of times, give the same
+    result."""
     seen = []
     for order in permutations(range(3)):
         folder = tmp_path / "".join(map(str, order))
@@ -103,7 +105,7 @@ def test_merging_counts_every_run_once(tmp_path: Path) -> None:
 
 
 def test_a_merge_takes_the_later_version(tmp_path: Path) -> None:
-    """A copy that is older than what is known changes nothing; a newer one replaces it."""
+    """A copy older than the known version changes nothing; a newer one replaces it."""
     one, other = file_of(tmp_path / "one.db", 5), EstimatesFile(tmp_path / "other.db")
     other.merge(one.path)
     one.add(gained(2, salt="more"), {})
@@ -132,7 +134,7 @@ def test_the_selector_that_learned_from_more_is_kept(tmp_path: Path) -> None:
 
 
 def state_of(name: str, learned: dict[str, int], action: str = "pick_slow") -> dict[str, Any]:
-    """A selector's state after so many successes of one action by context."""
+    """Return a selector's state after some successes of one action in each context."""
     selector = make(name, ("pick_fast", "pick_slow"))
     for context, trials in learned.items():
         for _ in range(trials):
@@ -141,9 +143,9 @@ def state_of(name: str, learned: dict[str, int], action: str = "pick_slow") -> d
     return selector.state()
 
 
-def test_what_was_learned_in_different_contexts_is_joined(tmp_path: Path) -> None:
-    """One machine learned in A and B, the other in B and C: of each context whoever knows more,
-    whoever takes in whom."""
+def test_learning_in_different_contexts_is_merged(tmp_path: Path) -> None:
+    """One machine learned in A and B, the other in B and C: for each context the state with more
+    trials is kept, in whichever direction the files merge."""
     states = [
         state_of("nikolic_fu", {"A": 9, "B": 4}),
         state_of("nikolic_fu", {"B": 7, "C": 2}, "pick_fast"),
@@ -160,8 +162,8 @@ def test_what_was_learned_in_different_contexts_is_joined(tmp_path: Path) -> Non
 
 
 def test_states_over_other_actions_are_not_mixed(tmp_path: Path) -> None:
-    """Numbers by position mean other actions then: the state with more trials is kept whole, frozen
-    as it was here."""
+    """Their numbers belong to other actions: the state with more trials is kept whole, frozen or
+    not as it was in this file."""
     mine, theirs = make("ucb1", ("pick_fast",)), state_of("ucb1", {"A": 3})
     mine.update("B", "pick_fast", Observation(Status.SUCCESS, 1.0))
     one, other = EstimatesFile(tmp_path / "one.db"), EstimatesFile(tmp_path / "other.db")
@@ -171,9 +173,9 @@ def test_states_over_other_actions_are_not_mixed(tmp_path: Path) -> None:
     assert one.read().states("ucb1")["pick"] == {**theirs, "frozen": True}
 
 
-def test_a_copy_that_goes_on_is_somebody_else(tmp_path: Path) -> None:
-    """Copied to another machine by hand: what both learn afterwards counts, what they share counts
-    once."""
+def test_a_copy_that_learns_becomes_a_separate_origin(tmp_path: Path) -> None:
+    """After a copy to another machine by hand, everything that both learn later counts, and their
+    common past counts once."""
     one = file_of(tmp_path / "one.db", 10)
     copy = EstimatesFile(Path(shutil.copy(one.path, tmp_path / "copy.db")))
     one.add(gained(5, salt="one"), {})
@@ -189,9 +191,9 @@ def test_a_copy_that_goes_on_is_somebody_else(tmp_path: Path) -> None:
     assert renamed.read().origin == origin
 
 
-def test_a_file_that_was_only_begun_holds_nothing(tmp_path: Path) -> None:
-    """A kill between making the file and its first transaction leaves an empty one: it is used as
-    if it were not there."""
+def test_an_empty_database_file_reads_as_empty(tmp_path: Path) -> None:
+    """A process killed between creating the file and its first transaction leaves an empty file: it
+    is treated as missing."""
     path = tmp_path / "begun.db"
     path.touch()
     file = EstimatesFile(path)
@@ -204,8 +206,8 @@ def test_a_file_that_was_only_begun_holds_nothing(tmp_path: Path) -> None:
     assert file.read().estimates.tally(KEY).runs == 4
 
 
-def test_a_damaged_selector_is_not_taken_in(tmp_path: Path) -> None:
-    """One clear error, and the file that should have taken it is as it was."""
+def test_a_damaged_selector_is_not_merged(tmp_path: Path) -> None:
+    """One clear error is reported, and the receiving file is unchanged."""
     one, other = file_of(tmp_path / "one.db", 2), EstimatesFile(tmp_path / "other.db")
     other.add(Estimates(), {"pick": state_of("ucb1", {"A": 3})})
     for body in (
@@ -222,8 +224,8 @@ def test_a_damaged_selector_is_not_taken_in(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("selectors_only", [False, True])
-def test_a_choice_that_was_reset_does_not_come_back(tmp_path: Path, selectors_only: bool) -> None:
-    """Neither from an old copy of the file; what is learned after the reset stays."""
+def test_a_selector_that_was_reset_stays_reset(tmp_path: Path, selectors_only: bool) -> None:
+    """Not even an old copy of the file restores it; what is learned after the reset is kept."""
     one = file_of(tmp_path / "one.db", 3)
     one.add(Estimates(), {"pick": state_of("nikolic_fu", {"A": 50})})
     copy = Path(shutil.copy(one.path, tmp_path / "copy.db"))
@@ -238,8 +240,8 @@ def test_a_choice_that_was_reset_does_not_come_back(tmp_path: Path, selectors_on
 
 
 def test_what_is_learned_after_another_files_reset_counts(tmp_path: Path) -> None:
-    """A file that hears of a reset of its own runs goes on under a new origin, so that the next
-    merge does not drop them."""
+    """A file that learns of a reset of its own runs continues under a new origin, so that the next
+    merge does not drop its new runs."""
     one, other = file_of(tmp_path / "one.db", 5), file_of(tmp_path / "other.db", 4)
     one.merge(other.path)
     one.reset("pick")
@@ -251,8 +253,8 @@ def test_what_is_learned_after_another_files_reset_counts(tmp_path: Path) -> Non
     assert one.read().estimates.tally(KEY).runs == other.read().estimates.tally(KEY).runs == 2
 
 
-def test_what_was_reset_stays_forgotten(tmp_path: Path) -> None:
-    """Also when an old copy is merged again; what comes after the reset counts."""
+def test_reset_estimates_stay_forgotten(tmp_path: Path) -> None:
+    """This holds also when an old copy is merged again; runs after the reset count."""
     one, copy = file_of(tmp_path / "one.db", 5), EstimatesFile(tmp_path / "copy.db")
     one.add(gained(3, OTHER), {})
     copy.merge(one.path)
@@ -268,7 +270,7 @@ def test_what_was_reset_stays_forgotten(tmp_path: Path) -> None:
 
 
 def test_selectors_alone_can_be_reset(tmp_path: Path) -> None:
-    """The estimates stay: they are about the actions, not about who chose."""
+    """The estimates stay: they describe the actions, not the selector that chose them."""
     file = EstimatesFile(tmp_path / "one.db")
     file.add(gained(5), {"pick": make("ucb1", ("pick_fast",)).state()})
     file.reset("pick", selectors_only=True)
@@ -277,8 +279,8 @@ def test_selectors_alone_can_be_reset(tmp_path: Path) -> None:
 
 
 def test_two_sessions_at_once_lose_nothing(tmp_path: Path) -> None:
-    """Both read the file, both add what they gained: the sums are added within the file, not
-    written over."""
+    """Both sessions read the file, and both add what they learned: the sums are added within the
+    file, not overwritten."""
     file = file_of(tmp_path / "one.db", 1)
     sessions = [EstimatesFile(tmp_path / "one.db") for _ in range(2)]
     for session in sessions:
@@ -288,8 +290,8 @@ def test_two_sessions_at_once_lose_nothing(tmp_path: Path) -> None:
     assert file.read().estimates.tally(KEY).runs == 9
 
 
-def test_a_reader_is_not_disturbed_by_a_writer(tmp_path: Path) -> None:
-    """WAL: while a transaction is open, the state before it is read."""
+def test_a_reader_sees_the_state_before_an_open_transaction(tmp_path: Path) -> None:
+    """SQLite's write-ahead log (WAL): during a transaction, readers see the state before it."""
     file = file_of(tmp_path / "one.db", 3)
     with sqlite3.connect(file.path, isolation_level=None) as db:
         assert db.execute("PRAGMA journal_mode").fetchone()[0] == "wal"
@@ -301,7 +303,7 @@ def test_a_reader_is_not_disturbed_by_a_writer(tmp_path: Path) -> None:
 
 
 def test_records_of_a_mission_are_remembered(tmp_path: Path) -> None:
-    """So that a run that was saved, resumed and saved again counts once."""
+    """A run that was saved, resumed and saved again counts once."""
     file = EstimatesFile(tmp_path / "one.db")
     assert file.records_of("m") == 0
     file.add(gained(2), {}, "m", 17)
@@ -309,7 +311,7 @@ def test_records_of_a_mission_are_remembered(tmp_path: Path) -> None:
 
 
 def written(path: Path, statements: str) -> Path:
-    """A database made by hand."""
+    """Write a database by hand."""
     db = sqlite3.connect(path)
     db.executescript(statements)
     db.close()
@@ -317,7 +319,7 @@ def written(path: Path, statements: str) -> Path:
 
 
 def asked_of(path: Path, statement: str) -> Path:
-    """A file that says by what actions were judged, spoilt."""
+    """Write a file with a damaged table of the criteria by which actions were judged."""
     EstimatesFile(path).add(gained(2), {}, asked={"pick": Question("cpu", 0.8, 0.1)})
     return written(path, statement)
 
@@ -358,7 +360,7 @@ def asked_of(path: Path, statement: str) -> Path:
     ],
 )
 def test_a_bad_file_gives_one_clear_error(tmp_path: Path, spoil: Any, said: str) -> None:
-    """File, what is wrong, what to do; and it is left as it was."""
+    """The error names the file, the fault and the remedy; the file is unchanged."""
     path = tmp_path / "learned.db"
     spoil(path)
     with pytest.raises(EstimatesError, match=said) as fault:
@@ -386,11 +388,10 @@ def test_a_bad_file_gives_one_clear_error(tmp_path: Path, spoil: Any, said: str)
         ("flow", "[2,", "[2,", 999, "expected version 2"),
     ],
 )
-def test_a_corrupted_file_poisons_no_other(
+def test_a_corrupted_file_does_not_damage_another_file(
     tmp_path: Path, table: str, old: str, new: str, version: int, said: str
 ) -> None:
-    """It is refused by name, whatever its version, and the file that should have taken it is as it
-    was."""
+    """It is refused by name in every version, and the receiving file is unchanged."""
     one, other = file_of(tmp_path / "one.db", 3), file_of(tmp_path / "other.db", 2)
     written(
         other.path,
@@ -405,12 +406,12 @@ def test_a_corrupted_file_poisons_no_other(
     assert known(one) == before
 
 
-# --- what was asked, and files of schema 1 ----------------------------------------------------
+# --- criteria of judgement, and files of schema 1 ---------------------------------------------
 
 
-def test_what_actions_are_judged_by_is_kept(tmp_path: Path) -> None:
-    """Per origin: a file's own says the last word, of others the one that was asked most often; all
-    that differ are known."""
+def test_the_criteria_by_which_actions_are_judged_are_kept(tmp_path: Path) -> None:
+    """They are kept per origin: the file's own criteria win, otherwise those used most often; all
+    different ones are listed."""
     one, other, third = (EstimatesFile(tmp_path / f"{i}.db") for i in range(3))
     images, wall = Question("value:images", 0.8, 0.1), Question("wall", 0.9)
     assert one.read().question("pick") == Question()
@@ -446,11 +447,12 @@ CREATE TABLE mission(id TEXT PRIMARY KEY, records INTEGER NOT NULL) WITHOUT ROWI
 PRAGMA application_id = 1885697138;
 PRAGMA user_version = 1;
 """
-"""As petrobot wrote it before there was a schema 2."""
+"""A file as petrobot wrote it before schema 2."""
 
 
 def old_file(path: Path, good: int, origin: str) -> EstimatesFile:
-    """A file of schema 1 with so many successes, and a selector that was learned by images."""
+    """Write a file of schema 1 with `good` successes and a selector whose cost is a number of
+    images."""
     written(path, SCHEMA_1)
     tally, state = (
         gained(good, salt=origin).tally(KEY),
@@ -477,14 +479,14 @@ def old_file(path: Path, good: int, origin: str) -> EstimatesFile:
 
 
 def schema_of(path: Path) -> int:
-    """Of a file on the disk."""
+    """Return the schema of a file on disk."""
     with closing(sqlite3.connect(path)) as db:
         return int(db.execute("PRAGMA user_version").fetchone()[0])
 
 
-def test_a_file_of_schema_1_goes_on(tmp_path: Path) -> None:
-    """It is read as it is, and becomes one of schema 2 when something is added; nothing is lost or
-    counted twice."""
+def test_a_file_of_schema_1_is_upgraded_when_something_is_added(tmp_path: Path) -> None:
+    """It is read as it is and becomes a file of schema 2 when something is added; nothing is lost
+    or counted twice."""
     old = old_file(tmp_path / "old.db", 4, "ab12")
     kept = old.read()
     assert (kept.generation, kept.estimates.tally(KEY).runs, kept.question("pick").measure) == (
@@ -502,7 +504,7 @@ def test_a_file_of_schema_1_goes_on(tmp_path: Path) -> None:
 
 
 def test_old_and_new_files_merge(tmp_path: Path) -> None:
-    """Either way; the old one that is only read stays as it is."""
+    """They merge in both directions; an old file that is only read is unchanged."""
     old, new = old_file(tmp_path / "old.db", 4, "ab12"), file_of(tmp_path / "new.db", 5)
     for _ in range(2):
         new.merge(old.path)
@@ -514,14 +516,14 @@ def test_old_and_new_files_merge(tmp_path: Path) -> None:
     assert known(old) == known(new)
 
 
-# --- campaigns: origins that are closed -------------------------------------------------------
+# --- campaigns: closed origins ----------------------------------------------------------------
 
 RUNS = "campaign/0123"
-"""The origin of one campaign, wherever it was run."""
+"""The origin of one campaign, the same on every machine."""
 
 
 def campaign_file(path: Path, good: int = 12) -> EstimatesFile:
-    """What a campaign writes beside its table."""
+    """Write the estimates file that a campaign writes next to its table."""
     file = EstimatesFile(path, RUNS)
     selectors = {"pick": state_of("nikolic_fu", {"regime=A": good})}
     file.put_closed(
@@ -530,9 +532,9 @@ def campaign_file(path: Path, good: int = 12) -> EstimatesFile:
     return file
 
 
-def test_what_is_added_to_a_campaigns_file_is_not_the_campaigns(tmp_path: Path) -> None:
-    """The same campaign on two machines, both go on, and meet: its runs count once, each one's own
-    too."""
+def test_runs_added_to_a_campaigns_file_get_an_origin_of_their_own(tmp_path: Path) -> None:
+    """The same campaign ran on two machines, both learned more, and then merge: the campaign's runs
+    count once, and so do the runs of each machine."""
     one, other = (campaign_file(tmp_path / f"m{i}.db") for i in (1, 2))
     one.add(gained(6, salt="one"), {})
     one.add(gained(1, salt="one again"), {})
@@ -547,8 +549,8 @@ def test_what_is_added_to_a_campaigns_file_is_not_the_campaigns(tmp_path: Path) 
     assert both.read().question("pick") == Question("value:images", 0.8)
 
 
-def test_a_campaign_that_is_written_again_wipes_nothing(tmp_path: Path) -> None:
-    """What was run, learned, frozen or asked since stays; nothing counts twice."""
+def test_writing_a_campaign_again_deletes_nothing(tmp_path: Path) -> None:
+    """Everything that was run, learned or frozen since stays; nothing counts twice."""
     file = campaign_file(tmp_path / "m.db")
     whole = file.read()
     campaign_file(file.path)
@@ -565,8 +567,8 @@ def test_a_campaign_that_is_written_again_wipes_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("goes_on", [False, True])
 def test_a_campaign_that_was_reset_stays_forgotten(tmp_path: Path, goes_on: bool) -> None:
-    """When it is written again, and when another machine's file of it comes in; also if a run was
-    added before."""
+    """It stays forgotten when it is written again, and when another machine's file of it is merged,
+    also if a run was added before."""
     file, other = (campaign_file(tmp_path / f"m{i}.db") for i in (1, 2))
     if goes_on:
         file.add(gained(6, salt="run"), {})
@@ -583,9 +585,11 @@ def test_a_campaign_that_was_reset_stays_forgotten(tmp_path: Path, goes_on: bool
     assert other.read().estimates.tally(KEY).runs == file.read().estimates.tally(KEY).runs == 2
 
 
-def test_a_campaigns_file_of_schema_1_is_closed_when_it_goes_on(tmp_path: Path) -> None:
-    """So a run that is added after the update merges; what the campaign writes again does not take
-    away what is there."""
+def test_the_origin_of_a_campaigns_file_of_schema_1_is_closed_when_something_is_added(
+    tmp_path: Path,
+) -> None:
+    """A run added after the update therefore merges, and writing the campaign again removes
+    nothing."""
     one, other = (old_file(tmp_path / f"m{i}.db", 12, RUNS) for i in (1, 2))
     one.add(gained(6, salt="one"), {})
     assert one.read().origin != RUNS
@@ -593,13 +597,13 @@ def test_a_campaigns_file_of_schema_1_is_closed_when_it_goes_on(tmp_path: Path) 
     other.add(gained(9, salt="other"), {})
     one.merge(other.path)
     assert one.read().estimates.tally(KEY).runs == 27
-    mixed = old_file(tmp_path / "mixed.db", 18, RUNS)  # a run had been added to it under schema 1
+    mixed = old_file(tmp_path / "mixed.db", 18, RUNS)  # A run was added to it under schema 1.
     campaign_file(mixed.path)
     assert mixed.read().estimates.tally(KEY).runs == 18
 
 
-def test_merging_from_nowhere_is_refused(tmp_path: Path) -> None:
-    """And makes no file."""
+def test_merging_from_a_missing_file_is_refused(tmp_path: Path) -> None:
+    """No file is created."""
     with pytest.raises(EstimatesError, match="no such file"):
         EstimatesFile(tmp_path / "one.db").merge(tmp_path / "two.db")
     assert not (tmp_path / "one.db").exists()
@@ -613,17 +617,19 @@ def test_merging_from_nowhere_is_refused(tmp_path: Path) -> None:
         st.tuples(st.integers(0, 2), st.sampled_from("amMc"), st.integers(1, 3)), max_size=10
     )
 )
-def test_files_that_met_agree(steps: list[tuple[int, str, int]], tmp_path: Path) -> None:
-    """Whatever was added where and merged whither, one file begun under schema 1, one by a
-    campaign, campaigns given again anywhere: after all have met, all know every run exactly
-    once."""
+def test_files_agree_after_all_were_merged(
+    steps: list[tuple[int, str, int]], tmp_path: Path
+) -> None:
+    """Runs are added and files merged in any order; one file starts under schema 1, one with a
+    campaign, and campaigns are written again anywhere. After all files were merged, each holds
+    every run exactly once."""
     folder = tmp_path / "crdt"
     for old in folder.glob("*") if folder.exists() else ():
         old.unlink()
     folder.mkdir(exist_ok=True)
 
     def campaign(number: int, file: EstimatesFile) -> None:
-        """Each is of 10 more runs than the one before; it may stand in several files."""
+        """Write a campaign with 10 more runs than the one before; several files may hold it."""
         runs = gained(10 * number, salt=f"campaign{number}")
         file.put_closed(f"campaign/{number}", runs, {}, {"pick": Question("cpu", 0.1 * number)})
         campaigns.add(number)

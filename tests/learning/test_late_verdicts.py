@@ -1,5 +1,5 @@
-"""Verdicts and the estimates file: R is corrected once, wherever the mission run was interrupted
-and wherever the file went."""
+"""Deferred verdicts and the estimates file: R is corrected exactly once, wherever the mission run
+was interrupted and whatever happened to the file."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ SELECTOR = "round_robin"
 
 @pytest.fixture(scope="module")
 def task() -> Task:
-    """Parts that are picked provisionally, and judged later."""
+    """A task in which parts are picked provisionally and judged later."""
     return sorting()
 
 
 def whole(task: Task, path: Path) -> LearningSession:
-    """A mission run that learned, and was not saved."""
+    """A mission run that learned but was not saved."""
     session = LearningSession(task, LearningSetting(path, SELECTOR), seed=1)
     cell, party = lockstep_cell(
         directory(), Setting(task, runs=PARTS, seed=1, selector=session.selector)
@@ -38,7 +38,7 @@ def whole(task: Task, path: Path) -> LearningSession:
 
 
 def shown(session: LearningSession, records: Sequence[Record]) -> LearningSession:
-    """The session after these records, as a resume shows them to it."""
+    """Return the session after these records, as a resume replays them."""
     for record in records:
         session.selector.records.append(record)
         session.learning.apply(record)
@@ -46,7 +46,7 @@ def shown(session: LearningSession, records: Sequence[Record]) -> LearningSessio
 
 
 def taken_up(task: Task, session: LearningSession, records: Sequence[Record]) -> LearningSession:
-    """Another process goes on with a session, and has come as far as these records."""
+    """Continue a session in another process up to these records."""
     header = {"seed": 1, "learning": json.loads(json.dumps(session.beginning()))}
     again = session_of(task, header)
     assert again is not None
@@ -54,7 +54,7 @@ def taken_up(task: Task, session: LearningSession, records: Sequence[Record]) ->
 
 
 def kept(path: Path) -> Mapping[str, tuple[dict[Any, int], int]]:
-    """By action: what the file says of its runs, and how many were corrected."""
+    """Return for each action the file's numbers of its runs, and how many were corrected."""
     tallies = EstimatesFile(path).read().estimates.tallies
     return {
         key.action: (dict(t.counts), t.corrected)
@@ -67,8 +67,8 @@ TRUE = {action: (counts, corrected) for action, (counts, corrected, _) in LEARNE
 
 
 def test_wherever_it_was_interrupted_each_verdict_counts_once(task: Task, tmp_path: Path) -> None:
-    """At any record: with the run and its verdict on one side, or the run counted and saved before
-    its verdict came."""
+    """Interrupted at any record: run and verdict fall on one side, or the run is counted and saved
+    before its verdict."""
     one = whole(task, tmp_path / "none.db")
     records = one.selector.records
     assert sum(isinstance(r, Correction) for r in records) == 5
@@ -85,8 +85,8 @@ def test_wherever_it_was_interrupted_each_verdict_counts_once(task: Task, tmp_pa
 
 
 def split(task: Task, path: Path, between: Callable[[], None]) -> None:
-    """All runs are counted and saved, something happens to the file, then the score's verdict on
-    the third pick comes."""
+    """Count and save all runs, change the file, then deliver the score's verdict on the third
+    pick."""
     records = whole(task, path.with_name("none.db")).selector.records
     last = max(n for n, r in enumerate(records) if isinstance(r, Correction))
     first = LearningSession(task, LearningSetting(path, SELECTOR), seed=1)
@@ -95,9 +95,11 @@ def split(task: Task, path: Path, between: Callable[[], None]) -> None:
     taken_up(task, first, records).save()
 
 
-def test_merged_before_and_after_it_counts_once(task: Task, tmp_path: Path) -> None:
-    """Another machine has heard of the run before its verdict came, and hears of that later, as
-    often as one likes."""
+def test_a_verdict_counts_once_in_files_merged_before_and_after_it(
+    task: Task, tmp_path: Path
+) -> None:
+    """Another machine received the run before its verdict, and receives the verdict later, any
+    number of times."""
     path, other = tmp_path / "here.db", tmp_path / "there.db"
     split(task, path, lambda: EstimatesFile(other).merge(path))
     assert kept(other)["pick_left"] == ({("failure", "crooked"): 1, ("success", ""): 2}, 1), (
@@ -109,8 +111,10 @@ def test_merged_before_and_after_it_counts_once(task: Task, tmp_path: Path) -> N
     assert kept(path) == kept(other) == TRUE
 
 
-def test_what_was_forgotten_or_copied_meanwhile_is_left_alone(task: Task, tmp_path: Path) -> None:
-    """The runs are not this file's own any more: no run of somebody else's is corrected in their
+def test_a_verdict_on_a_run_forgotten_or_copied_meanwhile_changes_nothing(
+    task: Task, tmp_path: Path
+) -> None:
+    """The runs no longer belong to this file: no run of another origin is corrected in their
     place."""
     path = tmp_path / "reset.db"
     split(task, path, EstimatesFile(path).reset)
@@ -122,12 +126,14 @@ def test_what_was_forgotten_or_copied_meanwhile_is_left_alone(task: Task, tmp_pa
         aside.replace(path)
 
     split(task, path, copy)
-    assert kept(path)["pick_left"][1] == 1, "as the copied file says"
+    assert kept(path)["pick_left"][1] == 1, "as in the copied file"
     assert sum(kept(path)["pick_left"][0].values()) == 3
 
 
-def test_a_file_reset_and_learned_anew_keeps_its_new_runs(task: Task, tmp_path: Path) -> None:
-    """The new runs look like the forgotten one, and are not taken for it."""
+def test_a_verdict_on_a_forgotten_run_does_not_change_runs_after_the_reset(
+    task: Task, tmp_path: Path
+) -> None:
+    """The new runs look like the forgotten run but are not mistaken for it."""
     path = tmp_path / "learned.db"
 
     def reset_and_learn() -> None:
@@ -138,7 +144,7 @@ def test_a_file_reset_and_learned_anew_keeps_its_new_runs(task: Task, tmp_path: 
     assert kept(path) == TRUE
 
 
-def test_records_of_verdicts_are_plain_data_and_back(task: Task, tmp_path: Path) -> None:
+def test_records_of_verdicts_survive_conversion_to_plain_data(task: Task, tmp_path: Path) -> None:
     records = whole(task, tmp_path / "none.db").selector.records
     judged = [r for r in records if isinstance(r, Correction)]
     assert [of_plain(json.loads(json.dumps(to_plain(r)))) for r in judged] == judged

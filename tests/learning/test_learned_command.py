@@ -1,5 +1,5 @@
-"""`run --learn` and `learned` as a user meets them: twice in a row, frozen, merged; and nothing
-touched without --learn."""
+"""`run --learn` and `learned` from the command line: two runs in a row, frozen, merged; and nothing
+is touched without --learn."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def petrobot(*more: str, runs: int = 6) -> tuple[int, dict[str, Any]]:
-    """Run the sorting task in lock step; the result without its wall-clock time."""
+    """Run the sorting task in lock step; return the result without its wall-clock time."""
     given = [
         "--mode",
         "lockstep",
@@ -115,8 +115,8 @@ def _uses_the_measurements(file: str, capsys: pytest.CaptureFixture[str]) -> Non
     assert "nothing was measured of catch_ball" in capsys.readouterr().err
 
 
-def test_learning_goes_on_where_it_stood(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two runs in a row add up; a fresh file and the same seed give the same again."""
+def test_learning_continues_in_the_next_run(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two runs in a row add up; a new file and the same seed give the same estimates again."""
     learn = ("--learn", "learned.db", "--selector", "nikolic_fu_fast")
     code, first = petrobot(*learn)
     assert code == 0
@@ -142,9 +142,9 @@ def test_learning_goes_on_where_it_stood(cell: Path, capsys: pytest.CaptureFixtu
     assert "nikolic_fu_fast regime=A" in capsys.readouterr().out.replace("\n", " ")
 
 
-def test_costs_are_shown_as_they_were_learned_by(cell: Path) -> None:
-    """The measure that the task declares for each primitive task, and in its unit; `--cost` asks
-    otherwise."""
+def test_costs_are_shown_in_the_measure_used_for_learning(cell: Path) -> None:
+    """The default is the measure that the task declares for each primitive task, with its unit;
+    `--cost` selects another one."""
     petrobot("--learn", "learned.db", runs=12)
 
     def shown(*more: str) -> dict[str, Any]:
@@ -169,9 +169,9 @@ def test_costs_are_shown_as_they_were_learned_by(cell: Path) -> None:
     )
 
 
-def test_it_learns_the_only_way_that_works(cell: Path) -> None:
-    """Of three ways to pick, one succeeds: after 150 runs it has nearly all probability, and frozen
-    it is always chosen."""
+def test_the_only_action_that_works_is_learned(cell: Path) -> None:
+    """One of three picking actions succeeds: after 150 runs it has nearly all probability, and with
+    learning frozen it is always chosen."""
     _, result = petrobot("--learn", "learned.db", runs=150)
     assert result["learned"]["probabilities"]["pick"]["pick_slow"] > 0.9
     before = (cell / "learned.db").read_bytes()
@@ -182,7 +182,7 @@ def test_it_learns_the_only_way_that_works(cell: Path) -> None:
 
 
 def test_without_learn_nothing_is_read_or_changed(cell: Path) -> None:
-    """The same result whether a file lies there or not, and the file is left alone."""
+    """The result is the same with and without an estimates file, and the file is unchanged."""
     _, clean = petrobot()
     petrobot("--learn", "learned.db", runs=20)
     files = {p: p.read_bytes() for p in cell.iterdir() if p.name != "out.json"}
@@ -211,7 +211,7 @@ def test_without_learn_nothing_is_read_or_changed(cell: Path) -> None:
 def test_bad_input_is_refused(
     cell: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Exit code 2 and one line, before anything runs or is written."""
+    """Exit code 2 and one line of error, before anything runs or is written."""
     given = [
         "run",
         str(TASK_FILE),
@@ -227,7 +227,7 @@ def test_bad_input_is_refused(
     assert not (cell / "learned.db").exists()
 
 
-def test_verbs_of_learned(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_subcommands_of_learned(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Merge adds, freeze holds the selectors, reset forgets; unknown names are refused."""
     petrobot("--learn", "one.db", runs=8)
     petrobot("--learn", "two.db", "--seed", "9", runs=8)
@@ -281,7 +281,7 @@ def test_verbs_of_learned(cell: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def told(path: Path, capsys: pytest.CaptureFixture[str], *more: str) -> tuple[dict[str, Any], str]:
-    """What `learned show` writes and prints."""
+    """Return what `learned show` writes and prints."""
     capsys.readouterr()
     out = path.with_suffix(".json")
     assert main(["learned", "show", str(path), "--json", str(out), *more]) == 0
@@ -290,7 +290,7 @@ def told(path: Path, capsys: pytest.CaptureFixture[str], *more: str) -> tuple[di
 
 
 def shares(seconds: float, **by_context: tuple[int, int]) -> dict[str, Tally]:
-    """Tallies of (successes, failures) by context."""
+    """Return tallies with (successes, failures) by context."""
     ends = {
         c: [Status.SUCCESS] * good + [Status.FAILURE] * bad for c, (good, bad) in by_context.items()
     }
@@ -301,7 +301,7 @@ def shares(seconds: float, **by_context: tuple[int, int]) -> dict[str, Tally]:
 
 
 def file_of(path: Path, asked: Question | None = None, **actions: dict[str, Tally]) -> Path:
-    """An estimates file of one primitive task."""
+    """Write an estimates file of one primitive task."""
     tallies = {
         TallyKey("pick", a, c): tally for a, by in actions.items() for c, tally in by.items()
     }
@@ -309,10 +309,10 @@ def file_of(path: Path, asked: Question | None = None, **actions: dict[str, Tall
     return path
 
 
-def test_shown_is_the_worst_case_and_each_context(
+def test_show_lists_the_worst_case_and_each_context(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Pooled over unequal shares of easy and hard, the better action would look the worse one."""
+    """Pooled over unequal shares of easy and hard contexts, the better action would look worse."""
     good = shares(1.0, easy=(98, 2), hard=(560, 440))
     bad = shares(1.0, easy=(900, 100), hard=(40, 60))
     shown, text = told(file_of(tmp_path / "x.db", good=good, bad=bad), capsys)
@@ -335,11 +335,11 @@ def test_shown_is_the_worst_case_and_each_context(
     assert "hard" not in text
 
 
-def test_shown_by_the_target_that_the_file_holds(
+def test_show_uses_the_target_stored_in_the_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """So without being asked again; `--target` asks otherwise, and one context by itself has
-    none."""
+    """The stored target is the default; `--target` overrides it, and a single context has no
+    target."""
     path = tmp_path / "x.db"
     act = shares(1.0, calm=(990, 10), windy=(900, 100), storm=(500, 500))
     act["windy"] = shares(2.0, windy=(900, 100))["windy"]
@@ -371,11 +371,11 @@ def test_shown_by_the_target_that_the_file_holds(
     assert told(path, capsys, "--context", "storm")[0]["pick"]["target"] is None
 
 
-def test_what_a_table_cannot_say_is_said(
+def test_notes_explain_what_the_table_cannot_show(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Contexts that not all actions share, costs that no result has, other questions of other
-    machines."""
+    """Notes on contexts that not all actions share, costs that no result reports, and other
+    criteria of other machines."""
     some, none = shares(1.0, A=(5, 5), B=(9, 1)), shares(1.0, C=(5, 5))
     _, text = told(file_of(tmp_path / "x.db", one=some, other=shares(1.0, A=(5, 5))), capsys)
     assert "judged over the contexts in which all actions were run: A" in text
@@ -391,11 +391,11 @@ def test_what_a_table_cannot_say_is_said(
     assert "no run reported" not in text
 
 
-def test_a_run_says_that_a_cost_was_never_reported(
+def test_a_run_warns_that_a_cost_was_never_reported(
     cell: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The number that the task file names as cost is in no result: one line for each action, and
-    what to correct."""
+    """No result holds the number that the task file names as cost: one line for each action, with
+    the remedy."""
     spoilt = cell / "sorting.toml"
     spoilt.write_text(
         TASK_FILE.read_text(encoding="utf-8").replace("value:tries", "value:trees"),
@@ -422,10 +422,8 @@ def test_a_run_says_that_a_cost_was_never_reported(
     assert "place: no run of place_soft reported value:trees" in capsys.readouterr().err
 
 
-def test_what_the_actions_come_to_in_the_task(
-    cell: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """R and C of primitive tasks and of the task through its net, for one run of it."""
+def test_r_and_c_of_the_whole_task(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """R and C of the primitive tasks, and of one run of the whole task computed through its net."""
     petrobot("--learn", "learned.db", "--selector", "round_robin", runs=30)
     assert main(["learned", "task", "learned.db", str(TASK_FILE), "--json", "task.json"]) == 0
     found = json.loads(Path("task.json").read_text(encoding="utf-8"))
@@ -433,9 +431,9 @@ def test_what_the_actions_come_to_in_the_task(
     assert parts["pick"]["R"] == pytest.approx(1 / 3, abs=0.01)
     assert parts["place"]["runs"] == pytest.approx(1 / 3, abs=0.01)
     assert found["R_conj"] == pytest.approx(1 / 3, abs=0.01)
-    assert 0 < found["R_goal"] < found["R_conj"], "a jam counts none, yet nothing is placed"
+    assert 0 < found["R_goal"] < found["R_conj"], "a jam counts no try, yet no part is placed"
     assert found["P_complete"] == pytest.approx(1.0)
-    assert found["cost"] is None, "seconds and tries do not add"
+    assert found["cost"] is None, "seconds and tries must not be added"
     assert found["R_conj_interval"][0] < found["R_conj"] < found["R_conj_interval"][1]
     told = capsys.readouterr().out
     assert "every run a success" in told and "do not add: give --cost" in told
@@ -448,7 +446,7 @@ def test_what_the_actions_come_to_in_the_task(
     shown = json.loads(Path("shown.json").read_text(encoding="utf-8"))["primitive_tasks"]
     mixed = {p["primitive_task"]: p["C"] for p in same["primitive_tasks"]}
     costs = [a["C"] for a in shown["place"]["actions"]]
-    assert min(costs) <= mixed["place"] <= max(costs), "the same costs in both commands"
+    assert min(costs) <= mixed["place"] <= max(costs), "both commands must show the same costs"
     assert main([*one, "--cost", "value:nothing"]) == 2
     assert main([*one, "--budget", "3"]) == 2
     capsys.readouterr()
@@ -458,8 +456,8 @@ def test_what_the_actions_come_to_in_the_task(
 
 
 def test_a_run_that_was_saved_and_resumed_counts_once(tmp_path: Path) -> None:
-    """The session of a recorded run begins as that run began, and adds only what was not saved
-    before."""
+    """The session of a resumed run starts from the estimates with which the run started, and adds
+    only what was not saved before."""
     task, path = sorting(), tmp_path / "learned.db"
     one = LearningSession(task, LearningSetting(path), seed=5)
     header = {"seed": 5, "learning": json.loads(json.dumps(one.beginning()))}
@@ -494,9 +492,9 @@ def test_a_run_that_was_saved_and_resumed_counts_once(tmp_path: Path) -> None:
     assert TallyKey("pick", "pick_slow", "regime=A") in kept.estimates.tallies
 
 
-def test_a_resumed_mission_brings_its_selector_to_where_it_was(tmp_path: Path) -> None:
-    """A journal that stops half way: what the resumed selector knows is what the live one knew
-    there, and its next choice is the same."""
+def test_a_resumed_mission_restores_its_selector(tmp_path: Path) -> None:
+    """At the end of an interrupted journal the resumed selector has the state of the live one, and
+    makes the same next choice."""
     task, path = sorting(), tmp_path / "learned.db"
     session = LearningSession(task, LearningSetting(path), seed=5)
     header = {

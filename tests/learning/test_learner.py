@@ -1,5 +1,5 @@
-"""The selector that learns, on the executor: what it records, by which contexts, and that replay
-derives the same state."""
+"""The learning selector on the executor: what it records, in which contexts, and that replay
+restores the same state."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ def task() -> Task:
 
 
 def learner(task: Task, name: str = "nikolic_fu_fast", **more: Any) -> LearningSelector:
-    """A selector that knows nothing."""
+    """Return a selector without any experience."""
     return LearningSelector(Learning(task, name), **more)
 
 
-def test_every_end_and_choice_is_recorded(task: Task) -> None:
-    """Tallies count what the mission's own tally counts; records are plain data and back."""
+def test_every_result_and_choice_is_recorded(task: Task) -> None:
+    """Tallies agree with the mission's own counts; records survive conversion to plain data."""
     selector = learner(task, seed=1)
     mission = run(task, selector, runs=12)
     recorded = Counter((r.primitive_task, r.action, r.status) for r in mission.tally.runs)
@@ -72,8 +72,8 @@ def test_every_end_and_choice_is_recorded(task: Task) -> None:
 
 
 def test_costs_durations_waits_and_values(task: Task) -> None:
-    """Seconds as the node says, what the token waited beyond, numbers of the result, and the wait
-    for the pulse."""
+    """The node's own duration, the additional wait of the token, numbers of the result, and the
+    wait for the pulse are recorded."""
     selector = learner(task, "round_robin", seed=1)
     run(task, selector, runs=12)
     known = selector.learning.estimates
@@ -91,8 +91,8 @@ def test_costs_durations_waits_and_values(task: Task) -> None:
 
 
 def test_a_preempted_run_is_censored_by_its_transition(task: Task) -> None:
-    """`jam` comes every 1.24 s and takes placing runs, which count none: exposure grows, R does not
-    change."""
+    """`jam` comes every 1.24 s and preempts placing runs, which then count no try: exposure grows,
+    R does not change."""
     selector = learner(task, "round_robin", seed=2)
     run(task, selector, runs=40)
     tallies = selector.learning.estimates.of("place")
@@ -105,8 +105,8 @@ def test_a_preempted_run_is_censored_by_its_transition(task: Task) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(RULES))
-def test_the_same_seed_chooses_the_same(task: Task, name: str) -> None:
-    """Draws are keyed by seed, generation and run; another generation draws others."""
+def test_the_same_seed_gives_the_same_choices(task: Task, name: str) -> None:
+    """Draws depend on seed, generation and run; another generation gives other draws."""
 
     def choices(**more: int) -> list[tuple[str, str]]:
         selector = learner(task, name, **more)
@@ -118,10 +118,9 @@ def test_the_same_seed_chooses_the_same(task: Task, name: str) -> None:
         assert choices(seed=3) != choices(seed=3, generation=1)
 
 
-def test_replay_derives_the_same_state(task: Task, tmp_path: Path) -> None:
-    """The recorded steps, shown to a fresh selector, leave exactly what the live one had: so a
-    resume goes on as if nothing had happened, and the reasons of the choices stand in the
-    journal."""
+def test_replay_restores_the_same_state(task: Task, tmp_path: Path) -> None:
+    """The recorded steps give a new selector exactly the state of the live one, so a resumed run
+    continues as if it had not been interrupted; the journal holds the reasons of the choices."""
     path = tmp_path / "run.journal"
     store = JournalStore(JournalWriter(path, {"mission": "m", "mode": "lockstep"}), 0.0)
     live = learner(task, seed=4)
@@ -147,8 +146,8 @@ def test_replay_derives_the_same_state(task: Task, tmp_path: Path) -> None:
     )
 
 
-def test_records_of_a_worker_applied_in_order_are_the_same(task: Task) -> None:
-    """A campaign's worker does not learn by itself; its records, applied later, make the same
+def test_records_of_a_worker_applied_in_order_give_the_same_estimates(task: Task) -> None:
+    """A campaign's worker does not learn itself; its records, applied later, give the same
     estimates."""
     worker, master = learner(task, "round_robin", seed=1, live=False), Learning(task, "round_robin")
     run(task, worker, runs=10)
@@ -160,7 +159,8 @@ def test_records_of_a_worker_applied_in_order_are_the_same(task: Task) -> None:
 
 
 def test_contexts_follow_parameters_variables_and_conditions(task: Task) -> None:
-    """Each part is told by its name and value; a value that was never written is unknown."""
+    """A context lists each part with name and value; a value that was never written is
+    `unknown`."""
     contexts = Contexts(("regime", "light < 0.5", "weight > 1.0"))
     selector = learner(task, "round_robin", seed=1, contexts=contexts)
     run(task, selector, runs=12, parameters={"regime": "B", "light": 0.3})
@@ -176,15 +176,15 @@ def test_contexts_follow_parameters_variables_and_conditions(task: Task) -> None
 @pytest.mark.parametrize(
     ("part", "said"), [("speed", "no parameter or variable 'speed'"), ("regime ==", "column")]
 )
-def test_a_context_that_cannot_be_told_is_refused(task: Task, part: str, said: str) -> None:
-    """At the beginning, with the names that there are."""
+def test_a_context_with_an_unknown_name_is_refused(task: Task, part: str, said: str) -> None:
+    """It is refused at the start, with the list of known names."""
     with pytest.raises(ContextError, match=said):
         LearningSelector(Learning(task), Contexts((part,)))
 
 
-def test_the_users_and_the_operators_choice_come_first(task: Task) -> None:
-    """Both are counted as what they are, and say so. The operator's is answered by the executor,
-    which journals it."""
+def test_choices_of_the_user_and_the_operator_override_the_selector(task: Task) -> None:
+    """Both are counted and labelled as such. The executor answers the operator's choice and writes
+    it to the journal."""
     selector = learner(task, seed=1, chosen={"pick": "pick_slow"})
     run(task, selector, runs=4, first=[Override("place", "place_hard")])
     assert {r.action for r in selector.records if isinstance(r, Choice)} == {
@@ -196,7 +196,7 @@ def test_the_users_and_the_operators_choice_come_first(task: Task) -> None:
 
 
 def test_a_deferred_verdict_corrects_r_once(task: Task) -> None:
-    """The engine says it once; a second one, or one on another run, changes nothing."""
+    """The engine reports it once; a second verdict, or one on another run, changes nothing."""
     selector = learner(task, seed=1)
     selector.settled(0.0, State((0,), {"regime": "A"}))
     selector.instruction(0.0, StartRun("pick#1", "pick", "pick", "pick_slow", {}, 5.0))
@@ -227,8 +227,8 @@ def test_a_deferred_verdict_corrects_r_once(task: Task) -> None:
     assert selector.learning.selectors["pick"].learner("regime=A").successes[0, 1] == 0.0
 
 
-def test_a_deferred_verdict_knows_how_many_trials_came_since(task: Task) -> None:
-    """Those of its own primitive task and context; a run that was cancelled is none."""
+def test_a_deferred_verdict_has_the_number_of_trials_since(task: Task) -> None:
+    """It counts trials of its own primitive task and context; a cancelled run is not a trial."""
     selector = learner(task, "tracking", seed=1)
 
     def ended(
@@ -260,8 +260,8 @@ def test_a_deferred_verdict_knows_how_many_trials_came_since(task: Task) -> None
 
 
 def test_alternatives_are_judged_in_a_context_or_over_scenarios(task: Task) -> None:
-    """In one context everything known counts; over scenarios the declared target (0.9) rules out
-    what never reaches it."""
+    """In one context all experience counts; over scenarios the declared target (0.9) excludes
+    actions that never reach it."""
     selector = learner(task, "round_robin", seed=1)
     for regime in ("A", "B"):
         run(task, selector, runs=120, parameters={"regime": regime})
@@ -277,7 +277,8 @@ def test_alternatives_are_judged_in_a_context_or_over_scenarios(task: Task) -> N
 
 
 def test_firings_are_counted(task: Task) -> None:
-    """Every firing is a passage; only transitions that wait for an event alone have a wait."""
+    """Every firing counts as a passage; only transitions that wait just for an event have a
+    wait."""
     selector = learner(task, "fixed", seed=1)
     mission = run(task, selector, runs=5)
     passages = [r for r in selector.records if isinstance(r, Passage)]
@@ -286,11 +287,11 @@ def test_firings_are_counted(task: Task) -> None:
 
 
 @pytest.mark.parametrize("declared", [None, {"pick_slow": 0.25}])
-def test_measured_cpu_time_never_steers_in_lock_step(
+def test_measured_cpu_time_never_affects_choices_in_lock_step(
     task: Task, declared: dict[str, float] | None
 ) -> None:
-    """Where CPU time is the cost, lock step takes what services.toml declares; real time takes what
-    was measured."""
+    """If CPU time is the cost, lock step uses the value declared in services.toml, and real time
+    the measured one."""
     costly = replace(
         task,
         primitive_tasks={
@@ -309,9 +310,9 @@ def test_measured_cpu_time_never_steers_in_lock_step(
         assert cost.tolist() == [0.0, 0.25, 0.0]
 
 
-def test_people_are_shown_what_was_learned(task: Task) -> None:
-    """Probability of each alternative, and R, C and J of those that ran; asking for it teaches
-    nothing."""
+def test_the_summary_shows_what_was_learned(task: Task) -> None:
+    """It has the probability of each alternative, and R, C and J of those that ran; reading it
+    changes nothing."""
     selector = learner(task, seed=1)
     assert selector.figures("pick")["pick_slow"] == {"probability": 0.0}
     assert not selector.learning.state()["pick"]["learners"]
@@ -324,9 +325,9 @@ def test_people_are_shown_what_was_learned(task: Task) -> None:
     assert selector.figures("nothing of the kind") == {}
 
 
-async def test_the_operators_page_follows_the_learning(task: Task) -> None:
-    """The snapshot has every alternative's probability at the beginning, and R, C and J once it
-    ran."""
+async def test_the_operators_page_shows_the_state_of_learning(task: Task) -> None:
+    """The snapshot has every alternative's probability from the start, and R, C and J after its
+    first run."""
     selector = learner(task, seed=1)
     setting = Setting(task, {}, 12, 1, selector)
     cell, party = lockstep_cell(directory(task), setting, scripts())

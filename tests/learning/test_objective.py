@@ -1,5 +1,5 @@
-"""J, rho, scenarios above the target, break-even, the Pareto front, and the target-reliability
-question both ways."""
+"""J, rho, scenarios above the target, break-even, the Pareto front, and the trade-off between
+target reliability and cost in both directions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from petrobot.coordinator.task import Executed, Status
 
 
 def runs(good: int, bad: int, seconds: float = 1.0, missing: int = 0) -> Tally:
-    """So many successes and failures of one length."""
+    """Return the tally of some successes and failures of one duration."""
     tally = Tally()
     for _ in range(good):
         tally = tally.adding(Observation(Status.SUCCESS, seconds))
@@ -37,7 +37,7 @@ def runs(good: int, bad: int, seconds: float = 1.0, missing: int = 0) -> Tally:
 
 
 def judged(question: Question | None = None, **actions: Tally) -> Comparison:
-    """A comparison in one scenario."""
+    """Compare actions in one scenario."""
     return compare({name: {"": tally} for name, tally in actions.items()}, question or Question())
 
 
@@ -51,20 +51,20 @@ def test_the_papers_cost_function() -> None:
 
 
 def test_a_declared_rho_lets_reliability_decide() -> None:
-    """With a small rho the more reliable action wins."""
+    """With a small rho the more reliable action is better."""
     assert judged(Question(rho=0.01), slow=runs(9, 1, 4.0), quick=runs(7, 3, 1.0)).best == "slow"
 
 
 def test_a_dead_nodes_action_is_not_best() -> None:
-    """R = 1 of three runs, but nine in ten starts never execute: A R counts."""
+    """R = 1 of three runs, but nine in ten starts never execute: A R decides."""
     found = judged(dead=runs(3, 0, 1.0, missing=27), alive=runs(30, 10, 1.0))
     assert found.of("dead").reliability == 1.0
     assert found.of("dead").availability == pytest.approx(0.1)
     assert found.best == "alive"
 
 
-def test_nothing_known_has_no_j() -> None:
-    """An action without runs is neither best nor a stumbling block."""
+def test_an_action_without_runs_has_no_j() -> None:
+    """It is never the best one, and does not affect the others."""
     found = judged(new=Tally(), old=runs(1, 1))
     assert isnan(found.of("new").j)
     assert found.best == "old"
@@ -88,7 +88,7 @@ def test_cost_is_that_of_the_hardest_scenario_above_the_target(
 
 
 def test_no_scenario_above_the_target_makes_inadmissible() -> None:
-    """An empty set: J is infinite, and another action is best whatever its J."""
+    """The set is empty: J is infinite, and another action is best with any finite J."""
     found = compare(
         {"weak": {"": runs(50, 50, 0.1)}, "strong": {"": runs(99, 1, 9.0)}}, Question(target=0.9)
     )
@@ -98,7 +98,8 @@ def test_no_scenario_above_the_target_makes_inadmissible() -> None:
 
 
 def test_membership_has_hysteresis() -> None:
-    """In when the lower bound reaches the target; out only when R itself falls below it."""
+    """A scenario enters when the lower bound reaches the target, and leaves only when R itself
+    falls below it."""
     unsure = {"": runs(46, 4)}  # R .92, Wilson's lower bound .81
     assert admitted(unsure, 0.9) == ()
     assert admitted(unsure, 0.9, before=("",)) == ("",)
@@ -106,8 +107,8 @@ def test_membership_has_hysteresis() -> None:
     assert admitted({"": runs(980, 20)}, 0.9) == ("",)
 
 
-def test_the_largest_cost_over_the_set_is_offered_too() -> None:
-    """The hardest scenario need not be the dearest."""
+def test_the_largest_cost_over_the_set_is_computed_too() -> None:
+    """The hardest scenario need not be the most expensive one."""
     figures = compare(
         {"act": {"hard": runs(90, 10, 1.0), "easy": runs(99, 1, 3.0)}}, Question()
     ).of("act")
@@ -126,7 +127,7 @@ def test_the_largest_cost_over_the_set_is_offered_too() -> None:
 def test_break_even_is_where_j_is_equal(
     g1: int, b1: int, g2: int, b2: int, c1: float, c2: float
 ) -> None:
-    """At the break-even rho both J agree; below it the more reliable action is better."""
+    """At the break-even rho both J are equal; below it the more reliable action is better."""
     found = judged(one=runs(g1, b1, c1), other=runs(g2, b2, c2))
     one, other = found.figures
     rho = break_even(one, other)
@@ -148,7 +149,8 @@ def test_break_even_is_where_j_is_equal(
     )
 )
 def test_the_pareto_front_is_not_dominated_and_complete(rows: list[tuple[int, int, float]]) -> None:
-    """Nobody beats a member in both; everybody else is matched or beaten by a member."""
+    """No action is better than a member in both R and C; every other action is matched or dominated
+    by a member."""
     found = compare({f"a{i}": {"": runs(g, b, c)} for i, (g, b, c) in enumerate(rows)}, Question())
     front = pareto(found.figures)
     assert front
@@ -159,8 +161,8 @@ def test_the_pareto_front_is_not_dominated_and_complete(rows: list[tuple[int, in
             assert all((g.reliability, g.cost) == (f.reliability, f.cost) for g in better)
 
 
-def test_the_target_question_both_ways() -> None:
-    """What a reliability costs, and what a cost buys."""
+def test_reliability_for_a_cost_and_cost_for_a_reliability() -> None:
+    """The cost of a required reliability, and the reliability that a cost allows."""
     found = judged(one=runs(70, 30, 1.0), four=runs(90, 10, 4.0), nine=runs(97, 3, 9.0))
     reach = {r: cost_to_reach(found.figures, r) for r in (0.5, 0.8, 0.95, 0.99)}
     assert [None if f is None else f.action for f in reach.values()] == [
@@ -180,7 +182,7 @@ def test_the_target_question_both_ways() -> None:
 
 
 def test_more_images_averaged_cost_more_and_are_more_reliable() -> None:
-    """The paper's example: cost is the number of pictures averaged, a value of the result."""
+    """The paper's example: the cost is the number of averaged images, a value of the result."""
     tallies = {}
     for images, good in ((1, 60), (4, 88), (16, 99)):
         tally = Tally()
@@ -199,17 +201,18 @@ def test_more_images_averaged_cost_more_and_are_more_reliable() -> None:
 
 
 def shares(good: float, runs_: int, seconds: float = 1.0) -> Tally:
-    """So many runs with a share of successes."""
+    """Return the tally of `runs_` runs, of which the share `good` succeeded."""
     return runs(round(good * runs_), runs_ - round(good * runs_), seconds)
 
 
 @pytest.mark.parametrize(
     ("easy", "hard"), [((50, 500), (500, 50)), ((500, 50), (50, 500)), ((200, 200), (200, 200))]
 )
-def test_unequal_shares_of_easy_and_hard_do_not_reverse_the_order(
+def test_unequal_shares_of_easy_and_hard_runs_do_not_reverse_the_order(
     easy: tuple[int, int], hard: tuple[int, int]
 ) -> None:
-    """Simpson: better in each scenario is better in all, whoever was run where how often."""
+    """Simpson's paradox: an action that is better in each scenario is better overall, however often
+    each was run in each scenario."""
     found = compare(
         {
             "good": {"easy": shares(0.98, easy[0]), "hard": shares(0.56, hard[0])},
@@ -224,9 +227,9 @@ def test_unequal_shares_of_easy_and_hard_do_not_reverse_the_order(
     assert found.of("good").lower < 0.56 < found.of("good").upper < 0.75
 
 
-def test_actions_are_compared_where_all_of_them_were_run() -> None:
-    """One that was never run in the storm is not better for it; the runs there are known
-    nevertheless."""
+def test_actions_are_compared_in_scenarios_where_all_of_them_were_run() -> None:
+    """An action that was never run in the storm gains no advantage from that; the other actions'
+    runs there are still known."""
     new = {"calm": shares(0.9, 50)}
     found = compare({"act": HARD, "new": new, "unknown": {}}, Question())
     assert found.scenarios == ("calm",)
@@ -238,8 +241,8 @@ def test_actions_are_compared_where_all_of_them_were_run() -> None:
     assert isnan(found.of("unknown").j)
 
 
-def test_while_nobody_meets_the_target_nobody_is_ruled_out() -> None:
-    """As a selector does: the lowest J of all, and it is said that the target is not met."""
+def test_if_no_action_meets_the_target_none_is_excluded() -> None:
+    """As in a selector, the lowest J of all wins, and a note says that the target is not met."""
     actions = {"weak": {"": runs(50, 50, 1.0)}, "weaker": {"": runs(20, 80, 1.0)}}
     found = compare(actions, Question(target=0.9))
     assert found.unmet
@@ -251,16 +254,16 @@ def test_while_nobody_meets_the_target_nobody_is_ruled_out() -> None:
     assert not compare({"new": {}}, Question(target=0.9)).unmet
 
 
-def test_a_cost_that_nobody_reported_is_named() -> None:
-    """It counts as 0 in J, which no figure shows."""
+def test_a_cost_that_no_result_reported_is_named() -> None:
+    """It counts as 0 in J, which the figures alone do not show."""
     found = judged(Question("value:images"), one=runs(9, 1), new=Tally())
     assert found.uncosted == ("one",)
     assert found.rho == 0.0
     assert judged(one=runs(9, 1)).uncosted == ()
 
 
-def test_a_node_that_is_away_is_away_in_all_scenarios() -> None:
-    """A is over all of them, though the starts that never began were in one without a single
+def test_the_availability_of_a_node_covers_all_scenarios() -> None:
+    """A is computed over all scenarios, although the failed starts were in one without a single
     run."""
     found = compare({"act": {"calm": runs(9, 1), "storm": runs(0, 0, missing=10)}}, Question())
     assert found.of("act").availability == 0.5
@@ -268,7 +271,7 @@ def test_a_node_that_is_away_is_away_in_all_scenarios() -> None:
 
 
 def test_declared_costs_count_until_measurements_replace_them() -> None:
-    """They set rho and J from the first run on, and stand beside what was measured later."""
+    """They set rho and J from the first run on, and are shown next to later measurements."""
     question = Question("value:energy", declared=(("a", 4.0), ("b", 1.0)))
     ran = Tally().adding(Observation(Status.SUCCESS, 1.0))
     found = compare({"a": {"": ran}, "b": {"": ran}, "c": {"": ran}}, question)

@@ -70,7 +70,7 @@ out = ["free"]
 
 
 def tally(good: int, bad: int, error: int, seconds: float) -> Tally:
-    """Runs of one length by status."""
+    """Return a tally of runs of one duration, by status."""
     out = Tally()
     for status, n in ((Status.SUCCESS, good), (Status.FAILURE, bad), (Status.ERROR, error)):
         for _ in range(n):
@@ -86,11 +86,11 @@ COUNTS = st.tuples(st.integers(1, 20), st.integers(0, 5), st.integers(0, 5), st.
 
 @settings(max_examples=15, deadline=None)
 @given(st.lists(st.tuples(COUNTS, COUNTS, st.floats(0, 1)), min_size=1, max_size=3))
-def test_a_series_comes_to_the_conjunctive_product(
+def test_a_series_equals_the_conjunctive_product(
     rows: list[tuple[Counts, Counts, float]],
 ) -> None:
-    """R = R_1 R_2 ... with each R_i mixed as its alternatives are chosen; costs add as far as runs
-    come."""
+    """R = R_1 R_2 ..., where each R_i is averaged over its alternatives as they are chosen; costs
+    add up to the step that a run reaches."""
     task, estimates = series(len(rows)), Estimates()
     choice, expected_r, reach, expected_c = {}, 1.0, 1.0, 0.0
     for name, (one, other, share) in zip("abc", rows, strict=False):
@@ -109,8 +109,8 @@ def test_a_series_comes_to_the_conjunctive_product(
 
 
 def test_loops_and_recoveries_are_not_products() -> None:
-    """An action that is repeated until it succeeds: R_conj is the first try's, but the task always
-    completes."""
+    """For an action that is repeated until it succeeds, R_conj is that of the first try, but the
+    task always completes."""
     text = (
         SERIES
         + """
@@ -138,7 +138,8 @@ out = ["a"]
 
 
 def test_intervals_of_the_task_come_from_those_of_its_actions() -> None:
-    """A series of two: each R moves the product by the other one; costs have the error of means."""
+    """In a series of two, the product changes with each R in proportion to the other; costs have
+    the standard error of a mean."""
     rng = np.random.default_rng(5)
     known = []
     for good, bad in ((60, 20), (45, 5)):
@@ -163,7 +164,7 @@ def test_intervals_of_the_task_come_from_those_of_its_actions() -> None:
     c1, c2 = (t.cost("wall") for t in known)
     assert found.cost.value == pytest.approx(c1.mean + r1 * c2.mean)
     own = 1.959964 * hypot(c1.deviation / 80**0.5, r1 * c2.deviation / 50**0.5)
-    more = c2.mean * (u1 - r1)  # the second action runs more often if the first is more reliable
+    more = c2.mean * (u1 - r1)  # The second action runs more often if the first is more reliable.
     assert found.cost.upper == pytest.approx(found.cost.value + hypot(own, more), rel=1e-5)
     assert found.rho == pytest.approx(1 / found.cost.value)
     assert found.j.value == pytest.approx(2 - r1 * r2)
@@ -174,8 +175,8 @@ def test_intervals_of_the_task_come_from_those_of_its_actions() -> None:
 
 
 def test_the_task_is_judged_in_its_hardest_scenario() -> None:
-    """R and C of a primitive task are those of `learned show`: the worst scenario, not the share of
-    all runs."""
+    """R and C of a primitive task are those of `learned show`: those of the worst scenario, not the
+    average over all runs."""
     estimates = Estimates(
         {
             TallyKey("a", "do_a", "calm"): tally(90, 0, 10, 1.0),
@@ -193,8 +194,8 @@ def test_the_task_is_judged_in_its_hardest_scenario() -> None:
     assert calm.conjunctive == pytest.approx(0.9) and calm.cost.value == pytest.approx(1.0)
 
 
-def test_what_never_executed_takes_the_error_branch() -> None:
-    """It does not lower R, but it lowers what the task comes to."""
+def test_a_call_that_never_executed_takes_the_error_branch() -> None:
+    """It does not lower the action's R, but it lowers the R of the task."""
     known = tally(9, 0, 0, 1.0)
     known = known.adding(Observation(Status.ERROR, 0.0, "unreachable", Executed.NO))
     task = replace(series(1))
@@ -210,8 +211,8 @@ def test_what_never_executed_takes_the_error_branch() -> None:
 # --- competing risks --------------------------------------------------------------------------
 
 
-def test_incidences_without_cut_offs_are_relative_frequencies() -> None:
-    """Shares, means and variances of the sample itself."""
+def test_incidences_without_censoring_are_relative_frequencies() -> None:
+    """They equal shares, means and variances of the sample itself."""
     found = incidences([1.0, 2.0, 2.0, 5.0], ["success", "success", "error", "success"])
     assert found["success"].share == pytest.approx(0.75)
     assert found["success"].mean == pytest.approx(8 / 3)
@@ -221,7 +222,8 @@ def test_incidences_without_cut_offs_are_relative_frequencies() -> None:
 
 
 def test_incidences_of_a_textbook_example() -> None:
-    """By hand: a at 1 (5 going), cut off at 2, b at 3 (3 going), a at 4 (2 going), cut off at 5."""
+    """Computed by hand: a at 1 (5 at risk), censored at 2, b at 3 (3 at risk), a at 4 (2 at risk),
+    censored at 5."""
     found = incidences([1, 2, 3, 4, 5], ["a", None, "b", "a", None])
     a, b = 1 / 5 + (4 / 5) * (2 / 3) * (1 / 2), (4 / 5) * (1 / 3)
     assert found["a"].share == pytest.approx(a / (a + b))
@@ -230,9 +232,9 @@ def test_incidences_of_a_textbook_example() -> None:
 
 
 @pytest.mark.parametrize("cut", [0.0, 0.5, 2.0])
-def test_incidences_see_through_cut_offs(cut: float) -> None:
-    """Two exponential causes (rates 2 and 1) with exponential cut-offs: shares 2/3 and 1/3, mean
-    1/3, all unbiased; counting the ends alone would get the mean wrong."""
+def test_incidences_are_unbiased_under_censoring(cut: float) -> None:
+    """Two exponential causes (rates 2 and 1) with exponential censoring: shares 2/3 and 1/3, mean
+    1/3, all unbiased; counting only the uncensored ends would give a wrong mean."""
     rng = np.random.default_rng(5)
     n = 20_000
     a, b = rng.exponential(1 / 2, n), rng.exponential(1.0, n)
@@ -254,8 +256,8 @@ def test_incidences_see_through_cut_offs(cut: float) -> None:
 
 
 def caught_or_missed(n: int, caught: int) -> Tally:
-    """Of n runs, `caught` are preempted near 0.5 s and count as success, the others end as failures
-    at 1.2 s."""
+    """Return a tally of n runs: `caught` are preempted near 0.5 s and count as success, the others
+    end as failures at 1.2 s."""
     rng = np.random.default_rng(1)
     out = Tally()
     for i in range(n):
@@ -267,9 +269,9 @@ def caught_or_missed(n: int, caught: int) -> Tally:
     return out
 
 
-def test_a_preempting_event_is_a_cause_not_a_race() -> None:
-    """The event comes at half a second in 93 of 100 runs or never. As a cause its share is met
-    exactly; an independent exponential with the same mean wait makes it 87 %."""
+def test_a_preempting_event_is_a_cause_of_end_not_an_independent_race() -> None:
+    """The event comes after half a second in 93 of 100 runs, or never. As a cause its share is
+    exact; an independent exponential wait with the same mean would give 87 %."""
     task, _ = with_runs(sorting(), 1)
     estimates = Estimates(
         {
@@ -291,9 +293,9 @@ def test_a_preempting_event_is_a_cause_not_a_race() -> None:
     assert forecast(stochastic_view(task, race)).firings["jammed"] < 0.88
 
 
-def test_causes_leave_nothing_behind() -> None:
-    """Every marking at the end is clean: a law of preemption whose transition was not the one that
-    took the run is flushed."""
+def test_causes_leave_no_tokens_behind() -> None:
+    """Every final marking is clean: the token of a preemption whose transition did not take the run
+    is removed."""
     task, _ = with_runs(sorting(), 2)
     runs = {
         ("pick", "pick_slow"): {Status.SUCCESS: Estimate(1.0, 0.4)},
@@ -317,8 +319,8 @@ def test_causes_leave_nothing_behind() -> None:
     assert not np.any(dirty & found.done.goal)
 
 
-def test_an_abort_is_a_mere_cut_off() -> None:
-    """Runs that the operator broke off are censored: their shares go by competing risks over the
+def test_an_aborted_run_is_censored() -> None:
+    """Runs that the operator aborted are censored: shares follow from competing risks over the
     sample."""
     rng, out = np.random.default_rng(2), Tally()
     for _ in range(400):
@@ -339,9 +341,9 @@ def test_an_abort_is_a_mere_cut_off() -> None:
 # --- the whole loop ---------------------------------------------------------------------------
 
 
-def test_the_forecast_of_a_learned_task_meets_its_runs() -> None:
-    """Runs of the sorting task, estimates, the stochastic view, and what the runs themselves had:
-    firings and time agree."""
+def test_the_forecast_of_a_learned_task_agrees_with_its_runs() -> None:
+    """Run the sorting task, estimate, and build the stochastic view: firings and time agree with
+    those of the runs."""
     task, n = sorting(), 150
     selector = LearningSelector(Learning(task, "round_robin"), seed=1)
     mission = run(task, selector, runs=n, seed=1)
@@ -357,7 +359,7 @@ def test_the_forecast_of_a_learned_task_meets_its_runs() -> None:
 
 
 def test_uniformly_censored_exponential_has_the_classic_rate() -> None:
-    """lambda = ends / exposure, cut-off runs included (exponential case)."""
+    """lambda = ends / exposure, censored runs included (exponential case)."""
     rng, out = np.random.default_rng(3), Tally()
     for _ in range(3000):
         t = rng.exponential(2.0)
@@ -371,8 +373,8 @@ def test_uniformly_censored_exponential_has_the_classic_rate() -> None:
     assert out.runs / (out.runs + out.censored) == pytest.approx(1 - exp(-0.5), abs=0.03)
 
 
-def test_a_view_without_preempting_measurements_is_as_before() -> None:
-    """Declared waits race, as documented, where no run was measured."""
+def test_without_measured_preemptions_declared_waits_race() -> None:
+    """As documented, declared waits race where no run was measured."""
     task, _ = with_runs(sorting(), 1)
     runs = {
         ("pick", "pick_slow"): {Status.SUCCESS: Estimate(1.0, 1.0)},

@@ -1,5 +1,5 @@
-"""Selectors: the same rules alone and side by side, contexts, targets, dead nodes, and what people
-may do to them."""
+"""Selectors: one row and batches give the same results; contexts, targets, dead nodes, and what
+the operator may change."""
 
 from __future__ import annotations
 
@@ -24,34 +24,34 @@ NAMES = sorted(RULES)
 
 
 class Uniform(np.random.Generator):
-    """A generator that gives the numbers it was made with."""
+    """A generator that returns given numbers."""
 
     def __init__(self, rows: Iterable[np.ndarray]) -> None:
         super().__init__(np.random.PCG64(0))
         self._rows = iter(rows)
 
     def random(self, *shape: object, **more: object) -> np.ndarray:  # type: ignore[override]
-        """The next row, as a batch of one."""
+        """Return the next row, as a batch of one."""
         return next(self._rows)[None, :]
 
 
 def success(seconds: float = 1.0) -> Observation:
-    """A run that met its specification."""
+    """Return a run that met its specification."""
     return Observation(Status.SUCCESS, seconds)
 
 
 def failure(seconds: float = 1.0) -> Observation:
-    """A run that did not."""
+    """Return a run that did not meet its specification."""
     return Observation(Status.FAILURE, seconds, "late")
 
 
 def missing() -> Observation:
-    """A run that never began."""
+    """Return a run that never executed."""
     return Observation(Status.ERROR, 0.0, "unreachable", Executed.NO)
 
 
 def taught(selector: RuleSelector, context: str = "", good: int = 30) -> RuleSelector:
-    """`b` succeeds always, the others never."""
+    """Train a selector: `b` always succeeds, the others never."""
     for _ in range(good):
         for action in ACTIONS:
             selector.chosen(context, action)
@@ -60,7 +60,7 @@ def taught(selector: RuleSelector, context: str = "", good: int = 30) -> RuleSel
 
 
 def test_the_command_line_names_every_selector() -> None:
-    """--selector offers what there is."""
+    """--selector offers every selector."""
     assert set(SELECTORS) == set(RULES)
 
 
@@ -70,8 +70,8 @@ def test_the_command_line_names_every_selector() -> None:
 def test_rows_of_a_batch_are_the_shipped_selector(
     name: str, seed: int, n: int, costly: bool
 ) -> None:
-    """What the convergence study simulates is, trial by trial and bit by bit, what a mission run
-    uses."""
+    """The convergence study simulates exactly what a mission run uses, trial by trial and bit by
+    bit."""
     rng = np.random.default_rng(seed)
     rows, trials, actions = 3, 60, ACTIONS[:n] if n < 5 else (*ACTIONS, "e")
     u, v = rng.random((trials, rows, n)), rng.random((trials, rows))
@@ -114,10 +114,10 @@ def test_rows_of_a_batch_are_the_shipped_selector(
         max_size=40,
     )
 )
-def test_probabilities_are_probabilities_whatever_happens(
+def test_probabilities_stay_valid_after_any_sequence_of_results(
     name: str, ends: list[tuple[str, str, float]]
 ) -> None:
-    """p and the choice probabilities stay in [0, 1] and sum to 1; censored runs teach nothing."""
+    """p and the choice probabilities stay in [0, 1] and sum to 1; censored runs change nothing."""
     selector = make(name, ACTIONS)
     for action, end, seconds in ends:
         outcome = {
@@ -141,7 +141,7 @@ def test_probabilities_are_probabilities_whatever_happens(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_choosing_changes_nothing(name: str) -> None:
-    """So that a resumed run, which is not asked again, comes to the same state."""
+    """A resumed run does not choose again, yet reaches the same state."""
     selector = taught(make(name, ACTIONS), good=3)
     selector.choose("never seen", ACTIONS, np.random.default_rng(7))
     assert "never seen" not in selector.state()["learners"]
@@ -152,8 +152,8 @@ def test_choosing_changes_nothing(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_state_survives_plain_data(name: str) -> None:
-    """A restored selector goes on exactly as the one whose state it took."""
+def test_the_state_survives_conversion_to_plain_data(name: str) -> None:
+    """A restored selector continues exactly like the original."""
     one = taught(make(name, ACTIONS), "regime=A", 7)
     other = make(name, ACTIONS)
     other.restore(json.loads(json.dumps(one.state())))
@@ -166,9 +166,9 @@ def test_state_survives_plain_data(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [n for n in NAMES if n not in ("fixed", "round_robin")])
-def test_contexts_are_learned_apart(name: str) -> None:
-    """What was learned in one context says nothing about another; frozen, each chooses its own
-    best."""
+def test_contexts_are_learned_separately(name: str) -> None:
+    """Learning in one context does not affect another; when frozen, each context chooses its own
+    best action."""
     selector = taught(make(name, ACTIONS), "regime=A", 60)
     for _ in range(240):
         for action in ACTIONS:
@@ -183,8 +183,8 @@ def test_contexts_are_learned_apart(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_frozen_learns_nothing_and_reset_forgets_all(name: str) -> None:
-    """Frozen: the state stands still and says so. Reset: as new."""
+def test_a_frozen_selector_learns_nothing_and_a_reset_one_forgets_all(name: str) -> None:
+    """Frozen: the state stays as it is and is marked so. Reset: the state is that of a new one."""
     selector = taught(make(name, ACTIONS), good=20)
     selector.frozen = True
     before = json.dumps(selector.state())
@@ -198,8 +198,8 @@ def test_frozen_learns_nothing_and_reset_forgets_all(name: str) -> None:
     assert selector.state() == make(name, ACTIONS).state()
 
 
-def test_a_choice_says_why_with_numbers() -> None:
-    """J, R, runs, C, the probability of the draw, and who would be best."""
+def test_a_choice_gives_its_reason_with_numbers() -> None:
+    """The reason has J, R, runs, C, the probability of the draw, and the best action."""
     selector = taught(make("nikolic_fu", ACTIONS), "regime=B", 5)
     action, why = selector.choose("regime=B", ACTIONS, Uniform([np.array([0.0, 0, 0, 0])]))
     assert action == "a"
@@ -208,9 +208,8 @@ def test_a_choice_says_why_with_numbers() -> None:
     )
 
 
-def test_an_action_of_a_dead_node_is_left() -> None:
-    """It never executes, so its R stays 1, yet its J grows with each start that comes to
-    nothing."""
+def test_an_action_of_a_dead_node_is_avoided() -> None:
+    """It never executes, so its R stays 1, yet its J grows with each failed start."""
     selector = make("nikolic_fu_fast", ("dead", "alive"))
     rng = np.random.default_rng(3)
     for _ in range(5):
@@ -226,8 +225,8 @@ def test_an_action_of_a_dead_node_is_left() -> None:
     assert selector.learner("").successes[0, 0] == 5
 
 
-def test_no_tries_are_owed_to_an_action_that_cannot_be_tried() -> None:
-    """First trials count starts, not results: a dead node does not keep them going for ever."""
+def test_first_trials_of_an_unavailable_action_end() -> None:
+    """First trials count starts, not results, so a dead node does not prolong them for ever."""
     selector = make("nikolic_fu_fast", ("dead", "alive"))
     for _ in range(5):
         selector.chosen("", "dead")
@@ -236,16 +235,16 @@ def test_no_tries_are_owed_to_an_action_that_cannot_be_tried() -> None:
 
 
 def test_a_deferred_verdict_changes_the_sums() -> None:
-    """R falls, J rises; the choice probabilities follow with later trials."""
+    """R falls and J rises; the choice probabilities follow with later trials."""
     selector = taught(make("nikolic_fu", ACTIONS), good=10)
     before = selector.objective("")["b"]
     selector.correct("", "b", Status.SUCCESS, Status.FAILURE)
     assert selector.objective("")["b"] == pytest.approx(before + 0.1)
 
 
-def test_a_late_verdict_changes_no_more_than_is_left_of_its_run() -> None:
-    """After 300 trials of b the sums hold 0.37 of the only run of a: corrected it is all of them,
-    and R is 1, not 2.7."""
+def test_a_late_verdict_changes_at_most_the_remaining_weight_of_its_run() -> None:
+    """After 300 trials of b the faded sums hold 0.37 of the only run of a: the correction takes
+    that weight, and R is 1, not 2.7."""
     selector = make("tracking", ("a", "b"))
     selector.update("", "a", failure())
     for _ in range(300):
@@ -262,7 +261,7 @@ def test_a_late_verdict_changes_no_more_than_is_left_of_its_run() -> None:
 
 @pytest.mark.parametrize("age", [0, 1, 40])
 def test_a_verdict_fades_with_its_run(age: int) -> None:
-    """The sums come out as if the run had ended so from the beginning."""
+    """The sums are those of a run that ended with the corrected status."""
 
     def learned(first: Observation) -> RuleSelector:
         selector = make("tracking", ("a", "b"))
@@ -283,8 +282,8 @@ def test_a_verdict_fades_with_its_run(age: int) -> None:
 
 
 def test_a_verdict_on_a_run_before_a_restart_changes_nothing() -> None:
-    """The run that raised the alarm was forgotten with the others; the first one after it is
-    corrected."""
+    """The run that caused the restart was forgotten with the earlier ones; the first run after it
+    can be corrected."""
     selector = make("tracking", ("a", "b"))
     trials, limit = 0, Limit("the alarm", steps=1000)
     while not selector.learner("").own["restarts"][0, 0] and limit.left():
@@ -310,11 +309,11 @@ STEPS = st.lists(
 
 @settings(max_examples=30, deadline=None)
 @given(st.sampled_from(NAMES), STEPS, st.sampled_from([None, 0.5, 0.9]))
-def test_shares_stay_shares_whatever_is_corrected(
+def test_shares_stay_within_bounds_after_any_corrections(
     name: str, steps: list[tuple[str, str, int, int]], target: float | None
 ) -> None:
-    """Trials, runs that never began, verdicts of any age, restarts by what is kept: R, A and J stay
-    what they are."""
+    """Trials, runs that never executed, verdicts of any age, and restarts: R, A and J stay in their
+    ranges."""
     selector = make(name, ACTIONS, Question("wall", target))
     for what, action, age, times in steps:
         for _ in range(times):
@@ -336,8 +335,8 @@ def test_shares_stay_shares_whatever_is_corrected(
         assert np.all(batch.successes <= batch.runs)
 
 
-def test_a_state_with_more_successes_than_runs_is_mended() -> None:
-    """As states could be that were written before corrections were bounded."""
+def test_a_state_with_more_successes_than_runs_is_corrected() -> None:
+    """Such states were written before corrections were bounded."""
     selector = taught(make("tracking", ACTIONS), good=3)
     state = selector.state()
     state["learners"][""]["successes"][0] = 1e3
@@ -345,9 +344,9 @@ def test_a_state_with_more_successes_than_runs_is_mended() -> None:
     assert selector.learner("").reliability().max() == 1.0
 
 
-def test_only_actions_that_meet_the_target_are_sought() -> None:
-    """Cheap but unreliable wins without a target, and is left with one; while nobody meets it, J
-    alone decides."""
+def test_only_actions_that_meet_the_target_are_preferred() -> None:
+    """A cheap but unreliable action wins without a target and loses with one; as long as no action
+    meets the target, J alone decides."""
     trials = [("cheap", [success(0.1)] * 6 + [failure(0.1)] * 4), ("sure", [success(5.0)] * 10)]
 
     def learned(target: float | None) -> str:
@@ -366,16 +365,18 @@ def test_only_actions_that_meet_the_target_are_sought() -> None:
     ("met", "before", "now"),
     [(100, False, True), (95, False, False), (95, True, True), (89, True, False)],
 )
-def test_an_action_comes_in_surely_and_goes_out_late(met: int, before: bool, now: bool) -> None:
-    """Target 0.9 and 100 runs: in when Wilson's lower bound reaches it (0.96 for 100, 0.89 for 95),
-    out when R itself is below."""
+def test_an_action_is_admitted_with_certainty_and_excluded_late(
+    met: int, before: bool, now: bool
+) -> None:
+    """With target 0.9 and 100 runs, an action is admitted when Wilson's lower bound reaches the
+    target (0.96 for 100 successes, 0.89 for 95), and excluded when R itself falls below."""
     batch = Batch.fresh(1, 1, None)
     batch.runs[:], batch.successes[:] = 100.0, met
     assert eligible(batch, 0.9, np.array([[before]])).tolist() == [[now]]
 
 
-def test_sums_are_taken_over_from_estimates() -> None:
-    """Another machine's runs decide the order from then on; a rule that fades its sums keeps its
+def test_a_selector_takes_its_sums_from_merged_estimates() -> None:
+    """Another machine's runs then decide the order of actions; a rule whose sums fade keeps its
     own."""
     tally = Tally()
     for _ in range(50):
@@ -389,8 +390,8 @@ def test_sums_are_taken_over_from_estimates() -> None:
 
 
 def test_new_and_vanished_alternatives() -> None:
-    """Sums go with their actions, a newcomer is unknown with an equal share, and the gain starts
-    again."""
+    """Sums stay with their actions, a new action is unknown and gets an equal share, and the gain
+    starts again."""
     old = taught(make("nikolic_fu", ACTIONS), good=25)
     new = make("nikolic_fu", ("d", "b", "new"))
     new.restore(old.state())
@@ -411,7 +412,7 @@ def test_new_and_vanished_alternatives() -> None:
     ],
 )
 def test_a_state_that_does_not_fit_is_refused(change: dict[str, object]) -> None:
-    """Another rule's, too short, or no probabilities."""
+    """It belongs to another rule, is too short, or holds invalid probabilities."""
     state = taught(make("nikolic_fu", ACTIONS), good=2).state()
     learners = {"": {**state["learners"][""], **change.get("learners", {}).get("", {})}}  # type: ignore[attr-defined]
     with pytest.raises(ValueError):
@@ -419,15 +420,15 @@ def test_a_state_that_does_not_fit_is_refused(change: dict[str, object]) -> None
 
 
 def test_unknown_selectors_and_alternatives_are_refused() -> None:
-    """With the names that there are."""
+    """The error lists the known names."""
     with pytest.raises(ValueError, match="nikolic_fu_fast"):
         make("greedy", ACTIONS)
     with pytest.raises(ValueError, match="none of x"):
         make("fixed", ACTIONS).choose("", ("x",), np.random.default_rng(0))
 
 
-def test_round_robin_takes_turns_and_fixed_does_not() -> None:
-    """Each alternative equally often; always the first that is offered."""
+def test_round_robin_alternates_and_fixed_does_not() -> None:
+    """Round robin chooses each alternative equally often; fixed always the first one offered."""
     turns, fixed = make("round_robin", ACTIONS), make("fixed", ACTIONS)
     rng, seen = np.random.default_rng(0), []
     for _ in range(8):
@@ -440,23 +441,23 @@ def test_round_robin_takes_turns_and_fixed_does_not() -> None:
 
 @given(st.lists(st.floats(0.01, 1), min_size=2, max_size=6), st.floats(0, 1, exclude_max=True))
 def test_draws_invert_the_distribution(weights: list[float], u: float) -> None:
-    """The action whose cumulative interval holds u."""
+    """A draw returns the action whose cumulative interval holds u."""
     p = np.array([weights]) / np.sum(weights)
     bounds = np.concatenate([[0.0], np.cumsum(p[0])]) / np.cumsum(p[0])[-1]
     action = int(drawn(p, np.array([u]))[0])
     assert bounds[action] <= u < bounds[action + 1] or action == len(weights) - 1
 
 
-def test_probabilities_of_what_is_offered() -> None:
-    """Scaled up; equal shares where none was left."""
+def test_probabilities_are_scaled_to_the_offered_actions() -> None:
+    """They are scaled up to sum to 1; if all are 0, shares are equal."""
     p = np.array([[0.5, 0.5, 0.0]])
     assert restricted(p, np.array([[True, False, True]])).tolist() == [[1.0, 0.0, 0.0]]
     assert restricted(p, np.array([[False, False, True]])).tolist() == [[0.0, 0.0, 1.0]]
 
 
 def test_declared_costs_count_from_the_first_trial() -> None:
-    """Of two actions that both succeed, the selector orders the one first that is declared cheaper;
-    a measured cost replaces the declared one, also after the state was saved and restored."""
+    """Of two actions that both succeed, the selector prefers the one declared cheaper. A measured
+    cost replaces the declared one, also after the state was saved and restored."""
     question = Question("value:energy", declared=(("a", 4.0), ("b", 1.0)))
     selector = RuleSelector(RULES["nikolic_fu"](), ("a", "b"), question)
     for action in ("a", "b"):

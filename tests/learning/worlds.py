@@ -1,4 +1,4 @@
-"""Bernoulli worlds with known J, and rules played in many of them side by side: the convergence
+"""Bernoulli worlds with known J, and rules simulated in many of them in parallel: the convergence
 study of docs/learning.md."""
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from petrobot.coordinator.learning.rules import Rule
 
 @dataclass(frozen=True)
 class BanditWorld:
-    """Reliability and mean cost of each action; from `change` on (trials) those of `later`."""
+    """Reliability and mean cost of each action; from trial `change` on those of `later`."""
 
     name: str
     reliability: tuple[float, ...]
@@ -24,46 +24,47 @@ class BanditWorld:
 
     @property
     def n(self) -> int:
-        """Actions."""
+        """Number of actions."""
         return len(self.reliability)
 
     def at(self, trial: int) -> BanditWorld:
-        """The world at a trial (from 0), without its future."""
+        """Return the world at a trial (from 0), without its later change."""
         if self.change is None or trial < self.change:
             return replace(self, change=None)
         return replace(self, reliability=self.later, change=None)
 
     def objective(self) -> Array:
-        """J of each action with rho = 1 / max C."""
+        """Return J of each action with rho = 1 / max C."""
         cost = np.array(self.cost)
         rho = 1.0 / cost.max() if cost.max() > 0 else 0.0
         return 1.0 - np.array(self.reliability) + rho * cost
 
     @property
     def gap(self) -> float:
-        """Difference of the two lowest J."""
+        """Return the difference of the two lowest J."""
         low = np.sort(self.objective())
         return float(low[1] - low[0])
 
 
 def gapped(gap: float, best: float = 0.9, n: int = 4) -> BanditWorld:
-    """One action of reliability `best`, all others `gap` worse; equal costs."""
+    """Return a world with one action of reliability `best` and all others `gap` worse, at equal
+    costs."""
     return BanditWorld(f"gap {gap:g}", (best - gap, *([best - gap] * (n - 2)), best), (1.0,) * n)
 
 
 @dataclass
 class PlayedTrials:
-    """What came of it: arrays over seeds (rows)."""
+    """Result of a simulation: arrays over seeds (rows)."""
 
     batch: Batch
     regret: Array
     """Cumulative regret in J at each checkpoint, shape (checkpoints, rows)."""
     optimal: Array
-    """Share of the last hundred choices that were optimal, by row."""
+    """Share of optimal choices among the last hundred, by row."""
     p_best: Array
     """p of the optimum at each checkpoint, shape (checkpoints, rows)."""
     recent: Array
-    """Share of the hundred choices before each checkpoint that were optimal, shape (checkpoints,
+    """Share of optimal choices among the hundred before each checkpoint, shape (checkpoints,
     rows)."""
     checkpoints: Sequence[int]
 
@@ -77,7 +78,7 @@ def play(
     checkpoints: Sequence[int] = (),
     watch: Callable[[int, Batch, Index], None] | None = None,
 ) -> PlayedTrials:
-    """Play a rule in `seeds` copies of a world; each row has uniform numbers of its own."""
+    """Simulate a rule in `seeds` copies of a world; each row has its own random numbers."""
     batch, n = rule.begin(seeds, world.n), world.n
     offered = np.ones((seeds, n), dtype=bool)
     marks = list(checkpoints) or [trials]

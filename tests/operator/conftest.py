@@ -1,4 +1,4 @@
-"""A station over two nodes of this process, with actions that follow a script."""
+"""A station with two nodes in this process whose actions follow a script."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ out = ["arm_free"]
 def toy_node(
     directory: Directory, name: str, script: Mapping[str, Callable[..., Any]]
 ) -> NodeInLoop:
-    """A node, in this loop."""
+    """Run a node in this event loop."""
     clock = asyncio.get_running_loop().time
     place = InlineHost(directory.actions, clock=clock, substitutes=script)
     node = Node(directory, name, boot=f"{name} 1", clock=clock, places={GENERAL: place})
@@ -121,7 +121,7 @@ def toy_node(
 
 
 class Cell:
-    """A station, its nodes, and one operator."""
+    """A station, its nodes and one operator."""
 
     def __init__(self, folder: Path, script: str = SCRIPT) -> None:
         path = folder / "services.toml"
@@ -139,28 +139,28 @@ class Cell:
 
     @property
     def state(self) -> dict[str, Any]:
-        """What clients see."""
+        """Return the state that clients see."""
         return self.station.feed.state
 
     async def say(self, verb: str, **data: Any) -> dict[str, Any]:
-        """A command by the operator."""
+        """Give a command as the operator."""
         return await self.station.command("ana", verb, data)
 
     async def until(self, holds: Callable[[], bool], timeout: float = 60.0) -> None:
-        """Wait until something holds."""
+        """Wait until the condition holds."""
         async with asyncio.timeout(timeout):
             while not holds():
                 await beat(0.002)
 
     async def ended(self) -> Mapping[str, Any]:
-        """Wait for the run's end; its result."""
+        """Wait for the end of the run; return its result."""
         await self.until(lambda: self.state["result"] is not None)
         return self.state["result"]  # type: ignore[no-any-return]
 
 
 @pytest_asyncio.fixture
 async def cell(tmp_path: Path) -> AsyncIterator[Cell]:
-    """A cell whose nodes are up, with an operator who holds the controls."""
+    """A cell with active nodes and an operator who holds the controls."""
     made = Cell(tmp_path)
     for node in made.nodes.values():
         await node.start()

@@ -1,5 +1,5 @@
-"""Simulated runs that set out from a point of a recorded one: from the beginning it is the run
-itself, from anywhere it ends."""
+"""Simulated runs that start from a point of a recorded run: from its first record they repeat it,
+from any other they reach an end."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TASK = Path(__file__).parents[1] / "chaos" / "shuttle.toml"
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a cell of one node, and a run of it."""
+    """A folder with a cell of one node and a recorded run."""
     folder = tmp_path_factory.mktemp("departure")
     for name, text in (("services.toml", SERVICES), ("mock.toml", SCRIPT)):
         (folder / name).write_text(text)
@@ -66,18 +66,18 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def the_run(cell: Path) -> Path:
-    """The folder of the first run."""
+    """Return the folder of the first run."""
     return min((cell / "runs").iterdir(), key=lambda p: p.stat().st_mtime)
 
 
 def parts(cell: Path) -> tuple[Journal, Task, Directory, Engine]:
-    """What a recorded run is made of."""
+    """Return the parts of a recorded run."""
     task, directory = load(TASK), parse(SERVICES, cell / "services.toml")
     return read_journal(the_run(cell) / JOURNAL), task, directory, Engine(task)
 
 
 def simulate(cell: Path, run: Path, seed: int, record: int = 0, **start: Any) -> RunSession:
-    """A run from a record of `run`, led to its end in this process."""
+    """Run from a record of `run` to the end in this process."""
     request = RunRequest(
         "lockstep",
         seed=seed,
@@ -93,7 +93,7 @@ def simulate(cell: Path, run: Path, seed: int, record: int = 0, **start: Any) ->
 
 
 def plain(journal: Journal) -> list[tuple[str, Any]]:
-    """The records, without the CPU time that they took."""
+    """Return the records without their CPU times."""
     for record in journal.records:
         if isinstance(record.data.get("stimulus"), dict):
             record.data["stimulus"].pop("cpu_seconds", None)
@@ -104,8 +104,10 @@ def plain(journal: Journal) -> list[tuple[str, Any]]:
     max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(seed=st.integers(0, 2**31))
-def test_from_the_beginning_with_the_same_seed_it_is_the_run_itself(cell: Path, seed: int) -> None:
-    """Record by record, for any seed."""
+def test_from_the_first_record_with_the_same_seed_the_run_is_repeated(
+    cell: Path, seed: int
+) -> None:
+    """It is equal record by record, for any seed."""
     then = the_run(cell)
     made = []
     for _ in range(2):
@@ -117,9 +119,9 @@ def test_from_the_beginning_with_the_same_seed_it_is_the_run_itself(cell: Path, 
     assert made[0] == made[1]
 
 
-def test_the_run_itself_comes_from_the_command_line(cell: Path) -> None:
-    """`petrobot run --from RUN` makes the recorded run again, in a folder of its own that says
-    where it comes from."""
+def test_the_command_line_repeats_a_recorded_run(cell: Path) -> None:
+    """`petrobot run --from RUN` repeats the recorded run in a new folder, which names the
+    original."""
     then = the_run(cell)
     out = cell / "again.json"
     given = [
@@ -150,8 +152,8 @@ def test_the_run_itself_comes_from_the_command_line(cell: Path) -> None:
 )
 @given(data=st.data())
 def test_from_any_record_it_reaches_an_end(cell: Path, data: st.DataObject) -> None:
-    """Whatever becomes of the runs that went on; the first marking is that of the record, and
-    replay derives it all again."""
+    """The active runs may end in any way; the first marking is that of the record, and the new
+    journal replays."""
     journal, task, _, engine = parts(cell)
     last = journal.records[-1].number
     record = data.draw(st.integers(0, last - 1), label="record")
@@ -197,10 +199,10 @@ def test_from_any_record_it_reaches_an_end(cell: Path, data: st.DataObject) -> N
         (["shuttle", "--going", "again"], "--going needs --from"),
     ],
 )
-def test_what_cannot_be_is_refused(
+def test_invalid_starting_points_are_refused(
     cell: Path, more: list[str], word: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Exit code 2 and one clear word, and no folder is left behind."""
+    """Exit code 2 and one clear message; no folder is left behind."""
     folder = cell / "refused"
     given = [text.format(run=the_run(cell)) for text in more]
     assert main(["run", *given, "--quiet", "--journal", str(folder)]) == 2
@@ -208,8 +210,8 @@ def test_what_cannot_be_is_refused(
     assert not folder.exists()
 
 
-def test_a_killed_departed_run_is_made_again(cell: Path) -> None:
-    """`petrobot resume` knows where it had set out."""
+def test_a_killed_run_from_a_point_is_repeated(cell: Path) -> None:
+    """`petrobot resume` knows its starting point."""
     then, kept = the_run(cell), cell / "killed"
     record = next(
         r.number for r in read_journal(then / JOURNAL).records if "RunEnded" in str(r.data)

@@ -25,7 +25,7 @@ from tests.waiting import Limit
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 120.0
-"""s that a condition may take on a slow machine."""
+"""Longest wait for a condition on a slow machine (s)."""
 ENTRIES = {
     "node": "nodes",
     "event": "events",
@@ -34,13 +34,13 @@ ENTRIES = {
     "report": "reports",
     "selector": "selectors",
 }
-"""The part of a snapshot that a change of this kind replaces an entry of."""
+"""Part of a snapshot in which a change of this kind replaces an entry."""
 LISTS = {"fired": ("firings", "firing", 60), "notice": ("notices", "notice", 30)}
 WHOLE = {"breakpoints", "paused", "controls", "result"}
 
 
 class Operator:
-    """A WebSocket of its own making, and the state as the page of the protocol says."""
+    """A WebSocket client without a library, with the state as the protocol page defines it."""
 
     def __init__(self, host: str, port: int, token: str) -> None:
         self.state: dict[str, Any] = {}
@@ -73,7 +73,7 @@ class Operator:
 
     def _more(self) -> None:
         data = self._socket.recv(1 << 16)
-        assert data, "the coordinator hung up"
+        assert data, "the coordinator closed the connection"
         self._rest += data
 
     def _take(self, count: int) -> bytes:
@@ -84,7 +84,7 @@ class Operator:
         return data
 
     def say(self, **message: Any) -> None:
-        """One text frame, masked as a client's must be (RFC 6455, 5.3)."""
+        """Send one text frame, masked as required for clients (RFC 6455, section 5.3)."""
         self._send(0x1, json.dumps(message).encode())
 
     def _send(self, code: int, body: bytes) -> None:
@@ -117,7 +117,7 @@ class Operator:
                 raise AssertionError(f"frame {code:#x}: {body!r}")
 
     def hear(self) -> str:
-        """Take one message in; gives its type."""
+        """Receive one message, apply it, and return its type."""
         message = json.loads(self._hear_text())
         kind = str(message["type"])
         if kind == "snapshot":
@@ -164,14 +164,14 @@ class Operator:
             state[kind] = change[kind]
 
     def until(self, holds: Callable[[dict[str, Any]], Any]) -> None:
-        """Listen until something holds."""
+        """Receive messages until the condition holds."""
         over = time.monotonic() + PATIENCE
         while not (self.state and holds(self.state)):
             assert time.monotonic() < over
             self.hear()
 
     def order(self, verb: str, **data: Any) -> dict[str, Any]:
-        """Give a command and listen until it is answered."""
+        """Give a command and receive messages until its answer."""
         self._number += 1
         self.say(type="command", id=self._number, verb=verb, data=data)
         limit = Limit(f"the answer to {verb}")
@@ -180,7 +180,7 @@ class Operator:
         return self.answers[self._number]
 
     def resynced(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The state as the changes made it, and the snapshot that was asked for after them."""
+        """Return the state built from changes, and a snapshot requested after them."""
         told = self.state
         self.say(type="resync")
         limit = Limit("the snapshot")
@@ -190,13 +190,13 @@ class Operator:
         return told, self.state
 
     def close(self) -> None:
-        """Leave."""
+        """Close the connection."""
         self._socket.close()
 
 
 @pytest.fixture
 def operator(tmp_path: Path) -> Iterator[Operator]:
-    """Connected to a coordinator that stays."""
+    """A client connected to a running `petrobot serve`."""
     command = [
         sys.executable,
         "-m",
@@ -210,7 +210,7 @@ def operator(tmp_path: Path) -> Iterator[Operator]:
     served = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     try:
         assert served.stdout is not None
-        assert select.select([served.stdout], [], [], PATIENCE)[0], "it says nothing"
+        assert select.select([served.stdout], [], [], PATIENCE)[0], "the coordinator prints nothing"
         address = re.search(r"http://([\d.]+):(\d+)/\?token=(\S+)", served.stdout.readline())
         assert address is not None
         made = Operator(address[1], int(address[2]), address[3])
@@ -225,8 +225,8 @@ def operator(tmp_path: Path) -> Iterator[Operator]:
 def test_a_foreign_operator_steers_a_catch_and_sees_what_the_coordinator_sees(
     operator: Operator,
 ) -> None:
-    """Controls, a start, a breakpoint, tokens in control places alone; every change applied as the
-    page says it."""
+    """It takes the controls, starts, sets a breakpoint and puts tokens into control places only;
+    every change is applied as the protocol page says."""
     assert operator.order("pause")["code"] == "not_holder"
     assert operator.order("take_controls")["ok"]
     assert operator.order("load", task="catch_ball")["ok"]
@@ -246,7 +246,7 @@ def test_a_foreign_operator_steers_a_catch_and_sees_what_the_coordinator_sees(
     limit = Limit("a quiet moment")
     while (
         told["sequence"] != now["sequence"] and limit.left()
-    ):  # what happened meanwhile came with the snapshot
+    ):  # Changes in the meantime are part of the snapshot.
         told, now = operator.resynced()
     assert told == now
     assert {

@@ -1,5 +1,5 @@
-"""In real time, over real nodes, a start takes what the command line takes: runs, seed, parameters,
-and learning into a file."""
+"""In real time with real nodes, a start accepts what the command line accepts: runs, seed,
+parameters, and learning into a file."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from tests.operator.conftest import Cell
 pytestmark = pytest.mark.processes
 
 
-async def test_a_run_in_real_time_takes_the_whole_order(
+async def test_a_run_in_real_time_follows_the_whole_order(
     cell: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What was asked for stands in the journal's header, holds in the run, and what was learned is
-    kept for the next one."""
-    monkeypatch.chdir(tmp_path)  # estimates are kept beside the coordinator
+    """The order is in the journal's header and holds in the run, and what was learned is kept for
+    the next run."""
+    monkeypatch.chdir(tmp_path)  # Estimates are kept in the coordinator's folder.
     learn = {"file": "cell", "selector": "thompson", "contexts": ["speed"]}
     answer = await cell.say(
         "start", task="moving", runs=3, seed=11, parameters={"speed": 2}, learn=learn
@@ -51,10 +51,10 @@ async def test_a_run_in_real_time_takes_the_whole_order(
     assert (await cell.ended())["learned"]["runs_counted"] == 0
 
 
-async def test_an_order_that_cannot_be_leaves_no_run(
+async def test_an_invalid_order_leaves_no_run(
     cell: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Refused before a folder is made or a node is spoken to."""
+    """It is refused before a folder is made or a node is called."""
     monkeypatch.chdir(tmp_path)
     for data in (
         {"runs": 0},

@@ -1,5 +1,5 @@
-"""What an operator may ask for at a start: read or refused; lock-step runs and runs from a point,
-shown live and steered."""
+"""Orders to start a run: read or refused; lock-step runs and runs from a recorded point, shown live
+and controlled."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ MOVING = loads(REMARKED, "moving.toml")
 
 
 class Simulated(Cell):
-    """A station whose nodes are not up: all that it can do is simulate."""
+    """A station without active nodes, which can only simulate."""
 
     def __init__(self, folder: Path) -> None:
         path = folder / "services.toml"
@@ -56,7 +56,7 @@ class Simulated(Cell):
         )
 
     async def simulate(self, **data: Any) -> tuple[str, Mapping[str, Any]]:
-        """Start in lock step and wait for the end; the run's folder and result."""
+        """Start in lock step and wait for the end; return the run's folder and result."""
         answer = await self.say(
             "start", **{"task": "moving", "mode": "lockstep", "pace": 0, **data}
         )
@@ -76,7 +76,7 @@ async def cell(tmp_path: Path) -> AsyncIterator[Simulated]:
 
 
 def records(folder: Path) -> list[tuple[str, Any]]:
-    """A journal without measured times."""
+    """Return a journal without measured times."""
     found = []
     for record in read_journal(folder / JOURNAL).records:
         if isinstance(record.data.get("stimulus"), dict):
@@ -85,12 +85,12 @@ def records(folder: Path) -> list[tuple[str, Any]]:
     return found
 
 
-# ---- what may be asked for
+# ---- orders
 # --------------------------------------------------------------------------------------------
 
 
-def test_the_form_has_types_defaults_and_the_authors_words(tmp_path: Path) -> None:
-    """Parameters as the task file declares them, with the comments behind them; only files of the
+def test_the_form_has_types_defaults_and_the_authors_comments(tmp_path: Path) -> None:
+    """Parameters are those that the task file declares, with their comments; only files of the
     folder are offered."""
     (tmp_path / "known.db").touch()
     (tmp_path / "no name.db").touch()
@@ -107,8 +107,8 @@ def test_the_form_has_types_defaults_and_the_authors_words(tmp_path: Path) -> No
     assert json.loads(json.dumps(form)) == form
 
 
-def test_everything_that_the_command_line_takes_is_read(tmp_path: Path) -> None:
-    """All fields at once, and none."""
+def test_every_option_of_the_command_line_is_read(tmp_path: Path) -> None:
+    """Tried with all fields at once, and with none."""
     assert read_start(MOVING, {}, tmp_path) == RunRequest()
     learn = {
         "file": "mine",
@@ -167,10 +167,10 @@ BAD = [
 
 
 @pytest.mark.parametrize(("data", "word"), BAD)
-def test_what_cannot_be_is_refused_with_a_clear_word(
+def test_invalid_orders_are_refused_with_a_clear_message(
     data: dict[str, Any], word: str | None, tmp_path: Path
 ) -> None:
-    """The field, what is wrong with it, and what would do."""
+    """The message names the field, the fault and the remedy."""
     if word is None:
         assert read_start(MOVING, data, tmp_path).parameters == {}
         return
@@ -195,8 +195,9 @@ FIELDS = st.sampled_from(
     max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(data=st.dictionaries(FIELDS, JSON, max_size=6))
-def test_whatever_comes_is_an_order_or_a_refusal(data: dict[str, Any], tmp_path: Path) -> None:
-    """Nothing else comes out, and what does is of the declared types; no name leaves its folder."""
+def test_any_input_becomes_an_order_or_a_refusal(data: dict[str, Any], tmp_path: Path) -> None:
+    """There is no third outcome; every field has its declared type, and no name leaves its
+    folder."""
     try:
         order = read_start(MOVING, data, tmp_path)
     except ValueError:
@@ -218,11 +219,10 @@ def test_whatever_comes_is_an_order_or_a_refusal(data: dict[str, Any], tmp_path:
 # -----------------------------------------------------------------------------------------------
 
 
-async def test_a_run_in_lock_step_is_that_of_the_command_line(
+async def test_a_run_in_lock_step_equals_that_of_the_command_line(
     cell: Simulated, tmp_path: Path
 ) -> None:
-    """Record by record and in its result, at any pace, watched or not; it has a folder, a journal
-    and a result."""
+    """Journal and result are equal at any pace, watched or not; the run has its own folder."""
     given = [
         "run",
         str(tmp_path / "tasks" / "moving.toml"),
@@ -257,9 +257,9 @@ async def test_a_run_in_lock_step_is_that_of_the_command_line(
             stop()
 
 
-async def test_a_run_in_lock_step_is_steered(cell: Simulated) -> None:
-    """While it is paused its time stands still; step, tokens, override, force and abort work as in
-    real time."""
+async def test_a_run_in_lock_step_can_be_controlled(cell: Simulated) -> None:
+    """During a pause its clock stops; step, tokens, override, force and abort work as in real
+    time."""
     assert (await cell.say("load", task="moving"))["ok"]
     assert (await cell.say("breakpoint", element="transitions.seen", on=True))["ok"]
     answer = await cell.say("start", mode="lockstep", pace=0, runs=4)
@@ -290,11 +290,11 @@ async def test_a_run_in_lock_step_is_steered(cell: Simulated) -> None:
     }
 
 
-async def test_the_stop_of_a_simulated_run_reaches_for_the_devices_too(
+async def test_an_emergency_stop_in_a_simulated_run_also_stops_the_real_devices(
     cell: Simulated, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever presses it means everything: the run ends, and the real devices are ordered to stop
-    as well."""
+    """An operator who presses it means everything: the run ends, and the real devices are ordered
+    to stop as well."""
     orders: list[str] = []
 
     async def order_all(directory: Any, credentials: Any, verb: str) -> list[Any]:
@@ -321,8 +321,8 @@ async def test_the_stop_of_a_simulated_run_reaches_for_the_devices_too(
 
 
 async def test_a_run_in_lock_step_learns(cell: Simulated, tmp_path: Path) -> None:
-    """Into the estimates file that was named; a second run begins with what the first one learned,
-    a frozen one adds nothing."""
+    """It writes to the named estimates file; a second run starts with what the first one learned,
+    and a frozen one adds nothing."""
     learn = {"file": "mine", "selector": "thompson"}
     _, first = await cell.simulate(runs=6, learn=learn)
     learned = dict(first["learned"])
@@ -350,14 +350,14 @@ async def test_a_run_in_lock_step_learns(cell: Simulated, tmp_path: Path) -> Non
     )
 
 
-# ---- from a point
+# ---- from a recorded point
 
 
-async def test_a_run_from_a_point_is_shown_live_and_says_where_it_comes_from(
+async def test_a_run_from_a_point_is_shown_live_and_names_its_origin(
     cell: Simulated,
 ) -> None:
-    """From its beginning it is the run itself; from the middle it stands where the other stood and
-    reaches an end."""
+    """From the first record it repeats the run; from the middle it starts in the marking of the
+    recorded run and reaches an end."""
     run, _ = await cell.simulate(runs=3, seed=5)
     again, _ = await cell.simulate(**{"from": {"run": run, "record": 0}})
     assert records(cell.runs / again) == records(cell.runs / run)
@@ -389,8 +389,8 @@ async def test_a_run_from_a_point_is_shown_live_and_says_where_it_comes_from(
         ({"run": "RUN", "record": 0, "going": "sometimes"}, "'sometimes'"),
     ],
 )
-async def test_a_point_that_is_none_is_refused(cell: Simulated, source: Any, word: str) -> None:
-    """Whatever is wrong with it, and the station goes on."""
+async def test_an_invalid_point_is_refused(cell: Simulated, source: Any, word: str) -> None:
+    """Every kind of fault is refused, and the station stays usable."""
     run, _ = await cell.simulate()
     if isinstance(source, dict) and source.get("run") == "RUN":
         source = {**source, "run": run}
@@ -408,8 +408,8 @@ async def test_a_point_that_is_none_is_refused(cell: Simulated, source: Any, wor
     await cell.simulate()
 
 
-async def test_a_damaged_journal_is_told(cell: Simulated) -> None:
-    """A journal that cannot be read is an answer, not the end of the station."""
+async def test_a_damaged_journal_is_reported(cell: Simulated) -> None:
+    """The station answers that the journal cannot be read, and stays usable."""
     run, _ = await cell.simulate()
     raw = bytearray((cell.runs / run / JOURNAL).read_bytes())
     raw[len(raw) // 2] ^= 0xFF

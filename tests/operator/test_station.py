@@ -1,5 +1,5 @@
-"""A coordinator that stays: tasks are started again and again, and every start that cannot be is
-answered clearly."""
+"""A permanent coordinator: tasks are started again and again, and every impossible start is
+refused with a reason."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.processes
 
 
 async def test_a_task_runs_again_and_again_over_real_nodes(cell: Cell) -> None:
-    """Each run has a journal and a result of its own; what the page knew of its operator stays."""
+    """Each run has its own journal and result; what the page knows of its operator is kept."""
     names = []
     for _ in range(2):
         answer = await cell.say("start", task="moving")
@@ -38,8 +38,8 @@ async def test_a_task_runs_again_and_again_over_real_nodes(cell: Cell) -> None:
     ] == ["slipped"]
 
 
-async def test_the_run_is_steered_and_its_door_is_open_while_it_goes_on(cell: Cell) -> None:
-    """Pause, step, tokens; the command line finds the run, and no longer when it has ended."""
+async def test_the_run_can_be_controlled_while_it_is_active(cell: Cell) -> None:
+    """Pause, step and tokens work; the command line finds the run until it has ended."""
     cell.station.door = lambda run: Door(run, "http://127.0.0.1:1", "secret", os.getpid())
     started = await cell.say("start", task="moving")
     await cell.until(lambda: cell.state["mission"]["state"] == "running")
@@ -59,9 +59,9 @@ async def test_the_run_is_steered_and_its_door_is_open_while_it_goes_on(cell: Ce
         find_door(None, cell.runs)
 
 
-async def test_what_cannot_be_started_says_why(cell: Cell) -> None:
-    """No task chosen, no such task, a task with faults, bad parameters, a run that goes on, a
-    stranger."""
+async def test_a_start_that_is_impossible_is_refused_with_the_reason(cell: Cell) -> None:
+    """Tried without a task, with an unknown or faulty task, with bad parameters, during a run, and
+    by a client without the controls."""
     assert (await cell.say("start"))["text"] == "choose a task first"
     assert "no task file nothing.toml" in (await cell.say("start", task="nothing"))["text"]
     cell.tasks.save_text("strange", None, TASK.replace('["pick_part"]', '["pick_apart"]'))
@@ -81,11 +81,11 @@ async def test_what_cannot_be_started_says_why(cell: Cell) -> None:
     await cell.ended()
 
 
-async def test_a_node_that_is_away_is_named_and_leaves_no_run(
+async def test_a_node_that_is_not_connected_is_named_and_leaves_no_run(
     cell: Cell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The start is refused with the node's name and address; the page says that it is lost, and a
-    later start succeeds."""
+    """The refusal has the node's name and address, the page shows the node as lost, and a later
+    start succeeds."""
     await cell.nodes["arm"].close()
 
     def offered() -> dict[str, bool]:
@@ -108,7 +108,7 @@ async def test_a_node_that_is_away_is_named_and_leaves_no_run(
 
 
 async def test_breakpoints_and_choices_before_the_start(cell: Cell) -> None:
-    """What is set on a loaded task holds for its next run; it is forgotten with another task."""
+    """Settings of a loaded task hold for its next run; loading another task removes them."""
     assert (await cell.say("pause"))["code"] == "idle"
     assert (await cell.say("load", task="moving"))["ok"]
     assert cell.state["marking"] == {"jobs": 2, "arm_free": 1, "look": 0, "pick": 0}
@@ -130,8 +130,8 @@ async def test_breakpoints_and_choices_before_the_start(cell: Cell) -> None:
     assert journal.header["mission"] == started["run"]
 
 
-async def test_closing_ends_the_run_that_goes_on(cell: Cell) -> None:
-    """The station aborts it, and its journal and result are whole."""
+async def test_closing_ends_the_active_run(cell: Cell) -> None:
+    """The station aborts it, and its journal and result are complete."""
     cell.tasks.save_text("long", None, TASK.replace("tokens = 2", "tokens = 9"))
     started = await cell.say("start", task="long")
     await cell.until(lambda: bool(cell.state["runs"]))
@@ -142,7 +142,8 @@ async def test_closing_ends_the_run_that_goes_on(cell: Cell) -> None:
 
 
 async def test_an_emergency_stop_needs_no_run(cell: Cell) -> None:
-    """Anybody may give it while idle; it is told, and cleared by whoever holds the controls."""
+    """Every client may give it while no run is active; it is shown, and cleared by the client that
+    holds the controls."""
     assert (await cell.station.command("ben", "estop", {}))["ok"]
     assert cell.state["mission"]["state"] == "stopped" and "ben" in cell.state["mission"]["reason"]
     assert (await cell.say("clear_estop"))["ok"]

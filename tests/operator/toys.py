@@ -1,15 +1,14 @@
-"""Primitive actions of a toy cell: they take their time and succeed. Scripts (`--mock`) let them
-fail."""
+"""Primitive actions of a toy cell: they wait and succeed. Scripts (`--mock`) make them fail."""
 
 from __future__ import annotations
 
 from petrobot.services.action import Context, Result, success
 
 TAKES = 0.3
-"""Seconds."""
+"""Duration (s)."""
 
 
 async def move(ctx: Context) -> Result:
-    """Take the time that a movement takes."""
+    """Wait as long as a movement takes."""
     await ctx.sleep(TAKES)
     return success()

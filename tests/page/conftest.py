@@ -1,4 +1,4 @@
-"""A served page over the scripted stage, and a real browser in front of it."""
+"""Fixtures: the page of a scripted mission, and a real browser that shows it."""
 
 from __future__ import annotations
 
@@ -37,9 +37,7 @@ ARGUMENTS = [
     "--disable-component-update",
     "--disable-sync",
 ]
-PATIENCE_MS = (
-    60_000  # for a condition: a browser beside other tests on two slow cores is late now and then
-)
+PATIENCE_MS = 60_000  # for a condition: with other tests on two slow cores a browser may be late
 SLIPPED = Part(0.3, Status.ERROR, "slipped", "the part slipped out of the gripper", Executed.YES)
 SCRIPT = {
     "look__edges": [Part(0.3)],
@@ -74,7 +72,7 @@ def tasks(tmp_path: Path) -> Path:
 
 @asynccontextmanager
 async def staged(tasks: Path, runs: Path) -> AsyncIterator[Stage]:
-    """A mission that stands ready to move parts; nothing has been started."""
+    """A mission that is ready to move parts; nothing has been started."""
     made = Stage(tasks, SCRIPT, WHERE, runs)
     path = tasks / "pick_and_place.toml"
     made.load(load(path))
@@ -84,7 +82,7 @@ async def staged(tasks: Path, runs: Path) -> AsyncIterator[Stage]:
 
 @asynccontextmanager
 async def served(stage: Stage, tasks: Path, runs: Path) -> AsyncIterator[Page]:
-    """The page of a mission, on loopback."""
+    """Serve the page of a mission on loopback."""
     history = JournalHistory(runs)
     made = await start_page(
         stage, tasks_folder=tasks, token="open sesame", offers=stage.offers, history=history
@@ -108,7 +106,7 @@ async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]
 
 
 def browser_missing() -> str:
-    """Return why there is no browser to test with; empty if there is one."""
+    """Return why no browser is available for tests; empty if there is one."""
     if not BROWSER.exists():
         return f"no browser at {BROWSER}: install chromium or set PETROBOT_BROWSER"
     if find_spec("playwright") is None:
@@ -126,8 +124,8 @@ def shots() -> Path:
 
 @pytest.fixture
 def faults() -> Callable[[Any], list[str]]:
-    """Collect what a browser page complains about: script errors, refused content, error messages
-    on its console."""
+    """Collect the errors of a browser page: script errors, refused content, errors on the
+    console."""
 
     def watch(tab: Any) -> list[str]:
         found: list[str] = []
@@ -139,13 +137,13 @@ def faults() -> Callable[[Any], list[str]]:
 
 
 def is_fault(message: ConsoleMessage) -> bool:
-    """Whether the page complains; a net that cannot be analysed yet is answered so, which the
-    browser notes (422)."""
+    """Return whether the message is an error. The answer 422 for a net that cannot be analysed yet,
+    which the browser logs, is not."""
     return message.type == "error" and "422" not in message.text
 
 
 async def until(holds: Callable[[], bool]) -> None:
-    """Wait until something holds on this side of the wire."""
+    """Wait until the condition holds in this process."""
     async with asyncio.timeout(PATIENCE_MS / 1000):
         while not holds():
             await beat()
@@ -160,13 +158,13 @@ NOTE_TOASTS = """() => {
 
 
 async def note_toasts(tab: Tab) -> None:
-    """Keep the messages that the page shows for a few seconds only: a test that looks once a second
-    may miss one."""
+    """Keep the messages that the page shows for only a few seconds: a test that checks once a
+    second could miss one."""
     await tab.evaluate(NOTE_TOASTS)
 
 
 async def toasted(tab: Tab, pattern: str) -> None:
-    """Wait until the page has said something like that since `note_toasts`."""
+    """Wait until the page has shown such a message since `note_toasts`."""
     script = "(pattern) => window.toasted.some((said) => new RegExp(pattern).test(said))"
     await tab.wait_for_function(script, arg=pattern)
 
@@ -178,8 +176,8 @@ PRESS_TWICE = (
 
 
 async def abort(toolbar: Locator) -> None:
-    """Press Abort, which asks, and press it again: in one go, as the page takes the answer for
-    three seconds only."""
+    """Press Abort, and press it again to confirm: in one step, as the page accepts the confirmation
+    for only three seconds."""
     from playwright.async_api import expect
 
     button = toolbar.get_by_role("button", name="Abort")
@@ -189,8 +187,8 @@ async def abort(toolbar: Locator) -> None:
 
 @contextmanager
 def nobody_listens(port: int) -> Iterator[None]:
-    """Keep a port that has just been left from being given to anybody else; it may be listened on
-    again meanwhile."""
+    """Reserve a port that has just been closed, so that no other process gets it; the test may
+    listen on it again."""
     with socket.socket() as placeholder:
         placeholder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         placeholder.bind(("127.0.0.1", port))
@@ -199,7 +197,7 @@ def nobody_listens(port: int) -> Iterator[None]:
 
 @pytest_asyncio.fixture(scope="session", loop_scope="session")
 async def browser() -> AsyncIterator[Browser]:
-    """Chromium without a window, one for all tests; each test closes its windows."""
+    """Headless Chromium, one for all tests; each test closes its windows."""
     if browser_missing():
         pytest.fail(browser_missing())
     from playwright.async_api import async_playwright

@@ -1,5 +1,5 @@
-"""A mission for tests and measurements: the real engine and narrator, with actions that follow a
-script instead of nodes."""
+"""A mission for tests and measurements: the real engine and narrator, with scripted actions instead
+of nodes."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ BEAT_S = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """How one run of an action goes."""
+    """Script of one run of an action."""
 
     seconds: float = 0.2
     status: Status = Status.SUCCESS
@@ -77,21 +77,22 @@ class _Playing:
 
 @dataclass
 class Controls:
-    """Who holds the controls, and who would like to."""
+    """Client that holds the controls, and clients that ask for them."""
 
     holder: str | None = None
     asking: list[str] = field(default_factory=list)
 
     def plain(self) -> dict[str, Any]:
-        """As in a snapshot."""
+        """Return the state as in a snapshot."""
         return {"holder": self.holder, "asking": list(self.asking)}
 
 
 class Stage:
-    """A mission port (coordinator.operator.port.MissionPort) that plays tasks of a folder. `script`
-    gives the parts of each action, of which the last one repeats; `where` gives the node of each
-    action. Time advances in steps of `BEAT_S`, driven by the loop's clock, so a pause really stops
-    every run."""
+    """A mission port (coordinator.operator.port.MissionPort) that runs tasks of a folder.
+
+    `script` gives the parts of each action, of which the last one repeats; `where` gives the node
+    of each action. Time advances in steps of `BEAT_S`, driven by the loop's clock, so a pause
+    really stops every run."""
 
     def __init__(
         self,
@@ -121,7 +122,7 @@ class Stage:
         self.on_beat: list[Callable[[float], None]] = []
         self.kept: set[str] = (
             set()
-        )  # actions whose runs go on until the test takes them out of here
+        )  # Actions whose runs stay active until the test removes them from this set.
         nodes = {
             node: {"state": "up", "round_trip": 0.0004} for node in sorted(set(where.values()))
         }
@@ -130,11 +131,11 @@ class Stage:
     # --- the port -----------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
-        """The state now."""
+        """Return the current state."""
         return self.feed.snapshot()
 
     def subscribe(self, receive: Callable[[dict[str, Any]], None]) -> Callable[[], None]:
-        """Later changes."""
+        """Call the function with every later change."""
         return self.feed.subscribe(receive)
 
     async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> dict[str, Any]:
@@ -146,8 +147,8 @@ class Stage:
         return answer
 
     def offers(self) -> list[dict[str, Any]]:
-        """What the nodes offer: one alternative for each primitive task of the same name, or
-        `task__alternative`."""
+        """Return the offers of the nodes: one alternative for each primitive task, named like the
+        task or `task__alternative`."""
         return [
             {
                 "action": a,
@@ -269,10 +270,10 @@ class Stage:
         self.feed.emit("selector", time=self.clock, name=name, selector=selector)
         return {"ok": True}
 
-    # --- the machine --------------------------------------------------------------------------
+    # --- the engine ---------------------------------------------------------------------------
 
     def load(self, task: Task, text: str = "") -> None:
-        """Stand ready to run a task."""
+        """Load a task, ready to run."""
         self._missions += 1
         self.clock = 0.0
         self._playing, self._timers = {}, {}
@@ -300,7 +301,7 @@ class Stage:
             self._store = JournalStore(self._writer, 0.0)
 
     def happen(self, event: str, number: int = 0) -> None:
-        """Something outside happens."""
+        """Raise an event from outside."""
         self._stimulate(EventOccurred(event, "stage", number))
 
     def _order(self, stimulus: Stimulus) -> dict[str, Any]:
@@ -330,7 +331,7 @@ class Stage:
     def _carry_out(self, instruction: Instruction) -> list[Stimulus]:
         match instruction:
             case StartRun(run, action=action):
-                assert self.kept <= self.where.keys(), "a run is kept by the name of its action"
+                assert self.kept <= self.where.keys(), "runs are stored by the name of their action"
                 self._playing[run] = _Playing(instruction, self._part(action))
                 return [RunStarted(run)]
             case CancelRun(run):
@@ -386,7 +387,7 @@ class Stage:
                 call(self.clock)
 
     def advance(self, seconds: float) -> None:
-        """Let runs and timers go on by so much."""
+        """Advance runs and timers by this time."""
         assert self.narrator is not None
         for run, playing in list(self._playing.items()):
             if playing.held:

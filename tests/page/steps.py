@@ -1,5 +1,5 @@
-"""Steps that a person takes on the page in a real browser, by role and name: open it, take the
-controls, draw, start."""
+"""Steps of a user on the page in a real browser, by role and name: open it, take the controls,
+draw, start."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ expect.set_options(timeout=PATIENCE_MS)
 
 
 async def opened(browser: Browser, page: Page, theme: Literal["light", "dark"] = "light") -> Tab:
-    """A new window on the page, as a new person would open it."""
+    """Open the page in a new window, as a new user."""
     context = await browser.new_context(
         viewport=SIZE, color_scheme=theme, reduced_motion="no-preference"
     )
@@ -35,7 +35,7 @@ async def opened(browser: Browser, page: Page, theme: Literal["light", "dark"] =
 
 
 async def settled(tab: Tab) -> None:
-    """The designer has opened what it was asked to open: nothing moves there any more by itself."""
+    """Wait until the designer has opened its task: nothing moves by itself any more."""
     await expect(tab.locator(".designer")).not_to_have_attribute("aria-busy", "true")
 
 
@@ -48,19 +48,19 @@ async def checked(tab: Tab, said: str = "May run") -> None:
 
 
 def element(tab: Tab, name: str, canvas: str = "Drawing of the task") -> Locator:
-    """A place or transition of a drawing by its accessible name."""
+    """Return a place or transition of a drawing by its accessible name."""
     return tab.get_by_role("application", name=canvas).get_by_role("button", name=re.compile(name))
 
 
 async def click_canvas(tab: Tab, x: float, y: float) -> None:
-    """Click so far into the drawing, as parts of its width and height."""
+    """Click at a position given as fractions of the drawing's width and height."""
     box = await tab.get_by_role("application", name="Drawing of the task").bounding_box()
     assert box is not None
     await tab.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
 
 
 async def draw_place(tab: Tab, kind: str, name: str, x: float, y: float) -> None:
-    """Put a place on the drawing and give it its name."""
+    """Draw a place and name it."""
     await tab.get_by_role("toolbar", name="Drawing tools").get_by_role("button", name=kind).click()
     await click_canvas(tab, x, y)
     await rename(tab, name)
@@ -68,14 +68,14 @@ async def draw_place(tab: Tab, kind: str, name: str, x: float, y: float) -> None
 
 
 async def rename(tab: Tab, name: str) -> None:
-    """Give the selected element a name."""
+    """Rename the selected element."""
     field = tab.get_by_role("complementary", name="Properties").get_by_label("Name", exact=True)
     await field.fill(name)
     await field.press("Enter")
 
 
 async def draw_transition(tab: Tab, name: str, x: float, y: float) -> None:
-    """Put a transition on the drawing and give it its name."""
+    """Draw a transition and name it."""
     await (
         tab.get_by_role("toolbar", name="Drawing tools")
         .get_by_role("button", name="Transition")
@@ -87,7 +87,7 @@ async def draw_transition(tab: Tab, name: str, x: float, y: float) -> None:
 
 
 async def draw_arcs(tab: Tab, *chains: str) -> None:
-    """Draw arcs along chains such as `a > t > b`, choosing one element after the other."""
+    """Draw arcs along chains such as `a > t > b` by selecting one element after the other."""
     await (
         tab.get_by_role("toolbar", name="Drawing tools")
         .get_by_role("button", name="Arc", exact=True)
@@ -111,7 +111,7 @@ async def choose_task(tab: Tab, place: str, primitive: str) -> None:
 
 
 async def hold_controls(tab: Tab) -> None:
-    """Take the controls, and wait until one holds them."""
+    """Take the controls, and wait until the page holds them."""
     await tab.get_by_role("button", name="Take controls").click()
     await expect(tab.get_by_role("toolbar", name="Mission")).to_contain_text(
         "You hold the controls"
@@ -167,7 +167,7 @@ async def start_mission(tab: Tab, task: str = "") -> None:
 
 
 async def designer(browser: Browser, page: Page) -> Tab:
-    """The designer with the shipped task open."""
+    """Open the shipped task in the designer."""
     tab = await opened(browser, page)
     await tab.get_by_role("tab", name="Design").click()
     await settled(tab)
@@ -176,7 +176,7 @@ async def designer(browser: Browser, page: Page) -> Tab:
 
 
 async def select_by_keyboard(tab: Tab, name: str) -> None:
-    """Go through the elements until the one of this name is selected."""
+    """Step through the elements by keyboard until the one with this name is selected."""
     properties = tab.get_by_role("complementary", name="Properties")
     for _ in range(12):
         await tab.keyboard.press("]")
@@ -187,7 +187,7 @@ async def select_by_keyboard(tab: Tab, name: str) -> None:
 
 
 async def late(tab: Tab, pattern: str, method: str) -> asyncio.Event:
-    """From now on the server's answers to such requests come only once the event is set."""
+    """Delay the server's answers to matching requests until the event is set."""
     arrive = asyncio.Event()
 
     async def handle(route: Route) -> None:
@@ -204,7 +204,7 @@ async def late(tab: Tab, pattern: str, method: str) -> asyncio.Event:
 
 @asynccontextmanager
 async def pressed(tab: Tab, button: str) -> AsyncIterator[None]:
-    """Hold a button down with the mouse for so long."""
+    """Hold a button down with the mouse for this time."""
     await tab.get_by_role("button", name=button).hover()
     await tab.mouse.down()
     yield

@@ -1,5 +1,5 @@
-"""Further attacks: names that climb out of their folder, bodies and frames that are not text,
-replays, secrets in headers, and messages that no client may send."""
+"""Further attacks: names that leave their folder, bodies and frames that are not text, replays,
+secrets in headers, and messages that no client may send."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ CLIMBING = [
 
 
 async def raw(page: Page, head: str, body: bytes = b"") -> bytes:
-    """One request byte by byte; everything that comes back."""
+    """Send one request as bytes; return the whole answer."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port_of(page))
     writer.write(head.replace("\n", "\r\n").encode("latin-1") + b"\r\n\r\n" + body)
     async with asyncio.timeout(60):
@@ -57,7 +57,7 @@ async def raw(page: Page, head: str, body: bytes = b"") -> bytes:
 
 @pytest_asyncio.fixture(loop_scope="session")
 async def cell(tmp_path: Path) -> AsyncIterator[tuple[Simulated, Page]]:
-    """A station that can be started, and its page."""
+    """A station that can start runs, and its page."""
     made = Simulated(tmp_path)
     secret = tmp_path / "secret" / "run.journal"
     secret.parent.mkdir()
@@ -74,11 +74,10 @@ async def cell(tmp_path: Path) -> AsyncIterator[tuple[Simulated, Page]]:
 
 
 @pytest.mark.parametrize("name", CLIMBING)
-async def test_names_of_documents_and_journals_do_not_climb(
+async def test_names_of_documents_and_journals_stay_in_their_folders(
     cell: tuple[Simulated, Page], name: str
 ) -> None:
-    """Neither a run, nor a task, nor a form, nor an export outside its folder; and nothing is
-    written anywhere."""
+    """No run, task, form or export outside its folder can be read, and nothing is written."""
     made, page = cell
     before = sorted(made.folder.rglob("*"))
     for path in (
@@ -104,7 +103,7 @@ async def test_names_of_documents_and_journals_do_not_climb(
 async def test_a_start_from_a_run_elsewhere_is_refused(
     cell: tuple[Simulated, Page], run: str
 ) -> None:
-    """`from` names a run of this coordinator's folder and nothing else."""
+    """`from` may only name a run in this coordinator's folder."""
     made, page = cell
     await ask(
         page,
@@ -137,8 +136,8 @@ STRANGE: list[dict[str, Any]] = [
 async def test_strange_orders_are_answered_briefly(
     cell: tuple[Simulated, Page], data: dict[str, Any]
 ) -> None:
-    """A message that is not a command is refused in a few words, whatever it holds, and leaves
-    nothing behind."""
+    """A message that is not a command is refused with a short reason, whatever it holds, and
+    changes nothing."""
     made, page = cell
     await ask(
         page,
@@ -185,9 +184,9 @@ async def test_deep_data_is_refused_or_ignored(page: Page, depth: int) -> None:
     assert (await ask(page, "/api/snapshot", headers=bearer(page))).status == 200
 
 
-async def test_a_compressed_body_may_not_swell(page: Page) -> None:
-    """A hundred megabytes of nothing, sent as a hundred kilobytes, are given up at the bound of any
-    body."""
+async def test_a_compressed_body_is_limited_by_its_expanded_size(page: Page) -> None:
+    """A hundred megabytes of zeros, sent as a hundred kilobytes, are refused at the limit that
+    holds for every body."""
     bomb = gzip.compress(b'{"a": "' + b" " * 100_000_000 + b'"}', 1)
     headers = {**bearer(page), "Content-Type": "application/json", "Content-Encoding": "gzip"}
     assert (
@@ -199,8 +198,8 @@ NO_TEXT = [b"\x00\x01", b"{}", b"\xff" * 1_000, b""]
 
 
 @pytest.mark.parametrize("frame", NO_TEXT)
-async def test_binary_frames_end_their_connection_alone(page: Page, frame: bytes) -> None:
-    """The protocol is text. A client that sends bytes is closed, with a reason."""
+async def test_a_binary_frame_ends_only_its_own_connection(page: Page, frame: bytes) -> None:
+    """The protocol is text. The connection of a client that sends bytes is closed with a reason."""
     async with joined(page) as good, joined(page, "bad", "2") as bad:
         await good.until(lambda s: True)
         await bad.until(lambda s: True)
@@ -232,7 +231,7 @@ async def test_binary_frames_end_their_connection_alone(page: Page, frame: bytes
 async def test_only_the_verbs_of_the_protocol_are_commands(
     page: Page, stage: Stage, verb: Any
 ) -> None:
-    """No method of the mission is reached by its name."""
+    """No other method of the mission can be called by its name."""
     async with joined(page) as client:
         answer = await client.command(verb)
     assert (answer["ok"], answer["code"]) == (False, "unknown_command")
@@ -241,7 +240,7 @@ async def test_only_the_verbs_of_the_protocol_are_commands(
 
 
 async def test_a_replayed_command_is_carried_out_once(page: Page, stage: Stage) -> None:
-    """The same frame again does nothing more, on its connection or, without the controls, on
+    """The same frame has no further effect, neither on its connection nor, without the controls, on
     another."""
     frame = {
         "type": "command",
@@ -268,7 +267,7 @@ async def test_a_replayed_command_is_carried_out_once(page: Page, stage: Stage) 
     )
 
 
-async def test_a_name_alone_is_nobody(page: Page, stage: Stage) -> None:
+async def test_a_name_alone_does_not_identify_a_client(page: Page, stage: Stage) -> None:
     """A client with the holder's name, but without the secret of the holder's tab, does not hold
     the controls."""
     async with joined(page) as ana, joined(page, "ana", "guessed") as thief:
@@ -278,9 +277,9 @@ async def test_a_name_alone_is_nobody(page: Page, stage: Stage) -> None:
         assert stage.controls.holder == ana.state["you"]
 
 
-async def test_the_token_leaves_by_no_header(page: Page) -> None:
-    """No referrer is sent from any answer, the first redirect included; a token in a Referer opens
-    nothing."""
+async def test_no_header_gives_the_token_away(page: Page) -> None:
+    """No answer lets the browser send a referrer, not even the first redirect; a token in a Referer
+    header is not accepted."""
     first = await ask(page, f"/?token={page.token}", allow_redirects=False)
     assert first.headers["Referrer-Policy"] == "no-referrer" and page.token not in str(
         first.headers
@@ -292,9 +291,9 @@ async def test_the_token_leaves_by_no_header(page: Page) -> None:
 
 
 @pytest.mark.parametrize("method", ["OPTIONS", "TRACE", "PUT", "DELETE", "PATCH", "PROPFIND"])
-async def test_no_other_site_is_ever_invited(page: Page, method: str) -> None:
-    """A preflight of another origin is refused, and no answer carries a word that would let it
-    read."""
+async def test_no_other_site_may_read_answers(page: Page, method: str) -> None:
+    """A preflight request of another origin is refused, and no answer has a header that would let
+    it read."""
     headers = {"Origin": "http://evil.example", "Access-Control-Request-Method": "POST"}
     answer = await ask(page, "/api/command", method, cookie=True, headers=headers)
     assert answer.status in (400, 403, 405)
@@ -305,8 +304,9 @@ async def test_no_other_site_is_ever_invited(page: Page, method: str) -> None:
 @pytest.mark.parametrize(
     "header", ["X-Forwarded-Host", "X-Host", "Forwarded", "X-Original-URL", "X-Rewrite-URL"]
 )
-async def test_no_header_stands_in_for_the_host(page: Page, header: str) -> None:
-    """What a proxy might say changes neither whom the server answers nor what."""
+async def test_no_header_replaces_the_host_header(page: Page, header: str) -> None:
+    """Headers that proxies set change neither which requests the server answers nor what it
+    answers."""
     good = f"127.0.0.1:{port_of(page)}"
     headers = {**bearer(page), "Host": "evil.example", header: good}
     assert (await ask(page, "/api/snapshot", headers=headers)).status == 421
@@ -328,8 +328,8 @@ async def test_no_header_stands_in_for_the_host(page: Page, header: str) -> None
         " folded: a",
     ],
 )
-async def test_requests_of_two_minds_are_refused(page: Page, stage: Stage, lines: str) -> None:
-    """What two servers would read differently (request smuggling) is not read at all."""
+async def test_ambiguous_requests_are_refused(page: Page, stage: Stage, lines: str) -> None:
+    """A request that two servers would read differently (request smuggling) is not read at all."""
     head = (
         f"POST /api/command HTTP/1.1\nHost: 127.0.0.1:{port_of(page)}\nAuthorization: "
         f"Bearer {page.token}\n"
@@ -341,8 +341,8 @@ async def test_requests_of_two_minds_are_refused(page: Page, stage: Stage, lines
 
 
 @pytest.mark.parametrize("pass_as", ["query", "body", "cookie", "basic", "lower"])
-async def test_the_token_counts_as_bearer_alone(page: Page, pass_as: str) -> None:
-    """In no other place is it a key; the cookie holds what is derived from it."""
+async def test_the_token_is_accepted_only_as_bearer(page: Page, pass_as: str) -> None:
+    """It is not accepted anywhere else; the cookie holds a value derived from it."""
     headers = {
         "cookie": {"Cookie": f"petrobot_{port_of(page)}={page.token}"},
         "basic": {"Authorization": f"Basic {page.token}"},

@@ -1,4 +1,4 @@
-"""End to end in a real browser, by role and name: draw, run, pause, step, feed tokens, and find out
+"""End to end in a real browser, by role and name: draw, run, pause, step, add tokens, and find out
 why something failed."""
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ pytestmark = pytest.mark.usefixtures("_windows_are_closed")
 async def test_a_new_user_draws_runs_and_understands(
     browser: Browser, page: Page, stage: Stage, shots: Path, faults: Watch
 ) -> None:
-    """The whole way without the manual: three actions with an error branch, run, pause, step, a run
-    more, and why it failed."""
+    """Without the manual: draw three actions with an error branch, run, pause, step, run once more,
+    and find out why it failed."""
     tab = await opened(browser, page)
     complaints = faults(tab)
     await tab.get_by_role("tab", name="Design").click()
@@ -80,7 +80,7 @@ async def test_a_new_user_draws_runs_and_understands(
 
 
 async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
-    """Pause, step, put a token in, go on, and read the reason of the provoked error."""
+    """Pause, step, add a token, continue, and read the reason of the provoked error."""
     mission = tab.get_by_role("status", name="Mission state")
     toolbar = tab.get_by_role("toolbar", name="Mission")
     await toolbar.get_by_role("button", name="Pause").click()
@@ -114,8 +114,8 @@ async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
 
 
 async def test_two_operators(browser: Browser, page: Page, stage: Stage) -> None:
-    """One holds the controls, the other watches the same, asks, and is handed them; the stop key is
-    everybody's."""
+    """One holds the controls; the other sees the same, asks for them and gets them; every client
+    may press the emergency stop."""
     ana, ben = await opened(browser, page), await opened(browser, page)
     await start_mission(ana)
     await expect(ben.get_by_role("status", name="Mission state")).to_contain_text("Running")
@@ -135,9 +135,9 @@ async def test_two_operators(browser: Browser, page: Page, stage: Stage) -> None
         )
 
 
-async def test_operators_hand_on_the_net(browser: Browser, page: Page, stage: Stage) -> None:
-    """Raise an event, stop at a breakpoint that was set before, choose an action, force an outgoing
-    transition, abort."""
+async def test_manual_interventions_in_the_net(browser: Browser, page: Page, stage: Stage) -> None:
+    """Raise an event, stop at a breakpoint, choose an action, force an outgoing transition,
+    abort."""
     stage.script["pick"].clear()
     stage.script["pick"].append(Part(0.3))
     stage.kept.update({"look__template", "pick", "put"})
@@ -175,11 +175,11 @@ async def test_operators_hand_on_the_net(browser: Browser, page: Page, stage: St
     ]
 
 
-async def test_who_chooses_an_alternative_while_a_run_learns_goes_on_choosing(
+async def test_an_open_list_of_alternatives_stays_usable_while_a_run_learns(
     browser: Browser, page: Page, stage: Stage
 ) -> None:
-    """Probabilities alter under an open list; a choice that is refused does not stand there as if
-    it had been taken."""
+    """Probabilities change under an open list; a refused choice is not shown as if it had been
+    accepted."""
     tab = await opened(browser, page)
     await hold_controls(tab)
     choose = tab.get_by_label("Alternative for look")
@@ -215,7 +215,7 @@ async def test_who_chooses_an_alternative_while_a_run_learns_goes_on_choosing(
 async def test_a_folded_error_branch_turns_red(
     browser: Browser, page: Page, stage: Stage, shots: Path
 ) -> None:
-    """Error branches are hidden behind a badge until a token enters one; a press shows them."""
+    """Error branches are hidden behind a badge until a token enters one; a click shows them."""
     stage.kept.add("clear")
     tab = await opened(browser, page, "dark")
     await expect(element(tab, "^Action place clear", "Task net")).to_be_hidden()
@@ -233,10 +233,10 @@ async def test_a_folded_error_branch_turns_red(
 EVIL = "<img src=x onerror=\"document.title='owned'\"><script>document.title='owned'</script>"
 
 
-async def test_script_in_names_and_reasons_is_text(
+async def test_markup_in_names_and_reasons_is_shown_as_text(
     browser: Browser, page: Page, stage: Stage, faults: Watch
 ) -> None:
-    """Whatever a node, a task file or another operator calls things, the page shows it as text."""
+    """The page shows every name from a node, a task file or another operator as text."""
     text = (stage.tasks / "pick_and_place.toml").read_text()
     quoted = EVIL.replace('"', '\\"')
     (stage.tasks / "evil.toml").write_text(
@@ -274,14 +274,14 @@ async def test_script_in_names_and_reasons_is_text(
     assert complaints == []
 
 
-async def test_a_lost_connection_is_plain_to_see(
+async def test_a_lost_connection_is_shown(
     browser: Browser, stage: Stage, tasks: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """When the coordinator disappears without a message, the page shows it at once. It catches up
     when the coordinator is back."""
 
     async def vanish(session: Session) -> None:
-        """Say no goodbye."""
+        """Close without a goodbye message."""
 
     monkeypatch.setattr(Session, "leave", vanish)
     async with served(stage, tasks, tmp_path / "runs") as first:
@@ -300,7 +300,7 @@ async def test_a_lost_connection_is_plain_to_see(
 
 
 async def labels_are_clear_of_each_other(tab: Tab) -> None:
-    """Labels of detections stand inside their image, and none covers another."""
+    """Check that labels of detections are inside their image and do not cover each other."""
     picture = await tab.get_by_role("img", name="Image of table").bounding_box()
     labels = await tab.locator(".detection-label").all()
     boxes = [box for label in labels if (box := await label.bounding_box())]
@@ -317,11 +317,11 @@ async def labels_are_clear_of_each_other(tab: Tab) -> None:
             assert beside or above
 
 
-async def test_details(
+async def test_the_detail_views(
     browser: Browser, page: Page, stage: Stage, shots: Path, faults: Watch
 ) -> None:
-    """Camera with detections, devices, set-point latency, learning curves, events, variables; on a
-    wall screen too."""
+    """Camera with detections, devices, set-point latency, learning curves, events, variables; also
+    on a wall screen."""
     tab = await opened(browser, page, "dark")
     complaints = faults(tab)
     await start_mission(tab)
@@ -382,7 +382,7 @@ async def test_details(
 
 
 def mission_of(stage: Stage) -> tuple[str, str]:
-    """Return which mission there is, and its state."""
+    """Return the name and state of the mission."""
     mission = stage.feed.state["mission"]
     return mission["id"], mission["state"]
 
@@ -441,11 +441,11 @@ async def test_history(
     assert complaints == []
 
 
-async def test_a_press_is_not_lost_to_what_comes_in_meanwhile(
+async def test_a_click_is_not_lost_when_updates_arrive_during_it(
     browser: Browser, page: Page, stage: Stage
 ) -> None:
-    """Between press and release offers, findings and tokens come in: the form under the pointer
-    waits, and the press counts."""
+    """Offers, findings and tokens arrive between press and release: the form under the pointer
+    waits with its update, and the click counts."""
     tab = await designer(browser, page)
     await element(tab, "^Transition pick_failed").click()
     await tab.keyboard.press("Delete")
@@ -469,8 +469,8 @@ async def test_a_press_is_not_lost_to_what_comes_in_meanwhile(
 
 
 async def test_the_browser_applies_changes_as_the_server_does(browser: Browser, page: Page) -> None:
-    """The two copies of the rules, in Python and in the page, lead to one state on random runs of
-    changes."""
+    """The two implementations of the rules, in Python and in the page, reach the same state on
+    random sequences of changes."""
     tab = await opened(browser, page)
     script = """async ([state, changes]) => {
       const { apply } = await import("/page/js/state.js");
@@ -485,7 +485,7 @@ async def test_the_browser_applies_changes_as_the_server_does(browser: Browser, 
 
 
 def some_changes() -> list[list[dict[str, Any]]]:
-    """Thirty runs of changes, the same at each run of the test."""
+    """Return thirty sequences of changes, the same in each run of the test."""
     found: list[list[dict[str, Any]]] = []
 
     @settings(max_examples=30, database=None, derandomize=True, phases=[Phase.generate])
@@ -500,8 +500,8 @@ def some_changes() -> list[list[dict[str, Any]]]:
 async def test_fifty_updates_a_second_leave_no_gap(
     browser: Browser, page: Page, stage: Stage
 ) -> None:
-    """A hundred nodes under steady fire: every number arrives, merged deltas only, and the page
-    ends at the newest."""
+    """A hundred nodes send updates all the time: every number arrives, in merged deltas, and the
+    page ends with the newest state."""
     tab = await opened(browser, page)
     mission = SyntheticMission(100)
     stage.feed.replace(**{k: v for k, v in mission.snapshot().items() if k != "sequence"})
@@ -511,18 +511,18 @@ async def test_fifty_updates_a_second_leave_no_gap(
     async with asyncio.timeout(PATIENCE_MS / 1000):
         while (
             await tab.evaluate("petrobot.link.deltas") <= 10
-        ):  # a starved browser gets them in few heaps
+        ):  # A slow browser receives them in a few large deltas.
             await ticking(mission, 0.5)
     last = str(stage.feed.state["sequence"])
     await expect(tab.locator("html")).to_have_attribute("data-sequence", last)
     assert await tab.evaluate("petrobot.link.gaps") == 0
 
 
-async def test_the_stop_is_within_reach_of_every_dialog(
+async def test_the_emergency_stop_can_be_pressed_in_every_dialog(
     browser: Browser, page: Page, stage: Stage
 ) -> None:
-    """Whatever is asked, the emergency stop can be pressed, and Escape closes the question without
-    an answer."""
+    """In every dialog the emergency stop can be pressed, and Escape closes the dialog without an
+    answer."""
     tab = await designer(browser, page)
     await tab.get_by_role("button", name="Keyboard").click()
     dialog = tab.get_by_role("dialog", name="Keyboard")

@@ -1,5 +1,5 @@
-"""The designer in a real browser, by role and name: drawn by keyboard, refused, edited by two, laid
-out, analysed."""
+"""The designer in a real browser, by role and name: drawing by keyboard, refusals, two editors,
+layout, analysis."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ pytestmark = pytest.mark.usefixtures("_windows_are_closed")
 
 
 async def test_drawing_by_keyboard_alone(browser: Browser, page: Page, faults: Watch) -> None:
-    """Places, transitions and arcs, names, undo and redo, copy, move and delete: no mouse, and
-    Escape destroys nothing."""
+    """Places, transitions, arcs, names, undo and redo, copy, move and delete work without a mouse,
+    and Escape destroys nothing."""
     tab = await designer(browser, page)
     complaints = faults(tab)
     await tab.get_by_role("button", name="New task").press("Enter")
@@ -88,9 +88,9 @@ async def test_drawing_by_keyboard_alone(browser: Browser, page: Page, faults: W
     assert complaints == []
 
 
-async def test_a_late_answer_takes_nothing_away(browser: Browser, page: Page, tasks: Path) -> None:
-    """A task that comes in late does not replace what was begun meanwhile; a late save keeps what
-    was drawn meanwhile."""
+async def test_a_late_answer_overwrites_nothing(browser: Browser, page: Page, tasks: Path) -> None:
+    """A task that arrives late does not replace a drawing started meanwhile; a late answer to a
+    save keeps what was drawn meanwhile."""
     tab = await opened(browser, page)
     opening = await late(tab, "**/api/tasks/*", "GET")
     async with tab.expect_request("**/api/tasks/*"):
@@ -120,8 +120,8 @@ async def test_a_late_answer_takes_nothing_away(browser: Browser, page: Page, ta
     assert set(load(tasks / "late.toml").places) == {"jobs", "arm_free"}
 
 
-async def test_what_is_typed_while_the_page_loads_stays(browser: Browser, page: Page) -> None:
-    """Offers of nodes that arrive late do not rebuild a form in which the user types already."""
+async def test_text_typed_while_the_page_loads_stays(browser: Browser, page: Page) -> None:
+    """Offers of nodes that arrive late do not rebuild a form in which the user is typing."""
     tab = await opened(browser, page)
     offers = await late(tab, "**/api/offers", "GET")
     await tab.get_by_role("tab", name="Design").click()
@@ -138,9 +138,9 @@ async def test_what_is_typed_while_the_page_loads_stays(browser: Browser, page: 
     await expect(tab.locator(".saved")).to_have_text("not saved")
 
 
-async def test_what_may_not_be_drawn_says_why(browser: Browser, page: Page) -> None:
+async def test_an_invalid_drawing_is_explained(browser: Browser, page: Page) -> None:
     """An arc between two places is refused; a missing branch and an action that no node offers are
-    shown where they are."""
+    marked in the drawing."""
     tab = await designer(browser, page)
     await (
         tab.get_by_role("toolbar", name="Drawing tools")
@@ -166,8 +166,7 @@ async def test_what_may_not_be_drawn_says_why(browser: Browser, page: Page) -> N
 
 
 async def test_two_people_edit_one_task(browser: Browser, page: Page, tasks: Path) -> None:
-    """The later save is refused, both versions are shown, and nothing is lost whatever one
-    chooses."""
+    """The later save is refused, both versions are shown, and no choice loses anything."""
     ana, ben = await designer(browser, page), await designer(browser, page)
     for tab, goal in ((ana, "from ana"), (ben, "from ben")):
         field = tab.get_by_label("Goal", exact=True)
@@ -191,8 +190,8 @@ async def test_two_people_edit_one_task(browser: Browser, page: Page, tasks: Pat
 async def test_formats_and_layout(
     browser: Browser, page: Page, tasks: Path, tmp_path: Path
 ) -> None:
-    """SVG stands on its own, PNG and PNML come out, PNML comes back, and the layout button moves
-    things as one step."""
+    """SVG is self-contained, PNG and PNML can be exported, PNML can be imported, and an automatic
+    layout is one step of undo."""
     tab = await designer(browser, page)
     made = {}
     for form in ("SVG", "PNG", "PNML", "TOML"):
@@ -264,11 +263,11 @@ async def test_macro_places_open_in_both_views(
     await expect(element(tab, "^Control place inside")).to_be_visible()
 
 
-async def test_verdicts_stand_beside_the_drawing(
+async def test_verdicts_are_shown_next_to_the_drawing(
     browser: Browser, page: Page, shots: Path, faults: Watch
 ) -> None:
-    """The page says by itself that a task may stop before its end. A click shows the marking and
-    the firings that lead there."""
+    """The page warns without being asked that a task may stop before its end. A click shows the
+    marking and the firings that lead to it."""
     tab = await designer(browser, page)
     complaints = faults(tab)
     analysis = tab.get_by_role("region", name="Analysis")

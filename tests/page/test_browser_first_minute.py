@@ -1,5 +1,5 @@
-"""The first minute on the page, where a slip costs trust: run what was drawn, draw arcs, fill in a
-form, answer a question."""
+"""The first minute of a user on the page: run the drawn task, draw arcs, fill in a form, answer a
+dialog."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ NAMES = ("p1", "p2", "p3", "t1", "t2", "t3")
 
 @pytest.fixture
 def tasks(tasks: Path) -> Path:
-    """The folder with one more task."""
+    """The task folder with one more task."""
     (tasks / "corners.toml").write_text(CORNERS, encoding="utf-8")
     return tasks
 
 
 @pytest_asyncio.fixture(loop_scope="session")
 async def cell(tmp_path: Path) -> AsyncIterator[Simulated]:
-    """A station that simulates."""
+    """A station that can only simulate."""
     made = Simulated(tmp_path)
     yield made
     await made.station.close()
@@ -69,7 +69,7 @@ async def own_page(cell: Simulated) -> AsyncIterator[Page]:
 
 
 async def on_the_desk(browser: Browser, page: Page, task: str) -> Tab:
-    """The designer with a task open."""
+    """Open a task in the designer."""
     tab = await designer(browser, page)
     await tab.get_by_label("Task", exact=True).select_option(task)
     await expect(tab.locator(".saved")).to_have_text("saved")
@@ -92,11 +92,11 @@ async def test_run_this_task_takes_free_controls(
     )
 
 
-async def test_what_is_run_from_the_designer_is_seen_whole(
+async def test_a_task_run_from_the_designer_is_shown_whole(
     browser: Browser, own_page: Page, cell: Simulated
 ) -> None:
-    """Live was not shown while its task was drawn: it is fitted when it is shown, with nothing
-    under the bar or cut off."""
+    """The live view was hidden when its task was drawn, so it is fitted when it is shown, with
+    nothing cut off or under the bar."""
     tab = await opened(browser, own_page)
     await tab.get_by_role("tab", name="Design").click()
     await settled(tab)
@@ -126,7 +126,7 @@ async def test_run_this_task_says_who_holds_the_controls(
 
 
 async def centre(tab: Tab, name: str) -> tuple[float, float]:
-    """The middle of an element's body."""
+    """Return the centre of an element's body."""
     box = await tab.locator(f".designer .net [data-name='{name}'] .body").bounding_box()
     assert box is not None
     return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -140,7 +140,7 @@ DRAWN = """() => Object.entries(petrobot.tabs.Design.model.data.transitions).fla
 async def test_an_arc_goes_from_where_the_drag_began_to_where_it_ended(
     browser: Browser, page: Page, key: str
 ) -> None:
-    """Whatever is selected when the tool is taken: every selection, every pair."""
+    """Tried with every selection before the tool is taken, and for every pair of elements."""
     tab = await on_the_desk(browser, page, "corners")
     at = {name: await centre(tab, name) for name in NAMES}
     pairs = [
@@ -163,11 +163,11 @@ async def test_an_arc_goes_from_where_the_drag_began_to_where_it_ended(
     assert wrong == []
 
 
-async def test_arcs_by_choosing_one_after_the_other_go_on_as_ever(
+async def test_arcs_can_be_drawn_by_selecting_one_element_after_the_other(
     browser: Browser, page: Page
 ) -> None:
-    """From the selected element with a key, or with two presses; Escape in the middle of a drag
-    draws nothing."""
+    """From the selected element with a key, or with two clicks; Escape during a drag draws
+    nothing."""
     tab = await on_the_desk(browser, page, "corners")
     at = {name: await centre(tab, name) for name in NAMES}
     await tab.mouse.click(*at["p1"])
@@ -194,9 +194,9 @@ FOCUSED = """() => { const at = document.activeElement;
     ?? at.tagName; }"""
 
 
-async def test_tab_goes_on_to_the_next_field_after_a_change(browser: Browser, page: Page) -> None:
-    """Through a whole form: whatever was changed, the next field has the focus, and digits are
-    text."""
+async def test_tab_moves_to_the_next_field_after_a_change(browser: Browser, page: Page) -> None:
+    """Through a whole form: after any change the next field has the focus, and digits are entered
+    as text."""
     tab = await designer(browser, page)
     await element(tab, "^Control place parts").click()
     form = tab.get_by_role("complementary", name="Properties")
@@ -208,7 +208,9 @@ async def test_tab_goes_on_to_the_next_field_after_a_change(browser: Browser, pa
     await tab.keyboard.type("12 pieces")
     await tab.keyboard.press("Tab")
     await checked(tab, "")
-    assert await tab.evaluate(FOCUSED) == "Kind", "also after the check has drawn the form again"
+    assert await tab.evaluate(FOCUSED) == "Kind", (
+        "the focus must stay after the check has rebuilt the form"
+    )
     await tab.keyboard.press("Tab")
     await tab.keyboard.type("3")
     await tab.keyboard.press("Tab")
@@ -226,7 +228,8 @@ async def test_tab_goes_on_to_the_next_field_after_a_change(browser: Browser, pa
 
 
 async def test_a_choice_keeps_the_focus(browser: Browser, page: Page) -> None:
-    """Another kind of place has another form. A user who chose it by keyboard keeps the focus."""
+    """Another kind of place has another form. The field keeps the focus if it was changed by
+    keyboard."""
     tab = await designer(browser, page)
     await element(tab, "^Control place parts").click()
     kind = tab.get_by_role("complementary", name="Properties").get_by_label("Kind")
@@ -236,11 +239,11 @@ async def test_a_choice_keeps_the_focus(browser: Browser, page: Page) -> None:
     assert await tab.evaluate(FOCUSED) == "Kind"
 
 
-# ---- questions
+# ---- dialogs
 
 
 async def test_the_safe_answer_has_the_focus(browser: Browser, page: Page, tasks: Path) -> None:
-    """Enter without looking must neither write over another's work nor throw one's own away."""
+    """Pressing Enter at once must neither overwrite another user's work nor discard one's own."""
     tab = await on_the_desk(browser, page, "corners")
     theirs = CORNERS.replace("x = 500, y = 300", "x = 510, y = 310")
     await element(tab, "^Control place p1").click()
@@ -277,7 +280,7 @@ async def test_an_emergency_stop_is_not_cleared_by_enter(
 
 
 def altered(cell: Simulated) -> str:
-    """Another program writes the task file."""
+    """Write the task file as another program would."""
     path = cell.folder / "tasks" / "moving.toml"
     text = path.read_text(encoding="utf-8").replace("tokens = 2", "tokens = 1")
     path.write_text(text, encoding="utf-8")
@@ -287,7 +290,7 @@ def altered(cell: Simulated) -> str:
 async def test_a_loaded_task_that_was_changed_outside_is_shown_before_it_runs(
     browser: Browser, own_page: Page, cell: Simulated
 ) -> None:
-    """Start runs what is seen, or says that it is something else now and shows that."""
+    """Start runs the task that is shown, or says that it has changed and shows the new one."""
     tab = await opened(browser, own_page)
     await hold_controls(tab)
     toolbar = tab.get_by_role("toolbar", name="Mission")
@@ -301,14 +304,14 @@ async def test_a_loaded_task_that_was_changed_outside_is_shown_before_it_runs(
     answer = await cell.station.command(
         cell.station.controls.holder or "", "start", {"mode": "lockstep", "pace": 0}
     )
-    assert answer["ok"], "what is seen now may be started"
+    assert answer["ok"], "the task that is shown now may be started"
 
 
-async def test_run_this_task_never_runs_another_text(
+async def test_run_this_task_never_runs_a_changed_file_unseen(
     browser: Browser, own_page: Page, cell: Simulated
 ) -> None:
-    """The designer says that its file was changed outside, refuses to run it unseen, and loads it
-    when asked to."""
+    """The designer says that another program changed its file, refuses to run it unseen, and loads
+    it on request."""
     tab = await opened(browser, own_page)
     await tab.get_by_role("tab", name="Design").click()
     await settled(tab)
@@ -324,7 +327,7 @@ async def test_run_this_task_never_runs_another_text(
     assert (cell.folder / "tasks" / "moving.toml").read_text(encoding="utf-8") == text
 
 
-async def test_a_change_outside_is_noticed_while_one_looks(
+async def test_a_change_by_another_program_is_noticed_at_once(
     browser: Browser, own_page: Page, cell: Simulated
 ) -> None:
     tab = await opened(browser, own_page)

@@ -1,5 +1,5 @@
-"""Closed macro places and folded error branches hide drawing, not what happens: activity, tokens
-and errors show from outside."""
+"""Closed macro places and folded error branches hide parts of the drawing, but activity, tokens and
+errors are still visible from outside."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BRANCH = ("pick_failed", "put_failed", "cleared", "stuck")
 
 
 def grouped(text: str, macros: dict[str, tuple[str, ...]]) -> str:
-    """The task with elements put into macro places: {macro place: names of what is in it}."""
+    """Return the task with elements in macro places: {macro place: names of its elements}."""
     for i, (macro, names) in enumerate(macros.items()):
         for name in names:
             text = re.sub(
@@ -41,8 +41,8 @@ def grouped(text: str, macros: dict[str, tuple[str, ...]]) -> str:
 async def running(
     browser: Browser, page: Page, stage: Stage, macros: dict[str, tuple[str, ...]]
 ) -> Tab:
-    """The task grouped like that, started, with a run of `pick` that lasts until the test lets it
-    end, in error."""
+    """Start the task with these groups; a run of `pick` lasts until the test lets it end in
+    error."""
     path = stage.tasks / "grouped.toml"
     path.write_text(
         grouped((stage.tasks / "pick_and_place.toml").read_text(), macros), encoding="utf-8"
@@ -64,8 +64,8 @@ async def running(
 async def test_an_error_that_leaves_a_closed_macro_place(
     browser: Browser, page: Page, stage: Stage, macros: dict[str, tuple[str, ...]]
 ) -> None:
-    """The run shows on the closed place; when it fails, the folded branch that begins there tells
-    its tokens."""
+    """The closed place shows the run; when it fails, the folded branch that starts there shows its
+    tokens."""
     tab = await running(browser, page, stage, macros)
     await expect(element(tab, "^Macro place handling, 1 token, running", NET)).to_be_visible()
     await expect(tab.locator(".live .moving [data-run=running]")).to_have_count(1)
@@ -90,7 +90,7 @@ async def test_an_error_that_leaves_a_closed_macro_place(
 async def test_an_error_that_stays_in_a_closed_macro_place(
     browser: Browser, page: Page, stage: Stage, shots: Path, deep: bool
 ) -> None:
-    """The error branch lies inside: the closed macro place shows it, and so does each macro place
+    """The error branch is inside: the closed macro place shows it, and so does each macro place
     around it."""
     inside = ("pick", "put", "clear", "picked", "pick_failed", "put_failed")
     macros: dict[str, tuple[str, ...]] = (
@@ -120,8 +120,8 @@ async def test_an_error_that_stays_in_a_closed_macro_place(
 async def test_an_error_elsewhere_shows_inside_an_opened_macro_place(
     browser: Browser, page: Page, stage: Stage
 ) -> None:
-    """Who looks into another part of the net sees that a token is in an error branch that is not on
-    this sheet."""
+    """In another part of the net the page shows that a token is in an error branch outside this
+    view."""
     tab = await running(browser, page, stage, {"looking": ("look",), "handling": ("put",)})
     await tab.locator(".live .net [data-name=looking] .body").dblclick()
     await expect(element(tab, "^Action place look", NET)).to_be_visible()

@@ -1,5 +1,5 @@
-"""The page never stands still without a word: numbers that JSON has not, messages that it cannot
-read or show, closed doors."""
+"""The page never freezes silently: numbers that JSON does not have, messages that it cannot read or
+show, connections that fail."""
 
 from __future__ import annotations
 
@@ -31,8 +31,7 @@ DETAILS = ("Camera", "Devices", "Set points", "Learning", "Variables", "Events",
 
 
 def emit_everything(stage: Stage, bad: float) -> None:
-    """Every kind of change that carries numbers, with one that is not finite wherever a number may
-    stand."""
+    """Emit every kind of change that has numbers, with a non-finite one in every position."""
     feed = stage.feed
     values = {"setpoint_age": bad, "load": 0.25, "list": [bad, {"deep": [bad]}]}
     feed.emit(
@@ -86,11 +85,11 @@ def emit_everything(stage: Stage, bad: float) -> None:
 
 
 @pytest.mark.parametrize("bad", [inf, -inf, nan], ids=["inf", "-inf", "nan"])
-async def test_numbers_that_are_not_finite_leave_the_page_alive(
+async def test_numbers_that_are_not_finite_do_not_break_the_page(
     browser: Browser, page: Page, stage: Stage, faults: Watch, bad: float
 ) -> None:
-    """They come as deltas to an open page and in the snapshot of a new one. No value is shown, and
-    everything else works."""
+    """They arrive as deltas at an open page and in the snapshot of a new one. The page shows no
+    value for them, and everything else works."""
     tab = await opened(browser, page)
     complaints = faults(tab)
     emit_everything(stage, bad)
@@ -115,7 +114,7 @@ async def test_numbers_that_are_not_finite_leave_the_page_alive(
 async def test_history_and_http_carry_no_infinity(
     browser: Browser, page: Page, stage: Stage
 ) -> None:
-    """The same for what is asked for over HTTP: a browser reads it."""
+    """Answers over HTTP are also readable in a browser."""
     tab = await opened(browser, page)
     stage.feed.emit("result", result={"score": inf, "deep": [{"x": nan}]})
     read = "async () => (await (await fetch('/api/snapshot')).json()).result"
@@ -123,7 +122,8 @@ async def test_history_and_http_carry_no_infinity(
 
 
 async def through_a_proxy(browser: Browser, page: Page, mangle: Mangle) -> tuple[Tab, list[str]]:
-    """A window whose live messages pass something that may alter them; also what passed."""
+    """Open a window whose live messages pass a function that may change them; also return the
+    messages."""
     context = await browser.new_context(viewport=SIZE)
     passed: list[str] = []
 
@@ -144,7 +144,7 @@ async def through_a_proxy(browser: Browser, page: Page, mangle: Mangle) -> tuple
 
 
 def once(alter: Callable[[str], str | bytes]) -> Mangle:
-    """Alter the next delta, and no other message."""
+    """Change the next delta and no other message."""
     done: list[bool] = []
 
     def mangle(message: str) -> str | bytes:
@@ -172,7 +172,7 @@ ALTERED: dict[str, Callable[[str], str | bytes]] = {
 async def test_a_message_that_cannot_be_read_is_a_lost_connection(
     browser: Browser, page: Page, stage: Stage, how: str
 ) -> None:
-    """The bar shows it, and the page continues with a fresh snapshot, so the content of the message
+    """The bar shows it, and the page continues with a new snapshot, so the content of the message
     is not missing."""
     tab, passed = await through_a_proxy(browser, page, once(ALTERED[how]))
     await tab.evaluate(NOTE_BAR)
@@ -181,7 +181,7 @@ async def test_a_message_that_cannot_be_read_is_a_lost_connection(
     await expect(tab.get_by_role("alert")).to_be_hidden()
     assert any("could not show" in said for said in await tab.evaluate("window.barSaid"))
     assert sum('"type":"snapshot"' in message for message in passed) == 2, (
-        "the one at the beginning and a fresh one"
+        "the first snapshot and a new one"
     )
     stage.feed.emit("marking", marking={"parts": 4})
     await expect(element(tab, "^Control place parts, 4 tokens", "Task net")).to_be_visible()
@@ -199,7 +199,7 @@ NOTE_BAR = """() => {
 async def test_a_page_that_receives_only_what_it_cannot_read_says_so_and_keeps_trying(
     browser: Browser, page: Page, stage: Stage
 ) -> None:
-    """Not one blink of the bar: it stays until something can be read again."""
+    """The bar does not flicker: it stays until a message can be read again."""
     broken: list[bool] = []
     tab, passed = await through_a_proxy(browser, page, lambda m: m[:-1] if broken else m)
     broken.append(True)
@@ -214,7 +214,7 @@ async def test_a_page_that_receives_only_what_it_cannot_read_says_so_and_keeps_t
     await expect(element(tab, "^Control place parts, 5 tokens", "Task net")).to_be_visible()
 
 
-async def test_a_fault_of_the_page_itself_is_said_and_mended(
+async def test_an_exception_in_the_page_is_reported_and_followed_by_a_new_connection(
     browser: Browser, page: Page, stage: Stage
 ) -> None:
     """After an exception in a handler the page does not show an old picture: it reports the fault
@@ -232,10 +232,10 @@ async def test_a_fault_of_the_page_itself_is_said_and_mended(
     await expect(tab.get_by_role("alert")).to_be_hidden()
 
 
-async def test_the_emergency_stop_goes_past_a_link_that_cannot_be_read(
+async def test_the_emergency_stop_works_when_messages_cannot_be_read(
     browser: Browser, page: Page, stage: Stage
 ) -> None:
-    """The page reads nothing, but the coordinator still answers: the button stops."""
+    """The page cannot read messages, but the coordinator still answers: the button stops."""
     broken: list[bool] = []
     tab, _ = await through_a_proxy(browser, page, lambda m: "?" if broken else m)
     broken.append(True)
@@ -247,8 +247,8 @@ async def test_the_emergency_stop_goes_past_a_link_that_cannot_be_read(
 
 
 async def test_a_page_that_never_connected_says_so(browser: Browser, page: Page) -> None:
-    """Its files came, but no live connection does: a bar, not an idle mission; it goes when there
-    is one."""
+    """Its files arrived, but the live connection fails: it shows a bar, not an idle mission, until
+    there is a connection."""
     context = await browser.new_context(viewport=SIZE)
     shut = [True]
 
@@ -276,8 +276,8 @@ async def test_a_page_whose_script_does_not_arrive_says_so(browser: Browser, pag
 async def test_after_a_restart_with_another_key_old_windows_say_what_to_do(
     browser: Browser, stage: Stage, tasks: Path, tmp_path: Path
 ) -> None:
-    """The key is drawn at each start. An old window says which address to open, and works again
-    once that was opened."""
+    """The key is new at each start. An old window says which address to open, and works again once
+    that was opened."""
     async with served(stage, tasks, tmp_path / "runs") as first:
         tab = await opened(browser, first)
         port = int(first.url.rpartition(":")[2].partition("/")[0])

@@ -1,5 +1,5 @@
-"""Changes applied one by one and merged lead to the same state; a client that is far behind stays
-small."""
+"""Changes applied one by one or merged give the same state; a client that is far behind needs
+little memory."""
 
 from __future__ import annotations
 
@@ -88,8 +88,8 @@ def _fields(draw: st.DrawFn, kind: str, number: int, going: list[str]) -> dict[s
 
 @given(changes(), st.lists(st.integers(1, 40), max_size=6))
 def test_merged_deltas_lead_to_the_same_state(made: list[dict[str, Any]], cuts: list[int]) -> None:
-    """However the changes are cut into deltas, a client ends where the server is, and numbers have
-    no gap."""
+    """However the changes are divided into deltas, a client reaches the server's state, and numbers
+    have no gap."""
     server, client = empty_state(), empty_state()
     pending = Pending()
     seen = 0
@@ -107,8 +107,8 @@ def test_merged_deltas_lead_to_the_same_state(made: list[dict[str, Any]], cuts: 
 
 
 @given(changes())
-def test_a_snapshot_is_out_of_reach_of_later_changes(made: list[dict[str, Any]]) -> None:
-    """What was handed out as a snapshot does not change under the hands of its reader."""
+def test_a_snapshot_is_not_affected_by_later_changes(made: list[dict[str, Any]]) -> None:
+    """A snapshot handed out does not change while it is read."""
     feed = Feed()
     half = len(made) // 2
     for change in made[:half]:
@@ -121,9 +121,9 @@ def test_a_snapshot_is_out_of_reach_of_later_changes(made: list[dict[str, Any]])
     assert feed.state["sequence"] == len(made)
 
 
-def test_a_verdict_changes_the_run_that_had_ended_and_no_other() -> None:
-    """What the page shows of a provisional run is what it came to; one that has left the list stays
-    away."""
+def test_a_verdict_changes_only_its_own_run() -> None:
+    """The page then shows the final result of the provisional run; a run that has left the list
+    does not return."""
     state = empty_state()
     for change in (
         {"kind": "run_started", "run": {"id": "a#1", "place": "a"}},
@@ -141,8 +141,8 @@ def test_a_verdict_changes_the_run_that_had_ended_and_no_other() -> None:
     assert state["ended"][0]["reason"] == {"code": "crooked"} and not state["runs"]
 
 
-def test_what_waits_for_a_slow_client_is_bounded() -> None:
-    """Ten thousand firings that the client does not fetch leave no backlog: it gets a snapshot
+def test_the_backlog_of_a_slow_client_is_bounded() -> None:
+    """Ten thousand firings that the client does not fetch are not queued: it gets a snapshot
     instead."""
     pending = Pending()
     for number in range(1, 10_001):
@@ -153,8 +153,8 @@ def test_what_waits_for_a_slow_client_is_bounded() -> None:
     assert not pending
 
 
-def test_values_that_only_have_a_newest_take_no_room() -> None:
-    """Images and progress at any rate wait as one entry each."""
+def test_only_the_newest_image_and_progress_are_kept() -> None:
+    """At any rate of updates they take one entry each."""
     pending = Pending()
     for number in range(1, 50 * PENDING_LIMIT):
         kind = ("image", "run_progress", "variable", "marking")[number % 4]
@@ -173,7 +173,7 @@ def test_values_that_only_have_a_newest_take_no_room() -> None:
     assert len(pending.take()["changes"]) == 4
 
 
-def test_reset_makes_every_client_start_anew() -> None:
+def test_a_reset_sends_every_client_a_snapshot() -> None:
     """Another mission is sent as a snapshot, not as a delta."""
     feed = Feed()
     pending = Pending()
@@ -185,6 +185,6 @@ def test_reset_makes_every_client_start_anew() -> None:
     assert feed.snapshot()["sequence"] == 2
 
 
-def test_a_snapshot_has_every_part() -> None:
-    """The parts that the protocol names are those of the state."""
+def test_a_snapshot_has_all_parts_named_by_the_protocol() -> None:
+    """The parts in the protocol page are those of the state."""
     assert set(SNAPSHOT_KEYS) == empty_state().keys() - {"sequence"}

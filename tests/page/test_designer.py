@@ -1,5 +1,5 @@
-"""The designer in a real browser on tasks that it was not made for: macro places, odd files, large
-nets, other tools' nets."""
+"""The designer in a real browser on difficult tasks: macro places, unusual files, large nets, nets
+of other tools."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ expect.set_options(timeout=PATIENCE_MS)
 async def designing(
     browser: Browser, page: Page, task: str = "pick_and_place"
 ) -> tuple[Tab, list[str]]:
-    """The designer with a task open, and what its window complains about."""
+    """Open the designer with a task; also return the list of errors in its window."""
     context = await browser.new_context(viewport={"width": 1440, "height": 900})
     context.set_default_timeout(PATIENCE_MS)
     tab = await context.new_page()
@@ -65,7 +65,7 @@ async def designing(
 
 
 async def open_task(tab: Tab, task: str) -> None:
-    """Choose a task, and wait until it lies on the desk."""
+    """Choose a task and wait until the designer shows it."""
     async with tab.expect_response(f"**/api/tasks/{task}"):
         await tab.get_by_label("Task", exact=True).select_option(task)
     await settled(tab)
@@ -74,18 +74,18 @@ async def open_task(tab: Tab, task: str) -> None:
 
 
 def properties(tab: Tab) -> Locator:
-    """The form on the right."""
+    """Return the form on the right."""
     return tab.get_by_role("complementary", name="Properties")
 
 
 async def choose(tab: Tab, *names: str) -> None:
-    """Choose several elements."""
+    """Select several elements."""
     for i, name in enumerate(names):
         await element(tab, name).click(modifiers=["Shift"] if i else [])
 
 
 async def drag(tab: Tab, name: str, dx: float, dy: float) -> None:
-    """Take an element with the mouse and put it down elsewhere (pixels of the window)."""
+    """Drag an element with the mouse (pixels of the window)."""
     box = await element(tab, name).bounding_box()
     assert box is not None
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -96,7 +96,7 @@ async def drag(tab: Tab, name: str, dx: float, dy: float) -> None:
 
 
 async def save(tab: Tab) -> None:
-    """Save, and wait until the server has it; what was saved before may say so already."""
+    """Save, and wait for the server's answer to this save, not to an earlier one."""
     async with tab.expect_response(
         lambda answer: answer.request.method == "PUT" and "/api/tasks/" in answer.url
     ):
@@ -107,11 +107,9 @@ async def save(tab: Tab) -> None:
 # ---- arranging
 
 
-async def test_a_task_that_is_opened_is_seen_whole(
-    browser: Browser, page: Page, tasks: Path
-) -> None:
-    """Every element with its words and arcs within the drawing, no field beyond the form, on a
-    laptop's screen."""
+async def test_an_opened_task_is_shown_whole(browser: Browser, page: Page, tasks: Path) -> None:
+    """On a laptop's screen every element is inside the drawing with its labels and arcs, and every
+    field inside the form."""
     shutil.copy(SHIPPED, tasks)
     tab, complaints = await designing(browser, page, "catch_ball")
     beyond = """(drawing) => {
@@ -129,8 +127,9 @@ async def test_a_task_that_is_opened_is_seen_whole(
     assert complaints == []
 
 
-async def test_chosen_elements_are_put_in_order(browser: Browser, page: Page, tasks: Path) -> None:
-    """In a row, in a column, spaced evenly, on the grid: as buttons; each is one step of undo."""
+async def test_selected_elements_are_aligned(browser: Browser, page: Page, tasks: Path) -> None:
+    """Buttons align them in a row, in a column, evenly spaced or on the grid; each is one step of
+    undo."""
     path = tasks / "pick_and_place.toml"
     names = ("look", "pick", "put")
     before = {name: (place.x, place.y) for name, place in load(path).places.items()}
@@ -159,11 +158,9 @@ async def test_chosen_elements_are_put_in_order(browser: Browser, page: Page, ta
     assert not complaints
 
 
-async def test_the_task_that_runs_is_opened_first(
-    browser: Browser, page: Page, tasks: Path
-) -> None:
-    """Loaded with the designer in front the page waits until it knows which task runs, however many
-    stand before it."""
+async def test_the_running_task_is_opened_first(browser: Browser, page: Page, tasks: Path) -> None:
+    """If the page is loaded with the designer in front, it waits until it knows which task is
+    running, however many tasks are listed before it."""
     (tasks / "earlier.toml").write_text((tasks / "pick_and_place.toml").read_text())
     tab = await browser.new_page()
     held: list[Callable[[], None]] = []
@@ -189,7 +186,7 @@ async def test_the_task_that_runs_is_opened_first(
 async def test_a_dragged_element_lands_on_the_grid(
     browser: Browser, page: Page, tasks: Path
 ) -> None:
-    """Whatever the zoom: positions are multiples of ten."""
+    """At any zoom, positions are multiples of ten."""
     path = tasks / "pick_and_place.toml"
     tab, complaints = await designing(browser, page)
     await tab.get_by_role("button", name="Zoom in").click()
@@ -208,8 +205,8 @@ async def test_a_dragged_element_lands_on_the_grid(
 async def test_a_part_of_the_net_becomes_a_macro_place(
     browser: Browser, page: Page, stage: Stage, tasks: Path
 ) -> None:
-    """Grouped, opened, nested, saved, undone and dissolved; in the live view it folds with its
-    tokens summed."""
+    """Group, open, nest, save, undo and dissolve it; in the live view it is closed and shows the
+    sum of its tokens."""
     path = tasks / "pick_and_place.toml"
     before, flat = path.read_text(), load(path).flat.net
     tab, complaints = await designing(browser, page)
@@ -226,7 +223,7 @@ async def test_a_part_of_the_net_becomes_a_macro_place(
     assert (
         grouped.transitions["picked"].macro == "handling" and not grouped.transitions["begin"].macro
     )
-    assert grouped.flat.net == flat, "grouping is a matter of the drawing alone"
+    assert grouped.flat.net == flat, "grouping must change nothing but the drawing"
     left = iter(path.read_text().splitlines())
     assert all(line in left for line in before.splitlines()), "a line was lost or moved"
 
@@ -281,8 +278,8 @@ async def test_a_part_of_the_net_becomes_a_macro_place(
 async def test_macro_places_by_keyboard_and_their_rules(
     browser: Browser, page: Page, tasks: Path
 ) -> None:
-    """An empty macro place is opened and drawn in; arcs go to places inside; what reaches out stays
-    out; it goes whole."""
+    """Open and draw in an empty macro place; arcs may lead to places inside; elements outside stay
+    outside; it is deleted as a whole."""
     tab, complaints = await designing(browser, page)
     await tab.get_by_role("button", name="New task").press("Enter")
     await tab.get_by_role("application", name=DRAWING).focus()
@@ -316,7 +313,7 @@ async def test_macro_places_by_keyboard_and_their_rules(
     await expect(element(tab, "^Arc from transition to control")).to_have_count(1)
     await expect(
         element(tab, "^Transition transition")
-    ).to_be_visible()  # drawn beside, as what is around it
+    ).to_be_visible()  # drawn next to it, as its surroundings
     await tab.keyboard.press("Backspace")
     await element(tab, "^Macro place macro").click()
     await tab.keyboard.press("Delete")
@@ -336,8 +333,8 @@ async def test_macro_places_by_keyboard_and_their_rules(
 async def test_what_the_nodes_offer_now_can_be_chosen(
     browser: Browser, page: Page, stage: Stage
 ) -> None:
-    """A node that joins while one draws brings its primitive tasks and arguments; one that goes
-    leaves a finding."""
+    """A node that joins during drawing adds its primitive tasks and arguments; one that leaves
+    causes a finding."""
     tab, complaints = await designing(browser, page)
     await element(tab, "^Action place put").click()
     choice = properties(tab).get_by_label("Primitive task")
@@ -392,11 +389,11 @@ alternatives = ["pick"]\r
 deadline = 5.0 # s"""
 
 
-async def test_an_odd_file_keeps_every_byte_but_the_edited(
+async def test_an_unusual_file_keeps_every_byte_that_was_not_edited(
     browser: Browser, page: Page, tasks: Path
 ) -> None:
-    """CR LF, inline tables, arrays of several lines, unicode, quotes, no positions: saved unedited
-    it is the same file."""
+    """With CR LF, inline tables, arrays on several lines, unicode, quotes and no positions, a file
+    saved without an edit is unchanged."""
     path = tasks / "odd.toml"
     path.write_bytes(ODD.encode())
     tab, complaints = await designing(browser, page, "odd")
@@ -413,7 +410,7 @@ async def test_an_odd_file_keeps_every_byte_but_the_edited(
     left = iter(moved.split("\r\n"))
     assert all(line in left for line in ODD.split("\r\n")), "a line was lost or moved"
     assert len(moved.split("\r\n")) == len(ODD.split("\r\n")) + 2
-    await tab.get_by_role("button", name="Undo").click()  # across the save
+    await tab.get_by_role("button", name="Undo").click()  # also across the save
     await save(tab)
     assert path.read_bytes() == ODD.encode()
     assert complaints == []
@@ -449,8 +446,8 @@ def long_task(places: int) -> str:
 async def test_a_hundred_and_twenty_places_without_positions(
     browser: Browser, page: Page, tasks: Path
 ) -> None:
-    """Laid out without overlap, found by search, in the minimap, folded and unfolded, undone as one
-    step."""
+    """They are laid out without overlap, found by search, shown in the minimap, folded and
+    unfolded, and undone as one step."""
     (tasks / "long.toml").write_text(long_task(120))
     tab, complaints = await designing(browser, page, "long")
     await expect(element(tab, "^Action place ")).to_have_count(118)
@@ -477,9 +474,11 @@ async def test_a_hundred_and_twenty_places_without_positions(
     assert complaints == []
 
 
-async def test_the_page_lays_out_as_the_drawing_does(browser: Browser, page: Page) -> None:
-    """The two copies of the layout, in Python and in the page, put random nets in the same
-    places."""
+async def test_the_page_has_the_same_layout_as_the_command_line(
+    browser: Browser, page: Page
+) -> None:
+    """The two implementations of the layout, in Python and in the page, give random nets the same
+    positions."""
     tab, _ = await designing(browser, page)
     script = """async ([names, edges, sources]) => {
       const { layered } = await import("/page/js/layers.js");
@@ -508,9 +507,9 @@ async def test_the_page_lays_out_as_the_drawing_does(browser: Browser, page: Pag
 COVERED = (Path(__file__).parent / "covered_words.js").read_text(encoding="utf-8")
 
 
-async def test_words_on_the_page_cover_nothing(browser: Browser, page: Page, tasks: Path) -> None:
-    """Random nets laid out by the page: measured in the browser no words cover words or elements,
-    and few arcs strike words."""
+async def test_labels_on_the_page_cover_nothing(browser: Browser, page: Page, tasks: Path) -> None:
+    """Measured in the browser on random nets laid out by the page: no label covers a label or an
+    element, and few arcs cross labels."""
     tab, _ = await designing(browser, page)
     total: Counter[str] = Counter()
     for seed in range(40, 45):
@@ -542,15 +541,15 @@ async def test_words_on_the_page_cover_nothing(browser: Browser, page: Page, tas
     assert total["struck"] <= 0.1 * total["words"], total
 
 
-# ---- while something else goes on
+# ---- while something else happens
 # -------------------------------------------------------------------------------------
 
 
-async def test_pasted_elsewhere_it_means_the_same(
+async def test_elements_pasted_into_another_task_keep_their_meaning(
     browser: Browser, page: Page, tasks: Path
 ) -> None:
-    """An action place pasted into another task brings its primitive task, its event and the arcs
-    among what was copied."""
+    """A pasted action place brings its primitive task, its event and the arcs between the copied
+    elements."""
     tab, complaints = await designing(browser, page)
     await choose(tab, "^Action place look", "^Transition begin", "^Control place parts")
     await tab.keyboard.press("Control+c")
@@ -568,8 +567,8 @@ async def test_pasted_elsewhere_it_means_the_same(
     assert complaints == []
 
 
-async def test_deleted_under_the_pointer(browser: Browser, page: Page) -> None:
-    """What is deleted, undone or renamed while it is dragged does not come back and breaks
+async def test_elements_deleted_while_they_are_dragged(browser: Browser, page: Page) -> None:
+    """An element that is deleted, undone or renamed during a drag does not come back and breaks
     nothing."""
     tab, complaints = await designing(browser, page)
     box = await element(tab, "^Action place put").bounding_box()
@@ -594,11 +593,11 @@ async def test_deleted_under_the_pointer(browser: Browser, page: Page) -> None:
 
 
 async def test_two_saves_at_once(browser: Browser, page: Page, tasks: Path) -> None:
-    """Of two people who save in one moment one is refused with both versions in view, and nothing
-    is half written."""
+    """If two users save at the same moment, one is refused and sees both versions, and no file is
+    half written."""
     (ana, _), (ben, _) = await designing(browser, page), await designing(browser, page)
     for tab, goal in ((ana, "from ana"), (ben, "from ben")):
-        await tab.get_by_label("Goal", exact=True).fill(goal)  # saved from within the field
+        await tab.get_by_label("Goal", exact=True).fill(goal)  # saved while the field has the focus
     await asyncio.gather(ana.keyboard.press("Control+s"), ben.keyboard.press("Control+s"))
     either = ana.get_by_role("dialog", name="Conflict").or_(
         ana.locator(".saved", has_text=re.compile("^saved$"))
@@ -616,11 +615,11 @@ async def test_two_saves_at_once(browser: Browser, page: Page, tasks: Path) -> N
     await expect(lost.get_by_label("Goal", exact=True)).to_have_value(kept)
 
 
-async def test_what_a_condition_needs_can_be_declared(
+async def test_variables_and_events_of_a_condition_can_be_declared(
     browser: Browser, page: Page, tasks: Path
 ) -> None:
-    """A variable and a latched event made on the page; a condition on them is checked while it is
-    typed; all undoable."""
+    """Create a variable and a latched event on the page; a condition on them is checked while it is
+    typed; all of it can be undone."""
     tab, complaints = await designing(browser, page)
     form = properties(tab)
     await form.get_by_label("New variable", exact=True).fill("seen")
@@ -647,11 +646,11 @@ async def test_what_a_condition_needs_can_be_declared(
 EDITS = (Path(__file__).parent / "random_edits.js").read_text(encoding="utf-8")
 
 
-async def test_everything_can_be_undone_and_done_again(
+async def test_every_edit_can_be_undone_and_redone(
     browser: Browser, page: Page, tasks: Path
 ) -> None:
-    """Random edits of every kind: each is undone exactly, done again, and what comes of them is a
-    file that says the same."""
+    """Random edits of every kind: each is undone exactly and redone, and the saved file has the
+    same content."""
     tab, _ = await designing(browser, page)
     document = plain(parse((tasks / "pick_and_place.toml").read_text()))
     for seed in range(1, 13):
@@ -701,7 +700,7 @@ PM4PY = """<?xml version='1.0' encoding='UTF-8'?><pnml>
 @pytest.mark.parametrize(
     ("text", "places", "transitions"), [(PIPE, 2, 1), (PM4PY, 2, 2)], ids=["pipe", "pm4py"]
 )
-async def test_a_net_of_another_tool_comes_in_and_goes_out_again(
+async def test_a_net_of_another_tool_is_imported_and_exported(
     browser: Browser,
     page: Page,
     tasks: Path,
@@ -710,11 +709,11 @@ async def test_a_net_of_another_tool_comes_in_and_goes_out_again(
     places: int,
     transitions: int,
 ) -> None:
-    """Imported, saved, exported, and imported once more: the same places, transitions, arcs,
+    """Imported, saved, exported and imported again, it has the same places, transitions, arcs,
     marking and weights.
 
-    Nobody waits for an import, which is slow here: Ctrl+S means what was imported, not what lay on
-    the desk before.
+    The test makes the import slow and does not wait for it: Ctrl+S must save the imported net, not
+    the one shown before.
     """
     (tmp_path / "net.pnml").write_text(text)
     tab, complaints = await designing(browser, page)

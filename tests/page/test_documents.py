@@ -41,12 +41,12 @@ FORBIDDEN = (
     (journals, "replay"),
     (journals, "loads"),
 )
-"""What takes longer than a turn of the loop may for a large net or a long journal."""
+"""Functions that, for a large net or a long journal, take longer than the event loop may block."""
 
 
 @pytest_asyncio.fixture(loop_scope="session")
 async def http(page: Page) -> AsyncIterator[aiohttp.ClientSession]:
-    """A script with the token."""
+    """An HTTP client of a script, with the token."""
     address = page.url.partition("/?")[0]
     headers = {"Authorization": f"Bearer {page.token}"}
     async with aiohttp.ClientSession(address, headers=headers) as session:
@@ -54,7 +54,7 @@ async def http(page: Page) -> AsyncIterator[aiohttp.ClientSession]:
 
 
 async def opened(http: aiohttp.ClientSession, name: str = TASK) -> dict[str, Any]:
-    """A task as the designer opens it."""
+    """Open a task as the designer does."""
     async with http.get(f"/api/tasks/{name}") as answer:
         assert answer.status == 200
         task: dict[str, Any] = await answer.json()
@@ -62,7 +62,7 @@ async def opened(http: aiohttp.ClientSession, name: str = TASK) -> dict[str, Any
 
 
 async def save(http: aiohttp.ClientSession, name: str, **body: Any) -> tuple[int, Any]:
-    """Save; gives status and answer."""
+    """Save; return status and answer."""
     async with http.put(f"/api/tasks/{name}", json=body) as answer:
         value = (
             await answer.json()
@@ -73,8 +73,7 @@ async def save(http: aiohttp.ClientSession, name: str, **body: Any) -> tuple[int
 
 
 async def test_open_edit_save(http: aiohttp.ClientSession, tasks: Path) -> None:
-    """One deadline edited in the page is one line altered on disk, and the revision changes with
-    it."""
+    """Editing one deadline in the page changes one line on disk, and the revision."""
     before = (tasks / f"{TASK}.toml").read_text()
     task = await opened(http)
     task["document"]["primitive_tasks"]["pick"]["deadline"] = 7.5
@@ -90,8 +89,8 @@ async def test_open_edit_save(http: aiohttp.ClientSession, tasks: Path) -> None:
 async def test_a_conflict_is_refused_with_both_versions(
     http: aiohttp.ClientSession, tasks: Path
 ) -> None:
-    """Two people edit; the second save writes nothing and shows both; afterwards either may be
-    chosen."""
+    """Of two users who edit, the second one's save writes nothing and returns both versions; then
+    either may be chosen."""
     first, second = await opened(http), await opened(http)
     first["document"]["task"]["goal"] = "theirs"
     second["document"]["task"]["goal"] = "mine"
@@ -106,8 +105,8 @@ async def test_a_conflict_is_refused_with_both_versions(
     assert load(tasks / f"{TASK}.toml").goal == "mine"
 
 
-async def test_a_new_file_does_not_replace_one(http: aiohttp.ClientSession) -> None:
-    """Saving under a name that exists, without having opened it, is a conflict."""
+async def test_a_new_file_does_not_replace_an_existing_one(http: aiohttp.ClientSession) -> None:
+    """Saving under an existing name without having opened that file is a conflict."""
     assert (await save(http, TASK, base=None, document={"schema": 1}))[0] == 409
     status, made = await save(
         http,
@@ -118,9 +117,9 @@ async def test_a_new_file_does_not_replace_one(http: aiohttp.ClientSession) -> N
     assert status == 200 and made["revision"]
 
 
-async def test_faults_name_the_element(http: aiohttp.ClientSession) -> None:
-    """A document that is being drawn is checked as it would be saved, and every finding has its key
-    and remedy."""
+async def test_findings_name_their_element(http: aiohttp.ClientSession) -> None:
+    """An unsaved document is checked as it would be saved, and every finding has its key and
+    remedy."""
     task = await opened(http)
     document = task["document"]
     assert [f for f in task["findings"] if f["severity"] == "error"] == []
@@ -137,7 +136,7 @@ async def test_faults_name_the_element(http: aiohttp.ClientSession) -> None:
 async def test_editing_does_not_touch_the_running_net(
     http: aiohttp.ClientSession, stage: Stage
 ) -> None:
-    """A save during a run changes the file; the active mission keeps the task that it was started
+    """A save during a run changes the file; the active mission keeps the task it was started
     with."""
     await stage.command("ana", "take_controls", {})
     assert (await stage.command("ana", "start", {}))["ok"]
@@ -151,18 +150,21 @@ async def test_editing_does_not_touch_the_running_net(
     assert stage.snapshot()["task"] == running
 
 
-async def test_a_broken_file_says_what_is_wrong(http: aiohttp.ClientSession, tasks: Path) -> None:
-    """A file that was broken by hand is listed with its fault; the others can be opened."""
+async def test_a_broken_file_is_listed_with_its_fault(
+    http: aiohttp.ClientSession, tasks: Path
+) -> None:
+    """After a mistake in a text editor the file is listed with its fault; the others can be
+    opened."""
     (tasks / "broken.toml").write_text("[places\n")
     async with http.get("/api/tasks/broken") as answer:
         assert answer.status == 422 and "broken.toml" in await answer.text()
     assert (await opened(http))["name"] == TASK
 
 
-async def test_saving_keeps_the_files_mode_and_leaves_no_rubbish(
+async def test_saving_keeps_the_files_mode_and_leaves_no_temporary_file(
     http: aiohttp.ClientSession, tasks: Path
 ) -> None:
-    """Saves are atomic: no temporary file stays, and permissions are those of before."""
+    """Saves are atomic: no temporary file is left, and the permissions stay as they were."""
     path = tasks / f"{TASK}.toml"
     os.chmod(path, 0o640)  # noqa: PTH101
     task = await opened(http)
@@ -172,8 +174,8 @@ async def test_saving_keeps_the_files_mode_and_leaves_no_rubbish(
     assert sorted(p.name for p in tasks.iterdir()) == [path.name]
 
 
-async def test_offers_are_those_of_the_nodes(http: aiohttp.ClientSession) -> None:
-    """The designer sees what can be had where."""
+async def test_offers_list_what_the_nodes_offer(http: aiohttp.ClientSession) -> None:
+    """The designer sees which node offers which primitive task."""
     async with http.get("/api/offers") as answer:
         offers = await answer.json()
     assert {"action": "pick", "primitive_task": "pick", "node": "arm"}.items() <= next(
@@ -181,9 +183,8 @@ async def test_offers_are_those_of_the_nodes(http: aiohttp.ClientSession) -> Non
     ).items()
 
 
-async def test_pnml_goes_out_and_comes_back(http: aiohttp.ClientSession, tasks: Path) -> None:
-    """The ordinary net with marking, weights, inhibitors and positions survives the way through
-    PNML."""
+async def test_pnml_is_exported_and_imported(http: aiohttp.ClientSession, tasks: Path) -> None:
+    """The ordinary net keeps marking, weights, inhibitors and positions through PNML."""
     async with http.get(f"/api/tasks/{TASK}/export/pnml") as answer:
         text = await answer.text()
         assert 'filename="pick_and_place.pnml"' in answer.headers["Content-Disposition"]
@@ -209,13 +210,15 @@ BAD_PNML = (
 
 @pytest.mark.parametrize("text", BAD_PNML)
 async def test_bad_pnml_is_refused(http: aiohttp.ClientSession, text: str) -> None:
-    """A file that is not a place/transition net, or defines entities, is refused with a reason."""
+    """A file that is not a place/transition net, or that defines XML entities, is refused with a
+    reason."""
     async with http.post("/api/import", json={"form": "pnml", "text": text}) as answer:
         assert answer.status == 400 and "PNML" in await answer.text()
 
 
-def test_names_from_elsewhere_become_names_of_ours() -> None:
-    """Names with spaces, twice, or beginning with a digit are made usable and stay apart."""
+def test_names_of_other_tools_become_valid_names() -> None:
+    """Names with spaces, duplicate names and names that begin with a digit become valid and
+    distinct."""
     nodes = "".join(
         f'<place id="p{i}"><name><text>{name}</text></name></place>'
         for i, name in enumerate(["a b", "a-b", "1", ""])
@@ -248,8 +251,8 @@ async def finished(stage: Stage) -> None:
 
 
 async def test_a_finished_run_can_be_scrubbed(http: aiohttp.ClientSession, stage: Stage) -> None:
-    """The journal gives every marking again: stepping through its changes ends in the marking of
-    the end, with reasons."""
+    """The journal gives every marking: stepping through its changes ends in the final marking, with
+    reasons."""
     await finished(stage)
     async with http.get("/api/runs") as answer:
         runs = await answer.json()
@@ -267,10 +270,8 @@ async def test_a_finished_run_can_be_scrubbed(http: aiohttp.ClientSession, stage
         assert answer.status == 404
 
 
-async def test_the_page_and_the_journal_tell_the_same(
-    http: aiohttp.ClientSession, stage: Stage
-) -> None:
-    """Firings that clients saw live are those that the journal gives afterwards."""
+async def test_the_page_and_the_journal_agree(http: aiohttp.ClientSession, stage: Stage) -> None:
+    """The firings that clients saw live are those that the journal gives afterwards."""
     await finished(stage)
     live = [(f["transition"], f["error"]) for f in stage.snapshot()["firings"]]
     async with http.get("/api/runs") as answer:
@@ -280,11 +281,11 @@ async def test_the_page_and_the_journal_tell_the_same(
     assert [(f["transition"], f["error"]) for r in records for f in r["firings"]] == live
 
 
-async def test_nothing_that_takes_long_is_done_in_the_coordinator(
+async def test_long_computations_never_run_in_the_coordinators_process(
     http: aiohttp.ClientSession, stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither in its loop nor in a thread of it, which would share the interpreter with the mission
-    that is running."""
+    """They run neither in its event loop nor in one of its threads, which would share the
+    interpreter with the active mission."""
     await stage.command("ana", "take_controls", {})
     await stage.command("ana", "start", {"task": TASK})
 
@@ -315,8 +316,10 @@ async def test_nothing_that_takes_long_is_done_in_the_coordinator(
         assert answer.headers.keys() >= HEADERS.keys()
 
 
-async def test_an_older_drawing_is_answered_without_an_error(http: aiohttp.ClientSession) -> None:
-    """A browser logs each 4xx answer as an error, and drawing on is none."""
+async def test_an_outdated_drawing_is_answered_without_an_error(
+    http: aiohttp.ClientSession,
+) -> None:
+    """A browser logs each 4xx answer as an error, but to continue drawing is not one."""
     document = (await opened(http))["document"]
     document["places"]["parts"] |= {"tokens": 100_000, "capacity": 100_000}  # a long analysis
     drawn = {"name": TASK, "document": document, "desk": "mine"}

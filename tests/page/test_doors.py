@@ -1,4 +1,4 @@
-"""Attacks on the page's server: each is refused or harmless, and those who may come in are still
+"""Attacks on the page's server: each is refused or harmless, and permitted clients are still
 served."""
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ EVIL = "http://evil.example"
 
 
 def base(page: Page) -> str:
-    """The server's address without the token."""
+    """Return the server's address without the token."""
     return page.url.partition("/?")[0]
 
 
 def port_of(page: Page) -> int:
-    """Its port."""
+    """Return the server's port."""
     return int(base(page).rpartition(":")[2])
 
 
 async def ask(
     page: Page, path: str, method: str = "GET", cookie: bool = False, **kwargs: Any
 ) -> aiohttp.ClientResponse:
-    """One request of a stranger, or with a browser's cookie."""
+    """Send one request without credentials, or with a browser's cookie."""
     async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as http:
         if cookie:
             await http.get(page.url)
@@ -50,7 +50,7 @@ async def ask(
 
 
 def bearer(page: Page) -> dict[str, str]:
-    """What a script sends."""
+    """Return the header that a script sends."""
     return {"Authorization": f"Bearer {page.token}"}
 
 
@@ -70,16 +70,16 @@ PATHS = (
 @pytest.mark.parametrize(
     "wrong", ["", "?token=", "?token=wrong", "?token=open+sesam", "?token=%00%ff"]
 )
-async def test_without_the_token_nothing_is_given(page: Page, path: str, wrong: str) -> None:
-    """Not even which files there are."""
+async def test_without_the_token_nothing_is_served(page: Page, path: str, wrong: str) -> None:
+    """Not even the names of files are revealed."""
     response = await ask(page, path + wrong)
     assert response.status == 401
     assert response.headers["Content-Security-Policy"] == HEADERS["Content-Security-Policy"]
 
 
-async def test_the_token_becomes_a_cookie_and_leaves_the_address(page: Page) -> None:
-    """The first visit is answered by a redirect with a cookie that scripts cannot read and other
-    sites do not send."""
+async def test_the_token_is_replaced_by_a_cookie_and_removed_from_the_address(page: Page) -> None:
+    """The first visit is answered by a redirect with a cookie that scripts cannot read and that is
+    not sent with requests from other sites."""
     first = await ask(page, "/?token=" + page.token, allow_redirects=False)
     assert (first.status, first.headers["Location"]) == (303, "/")
     cookie = first.headers["Set-Cookie"]
@@ -88,8 +88,8 @@ async def test_the_token_becomes_a_cookie_and_leaves_the_address(page: Page) -> 
     assert (await ask(page, "/", cookie=True)).status == 200
 
 
-async def test_a_token_elsewhere_in_an_address_is_no_key(page: Page) -> None:
-    """Only the front page takes it: addresses with secrets end up in logs."""
+async def test_a_token_in_any_other_address_is_not_accepted(page: Page) -> None:
+    """Only the front page accepts it: addresses with secrets end up in logs."""
     assert (await ask(page, "/api/snapshot?token=" + page.token)).status == 401
 
 
@@ -105,15 +105,15 @@ async def test_a_token_elsewhere_in_an_address_is_no_key(page: Page) -> None:
     ],
 )
 async def test_dns_rebinding_is_refused(page: Page, host: str) -> None:
-    """A name that an attacker points at this machine gets nothing, whatever else is right."""
+    """A host name that an attacker points at this machine is refused, even if all else is valid."""
     headers = {**bearer(page), "Host": host.format(port=port_of(page))}
     response = await ask(page, "/api/snapshot", headers=headers)
     assert response.status in (400, 421)
 
 
 @pytest.mark.parametrize("name", ["127.0.0.1", "localhost"])
-async def test_own_names_are_let_in(page: Page, name: str) -> None:
-    """The two names of the loopback address."""
+async def test_requests_to_the_servers_own_names_are_served(page: Page, name: str) -> None:
+    """These are the two names of the loopback address."""
     headers = {**bearer(page), "Host": f"{name}:{port_of(page)}"}
     assert (await ask(page, "/api/snapshot", headers=headers)).status == 200
 
@@ -136,7 +136,8 @@ async def test_other_origins_are_refused(page: Page, origin: str) -> None:
 
 
 async def test_a_browser_without_origin_cannot_change_anything(page: Page) -> None:
-    """A cookie alone opens no WebSocket and posts nothing: every browser says its origin there."""
+    """A cookie alone opens no WebSocket and posts nothing: every browser sends its origin with
+    these requests."""
     assert (await ask(page, "/api/command", "POST", cookie=True, json={})).status == 403
     assert (
         await ask(page, "/api/live", cookie=True, headers={"Upgrade": "websocket"})
@@ -145,8 +146,8 @@ async def test_a_browser_without_origin_cannot_change_anything(page: Page) -> No
 
 @pytest.mark.parametrize("site", ["cross-site", "same-site"])
 @pytest.mark.parametrize("path", ["/", "/api/snapshot", "/page/js/main.js"])
-async def test_other_sites_get_nothing(page: Page, site: str, path: str) -> None:
-    """Neither links nor images nor scripts of another site reach anything here."""
+async def test_requests_caused_by_other_sites_are_refused(page: Page, site: str, path: str) -> None:
+    """Links, images and scripts of another site cannot load anything from this server."""
     assert (await ask(page, path, cookie=True, headers={"Sec-Fetch-Site": site})).status == 403
 
 
@@ -154,7 +155,7 @@ async def test_other_sites_get_nothing(page: Page, site: str, path: str) -> None
     "kind", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data; boundary=x"]
 )
 async def test_forms_are_refused(page: Page, stage: Stage, kind: str) -> None:
-    """What a form on another site could send is not JSON, so it is not even read."""
+    """A form on another site cannot send JSON, so its body is not even read."""
     headers = {**bearer(page), "Content-Type": kind}
     response = await ask(page, "/api/command", "POST", headers=headers, data=b'{"verb": "estop"}')
     assert response.status == 415
@@ -165,8 +166,8 @@ async def test_forms_are_refused(page: Page, stage: Stage, kind: str) -> None:
     "path",
     ["/page/../server.py", "/page/%2e%2e/server.py", "/page/..%2fserver.py", "/page//etc/passwd"],
 )
-async def test_files_beside_the_page_stay_hidden(page: Page, path: str) -> None:
-    """Paths do not climb."""
+async def test_files_outside_the_page_are_not_served(page: Page, path: str) -> None:
+    """Paths cannot leave the page's folder."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port_of(page))
     head = (
         f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{port_of(page)}\r\nAuthorization: Bearer "
@@ -181,7 +182,7 @@ async def test_files_beside_the_page_stay_hidden(page: Page, path: str) -> None:
 @pytest.mark.parametrize(
     "name", ["..%2f..%2fetc%2fpasswd", ".hidden", "a.b", "a" * 65, "%00", "-x"]
 )
-async def test_task_names_do_not_climb(page: Page, name: str) -> None:
+async def test_task_names_cannot_leave_their_folder(page: Page, name: str) -> None:
     """A task's name is a name, not a path."""
     assert (await ask(page, f"/api/tasks/{name}", headers=bearer(page))).status in (400, 404)
     body = {"base": None, "document": {"schema": 1}}
@@ -191,8 +192,8 @@ async def test_task_names_do_not_climb(page: Page, name: str) -> None:
 
 @pytest.mark.parametrize("body", ["{", "[]", "3", '"text"', "[" * 100_000, "{}" * 2_000_000])
 async def test_bad_bodies_are_refused(page: Page, body: str) -> None:
-    """A body that is not a JSON object, nested too deep or too large is refused with one clear
-    answer."""
+    """A body that is not a JSON object, is nested too deep or is too large is refused with one
+    clear answer."""
     headers = {**bearer(page), "Content-Type": "application/json"}
     assert (
         await ask(page, "/api/check", "POST", headers=headers, data=io.BytesIO(body.encode()))
@@ -200,7 +201,8 @@ async def test_bad_bodies_are_refused(page: Page, body: str) -> None:
 
 
 async def test_every_answer_carries_the_headers(page: Page) -> None:
-    """Strict content policy, no sniffing, no framing, no referrer: on pages, data and refusals."""
+    """Pages, data and refusals have a strict content policy, and forbid sniffing, framing and
+    referrers."""
     for path, headers in (
         ("/", bearer(page)),
         ("/api/tasks", bearer(page)),
@@ -217,16 +219,16 @@ async def test_every_answer_carries_the_headers(page: Page) -> None:
     )
 
 
-async def test_a_thousand_sockets_do_not_keep_the_operator_out(page: Page) -> None:
-    """Connections beyond the bound are closed at once; those that say nothing are closed later; a
-    command gets through."""
+async def test_a_thousand_sockets_do_not_block_the_operator(page: Page) -> None:
+    """Connections above the limit are closed at once, silent ones later; a command still gets
+    through."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 8192), hard))
     crowd: list[socket.socket] = []
     async with aiohttp.ClientSession(headers=bearer(page)) as http:
         assert (
             await http.get(base(page) + "/api/snapshot")
-        ).status == 200  # the operator's connection is open
+        ).status == 200  # The operator's connection is open.
         try:
             for _ in range(1_000):
                 crowd.append(socket.socket())
@@ -246,7 +248,8 @@ async def test_a_thousand_sockets_do_not_keep_the_operator_out(page: Page) -> No
 
 
 async def test_silent_connections_are_closed(page: Page) -> None:
-    """Half a request head, sent slowly, does not hold a connection for ever (slow-loris)."""
+    """A request header sent slowly and in part does not keep its connection for ever
+    (slow-loris)."""
     page.gate.silent = 0.2
     reader, writer = await asyncio.open_connection("127.0.0.1", port_of(page))
     writer.write(b"GET / HTTP/1.1\r\nHost: 127")
@@ -257,8 +260,7 @@ async def test_silent_connections_are_closed(page: Page) -> None:
 
 
 async def test_scripts_use_the_token(page: Page, stage: Stage) -> None:
-    """A command over plain HTTP with a Bearer token, as the command line gives it; it has a name of
-    its own."""
+    """The command line sends commands over plain HTTP with a Bearer token, under its own name."""
     answer = await ask(
         page,
         "/api/command",
@@ -282,18 +284,18 @@ OUTSIDE = ("0.0.0.0", "10.0.0.7", "robot.lab")
     ("host", "loopback"), [*((h, True) for h in INSIDE), *((h, False) for h in OUTSIDE)]
 )
 def test_loopback(host: str, loopback: bool) -> None:
-    """Which addresses only this machine reaches."""
+    """Which addresses can be reached only from this machine."""
     assert is_loopback(host) is loopback
 
 
-def test_names_of_a_server_on_all_addresses_are_given() -> None:
-    """Bound to all addresses it answers to no name of the network unless told."""
+def test_a_server_on_all_addresses_needs_its_names() -> None:
+    """Bound to all addresses, it answers to a name of the network only if configured."""
     assert names_for("0.0.0.0", ()) == {"0.0.0.0", "127.0.0.1", "localhost", "[::1]"}
     assert "cell.lab" in names_for("0.0.0.0", ("Cell.lab",))
 
 
 async def test_each_server_draws_its_own_token(stage: Stage, tasks: Any) -> None:
-    """Two servers have two tokens, and the cookie of one is none for the other."""
+    """Two servers have different tokens, and the cookie of one is not valid for the other."""
     one = await start_page(stage, tasks_folder=tasks)
     two = await start_page(stage, tasks_folder=tasks)
     try:
@@ -313,8 +315,8 @@ async def test_each_server_draws_its_own_token(stage: Stage, tasks: Any) -> None
 async def test_without_the_page_only_the_protocol_is_served(
     stage: Stage, tasks: Any, path: str
 ) -> None:
-    """`--no-page` leaves no file and no document within reach, even with the token; commands go
-    on."""
+    """With `--no-page` no file and no document is served, even with the token; commands still
+    work."""
     bare = await start_page(stage, tasks_folder=tasks, page=False)
     try:
         assert (await ask(bare, path, headers=bearer(bare))).status == 404
@@ -329,7 +331,7 @@ async def test_without_the_page_only_the_protocol_is_served(
 
 
 @pytest.mark.parametrize("size", [LARGEST_MESSAGE + 1, 8 * LARGEST_MESSAGE])
-async def test_an_oversized_message_ends_its_connection_alone(page: Page, size: int) -> None:
+async def test_an_oversized_message_ends_only_its_own_connection(page: Page, size: int) -> None:
     """The server does not even read all of it; another client is not affected."""
     hello = {"type": "hello", "protocol": PROTOCOL, "name": "ana", "tab": "1"}
     async with (
@@ -355,8 +357,8 @@ async def test_an_oversized_message_ends_its_connection_alone(page: Page, size: 
                 pass
 
 
-async def test_clients_are_bounded_and_commands_still_come_in(page: Page) -> None:
-    """One client more than allowed is refused with a reason. The emergency stop of a script still
+async def test_the_number_of_clients_is_bounded_and_commands_still_arrive(page: Page) -> None:
+    """One client more than allowed is refused with a reason. A script's emergency stop still
     works."""
     hello = {"type": "hello", "protocol": PROTOCOL, "name": "ana", "tab": "1"}
     async with aiohttp.ClientSession(
@@ -376,10 +378,10 @@ async def test_clients_are_bounded_and_commands_still_come_in(page: Page) -> Non
             await socket.close()
 
 
-async def test_a_body_that_never_ends_is_given_up(
+async def test_a_request_body_that_never_ends_is_abandoned(
     page: Page, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A command whose body drips in does not hold its handler for ever."""
+    """A command whose body arrives byte by byte does not keep its handler for ever."""
     monkeypatch.setattr(requests, "BODY_S", 0.2)
     reader, writer = await asyncio.open_connection("127.0.0.1", port_of(page))
     head = (

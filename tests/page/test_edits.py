@@ -1,5 +1,5 @@
-"""Editing a task file changes what was edited and nothing else: comments, order, spacing and every
-other byte stay."""
+"""Editing a task file changes only the edited values: comments, order, spacing and every other byte
+stay."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ comments = st.sampled_from(["", "  # why it is so", ' # 1 [not.a.header] = "text
 
 
 def through_a_browser(document: dict[str, Any]) -> dict[str, Any]:
-    """What the page sends back: JSON, in which 1.0 has become 1."""
+    """Return what the page sends back: JSON, in which 1.0 has become 1."""
 
     def shorten(value: Any) -> Any:
         if isinstance(value, dict):
@@ -48,7 +48,7 @@ def through_a_browser(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def written(value: Any) -> str:
-    """A value as TOML."""
+    """Return a value as TOML."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
@@ -62,7 +62,8 @@ def written(value: Any) -> str:
 
 @st.composite
 def files(draw: st.DrawFn) -> str:
-    """Task files as people write them: comments anywhere, odd spacing, tables in any order."""
+    """Return a strategy for task files as people write them: comments anywhere, irregular spacing,
+    tables in any order."""
     lines = ["# head", "schema=1" + draw(comments), ""]
     for group in draw(st.permutations(["places", "transitions", "events"])):
         for name in draw(st.lists(names, min_size=1, max_size=3, unique=True)):
@@ -86,14 +87,14 @@ def test_saving_without_an_edit_changes_nothing(name: str) -> None:
 @settings(max_examples=40)
 @given(files())
 def test_saving_any_file_without_an_edit_changes_nothing(text: str) -> None:
-    """The same for any file."""
+    """The same holds for any file."""
     assert edited(text, through_a_browser(plain(parse(text)))) == text
 
 
 @settings(max_examples=40)
 @given(files(), st.data())
 def test_one_edit_changes_one_line(text: str, data: st.DataObject) -> None:
-    """A changed value replaces its own line and no other, and its comment stays."""
+    """A changed value changes only its own line, and its comment stays."""
     document = plain(parse(text))
     group = data.draw(
         st.sampled_from([g for g in ("places", "transitions", "events") if document.get(g)])
@@ -120,8 +121,8 @@ def test_one_edit_changes_one_line(text: str, data: st.DataObject) -> None:
 
 @settings(max_examples=40)
 @given(files(), st.data())
-def test_other_lines_outlive_a_new_and_a_deleted_element(text: str, data: st.DataObject) -> None:
-    """An element that is added or taken away leaves all lines of the others in their order."""
+def test_adding_and_deleting_elements_keeps_all_other_lines(text: str, data: st.DataObject) -> None:
+    """The lines of the other elements stay in their order."""
     document = plain(parse(text))
     name = data.draw(names.filter(lambda n: n not in document["places"]))
     grown = copy.deepcopy(document)
@@ -135,8 +136,8 @@ def test_other_lines_outlive_a_new_and_a_deleted_element(text: str, data: st.Dat
     assert back == document
 
 
-def test_a_renamed_element_keeps_its_place_and_comments() -> None:
-    """The header is renamed where it is in the file; the lines below it stay."""
+def test_a_renamed_element_keeps_its_position_and_comments() -> None:
+    """The header is renamed in place; the lines below it stay."""
     text = TEXTS["pick_and_place"]
     document = plain(parse(text))
     document["places"] = {("grab" if n == "pick" else n): p for n, p in document["places"].items()}
@@ -144,9 +145,9 @@ def test_a_renamed_element_keeps_its_place_and_comments() -> None:
     assert result == text.replace("[places.pick]", "[places.grab]")
 
 
-def test_a_rename_that_cannot_be_done_in_place_is_written_anew() -> None:
+def test_a_renamed_element_without_a_header_is_written_again() -> None:
     """Inline tables have no header to rename; the element is written again, and the document is
-    right."""
+    correct."""
     text = "schema = 1\n[places]\na = {kind = 'control'} # first\n"
     result = edited(
         text, {"schema": 1, "places": {"b": {"kind": "control"}}}, [Rename(("places",), "a", "b")]
@@ -155,14 +156,14 @@ def test_a_rename_that_cannot_be_done_in_place_is_written_anew() -> None:
 
 
 def test_numbers_keep_their_kind() -> None:
-    """A whole number typed for a value with a point is written with a point."""
+    """An integer typed for a decimal value is written with a decimal point."""
     assert edited("a = 2.5 # s\n", {"a": 3}) == "a = 3.0 # s\n"
     assert edited("a = 2\n", {"a": 3}) == "a = 3\n"
     assert edited("a = true\n", {"a": 1}) == "a = 1\n"
 
 
 def test_lists_keep_their_layout() -> None:
-    """One arc added to a list on several lines leaves the others' lines and comments."""
+    """Adding an arc to a list on several lines keeps the other lines and their comments."""
     text = 'in = [\n  "a", # first\n  "b",\n]\n'
     result = edited(text, {"in": ["a", "b", "c"]})
     assert tomllib.loads(result) == {"in": ["a", "b", "c"]}
@@ -170,15 +171,14 @@ def test_lists_keep_their_layout() -> None:
     assert edited(result, {"in": ["a", "b"]}).count("# first") == 1
 
 
-def test_what_json_cannot_hold_survives() -> None:
-    """Dates, infinities and huge integers go to the page as text and are not altered by coming
-    back."""
+def test_values_that_json_cannot_hold_survive() -> None:
+    """Dates, infinities and huge integers are sent to the page as text and return unchanged."""
     text = "when = 2026-01-02T03:04:05Z\nlimit = inf\nbig = 123456789012345678901\nodd = nan\n"
     assert edited(text, through_a_browser(plain(parse(text)))) == text
 
 
 @pytest.mark.parametrize("text", ["a = ", "[a", "a = 1\na = 2", "[a]\n[a]"])
-def test_what_is_no_toml_is_refused(text: str) -> None:
-    """A file that is broken on disk is not written over."""
+def test_a_file_that_is_not_toml_is_refused(text: str) -> None:
+    """A file that is broken on disk is not overwritten."""
     with pytest.raises(EditError):
         edited(text, {})

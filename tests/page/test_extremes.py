@@ -1,6 +1,6 @@
-"""What nobody designed for: names of eighty letters, markup and other alphabets, sixty places,
-twelve nodes, hundreds of errors; on a laptop, a wall, and zoomed to twice the size: nothing is cut
-off, nothing runs over its neighbour, all of it is text."""
+"""Extreme contents: names of eighty letters, markup, other alphabets, sixty places, twelve nodes
+and hundreds of errors, on a laptop, a wall screen, and zoomed to twice the size. Nothing is cut
+off, nothing overlaps its neighbour, and all of it is shown as text."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SIZES = [
 
 @pytest_asyncio.fixture(loop_scope="session")
 async def page(tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
-    """A mission of extremes."""
+    """The page of a mission with extreme contents."""
     async with (
         staged(tasks, tmp_path / "runs") as stage,
         served(stage, tasks, tmp_path / "runs") as made,
@@ -48,7 +48,7 @@ async def page(tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
 
 
 def crowd(stage: Stage) -> None:
-    """Sixty places, twelve nodes, five hundred error rows, and names as they come."""
+    """Build sixty places, twelve nodes, five hundred error rows and extreme names."""
     drawn = stage.feed.state["task"]
     kinds = ("control", "resource", "action")
     like = {p["kind"]: p for p in drawn["places"]}
@@ -174,8 +174,8 @@ OVERLAP = """(box) => {
 
 
 async def nothing_is_cut(tab: Tab) -> None:
-    """No control of header, bars and lists is outside the window or over another; the emergency
-    stop is in sight."""
+    """Check that no control of header, bars and lists is outside the window or covers another one,
+    and that the emergency stop is visible."""
     assert await tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
     for box in (
         ".top button",
@@ -208,7 +208,7 @@ async def test_nothing_is_cut(
     zoom: int,
     theme: Any,
 ) -> None:
-    """Every tab of the page, in both colours, at every size."""
+    """Check every tab of the page, in light and dark colours, at every size."""
     context = await browser.new_context(
         viewport={"width": width, "height": height}, device_scale_factor=zoom, color_scheme=theme
     )

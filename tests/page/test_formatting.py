@@ -1,5 +1,5 @@
-"""Task files as different people format them: nothing edited, nothing changed; one thing edited,
-the rest stays as it was."""
+"""Task files in different formatting: without an edit nothing changes, and an edit changes nothing
+else."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WAYS = ("header", "header", "header", "inline", "dotted", "quoted")
 
 
 def sent_back(value: Any) -> Any:
-    """What the page sends: JSON, in which 1.0 has become 1."""
+    """Return what the page sends: JSON, in which 1.0 has become 1."""
     if isinstance(value, dict):
         return {k: sent_back(v) for k, v in value.items()}
     if isinstance(value, list):
@@ -31,7 +31,7 @@ def sent_back(value: Any) -> Any:
 
 @st.composite
 def place(draw: st.DrawFn, name: str, way: str) -> tuple[str, str]:
-    """One place: (its block with a header, or "", its lines under a common [places])."""
+    """Draw one place: (its block with a header or "", its lines under a common [places])."""
     kind, end = draw(st.sampled_from(KINDS)), draw(comments)
     eq = draw(equals)
     where = draw(st.booleans())
@@ -63,7 +63,7 @@ def place(draw: st.DrawFn, name: str, way: str) -> tuple[str, str]:
 
 @st.composite
 def transition(draw: st.DrawFn, name: str) -> str:
-    """One transition with its arcs on one line or several."""
+    """Draw one transition with its arcs on one line or several."""
     took = draw(
         st.sampled_from(
             [
@@ -80,7 +80,7 @@ def transition(draw: st.DrawFn, name: str) -> str:
 
 @st.composite
 def task_files(draw: st.DrawFn) -> str:
-    """A whole file: sections in any order, LF or CR LF, with or without an end of the last line."""
+    """Draw a whole file: sections in any order, LF or CR LF, with or without a final line end."""
     made = [
         draw(place(f"p{i}", draw(st.sampled_from(WAYS)))) for i in range(draw(st.integers(1, 4)))
     ]
@@ -123,16 +123,16 @@ many = settings(
 
 @many
 @given(task_files())
-def test_what_was_not_edited_is_the_same_file(text: str) -> None:
-    """From the file to the page and back every byte is the same."""
+def test_a_file_without_an_edit_is_unchanged(text: str) -> None:
+    """From the file to the page and back every byte stays the same."""
     assert edited(text, sent_back(document_of(text))) == text
 
 
 @many
 @given(task_files(), st.data())
 def test_an_edit_keeps_all_other_lines_and_comments(text: str, data: st.DataObject) -> None:
-    """A place moved, put into a macro place, an arc or element added: no line of others is lost,
-    and line ends are kept."""
+    """Moving a place, putting it into a macro place, or adding an arc or element loses no line of
+    other elements and keeps line ends."""
     document = document_of(text)
     wanted = copy.deepcopy(document)
     name = data.draw(st.sampled_from(sorted(document["places"])))
@@ -158,5 +158,5 @@ def test_an_edit_keeps_all_other_lines_and_comments(text: str, data: st.DataObje
     changed = [line for line in text.splitlines() if line.strip() and line not in kept]
     assert len(changed) <= 2, changed
     assert sent_back(plain(parse(edited(result, sent_back(document))))) == sent_back(document), (
-        "undone"
+        "undoing the edit must restore the file"
     )

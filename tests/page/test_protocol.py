@@ -1,5 +1,5 @@
-"""The live protocol over a real WebSocket: snapshot first, no gaps, slow clients, commands and who
-may give them."""
+"""The live protocol over a real WebSocket: snapshot first, no gaps, slow clients, commands, and
+which client may give them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.waiting import beat
 
 
 class Client:
-    """A client in Python: keeps the state as the browser does."""
+    """A client in Python that keeps the state as the browser does."""
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self.socket = socket
@@ -32,7 +32,7 @@ class Client:
         self._number = 0
 
     async def hear(self) -> str:
-        """Take the next message in; gives its type. Fails on a gap in the numbers."""
+        """Receive and apply the next message; return its type. Fails on a gap in the numbers."""
         message = await self.socket.receive_json(timeout=60)
         kind = str(message["type"])
         if kind == "snapshot":
@@ -40,7 +40,9 @@ class Client:
             self.state = {k: v for k, v in message.items() if k not in ("type", "protocol")}
         elif kind == "delta":
             self.deltas += 1
-            assert message["first"] == self.state["sequence"] + 1, "a gap in the sequence"
+            assert message["first"] == self.state["sequence"] + 1, (
+                "a gap in the sequence of numbers"
+            )
             for change in message["changes"]:
                 apply(self.state, change)
             self.state["sequence"], self.state["time"] = message["last"], message["time"]
@@ -49,7 +51,7 @@ class Client:
         return kind
 
     async def until(self, holds: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        """Take messages in until something holds."""
+        """Receive messages until the condition holds."""
         async with asyncio.timeout(60):
             while not (self.state and holds(self.state)):
                 await self.hear()
@@ -69,7 +71,7 @@ class Client:
 
 @asynccontextmanager
 async def joined(page: Page, name: str = "ana", tab: str = "1") -> AsyncIterator[Client]:
-    """A client that has said hello."""
+    """Connect a client and complete its hello."""
     address = page.url.partition("?")[0] + "api/live"
     headers = {"Authorization": f"Bearer {page.token}"}
     async with aiohttp.ClientSession() as http, http.ws_connect(address, headers=headers) as socket:
@@ -77,8 +79,8 @@ async def joined(page: Page, name: str = "ana", tab: str = "1") -> AsyncIterator
         yield Client(socket)
 
 
-async def test_late_joiners_see_the_same(page: Page, stage: Stage) -> None:
-    """A client that connects at any time ends with the server's state and misses no change."""
+async def test_clients_that_join_late_see_the_same(page: Page, stage: Stage) -> None:
+    """A client that connects at any time reaches the server's state and misses no change."""
     async with joined(page) as first:
         await first.command("take_controls")
         assert (await first.command("start"))["ok"]
@@ -99,8 +101,10 @@ async def test_late_joiners_see_the_same(page: Page, stage: Stage) -> None:
                 )
 
 
-async def test_a_slow_client_gets_less_and_holds_nobody_up(page: Page, stage: Stage) -> None:
-    """One client that reads nothing for thousands of changes costs bounded room and is caught up by
+async def test_a_slow_client_gets_merged_changes_and_delays_no_other_client(
+    page: Page, stage: Stage
+) -> None:
+    """A client that reads nothing for thousands of changes needs bounded memory and catches up with
     one message."""
     async with joined(page, "slow") as slow, joined(page, "quick", "2") as quick:
         await slow.until(lambda s: True)
@@ -118,8 +122,8 @@ async def test_a_slow_client_gets_less_and_holds_nobody_up(page: Page, stage: St
         assert slow.state["variables"] == stage.feed.state["variables"]
 
 
-async def test_firings_beyond_bounds_become_a_snapshot(page: Page, stage: Stage) -> None:
-    """A burst that cannot be merged is answered with a fresh snapshot, not with a backlog."""
+async def test_too_many_firings_are_replaced_by_a_snapshot(page: Page, stage: Stage) -> None:
+    """A burst that cannot be merged causes a new snapshot, not a backlog."""
     async with joined(page) as client:
         await client.until(lambda s: True)
         for number in range(5_000):
@@ -131,9 +135,11 @@ async def test_firings_beyond_bounds_become_a_snapshot(page: Page, stage: Stage)
         assert client.state["firings"][-1]["number"] == 4_999
 
 
-async def test_controls_are_held_by_one_and_asked_for(page: Page, stage: Stage) -> None:
-    """A second operator is refused, asks, and is handed the controls; an emergency stop is
-    everybody's."""
+async def test_one_client_holds_the_controls_and_others_ask_for_them(
+    page: Page, stage: Stage
+) -> None:
+    """A second operator is refused, asks for the controls and gets them; every client may give an
+    emergency stop."""
     async with joined(page) as ana, joined(page, "ben", "2") as ben:
         await ben.until(lambda s: True)
         assert (await ana.command("take_controls"))["ok"]
@@ -149,11 +155,11 @@ async def test_controls_are_held_by_one_and_asked_for(page: Page, stage: Stage) 
         await ben.until(lambda s: s["mission"]["state"] == "stopped")
 
 
-async def test_controls_go_free_when_their_holder_is_gone(
+async def test_controls_become_free_when_their_holder_is_gone(
     page: Page, stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A holder whose last window was closed does not block the others for ever; one that only
-    reloads keeps them."""
+    """A holder whose last window was closed does not block others for ever; one that only reloads
+    the page keeps them."""
     monkeypatch.setattr(house, "ABSENT_S", 0.3)
     async with joined(page, "ben", "2") as ben:
         async with joined(page) as ana:
@@ -165,8 +171,8 @@ async def test_controls_go_free_when_their_holder_is_gone(
         await ben.until(lambda s: s["controls"]["holder"] is None)
 
 
-async def test_commands_go_on_when_their_client_leaves(page: Page, stage: Stage) -> None:
-    """A command is carried out although its client no longer waits for the answer."""
+async def test_a_command_is_completed_when_its_client_leaves(page: Page, stage: Stage) -> None:
+    """It is carried out although its client no longer waits for the answer."""
     begun, go = asyncio.Event(), asyncio.Event()
     done: list[str] = []
 
@@ -186,8 +192,8 @@ async def test_commands_go_on_when_their_client_leaves(page: Page, stage: Stage)
 
 
 async def test_the_command_that_ends_the_run_is_answered(page: Page, stage: Stage) -> None:
-    """The coordinator closes while the command is still being carried out; its client still gets
-    the answer."""
+    """The coordinator closes while the command is being carried out; its client still gets the
+    answer."""
     begun, closing = asyncio.Event(), asyncio.Event()
 
     async def last(who: str, data: Any) -> dict[str, Any]:
@@ -200,14 +206,15 @@ async def test_the_command_that_ends_the_run_is_answered(page: Page, stage: Stag
         asked = asyncio.create_task(client.command("estop"))
         await asyncio.wait_for(begun.wait(), 60)
         ended = asyncio.create_task(page.close())
-        await beat(0)  # it has begun to close
+        await beat(0)  # The coordinator has begun to close.
         closing.set()
         assert (await asked)["last"]
         await ended
 
 
-async def test_a_fault_in_the_mission_is_an_answer(page: Page, stage: Stage) -> None:
-    """A command whose carrying out breaks is answered with the reason, and the connection lives."""
+async def test_an_exception_in_the_mission_is_answered(page: Page, stage: Stage) -> None:
+    """A command that raises an exception is answered with the reason, and the connection stays
+    open."""
     async with joined(page) as client:
         await client.command("take_controls")
         answer = await client.command("add_tokens")
@@ -227,8 +234,8 @@ NONSENSE = (
 
 
 @pytest.mark.parametrize("text", NONSENSE)
-async def test_nonsense_ends_the_connection_with_a_reason(page: Page, text: str) -> None:
-    """A client that does not speak the protocol gets a reason and is closed; the others are not
+async def test_an_invalid_message_ends_the_connection_with_a_reason(page: Page, text: str) -> None:
+    """A client that violates the protocol gets a reason and is disconnected; other clients are not
     affected."""
     async with joined(page) as good, joined(page, "bad", "2") as bad:
         await good.until(lambda s: True)
@@ -241,8 +248,8 @@ async def test_nonsense_ends_the_connection_with_a_reason(page: Page, text: str)
         assert (await good.command("take_controls"))["ok"]
 
 
-async def test_who_floods_is_closed(page: Page) -> None:
-    """More messages a second than any person gives end the connection."""
+async def test_a_client_that_floods_the_server_is_disconnected(page: Page) -> None:
+    """More messages per second than any person can cause end the connection."""
     async with joined(page) as client:
         await client.until(lambda s: True)
         for _ in range(4 * sessions.MESSAGES_PER_S):
@@ -254,8 +261,7 @@ async def test_who_floods_is_closed(page: Page) -> None:
 
 
 async def test_hello_comes_first(page: Page) -> None:
-    """A client is served only after it has given its name, in the version that the server
-    speaks."""
+    """A client is served only after it has sent its name and a version that the server supports."""
     address = page.url.partition("?")[0] + "api/live"
     headers = {"Authorization": f"Bearer {page.token}"}
     for first in ({"type": "command", "id": 1, "verb": "estop"}, {"type": "hello", "protocol": 99}):
@@ -268,9 +274,11 @@ async def test_hello_comes_first(page: Page) -> None:
             assert message.type is aiohttp.WSMsgType.CLOSE
 
 
-async def test_strange_values_do_not_end_the_feed(page: Page, stage: Stage) -> None:
-    """Infinities, not-a-numbers and objects that JSON does not know still reach the client as
-    something readable."""
+async def test_values_that_json_cannot_hold_do_not_end_the_connection(
+    page: Page, stage: Stage
+) -> None:
+    """Infinities, not-a-numbers and objects outside JSON still reach the client in a readable
+    form."""
     async with joined(page) as client:
         await client.until(lambda s: True)
         stage.feed.emit("variable", name="odd", value=[float("inf"), float("nan"), {1, 2}, 1 + 2j])

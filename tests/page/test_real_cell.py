@@ -1,5 +1,5 @@
-"""`petrobot serve` as its own process over node processes, driven through the page alone: draw,
-run, step in, look back."""
+"""`petrobot serve` as its own process with node processes, used only through the page: draw, run,
+intervene, look at the history."""
 
 from __future__ import annotations
 
@@ -69,14 +69,14 @@ seconds = 0.3
 
 @dataclass
 class Served:
-    """A coordinator that stays, as a process."""
+    """A permanent coordinator, as a process."""
 
     process: asyncio.subprocess.Process
     url: str
     folder: Path
 
     async def end(self) -> int:
-        """Ctrl-C; its exit code."""
+        """Press Ctrl-C; return the exit code."""
         if self.process.returncode is None:
             self.process.send_signal(signal.SIGINT)
         async with asyncio.timeout(120):
@@ -85,7 +85,7 @@ class Served:
 
 @asynccontextmanager
 async def serving(folder: Path) -> AsyncIterator[Served]:
-    """`petrobot serve --up --mock` in a folder of its own."""
+    """Run `petrobot serve --up --mock` in its own folder."""
     (folder / "services.toml").write_text(SERVICES.format(*free_ports(2)), encoding="utf-8")
     (folder / "script.toml").write_text(SCRIPT, encoding="utf-8")
     command = [
@@ -112,14 +112,14 @@ async def serving(folder: Path) -> AsyncIterator[Served]:
 
 @pytest_asyncio.fixture(loop_scope="session")
 async def served(tmp_path: Path) -> AsyncIterator[Served]:
-    """A cell with two nodes that wait for a task."""
+    """A cell with two idle nodes."""
     async with serving(tmp_path) as made:
         yield made
 
 
 @asynccontextmanager
 async def window(browser: Browser, served: Served, theme: str = "light") -> AsyncIterator[Tab]:
-    """A new window on the page, as a new person would open it."""
+    """Open the page in a new window, as a new user."""
     context = await browser.new_context(viewport=SIZE, color_scheme=theme)  # type: ignore[arg-type]
     context.set_default_timeout(PATIENCE_MS)
     tab = await context.new_page()
@@ -133,8 +133,8 @@ async def window(browser: Browser, served: Served, theme: str = "light") -> Asyn
 async def test_a_new_user_draws_a_task_and_runs_it_on_the_cell(
     browser: Browser, served: Served, shots: Path, faults: Watch
 ) -> None:
-    """The whole way on real nodes: draw, start, pause, step, one run more, why it failed, start
-    again, look back, goodbye."""
+    """All on real nodes: draw, start, pause, step, run once more, find out why it failed, start
+    again, look at the history, quit."""
     async with window(browser, served) as tab:
         complaints = faults(tab)
         await expect(tab.get_by_role("region", name="Nodes")).to_contain_text("2 of 2 up")
@@ -161,7 +161,7 @@ async def test_a_new_user_draws_a_task_and_runs_it_on_the_cell(
 
 
 async def lead_by_hand(tab: Tab, shots: Path) -> None:
-    """Pause while the camera looks, step, put a token in, go on, read why the first pick failed."""
+    """Pause while the camera looks, step, add a token, continue, read why the first pick failed."""
     mission = tab.get_by_role("status", name="Mission state")
     toolbar = tab.get_by_role("toolbar", name="Mission")
     fired = tab.get_by_role("region", name="Last firings").get_by_role("listitem")
@@ -188,8 +188,8 @@ async def lead_by_hand(tab: Tab, shots: Path) -> None:
 
 
 async def start_again(tab: Tab, shots: Path) -> None:
-    """Choose the task in the bar and start it once more, with a breakpoint set before; the shipped
-    tasks are listed."""
+    """Choose the task in the bar and start it again after setting a breakpoint; the shipped tasks
+    are listed."""
     toolbar = tab.get_by_role("toolbar", name="Mission")
     mission = tab.get_by_role("status", name="Mission state")
     await expect(
@@ -221,11 +221,11 @@ async def look_back(tab: Tab, shots: Path) -> None:
     await tab.screenshot(path=shots / "serve-history.png")
 
 
-async def test_what_cannot_start_says_why_on_the_page(
+async def test_the_page_explains_why_a_task_cannot_start(
     browser: Browser, served: Served, shots: Path
 ) -> None:
-    """A shipped task for which this cell has no nodes is listed, drawn, and refused with the
-    reason; its copy is one's own."""
+    """A shipped task for which this cell has no nodes is listed and drawn, and its start is refused
+    with the reason; the user may edit a copy."""
     async with window(browser, served, "dark") as tab:
         await tab.get_by_role("button", name="Take controls").click()
         toolbar = tab.get_by_role("toolbar", name="Mission")

@@ -1,5 +1,5 @@
-"""From the page alone, in a real browser, by role and name: start with options, learn, set out from
-a point, stop and clear."""
+"""Starting from the page in a real browser, by role and name: options, learning, start from a
+recorded point, emergency stop and clearing it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ expect.set_options(timeout=PATIENCE_MS)
 
 @pytest_asyncio.fixture(loop_scope="session")
 async def cell(tmp_path: Path) -> AsyncIterator[Simulated]:
-    """A station that simulates."""
+    """A station that can only simulate."""
     made = Simulated(tmp_path)
     made.tasks.save_text("remarked", None, REMARKED.replace('name = "moving"', 'name = "remarked"'))
     yield made
@@ -55,12 +55,12 @@ async def page(cell: Simulated) -> AsyncIterator[Page]:
 
 
 def mission(tab: Tab) -> Locator:
-    """The mission in one line."""
+    """Return the mission in one line."""
     return tab.get_by_role("status", name="Mission state")
 
 
 async def chosen(tab: Tab, task: str) -> Locator:
-    """Hold the controls and have the start form of a task open."""
+    """Take the controls and open the start form of a task."""
     await hold_controls(tab)
     toolbar = tab.get_by_role("toolbar", name="Mission")
     await toolbar.get_by_label("Task to start").select_option(task)
@@ -70,7 +70,7 @@ async def chosen(tab: Tab, task: str) -> Locator:
     return dialog
 
 
-async def test_everything_that_the_command_line_takes(
+async def test_every_option_of_the_command_line(
     browser: Browser, page: Page, cell: Simulated, shots: Path, faults: Watch
 ) -> None:
     """Mode, runs, seed, parameters of each type, and learning. Wrong input is explained in the
@@ -122,8 +122,8 @@ async def test_everything_that_the_command_line_takes(
 
 
 async def learning_view(tab: Tab, shots: Path) -> None:
-    """Curves of probability and of J, what is known of each alternative, places coloured by J, and
-    the choice fixed by hand."""
+    """Check the curves of probability and J, the details of each alternative, places coloured by J,
+    and a choice fixed by hand."""
     await tab.get_by_role("tab", name="Learning").click()
     panel = tab.get_by_role("tabpanel", name="Learning")
     await expect(
@@ -151,8 +151,8 @@ async def learning_view(tab: Tab, shots: Path) -> None:
 async def test_the_selector_is_overridden_and_frozen_from_the_page(
     browser: Browser, page: Page, cell: Simulated
 ) -> None:
-    """The reason of each choice is shown where the run is: the operator's, or the best of what was
-    learned."""
+    """The reason of each choice is shown with the run: chosen by the operator, or best of the
+    learned ones."""
     await cell.say("take_controls")
     await cell.simulate(runs=4, learn={"file": "known", "selector": "nikolic_fu"})
     await cell.say("release_controls")
@@ -182,12 +182,12 @@ async def test_the_selector_is_overridden_and_frozen_from_the_page(
     await expect(selected).to_be_visible()
     reasons = {run["why"] for run in cell.state["ended"] if run["place"] == "look"}
     assert "chosen by the operator" in reasons
-    await cell.until(lambda: cell.state["result"] is not None)  # it comes after the status
+    await cell.until(lambda: cell.state["result"] is not None)  # It arrives after the status.
     assert cell.state["result"]["learned"]["runs_counted"] == 0
 
 
 async def again(tab: Tab, task: str) -> Locator:
-    """The start form once more."""
+    """Open the start form again."""
     await (
         tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start with").click()
     )
@@ -196,7 +196,7 @@ async def again(tab: Tab, task: str) -> Locator:
     return dialog
 
 
-async def test_a_run_sets_out_from_a_point_of_another(
+async def test_a_run_starts_from_a_point_of_another(
     browser: Browser, page: Page, cell: Simulated, shots: Path, faults: Watch
 ) -> None:
     """Move to a moment of a recorded run, choose how its active actions continue, simulate, and
@@ -249,11 +249,11 @@ async def test_a_run_sets_out_from_a_point_of_another(
     assert complaints == []
 
 
-async def test_the_emergency_stop_is_cleared_by_who_holds_the_controls(
+async def test_the_holder_of_the_controls_clears_the_emergency_stop(
     browser: Browser, page: Page, cell: Simulated, shots: Path, faults: Watch
 ) -> None:
-    """The stop stays until it is cleared, however the run ended, and nothing starts. Clearing asks
-    for a confirmation; all by keyboard."""
+    """The stop holds until it is cleared, however the run ended, and nothing can start. Clearing
+    asks for confirmation; all by keyboard."""
     cell.tasks.save_text(
         "long", None, TASK.replace("[transitions.begin]", "[transitions.begin]\nafter = 3600.0")
     )

@@ -1,4 +1,4 @@
-"""Every vendored file is the one that the list names, and nothing is fetched from elsewhere."""
+"""Every vendored file is the one in the list, and nothing is fetched from another host."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ OWN = sorted(
 )
 
 
-def test_each_file_is_the_one_that_was_taken() -> None:
-    """Hashes of all vendored files, none missing, none more; each library names its version and
-    licence."""
+def test_each_vendored_file_has_its_recorded_hash() -> None:
+    """All vendored files are listed with their hashes, none is missing or additional, and each
+    library names its version and licence."""
     listed: dict[str, str] = {}
     for name, library in LIST.items():
         assert library["version"] and library["licence"] and library["package"]
@@ -33,8 +33,9 @@ def test_each_file_is_the_one_that_was_taken() -> None:
 
 
 @pytest.mark.parametrize("path", OWN, ids=lambda p: p.name)
-def test_nothing_comes_from_elsewhere(path: Path) -> None:
-    """No address of another host, no markup built from text, no inline handler or style."""
+def test_nothing_is_loaded_from_another_host(path: Path) -> None:
+    """There is no address of another host, no markup built from text, no inline handler or
+    style."""
     text = path.read_text(encoding="utf-8")
     addresses = [
         a
@@ -58,8 +59,8 @@ def test_nothing_comes_from_elsewhere(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", [p for p in OWN if p.suffix == ".js"], ids=lambda p: p.name)
-def test_modules_say_their_role_and_stay_short(path: Path) -> None:
-    """Each module begins with what it is for, and none grows beyond what one can read."""
+def test_modules_state_their_purpose_and_stay_short(path: Path) -> None:
+    """Each module begins with its purpose, and none exceeds a readable length."""
     lines = path.read_text(encoding="utf-8").splitlines()
     assert lines[0].startswith("// ")
     assert len(lines) <= 520
