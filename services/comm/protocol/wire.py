@@ -390,11 +390,8 @@ class Connection:
             if end > size or not least <= length <= longest(kind, 0) or array & 0xF0 != 0x90:
                 break
             middle = end - CHECK_BYTES
-            if (
-                self._keys
-                or length > _LARGE
-                or crc32(part := data[body:middle]) != _check_at(data, middle)[0]
-            ):
+            part: bytes | memoryview = data[body:middle] if length <= _LARGE else b""
+            if not part or self._keys or crc32(part) != _check_at(data, middle)[0]:
                 # With a key, for large bodies, and to word the error. What follows in this loop for
                 # a short frame with a checksum is written out: at a hundred thousand frames a
                 # second each function call per frame can be measured.
