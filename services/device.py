@@ -79,7 +79,18 @@ class Ports(Protocol):
         """A file named in services.toml, relative to it."""
 
 
-PORT_KEYS = ("interface", "channel", "bitrate", "can", "source", "address", "latency")
+CAMERA_KEYS = (
+    "source",
+    "address",
+    "latency",
+    "fps",
+    "width",
+    "height",
+    "fourcc",
+    "exposure",
+    "colour",
+)
+PORT_KEYS = ("interface", "channel", "bitrate", "can", *CAMERA_KEYS)
 """Keys of a device's table that its ports read: what bus and which images it has."""
 
 
