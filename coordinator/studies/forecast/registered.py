@@ -222,4 +222,6 @@ def _share_error(
             first = sum(d * q for d, q in by_status.values())
             variance += (sum(q * d * d for d, q in by_status.values()) - first**2) / runs
     half = 1.96 * math.sqrt(max(0.0, variance)) / p
+    if half <= 0.0:  # nothing that decides was ever seen otherwise: no interval, not one of width 0
+        return None
     return [float(f"{p * math.exp(-half):.7g}"), float(f"{min(1.0, p * math.exp(half)):.7g}")]
