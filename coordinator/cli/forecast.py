@@ -10,8 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.loading import load_directory, load_task, write_json
-from petrobot.services.comm.location_file import FIRST_PHYSICS, same_physics
+from petrobot.coordinator.cli.loading import (
+    add_services_argument,
+    load_directory,
+    load_task,
+    write_json,
+)
+from petrobot.services.comm.location_file import FIRST_PHYSICS, physics_of, same_physics
 from petrobot.services.host.command_line import whole
 from petrobot.services.host.whole_file import make_folder, write_whole
 
@@ -20,6 +25,7 @@ if TYPE_CHECKING:
     from petrobot.coordinator.studies.campaign.plan import CampaignPlan
     from petrobot.coordinator.studies.campaign.rows import TrialRow
     from petrobot.coordinator.studies.forecast.history import Training
+    from petrobot.coordinator.studies.forecast.predict import Request
     from petrobot.coordinator.task import Task
 
 EXAMPLE = (
@@ -39,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="a campaign's folder, or an estimates file without its trials",
     )
+    add_services_argument(parser)
     parser.add_argument(
         "--runs",
         type=whole(),
@@ -118,6 +125,8 @@ def _forecast(options: argparse.Namespace) -> int:
     trainings, estimates, about = _trainings(task, options.estimates)
     names = [name for name in options.regime.split(",") if name] or list(trainings)
     requests = {name: _request(task, trainings, name, options) for name in names}
+    if options.services is not None:
+        _refuse_other_cell(task, options.services, requests, about)
     made = register(task, trainings, requests, about, estimates)
     doubtful = any(said["doubts"] for said in made["regimes"].values())
     registered = options.out is not None and (options.doubtful or not doubtful)
@@ -138,6 +147,34 @@ def _forecast(options: argparse.Namespace) -> int:
         print(f"petrobot forecast: DOUBTFUL, see above{kept}", file=sys.stderr)
         return 1
     return 0
+
+
+def _refuse_other_cell(
+    task: Task, services: Path, requests: Mapping[str, Request], about: Mapping[str, Any]
+) -> None:
+    """Raises CommandError when the new trials cannot run with a location file as the forecast
+    assumes: another physics, or an action that it gives to no node."""
+    directory = load_directory(services)
+    try:
+        physics = physics_of(directory)
+    except ValueError as fault:
+        raise CommandError(2, str(fault)) from fault
+    # empty: no laboratory, or its package is not installed here
+    if physics and not same_physics(about.get("physics", ""), physics):
+        raise CommandError(
+            2,
+            f"{services}: its physics is {physics or FIRST_PHYSICS!r}, but the estimates are of "
+            f"{about.get('physics', '') or FIRST_PHYSICS!r}; train with this location file",
+        )
+    for name, request in requests.items():
+        for primitive, chosen in request.choices.items():
+            for action, probability in chosen.items():
+                if probability > 0 and action not in directory.actions:
+                    raise CommandError(
+                        2,
+                        f"regime {name or '-'}: {primitive}={action} is chosen in {task.name}, but "
+                        f"{services} gives {action} to no node; choose another one with --choose",
+                    )
 
 
 def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, dict[str, Any]]:
@@ -244,7 +281,7 @@ def _refuse_other_names(task: Task, path: Path, found: Mapping[str, Iterable[str
 
 def _request(
     task: Task, trainings: Mapping[str, Training], regime: str, options: argparse.Namespace
-) -> Any:
+) -> Request:
     from petrobot.coordinator.studies.campaign.policies import learned_choices
     from petrobot.coordinator.studies.forecast.choices import choices_of
     from petrobot.coordinator.studies.forecast.predict import Request
@@ -262,6 +299,7 @@ def _request(
     asked = {
         name: (action, f"--learned {options.learned}")
         for name, action in learned.get(regime, {}).items()
+        if name in choices  # a place that training never entered stays at probability 0
     }
     asked |= {
         name: (action, "--choose")

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import Any
 
-from tools.proof import catching, convergence, learning, long_tests, physics
+from tools.proof import catching, convergence, coverage, learning, long_tests, physics
 from tools.proof.page import figures
 from tools.proof.proof import KEPT, ROOT, FigureProof
 
@@ -29,6 +29,7 @@ def proofs() -> list[FigureProof]:
         *catching.proofs(),
         *physics.proofs(),
         *convergence.proofs(),
+        *coverage.proofs(),
         *long_tests.proofs(),
         *learning.proofs(),
     ]

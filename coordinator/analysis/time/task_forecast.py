@@ -78,6 +78,23 @@ class Forecast:
         return self.done.probability
 
     @cached_property
+    def completion_error(self) -> float:
+        """Bound of the relative error of P_complete that solving left: residuals of its equation,
+        each weighted with the expected visits to its marking.
+
+        With h' the exact solution, h' - h = (I - A)^-1 r, and row 0 of that inverse are the
+        expected visits. So the bound holds for probabilities of any size.
+        """
+        chain, h = self.chain, self.done.h
+        if h[0] <= 0.0:
+            return 0.0
+        inside = (h > 0) & ~self.done.goal
+        ahead = np.where(inside[chain.source], chain.probability * h[chain.target], 0.0)
+        off = np.abs(sum_by(chain.source, ahead, chain.n) - np.where(inside, h, 0.0))
+        visits = visits_before(chain, inside)
+        return float(np.where(inside, visits * off, 0.0).sum() / h[0])
+
+    @cached_property
     def firings(self) -> dict[str, float]:
         """Expected firings of each transition of the task in one mission run."""
         names = self.chain.gspn.net.transitions
@@ -295,6 +312,7 @@ class Forecast:
         shape = self.completion_time() if quantiles and self.completion_probability > 0 else None
         return {
             "P_complete": self.completion_probability,
+            "P_complete_error": self.completion_error,
             "R_goal": self.goal_reliability,
             "R_conj": self.conjunctive_reliability,
             "mean": self.done.mean,

@@ -50,6 +50,10 @@ GRID = tuple(float(q) for q in np.linspace(0.005, 0.995, 100))
 """Probabilities at which the distribution of the time is stored."""
 TRIALS, NET = "trials", "net"
 """Where the figures come from: the training trials themselves, or the simulated net."""
+NO_TRIALS = (
+    "an estimates file contains no trials: runs of one trial are taken as independent, and nothing "
+    "tests that; give a campaign's folder"
+)
 NO_FIGURE: dict[str, Any] = {"value": None, "interval": None, "confidence": None}
 
 
@@ -266,7 +270,10 @@ def _from_net(training: Training, request: Request, random: np.random.Generator)
         "law": {**law, "trials": float(n)},
         "doubts": doubts(residual, whole, request.point) + order_doubts(training),
         **_net_told(
-            residual, measured_runs, whole.endless / request.point, list(structure.assumptions)
+            residual,
+            measured_runs,
+            whole.endless / request.point,
+            [*structure.assumptions, *([] if training.whole else [NO_TRIALS])],
         ),
     }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -13,14 +14,16 @@ from typing import Any
 
 from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.time.completion import completion_time
-from petrobot.coordinator.analysis.time.stochastic import NoEstimate, stochastic_view
+from petrobot.coordinator.analysis.time.sensitivity import reliability_slopes
+from petrobot.coordinator.analysis.time.stochastic import Measured, NoEstimate, stochastic_view
+from petrobot.coordinator.analysis.time.task_forecast import Forecast
 from petrobot.coordinator.analysis.time.task_forecast import forecast as solve
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.propagation import ChoiceShares, measured_from
 from petrobot.coordinator.studies.campaign.observed import context_of
 from petrobot.coordinator.studies.forecast.history import ForecastError, Training
 from petrobot.coordinator.studies.forecast.predict import Request, predict
-from petrobot.coordinator.task import Task
+from petrobot.coordinator.task import Estimate, Kind, Status, Task
 from petrobot.services.host.json_text import finite, json_text
 from petrobot.services.host.whole_file import make_folder, write_whole
 
@@ -128,14 +131,18 @@ def _no_forecast(path: Path, why: str) -> ForecastError:
 def exact(task: Task, estimates: Estimates, regime: str, choice: ChoiceShares) -> dict[str, Any]:
     """Return the figures of the stochastic view for one trial; only `why` if it cannot be solved.
 
-    Its times begin with the initial marking, so they include the wait for the event that begins the
-    trial.
+    `P_complete_interval` contains what the estimates leave open (see `_share_error`),
+    `P_complete_error` what the solution does (relative). Its times begin with the initial marking,
+    so they include the wait for the event that begins the trial.
     """
+    context = context_of(regime)
     try:
-        view = stochastic_view(task, measured_from(task, estimates, context_of(regime), choice))
+        known = measured_from(task, estimates, context, choice)
+        view = stochastic_view(task, replace(known, runs={**known.runs, **_unentered(task, known)}))
         if task.runs_place:
             view = replace(view, gspn=view.gspn.marked({task.runs_place: 1}))
         found = solve(view, limits=SearchLimits(states=LARGEST))
+        _refuse_guesses(task, found, _unentered(task, known))
     except (NoEstimate, ValueError, ArithmeticError) as fault:
         return {"why": str(fault)}
     try:
@@ -152,8 +159,69 @@ def exact(task: Task, estimates: Estimates, regime: str, choice: ChoiceShares) -
         "R_conj": found.conjunctive_reliability,
         "mean": found.done.mean,
         "q90": q90,
+        "P_complete_error": found.completion_error,
     }
+    # digits, not decimals: a probability of 1e-6 keeps its own
     return {
-        **{k: None if v is None else round(float(v), 6) for k, v in numbers.items()},
+        **{k: None if v is None else float(f"{v:.7g}") for k, v in numbers.items()},
+        "P_complete_interval": _share_error(task, estimates, context, found),
         "markings": found.chain.n,
     }
+
+
+def _unentered(task: Task, known: Measured) -> dict[tuple[str, str], dict[Status, Estimate]]:
+    """Return estimates that only let the view be built, for places of which nothing is known."""
+    flat = task.flat
+    return {
+        (place.name, action): {Status.SUCCESS: Estimate(1.0, 1.0)}
+        for place in flat.places.values()
+        if place.kind is Kind.ACTION and not flat.primitive_tasks[place.task].estimates
+        for action in flat.primitive_tasks[place.task].alternatives
+        if not any(key[0] in (place.name, place.task) for key in known.runs)
+    }
+
+
+def _refuse_guesses(task: Task, found: Forecast, unentered: Mapping[tuple[str, str], Any]) -> None:
+    """Raise ValueError if the view enters a place of which nothing is known."""
+    for place in dict.fromkeys(name for name, _ in unentered):
+        often = sum(
+            found.firings[t.name]
+            for t in task.flat.transitions.values()
+            if any(out.place == place for out in t.outputs)
+        )
+        if often > 0.0:
+            raise ValueError(
+                f"no training run entered {place}, but by the net a trial enters it {often:.2g} "
+                "times; train with more trials"
+            )
+
+
+def _share_error(
+    task: Task, estimates: Estimates, context: str | None, found: Forecast
+) -> list[float] | None:
+    """Return the 95 % interval of P_complete that the measured shares of statuses leave.
+
+    Delta method on the logarithm, with the exact derivatives of the solution: the shares of one
+    action are multinomial in its number of runs. A status that was never seen adds nothing.
+    """
+    p, variance = found.completion_probability, 0.0
+    if p <= 0.0:
+        return None
+    slopes = reliability_slopes(found.done)
+    moves: dict[tuple[str, str], dict[Status, list[float]]] = {}
+    for label, (place, action, status) in found.view.statuses.items():
+        primitive = task.primitive_task_of(place).name
+        # places with the same primitive task share its runs
+        own = moves.setdefault((primitive, action), {}).setdefault(status, [0.0, 0.0])
+        own[0] += slopes[label].derivative
+        own[1] = slopes[label].value
+    for (primitive, action), by_status in moves.items():
+        tallies = estimates.of(primitive, context).get(action, {})
+        runs = sum(t.runs for t in tallies.values())
+        if runs:
+            first = sum(d * q for d, q in by_status.values())
+            variance += (sum(q * d * d for d, q in by_status.values()) - first**2) / runs
+    half = 1.96 * math.sqrt(max(0.0, variance)) / p
+    if half <= 0.0:  # nothing that decides was ever seen otherwise: no interval, not one of width 0
+        return None
+    return [float(f"{p * math.exp(-half):.7g}"), float(f"{min(1.0, p * math.exp(half)):.7g}")]

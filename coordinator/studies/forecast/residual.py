@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2_contingency, spearmanr, ttest_ind
+from scipy.stats import chi2_contingency, rankdata, spearmanr, ttest_ind
 
 from petrobot.coordinator.studies.forecast.history import Training, Values
 from petrobot.coordinator.studies.forecast.play import Choices, Played
@@ -142,6 +142,33 @@ ORDER = 0.1
 """Rank correlation from which such a dependence matters."""
 
 
+LIKELY = 0.05
+"""p-value of the asymptotic test above which no permutations are drawn."""
+PERMUTATIONS = 20_000
+
+
+def _rank_test(one: Values, other: Values) -> tuple[float, float]:
+    """Return Spearman's rank correlation and its p-value. Where the asymptotic one is small it is
+    found by permutations, because two rare events that happen to be neighbours are no dependence.
+    """
+    test = spearmanr(one, other)
+    if test.pvalue > LIKELY:
+        return float(test.statistic), float(test.pvalue)
+    random, a, b = np.random.default_rng(0), _scores(one), _scores(other)
+    at_once = max(1, 2_000_000 // len(a))
+    least, beyond = abs(float(a @ b)) - 1e-9, 0
+    for begin in range(0, PERMUTATIONS, at_once):
+        count = min(at_once, PERMUTATIONS - begin)
+        mixed = random.permuted(np.broadcast_to(b, (count, len(b))), axis=1)
+        beyond += int(np.sum(np.abs(mixed @ a) >= least))
+    return float(test.statistic), (beyond + 1) / (PERMUTATIONS + 1)
+
+
+def _scores(values: Values) -> Values:
+    ranks = rankdata(values) - (len(values) + 1) / 2
+    return np.asarray(ranks / np.sqrt(ranks @ ranks))
+
+
 def order_doubts(training: Training) -> list[str]:
     """Return in words whether trials depend on their order: a trend, or a dependence of each trial
     on the one before (rank correlations, Holm). All forecasts assume that trials are independent
@@ -158,8 +185,7 @@ def order_doubts(training: Training) -> list[str]:
         if values[1:].std() > 0 and values[:-1].std() > 0:
             tests.append(("depends on the trial before", values[:-1], values[1:]))
         for words, one, other in tests:
-            test = spearmanr(one, other)
-            found.append((f"{name} {words}", float(test.statistic), float(test.pvalue)))
+            found.append((f"{name} {words}", *_rank_test(one, other)))
     together = holm([p for _, _, p in found])
     return [
         f"the training's {words} (rank correlation {r:+.2f}, p = {p:.1e}), but a forecast assumes "

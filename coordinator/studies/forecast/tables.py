@@ -76,7 +76,13 @@ def _exact_lines(gspn: Mapping[str, Any]) -> list[str]:
     if "markings" not in gspn:
         return [f"    stochastic view: {gspn['why']}"] if gspn else []
     shown = ", ".join(f"{WORDS[k]} {_digits(gspn[k])}" for k in WORDS if gspn.get(k) is not None)
-    return [f"    stochastic view, {gspn['markings']} markings: {shown}"]
+    lines = [f"    stochastic view, {gspn['markings']} markings: {shown}"]
+    if gspn.get("P_complete_interval"):
+        lines.append(
+            f"      its P_complete: 95 % {_bounds(gspn['P_complete_interval'])} from the measured "
+            f"shares; relative error of the solution {gspn['P_complete_error']:.0e}"
+        )
+    return lines
 
 
 def _worst(said: Mapping[str, Any]) -> str:

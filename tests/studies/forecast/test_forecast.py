@@ -11,10 +11,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import binom
+from scipy.stats import binom, norm
 
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
-from petrobot.coordinator.studies.forecast.agreement import agreement, quantile_interval
+from petrobot.coordinator.studies.forecast.agreement import (
+    agreement,
+    quantile_interval,
+    time_p_value,
+)
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.distributions import RunDistributions, dependences
 from petrobot.coordinator.studies.forecast.history import ForecastError, Training
@@ -169,6 +173,47 @@ def test_the_weight_of_censored_runs_goes_to_later_ends(pair: Task) -> None:
     ).ends
     assert law.took.tolist() == [1.0, 3.0]
     assert law.weight.tolist() == pytest.approx([1 / 3, 2 / 3])
+
+
+def test_a_forecast_of_an_older_version_is_still_compared(pair: Task, make_trials: Make) -> None:
+    """Files of schema 1 contain a standard deviation instead of a distribution of each figure."""
+    made = forecast(pair, make_trials(1500, np.random.default_rng(6)))
+    sd = {"R_goal": 0.02, "P_complete": 0.0, "R_conj": 0.02, "mean": 0.02, "q90": 0.01}
+    old = {
+        **made,
+        "figures": {
+            name: {"value": f["value"], "interval": f["interval"], "sd": sd[name]}
+            for name, f in made["figures"].items()
+        },
+        "law": {k: made["law"][k] for k in ("q", "s")},
+        "distance_99": 0.08,
+    }
+    same = {"": Training.of(pair, make_trials(RUNS, np.random.default_rng(7)))}
+    found = agreement({"regimes": {"": old}}, same)
+    assert found["agrees"], found
+    (mean,) = (row for row in found["rows"] if row["figure"] == "mean")
+    scale = np.sqrt((1 / RUNS + 1 / 1500) / (1 / made["runs"] + 1 / 1500))
+    z = abs(mean["measured"] - mean["forecast"]) / (0.02 * scale)
+    assert mean["p"] == pytest.approx(2 * norm.sf(z), abs=0.01)
+
+
+@pytest.mark.parametrize("figure", ["mean", "q90"])
+def test_a_time_at_the_end_of_its_interval_has_a_p_value_of_five_per_cent(
+    pair: Task, make_trials: Make, figure: str
+) -> None:
+    """Interval and test say the same; far outside the p-value goes to 0, inside to 1."""
+    found = forecast(pair, make_trials(400, np.random.default_rng(6)))["figures"][figure]
+    curve, value = np.array(found["curve"]), found["value"]
+
+    def p(seen: float) -> float:
+        return time_p_value(value, curve, seen, RUNS, RUNS, 400)
+
+    for end in found["interval"]:
+        assert p(end) == pytest.approx(0.05, abs=0.002)
+    low, high = found["interval"]
+    assert p(curve[len(curve) // 2]) > 0.95
+    assert p(value + 5 * (high - low)) < 1e-6
+    assert p(low + 0.3 * (high - low)) > 0.1
 
 
 # --- statistics -------------------------------------------------------------------------------

@@ -210,3 +210,148 @@ def test_estimates_of_another_task_are_refused(
     own.write_text(ONE_WAY, encoding="utf-8")
     assert main(["forecast", str(own), "--estimates", str(path), *QUICK]) == 0
     assert "no trials to compare with" in capsys.readouterr().out
+
+
+# --- places that training never entered -------------------------------------------------------
+
+BRANCH = TASK.replace(
+    '[transitions.off]\nin = ["first:error"]\nout = ["free"]',
+    '[transitions.off]\nin = ["first:error"]\nout = ["repair"]\n'
+    '[transitions.repaired]\nin = ["repair:normal"]\nout = ["free"]\n'
+    '[transitions.broken]\nin = ["repair:error"]\nout = ["free"]',
+).replace(
+    "[events.signal]",
+    '[primitive_tasks.repair]\ngoal = "repaired"\nalternatives = ["repair_a", "repair_b"]\n'
+    "deadline = 9.0\n[events.signal]",
+) + '[places.repair]\nkind = "action"\ntask = "repair"\n'  # fmt: skip
+
+
+def unbroken(make_trials: Make, n: int) -> list[Trial]:
+    """Trials whose first run never ends with ERROR."""
+    trials = make_trials(2 * n, np.random.default_rng(5))
+    return [t for t in trials if t.runs[0].status != "error"][:n]
+
+
+def test_a_place_that_training_never_entered_forbids_nothing(
+    write_campaign: Write, make_trials: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It has probability 0, with a note of what that is worth, also in the stochastic view; a
+    what-if about it is refused with the reason."""
+    train = write_campaign("train", BRANCH, unbroken(make_trials, 200))
+    out = tmp_path / "f.json"
+    told = ["forecast", str(tmp_path / "pair.toml"), "--estimates", str(train), *QUICK]
+    assert main([*told, "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert "no training run entered repair: forecast with probability 0 (below 0.015" in shown
+    made = json.loads(out.read_text(encoding="utf-8"))["regimes"][""]
+    assert made["figures"]["P_complete"]["value"] == 1.0
+    assert made["gspn"]["P_complete"] == pytest.approx(1.0, abs=1e-12)
+    assert made["gspn"]["mean"] > 0
+    assert main([*told, "--choose", "repair=repair_b"]) == 2
+    assert "repair: no training run entered repair" in capsys.readouterr().err
+
+
+def test_an_estimates_file_is_counted_in_runs(
+    make_trials: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """60 trials of about two runs each are neither 60 trials nor as many trials as runs there."""
+    from petrobot.coordinator.studies.campaign.observed import estimates_of, write_estimates
+
+    task = loads(TASK, "pair.toml")
+    trials = make_trials(60, np.random.default_rng(1))
+    rows = [TrialRow(i, "", i, 1, i, 1.0, trial) for i, trial in enumerate(trials)]
+    path = write_estimates(tmp_path, estimates_of(task, rows, "t"), {}, "t")
+    own = tmp_path / "pair.toml"
+    own.write_text(TASK, encoding="utf-8")
+    assert main(["forecast", str(own), "--estimates", str(path), *QUICK]) == 0
+    shown = capsys.readouterr().out
+    assert f"from {sum(len(t.runs) for t in trials)} runs of an estimates file" in shown
+    assert "by simulating the net" in shown and "trials, by" not in shown
+
+
+def test_services_say_where_the_new_trials_run(
+    write_campaign: Write, make_trials: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An action that the location file gives to no node is refused."""
+    train = write_campaign("train", TASK, make_trials(100, np.random.default_rng(1)))
+    told = ["forecast", str(tmp_path / "pair.toml"), "--estimates", str(train), *QUICK]
+    cell = tmp_path / "services.toml"
+    for actions, code in ((("first_a", "second_a"), 0), (("second_a",), 2)):
+        text = "".join(f'[actions.{a}]\nnode = "arm"\nrun = "json:dumps"\n' for a in actions)
+        cell.write_text(
+            f'schema = 1\n[nodes.arm]\nhost = "127.0.0.1"\nport = 9101\n{text}', encoding="utf-8"
+        )
+        assert main([*told, "--services", str(cell)]) == code, capsys.readouterr().err
+    assert "first=first_a is chosen in pair, but" in capsys.readouterr().err
+
+
+def test_a_disagreement_of_the_distribution_is_a_disagreement(
+    write_campaign: Write, make_trials: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Equal shares, mean and 90 % quantile, but other times between: the last line does not say
+    that the forecast agrees."""
+    random = np.random.default_rng(4)
+
+    def timed(times: np.ndarray) -> list[Trial]:
+        runs = [RunEntry("first", "first_a", 0.0, 1.0, "success", taken="on")]
+        return [Trial(1, 0.0, round(float(t), 6), True, 1, runs=runs) for t in times]
+
+    train = write_campaign("train", TASK, timed(random.uniform(1.0, 3.0, 1000)))
+    out = tmp_path / "f.json"
+    told = ["forecast", str(tmp_path / "pair.toml"), "--estimates", str(train), *QUICK]
+    assert main([*told, "--out", str(out)]) == 0
+    # 2.2 +- 0.01 and 1.8 +- 0.01 instead of what lies between 1.6 and 2.4
+    times = random.uniform(1.0, 3.0, 1000)
+    middle = np.abs(times - 2.0) < 0.4
+    times[middle] = np.where(times[middle] < 2.0, 1.6, 2.4)
+    new = write_campaign("new", TASK, timed(times), 2)
+    capsys.readouterr()
+    assert main(["forecast", "--compare", str(out), str(new)]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert any("distribution of the time" in line and "DISAGREES" in line for line in lines)
+    assert lines[-1].startswith("DISAGREES") and "agrees" not in lines
+
+
+def test_trials_of_a_rare_success_keep_their_digits(
+    write_campaign: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Six steps that succeed every tenth time complete once in a million: the trials only bound it,
+    the chain says it, with its error."""
+    random = np.random.default_rng(1)
+    text = (
+        'schema = 1\n[task]\nname = "steps"\nfinal = "over == 1"\nruns_place = "jobs"\n'
+        '[places.jobs]\nkind = "control"\ntokens = 1\n[places.over]\nkind = "control"\n'
+        '[places.gone]\nkind = "control"\n[transitions.begin]\nin = ["jobs"]\nout = ["a"]\n'
+    )
+    for step, after in zip("abcdef", [*"bcdef", "over"], strict=True):
+        text += (
+            f'[primitive_tasks.{step}]\ngoal = "g"\nalternatives = ["{step}_a"]\ndeadline = 9.0\n'
+            f'[places.{step}]\nkind = "action"\ntask = "{step}"\n'
+            f'[transitions.{step}_on]\nin = ["{step}:normal"]\nout = ["{after}"]\n'
+            f'[transitions.{step}_lost]\nin = ["{step}:error"]\nout = ["gone"]\n'
+        )
+    # each trial is one run of a step, so that all steps are measured equally often
+    trials = []
+    for k in range(1200):
+        step, lost = "abcdef"[k % 6], bool(random.random() > 0.1)
+        status, taken = ("error", f"{step}_lost") if lost else ("success", f"{step}_on")
+        runs = [RunEntry(step, f"{step}_a", 0.0, 1.0, status, taken=taken)]
+        trials.append(Trial(1, 0.0, None, False, 0, runs=runs))
+    train = write_campaign("train", text, trials)
+    told = ["forecast", str(tmp_path / "steps.toml"), "--estimates", str(train), *QUICK]
+    assert main([*told, "--json", str(tmp_path / "f.json")]) in (0, 1)
+    made = json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))["regimes"][""]
+    shares = [
+        np.mean([t.runs[0].status == "success" for t in trials if t.runs[0].place == step])
+        for step in "abcdef"
+    ]
+    found = made["gspn"]
+    assert found["P_complete"] == pytest.approx(float(np.prod(shares)), rel=1e-6)
+    assert found["P_complete_error"] < 1e-12
+    # var(log P) = sum (1 - p) / (n p)
+    sd = float(np.sqrt(sum((1 - p) / (200 * p) for p in shares)))
+    low, high = found["P_complete_interval"]
+    assert high / low == pytest.approx(np.exp(2 * 1.96 * sd), rel=1e-6)
+    assert low < 1e-6 < high
+    assert made["figures"]["P_complete"]["confidence"][1] < 0.005
+    assert "e-0" in capsys.readouterr().out

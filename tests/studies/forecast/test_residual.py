@@ -9,7 +9,13 @@ import pytest
 
 from petrobot.coordinator.studies.forecast.history import Training
 from petrobot.coordinator.studies.forecast.play import Played
-from petrobot.coordinator.studies.forecast.residual import doubts, measured, residuals, routing
+from petrobot.coordinator.studies.forecast.residual import (
+    doubts,
+    measured,
+    order_doubts,
+    residuals,
+    routing,
+)
 from petrobot.coordinator.task.file import loads
 from tests.studies.forecast.test_preempting import ONE_WAY, one_way, trials_of
 
@@ -60,3 +66,40 @@ def test_the_distance_is_the_largest_difference_of_shares_or_relative_difference
     assert any("goal, off by 15.0%" in one for one in said) and any(
         "mean time" in one for one in said
     )
+
+
+def timed(times: np.ndarray, goals: np.ndarray) -> Training:
+    """Trials with these times and goals."""
+    trials = [
+        replace(trial, time=round(float(t), 6), goals=int(g))
+        for trial, t, g in zip(trials_of(one_way, len(times), 3), times, goals, strict=True)
+    ]
+    return Training.of(loads(ONE_WAY, "scan.toml"), trials)
+
+
+def test_trials_that_depend_on_their_order_are_doubtful() -> None:
+    """A trend, and a time that follows the one before; independent trials, also long-tailed ones
+    with a few failures side by side, are not."""
+    random, n = np.random.default_rng(1), 300
+    even, goals = random.lognormal(0.0, 1.0, n), np.ones(n, np.int64)
+    assert order_doubts(timed(even, goals)) == []
+    neighbours = goals.copy()
+    neighbours[[20, 21, 90, 91, 150, 210]] = 0
+    assert order_doubts(timed(even, neighbours)) == []
+    (trend,) = order_doubts(timed(even * np.linspace(1.0, 3.0, n), goals))
+    assert trend.startswith("the training's time changes with the order of the trials")
+    follows = np.zeros(n)
+    for k in range(1, n):
+        follows[k] = 0.5 * follows[k - 1] + random.normal()
+    (lag,) = order_doubts(timed(10.0 + follows, goals))
+    assert "time depends on the trial before" in lag
+
+
+def test_independent_trials_are_seldom_doubtful() -> None:
+    """At 0.1 % for each training: at most 3 of 200."""
+    random = np.random.default_rng(2)
+    found = sum(
+        bool(order_doubts(timed(random.exponential(1.0, 60), random.random(60) < 0.9)))
+        for _ in range(200)
+    )
+    assert found <= 3
