@@ -53,7 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--regime",
         default="",
         metavar="A,B",
-        help="regimes that take turns, with the same seeds in each",
+        help="regimes that take turns, with the same seeds in each; C@1-5: regime C in the "
+        "simulated installations 1 to 5",
     )
     parser.add_argument(
         "--selector",
@@ -261,13 +262,11 @@ async def _conduct(campaign: Campaign, options: argparse.Namespace) -> None:
 
 def _plan(options: argparse.Namespace, task: Task) -> CampaignPlan:
     from petrobot.coordinator.cli.options import parameter_of
-    from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest
+    from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest, regimes_of
     from petrobot.coordinator.studies.campaign.policies import learns
 
     given = dict(_pair("--set", text) for text in options.set)
-    regimes = tuple(name for name in options.regime.split(",") if name) or (
-        str(task.parameters.get("regime", "")),
-    )
+    regimes = regimes_of(options.regime) or (str(task.parameters.get("regime", "")),)
     if regimes != ("",) and "regime" not in task.parameters:
         raise CommandError(2, f"--regime {options.regime}: {task.name} has no parameter regime")
     if len(set(regimes)) < len(regimes):

@@ -29,6 +29,7 @@ from petrobot.coordinator.studies.campaign.plan import (
     CampaignPlan,
     digest,
     read_manifest,
+    regimes_of,
     write_manifest,
 )
 from petrobot.coordinator.studies.campaign.pool import LocalPool
@@ -575,3 +576,11 @@ def test_the_summary_adds_up_what_the_score_counts_for_each_trial() -> None:
     assert whole.to_plain(False)["counts"] == {"eggs": {"laid": 9}}
     assert by_regime["A"].to_plain(False)["counts"] == {"eggs": {"laid": 4}}
     assert by_regime["B"].to_plain(False)["counts"] == {"eggs": {"laid": 5}}
+
+
+def test_regimes_may_be_named_in_several_installations() -> None:
+    assert regimes_of("A, C+dim@2,B@1-3") == ("A", "C+dim@2", "B@1", "B@2", "B@3")
+    assert regimes_of("") == ()
+    for text in ("C@3-1", "C@1-x", "C@-2"):
+        with pytest.raises(CampaignError, match="from and to, such as C@1-5"):
+            regimes_of(text)
