@@ -28,7 +28,8 @@ times g."""
 LARGEST_LOSS, LOSS_SIGMA = 0.13, 0.02
 """Largest share of its speed that a ball loses by sliding, and how sharp that bound is. As measured
 in one installation: 0.12 was the most of 30 throws; a tenth more, since 30 throws need not show the
-largest. Others throw with less spin (without any, a ball loses 0.4), and there this prior is wrong."""
+largest. Where balls are thrown with less spin this prior is wrong (without any, a ball loses
+0.4)."""
 
 
 class ExitWay(StrEnum):
