@@ -78,6 +78,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="learn and judge by this reliability, not the declared one",
     )
     parser.add_argument(
+        "--credit",
+        choices=("action", "task"),
+        help="what judges a choice: how its own run ended (default), or whether the goal was met",
+    )
+    parser.add_argument(
         "--rho",
         type=number(least=0.0),
         metavar="X",
@@ -309,7 +314,9 @@ def _selector_options(options: argparse.Namespace) -> dict[str, Any]:
     from petrobot.coordinator.studies.campaign.policies import learned_choices
 
     found: dict[str, Any] = {
-        name: value for name in ("target", "rho") if (value := getattr(options, name)) is not None
+        name: value
+        for name in ("target", "rho", "credit")
+        if (value := getattr(options, name)) is not None
     }
     if options.learned is not None:
         if options.selector != "fixed":

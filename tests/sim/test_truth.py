@@ -37,6 +37,7 @@ def changed(one: Truth, other: Truth) -> set[str]:
     [
         ("A+drift", {"light_drift"}),
         ("A+dim", {"light_level"}),
+        ("A+dark15", {"light_level"}),
         ("A+miscalibrated", {"camera.position", "camera.rotation", "cup.mouth"}),
         ("A+latency200", {"image_latency"}),
         ("A,latency400", {"image_latency"}),
