@@ -53,7 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--regime",
         default="",
         metavar="A,B",
-        help="regimes that take turns, with the same seeds in each",
+        help="regimes that take turns, with the same seeds in each; C@1-5: regime C in the "
+        "simulated installations 1 to 5",
     )
     parser.add_argument(
         "--selector",
@@ -75,6 +76,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=probability,
         metavar="R",
         help="learn and judge by this reliability, not the declared one",
+    )
+    parser.add_argument(
+        "--credit",
+        choices=("action", "task"),
+        help="what judges a choice: how its own run ended (default), or whether the goal was met",
     )
     parser.add_argument(
         "--rho",
@@ -261,13 +267,11 @@ async def _conduct(campaign: Campaign, options: argparse.Namespace) -> None:
 
 def _plan(options: argparse.Namespace, task: Task) -> CampaignPlan:
     from petrobot.coordinator.cli.options import parameter_of
-    from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest
+    from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest, regimes_of
     from petrobot.coordinator.studies.campaign.policies import learns
 
     given = dict(_pair("--set", text) for text in options.set)
-    regimes = tuple(name for name in options.regime.split(",") if name) or (
-        str(task.parameters.get("regime", "")),
-    )
+    regimes = regimes_of(options.regime) or (str(task.parameters.get("regime", "")),)
     if regimes != ("",) and "regime" not in task.parameters:
         raise CommandError(2, f"--regime {options.regime}: {task.name} has no parameter regime")
     if len(set(regimes)) < len(regimes):
@@ -310,7 +314,9 @@ def _selector_options(options: argparse.Namespace) -> dict[str, Any]:
     from petrobot.coordinator.studies.campaign.policies import learned_choices
 
     found: dict[str, Any] = {
-        name: value for name in ("target", "rho") if (value := getattr(options, name)) is not None
+        name: value
+        for name in ("target", "rho", "credit")
+        if (value := getattr(options, name)) is not None
     }
     if options.learned is not None:
         if options.selector != "fixed":
