@@ -1,5 +1,5 @@
-"""Draws the figures of docs/mobile.md from what was measured, and prints their tables. See there
-for the commands.
+"""Draw the figures of docs/mobile.md from measurements and print their tables; that page has the
+commands.
 
 python -m tests.mobile.figures learning LEARNING_FOLDER FIXED_FOLDER... --out
 docs/pictures/track-learning.svg python -m tests.mobile.figures speed 0.8=slow.log 1.2=fast.log
@@ -60,8 +60,8 @@ def main() -> None:
 
 
 def draw_learning(options: argparse.Namespace) -> None:
-    """A panel for each regime: runs of the campaign that learns, over the means of those that do
-    not."""
+    """Draw a panel for each regime: runs of the learning campaign, and the means of the campaigns
+    with a fixed choice."""
     learned = read(options.learned)
     fixed = [row for folder in options.fixed for row in read(folder)]
     regimes = list(dict.fromkeys(row.regime for row in learned))
@@ -146,7 +146,7 @@ def _learning_panel(
 
 
 def draw_speed(options: argparse.Namespace) -> None:
-    """Share of runs that finished and stopped at the T over the speed asked for, with 95 %
+    """Draw the share of runs that finished and stopped at the T over the requested speed, with 95 %
     intervals."""
     shares = []
     for given in options.logs:

@@ -1,5 +1,5 @@
-"""Every detector recovers the line on rendered floors, whatever the colours, and tells nothing
-where there is none."""
+"""Every detector finds the line on rendered floors in both colours, and reports nothing where there
+is none."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def look(
     seed: int = 1,
     photographer: Photographer = PHOTOGRAPHER,
 ) -> Sight:
-    """What a detector sees of a floor from a pose."""
+    """Return what a detector sees of a floor from a pose."""
     image = photographer(floor, pose, np.random.default_rng(seed))
     return DETECTORS[name]()(GRID, GRID.sample(image), WIDTH, None)
 
@@ -117,8 +117,8 @@ def test_swapping_black_and_white_changes_nothing(
 @EVERY
 @pytest.mark.parametrize("back", [0.5, 0.7, 0.9, 1.1])
 def test_the_line_continues_where_its_colour_is_inverted(name: str, back: float) -> None:
-    """The edge of a square lies across the view: the same line is seen before and behind it, and
-    has not ended."""
+    """The edge of a square crosses the view: the line before and behind it is the same, and does
+    not end there."""
     floor = DrawnFloor("SSS")
     pose = floor.at(2.0 - back, 0.02, 0.06)
     sight = look(name, floor, pose)
@@ -136,7 +136,7 @@ def test_an_empty_square_shows_no_line(name: str) -> None:
 
 @EVERY
 def test_the_edge_of_a_square_alone_is_not_a_line(name: str) -> None:
-    """Beside the track, along the border between black and white."""
+    """Tried next to the track, along the border between black and white."""
     floor = DrawnFloor("sss")
     assert not look(name, floor, DrawnPose(0.3, 1.0, 0.0)).seen
 
@@ -164,7 +164,7 @@ def test_the_line_before_decides_which_of_two_is_followed(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "noise"), [("edges", 10.0), ("ridge", 16.0), ("consensus", 10.0), ("template", 20.0)]
 )
-def test_noise_is_stood(name: str, noise: float) -> None:
+def test_noise_is_tolerated(name: str, noise: float) -> None:
     """Three to seven times the nominal noise: nine of ten images still show the line."""
     loud = Photographer(noise=noise)
     floor = DrawnFloor("SSS")
@@ -179,8 +179,8 @@ def test_noise_is_stood(name: str, noise: float) -> None:
 
 
 @EVERY
-def test_dim_light_is_stood(name: str) -> None:
-    """Two fifths of the contrast."""
+def test_dim_light_is_tolerated(name: str) -> None:
+    """Tried with two fifths of the contrast."""
     dim = Photographer(black=20.0, white=85.0)
     floor = DrawnFloor("SLS")
     for i in range(6):

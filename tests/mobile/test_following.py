@@ -1,5 +1,5 @@
-"""Both laws bring a rover with lagging wheels onto lines and arcs and keep it there; speed goes
-with curve and knowledge."""
+"""Both control laws bring a rover with lagging wheels onto lines and arcs and keep it there; its
+speed depends on curvature and on how far the line is known."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def drive(law: str, floor: DrawnFloor, begin: Pose, speed: float, seconds: float
 @EVERY
 @settings(max_examples=4, deadline=None)
 @given(st.floats(-0.2, 0.2), st.floats(-0.3, 0.3))
-def test_a_rover_beside_a_straight_comes_onto_it_and_stays(
+def test_a_rover_next_to_a_straight_line_reaches_it_and_stays_on_it(
     law: str, aside: float, askew: float
 ) -> None:
     errors = drive(law, DrawnFloor("SSS"), Pose(0.4, aside, askew), 0.5, 4.5)
@@ -87,13 +87,13 @@ def test_the_feed_forward_stays_stable_at_twice_the_speed() -> None:
 
 
 @EVERY
-def test_no_line_no_curvature(law: str) -> None:
+def test_without_a_line_the_curvature_is_zero(law: str) -> None:
     assert LAWS[law].curvature(lambda d: None, 0.5) is None
 
 
 @EVERY
 @given(st.floats(-0.6, 0.6), st.floats(-2.0, 2.0), st.floats(-9.0, 9.0), st.floats(0.0, 1.0))
-def test_no_way_tighter_than_the_limit_is_asked_for(
+def test_no_curve_tighter_than_the_limit_is_commanded(
     law: str, y: float, slope: float, bend: float, speed: float
 ) -> None:
     curvature = LAWS[law].curvature(lambda d: Fit(y, slope, bend), speed)
@@ -109,7 +109,7 @@ def test_left_and_right_are_mirror_images(law: str, y: float, slope: float, bend
 
 
 @given(st.floats(0.1, 1.2), st.floats(-3.0, 3.0), st.floats(-0.5, 3.0))
-def test_the_speed_never_outruns_curve_or_knowledge(
+def test_the_speed_respects_the_curve_and_the_known_part_of_the_line(
     asked: float, curvature: float, ahead: float
 ) -> None:
     profile = SpeedProfile()
@@ -117,7 +117,7 @@ def test_the_speed_never_outruns_curve_or_knowledge(
     assert 0.0 <= speed <= asked
     assert speed**2 * abs(curvature) <= profile.sideways + 1e-9
     assert speed**2 / (2.0 * profile.braking) <= max(0.0, ahead) + 1e-9, (
-        "it can still stand before the end"
+        "it can still stop before the end"
     )
 
 

@@ -20,8 +20,8 @@ PHOTOGRAPHER = Photographer()
 def drive(
     floor: DrawnFloor, first: float, last: float, step: float = 0.02, seed: int = 5
 ) -> list[tuple[DrawnPose, TrackEnd, tuple[float, float]]]:
-    """Images every `step` m along the line, with a little weaving: poses, and the end that a
-    watcher believes in."""
+    """Take images every `step` m along the line, weaving a little; return the poses and the end
+    that a watcher reports."""
     random = np.random.default_rng(seed)
     watcher, seen = LineWatcher(WATCH, detect_edges), []
     for s in np.arange(first, last, step):
@@ -62,7 +62,7 @@ def test_a_track_that_continues_has_no_end(elements: str) -> None:
     assert drive(DrawnFloor(elements), 0.3, length - 1.6, 0.06) == []
 
 
-def test_one_image_is_not_believed() -> None:
+def test_a_single_image_is_not_sufficient() -> None:
     floor = DrawnFloor("SSs")
     watcher, random = LineWatcher(WATCH, detect_edges), np.random.default_rng(0)
     sights = [watcher.look(PHOTOGRAPHER(floor, floor.at(3.2 + 0.02 * i), random)) for i in range(4)]

@@ -24,7 +24,7 @@ TICK = 0.004
 def run(
     seed: int, regime: str, *, faults: dict[str, Any] | None = None, **use: str
 ) -> dict[str, Any]:
-    """A run's result without its wall-clock time, with what its runs came to."""
+    """Return a run's result without its wall-clock time, and the results of its actions."""
     directory = load_directory(SERVICES)
     setting = Setting(load(TASK), {"regime": regime}, None, seed, FirstAlternative(use))
     party = CoordinatorParty(directory, lockstep_mission(directory, setting))

@@ -1,4 +1,4 @@
-"""Dead reckoning by two wheels, and poses of a moment ago."""
+"""Dead reckoning with two wheels, and poses in the recent past."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PLACE = st.floats(-5.0, 5.0)
 
 
 @given(st.floats(0.05, 3.0), st.floats(-1.5, 1.5), st.integers(1, 40))
-def test_an_arc_is_exact_in_however_many_steps(length: float, turn: float, steps: int) -> None:
+def test_an_arc_is_exact_in_any_number_of_steps(length: float, turn: float, steps: int) -> None:
     odometry = Odometry(0.4)
     for i in range(steps):
         odometry.add(0.02 * i, (length - 0.2 * turn) / steps, (length + 0.2 * turn) / steps)

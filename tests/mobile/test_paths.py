@@ -17,8 +17,8 @@ POSES = st.builds(Pose, st.floats(-5, 5), st.floats(-5, 5), st.floats(-7, 7))
 
 @given(POSES)
 def test_the_circle_through_a_place_of_resumption_is_the_missing_element(end: Pose) -> None:
-    """Straight on, it is straight; aside, it has the arcs' radius, and leaves in the direction in
-    which the track resumes."""
+    """To a place straight ahead it is straight; to one at the side it has the radius of the arcs
+    and ends in the direction in which the track resumes."""
     on, left, right = resume_poses(end, 2.0, 1.0)
     for gate, radius in ((on, math.inf), (left, 1.0), (right, 1.0)):
         points = arc_through(end, gate.x, gate.y, 0.5)

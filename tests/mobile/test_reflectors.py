@@ -17,7 +17,7 @@ ROVER = nominal_rover()
 
 
 def echo(pose: Pose, x: float, y: float) -> tuple[float, float]:
-    """Bearing and slant range of a reflector at (x, y), heard from a pose."""
+    """Return bearing and slant range of a reflector at (x, y) from a pose."""
     ahead, left = pose.body(x, y)
     ahead -= ROVER.sensor.forward
     above = ROVER.track.reflector_height - ROVER.sensor.height

@@ -1,5 +1,5 @@
 """The driver on the simulated bus, and the actions that use it: follow, recover, search, stop, and
-what can go wrong."""
+their faults."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def enabled(yard: Yard) -> Yard:
 
 
 def gap_yard(kind: str, *, reflector: bool = True) -> tuple[Yard, Any]:
-    """A rover that has followed the track to an interruption; with what following gave."""
+    """A rover that has followed the track to an interruption, and the result of following."""
     floor = DrawnFloor("S" + kind + "SS")
     resumes = floor.at(2.0 + (2.0 if kind == "s" else math.pi / 2))
     yard = enabled(Yard(floor, START, reflectors=[(resumes.x, resumes.y)] if reflector else ()))
@@ -145,7 +145,7 @@ def test_dead_reckoning_along_the_right_curve_recovers(kind: str, curvature: flo
     assert result.status == "success" and result.values["recovered"] is True
 
 
-def test_dead_reckoning_along_the_wrong_curve_fails_and_a_search_finds_back() -> None:
+def test_dead_reckoning_along_the_wrong_curve_fails_and_a_search_finds_the_track() -> None:
     yard, followed = gap_yard("l", reflector=False)
     line_end = followed.values["line_end"]
     wrong = play(yard, driving.dead_reckon, line_end=line_end).result
@@ -162,7 +162,7 @@ def test_a_search_needs_neither_sensor_nor_guess(kind: str) -> None:
 
 
 def blindly_on(yard: Yard, end: Odo, ahead: float) -> None:
-    """Drive on straight beyond the line's end without looking, and stand."""
+    """Drive straight beyond the line's end without looking, and stop."""
     yard.rover.command(yard.ports.now, {"do": "stretch", "look": False})
     yard.rover.command(yard.ports.now, {"do": "plan", "points": arc(end, 0.0, ahead)})
     for _ in range(25):
@@ -173,7 +173,7 @@ def blindly_on(yard: Yard, end: Odo, ahead: float) -> None:
 
 def test_a_rover_that_stands_beyond_the_gap_drives_on_and_not_back() -> None:
     """It is where a first attempt has ended: nearer to the point where the track resumes than a
-    search would look."""
+    search would start."""
     yard, followed = gap_yard("s", reflector=False)
     line_end = Odo(*followed.values["line_end"])
     blindly_on(yard, line_end, 1.3)
@@ -203,14 +203,14 @@ def test_a_line_seen_in_passing_is_not_regained_by_turning_away_from_it() -> Non
         assert not yard.rover.state()["regained"]
 
 
-def test_a_search_where_nothing_is_gives_up() -> None:
+def test_a_search_without_a_track_gives_up() -> None:
     yard = enabled(Yard(DrawnFloor("Sss"), START))
     followed = play(yard, driving.follow_feed_forward).result
     result = play(yard, driving.search_pattern, line_end=followed.values["line_end"]).result
     assert (result.status, result.cause) == ("failure", "no_track")
 
 
-def test_a_stream_that_ceases_stops_the_rover() -> None:
+def test_the_rover_stops_when_its_stream_ends() -> None:
     yard = enabled(Yard(DrawnFloor("SSS"), START))
 
     def cut(now: float) -> None:
@@ -227,7 +227,7 @@ def test_no_line_at_all_is_an_error() -> None:
     assert (result.status, result.cause) == ("error", "no_line")
 
 
-def test_a_drive_fault_ends_the_run_and_a_reset_mends_it() -> None:
+def test_a_drive_fault_ends_the_run_and_a_reset_clears_it() -> None:
     yard = enabled(Yard(DrawnFloor("SSS"), START))
 
     def trip(now: float) -> None:
@@ -267,7 +267,7 @@ def test_a_cancelled_follower_comes_to_rest() -> None:
     assert yard.rover.stopped() and yard.body.standing
 
 
-def test_a_silent_action_does_not_drive_on() -> None:
+def test_the_rover_stops_when_its_action_stops_sending() -> None:
     yard = enabled(Yard(DrawnFloor("SSSSS"), START))
     yard.rover.command(yard.ports.now, {"do": "follow", "speed": 0.5})
     yard.run(2.5)
@@ -305,7 +305,7 @@ def test_bad_commands_are_refused(body: dict[str, Any]) -> None:
         yard.rover.command(yard.ports.now, body)
 
 
-def test_nothing_is_obeyed_before_the_drives_are_enabled() -> None:
+def test_commands_are_ignored_before_the_drives_are_enabled() -> None:
     yard = Yard(DrawnFloor("SS"), START)
     with pytest.raises(ValueError, match="not enabled"):
         yard.rover.command(0.0, {"do": "follow", "speed": 0.5})

@@ -100,7 +100,7 @@ def test_a_track_is_watched_to_its_t() -> None:
     assert played.result.values["share"] > 0.9
 
 
-def test_nothing_to_find_is_an_error_but_the_stream_tells_that_images_come() -> None:
+def test_finding_nothing_is_an_error_but_the_stream_shows_that_images_arrive() -> None:
     played = CarriedCamera(DrawnFloor("sss"), 0.3, 0.1).play(seeing.find_edges, timeout=1.0)
     assert (played.result.status, played.result.cause) == ("error", "no_line")
     assert len(played.published) > 20 and all(values[1] == 0.0 for _, _, values in played.published)
@@ -113,7 +113,7 @@ def test_a_line_that_vanishes_without_an_end_is_lost() -> None:
     assert (played.result.status, played.result.cause) == ("error", "no_line")
 
 
-def test_a_camera_that_goes_dark_is_an_error_and_is_started_again() -> None:
+def test_a_camera_that_stops_is_an_error_and_is_started_again() -> None:
     drive = CarriedCamera(DrawnFloor("SSS"), 0.3, 0.1, dark=0.5)
     played = drive.play(seeing.watch_edges)
     assert (played.result.status, played.result.cause) == ("error", "no_image")
@@ -132,7 +132,7 @@ def test_a_cancelled_watch_withdraws_its_set_points() -> None:
     assert max(time for time, _, _ in played.published) <= 0.51
 
 
-def test_the_driver_refuses_a_rate_that_cannot_be() -> None:
+def test_the_driver_refuses_an_impossible_rate() -> None:
     with pytest.raises(FloorCameraError, match="rate"):
         FloorCamera({"rate": 0.0}, CameraPorts())  # type: ignore[arg-type]
 

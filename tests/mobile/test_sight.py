@@ -25,7 +25,7 @@ SMALL = st.floats(-2.0, 2.0)
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-0.8, 0.8), st.floats(-1.5, 1.5))
-def test_a_parabola_comes_back(offset: float, slope: float, bend: float) -> None:
+def test_a_parabola_is_recovered(offset: float, slope: float, bend: float) -> None:
     x = np.linspace(0.43, 0.93, 16)
     d = x - x[0]
     line = fit_line(x, offset + slope * d + 0.5 * bend * d * d)
@@ -40,7 +40,7 @@ def test_a_parabola_comes_back(offset: float, slope: float, bend: float) -> None
     st.lists(st.tuples(SMALL, SMALL), max_size=STREAMED),
     st.floats(0.0, 0.1),
 )
-def test_a_set_point_comes_back_older_by_what_it_was_held(
+def test_the_time_that_a_set_point_was_held_is_added_to_its_age(
     age: float, confidence: float, kind: TrackEnd, points: list[tuple[float, float]], held: float
 ) -> None:
     end = None if kind is TrackEnd.NONE else LineEnd(kind, 0.7, -0.1)
@@ -53,7 +53,7 @@ def test_a_set_point_comes_back_older_by_what_it_was_held(
     "values",
     [[], [0.1, 1.0, 0.0, 0.0], [0.1, 1.0, 0.0, 0.0, 0.0, 0.5], [-0.1, 1, 0, 0, 0], [0, 1, 7, 0, 0]],
 )
-def test_numbers_that_are_no_set_point_are_refused(values: list[float]) -> None:
+def test_numbers_that_are_not_a_set_point_are_refused(values: list[float]) -> None:
     with pytest.raises(ValueError, match="track_ahead"):
         TrackAhead.parse(values)
 
@@ -72,7 +72,7 @@ def test_nothing_seen_cannot_be_described() -> None:
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-0.7, 0.7), st.floats(-1.1, 1.1))
-def test_offset_heading_and_curvature_of_a_circle_come_back(
+def test_offset_heading_and_curvature_of_a_circle_are_recovered(
     offset: float, heading: float, curvature: float
 ) -> None:
     way = np.linspace(0.0, 0.5, 20)

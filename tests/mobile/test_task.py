@@ -1,5 +1,5 @@
-"""The task of figure 3: what check says, what its state space holds, and what happens on each
-ending of a run."""
+"""The task of figure 3: the result of check, its state space, and what happens after each result of
+a run."""
 
 from __future__ import annotations
 
@@ -65,11 +65,11 @@ def test_all_events_are_internal_and_conflicts_are_settled_by_variables(task: Ta
                 )
 
 
-def test_the_state_space_holds_what_a_task_must() -> None:
+def test_the_state_space_has_the_required_properties() -> None:
     data = analyse_command(PATH, load, limits=SearchLimits()).data
     assert data["complete"] and data["states"] < 1000
     verdicts = {name: verdict["holds"] for name, verdict in data["verdicts"].items()}
-    assert verdicts.pop("safe") is False, "six attempts lie in one place"
+    assert verdicts.pop("safe") is False, "one place holds six attempts"
     assert set(verdicts) >= {
         "bounded",
         "deadlock_free",
@@ -89,10 +89,10 @@ def test_the_state_space_holds_what_a_task_must() -> None:
     lost = {name for name, r in recoveries.items() if not r["possible"]["holds"]}
     assert lost == {"reset_failed"}, "the drives stay off: the task gives up"
     sure = {name for name, r in recoveries.items() if r["almost_sure"]["holds"]}
-    assert sure == {"line_lost", "not_found", "watch_lost"}, "all others may come to that"
+    assert sure == {"line_lost", "not_found", "watch_lost"}, "all other markings can lead to it"
 
 
-def test_nothing_of_this_application_is_known_to_the_runtime() -> None:
+def test_the_runtime_knows_nothing_of_this_application() -> None:
     """Another robot, another net, another services file: no name of them in coordinator/ (tasks/
     aside) or services/comm."""
     named = {"follow_track", "recover_track", "track_ahead", "petrobot.services.mobile", "rover"}

@@ -1,4 +1,5 @@
-"""The map of the track: sights and plans gathered in the odometry frame, asked near the rover."""
+"""The map of the track: sights and plans collected in the odometry frame, queried near the
+rover."""
 
 from __future__ import annotations
 
@@ -20,8 +21,8 @@ FAR = 12
 def sight(
     pose: Pose, line: Pose, bend: float = 0.0, end: LineEnd | None = None, noise: float = 0.0
 ) -> TrackAhead:
-    """What a camera at `pose` tells of a line (a circle of that curvature through `line`), from
-    0.43 m ahead on."""
+    """Return what a camera at `pose` reports of a line (a circle of this curvature through `line`),
+    from 0.43 m ahead on."""
     random = np.random.default_rng(round(1e6 * abs(pose.x + pose.y)))
     points: list[tuple[float, float]] = []
     for x, y in arc(Pose(*line.floor(-1.0, 0.0), line.heading) if bend == 0.0 else line, bend, 5.0):
@@ -32,7 +33,7 @@ def sight(
 
 
 def driven(line: Pose, poses: list[Pose], bend: float = 0.0, noise: float = 0.0) -> TrackMap:
-    """A map of what was seen from these poses."""
+    """Return a map of what was seen from these poses."""
     track = TrackMap()
     for pose in poses:
         track.take(pose, sight(pose, line, bend, noise=noise))
@@ -71,13 +72,13 @@ def test_nothing_is_known_where_nothing_was_seen() -> None:
     assert track.ahead(Pose(0, 0, 0)) == pytest.approx(1.05, abs=0.06)
 
 
-def test_a_standing_rover_takes_a_few_sights_and_no_more() -> None:
+def test_a_standing_rover_stores_only_a_few_sights() -> None:
     track, pose = TrackMap(), Pose(0, 0, 0)
     taken = [track.take(pose, sight(pose, Pose(0, 0, 0))) for _ in range(20)]
     assert 2 <= sum(taken) <= 6 and not any(taken[8:])
 
 
-def test_what_contradicts_what_is_known_is_refused() -> None:
+def test_a_sight_that_contradicts_the_map_is_refused() -> None:
     line = Pose(0, 0, 0)
     track = driven(line, [Pose(0.03 * i, 0, 0) for i in range(20)])
     pose = Pose(0.6, 0, 0)
@@ -102,7 +103,7 @@ def test_the_end_is_the_mean_of_its_sights_and_bounds_what_is_ahead() -> None:
     assert known == [True, False]
 
 
-def test_a_plan_stands_in_until_the_line_is_seen() -> None:
+def test_a_plan_is_used_until_the_line_is_seen() -> None:
     line = Pose(0, 0, 0)
     track = driven(line, [Pose(0.03 * i, 0, 0) for i in range(20)])
     track.begin()
@@ -118,7 +119,7 @@ def test_a_plan_stands_in_until_the_line_is_seen() -> None:
     )
 
 
-def test_a_line_well_beside_the_plan_replaces_it_by_a_smooth_way() -> None:
+def test_a_line_far_from_the_plan_replaces_it_by_a_smooth_path() -> None:
     track = TrackMap()
     track.plan(arc(Pose(0, 0, 0), 0.0, 3.0))
     pose, line = Pose(0.5, 0, 0), Pose(0, 0.15, 0)
@@ -146,7 +147,7 @@ def test_only_a_line_through_a_gate_begins_a_gated_stretch() -> None:
     assert track.entry.heading == pytest.approx(0.1, abs=1e-6)
 
 
-def test_gates_are_asked_until_the_stretch_has_been_found() -> None:
+def test_gates_are_checked_until_the_stretch_has_been_found() -> None:
     track, pose, behind = TrackMap(), Pose(1.2, 0, 0), Pose(1.2, 0, math.pi)
     track.begin([Pose(2.0, 0.0, 0.0)])
     regained = [track.regained]
@@ -161,7 +162,7 @@ def test_gates_are_asked_until_the_stretch_has_been_found() -> None:
     assert [*regained, track.regained] == [False, True, False]
 
 
-def test_without_looking_no_sight_is_taken() -> None:
+def test_without_looking_no_sight_is_stored() -> None:
     track, pose = TrackMap(), Pose(0, 0, 0)
     track.begin(look=False)
     assert not track.take(pose, sight(pose, Pose(0, 0, 0))) and track.complete

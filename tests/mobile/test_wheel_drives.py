@@ -20,7 +20,7 @@ LEFT, RIGHT, SENSOR = 1, 2, 3
 
 
 class WheelBench:
-    """A master on a rover's bus; `passes` says which of the nodes' frames come through."""
+    """A master on a rover's bus; `passes` decides which frames of the nodes are delivered."""
 
     def __init__(self, quick_stop: float = 30.0) -> None:
         self.yard = Yard(DrawnFloor("SS"), DrawnPose(0.0, 0.0, 0.0))
@@ -51,7 +51,7 @@ class WheelBench:
 
 
 def without(node: int, *bases: int) -> Callable[[Frame], bool]:
-    """All frames but a node's of these kinds."""
+    """Return a filter that drops a node's frames of these kinds."""
     return lambda frame: frame.id not in {base + node for base in bases}
 
 

@@ -129,7 +129,7 @@ class Yard:
 
     @property
     def pose(self) -> DrawnPose:
-        """Where the rover truly is."""
+        """Return the rover's true pose."""
         return DrawnPose(self.body.x, self.body.y, self.body.heading)
 
     def beyond(self, place: DrawnPose) -> tuple[float, float]:
@@ -142,8 +142,8 @@ class Yard:
         return look(self._sensor, self.body.pose, self.reflectors, self._random)
 
     def _sight(self) -> TrackAhead:
-        """What an ideal camera tells: painted points in its view, the nearest connected row of
-        them, and where that ends."""
+        """Return what an ideal camera reports: the nearest connected row of painted points in its
+        view, and where it ends."""
         rows: list[tuple[float, float]] = []
         end: LineEnd | None = None
         for place, painted in zip(self._line, self._painted, strict=True):

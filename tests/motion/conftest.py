@@ -1,5 +1,5 @@
-"""A rig for the motion room: the driver `Arm` on a bus of simulated drives around a simple arm, on
-a clock of its own."""
+"""A rig for the motion tests: the driver `Arm` on a bus of simulated drives of a simple arm, with
+its own clock."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ TABLE = tomllib.loads(
 
 
 class SimplePlant:
-    """Six joints that do not feel each other: inertia, gravity on joints 2 and 3, dry and viscous
-    friction, brakes."""
+    """Six uncoupled joints: inertia, gravity on joints 2 and 3, dry and viscous friction,
+    brakes."""
 
     GRAVITY = (0.0, 37.0, 9.0, 0.0, 0.3, 0.0)
 
@@ -74,7 +74,7 @@ class SimplePlant:
 
 
 class Wire:
-    """Both directions between the arm and its drives; may be cut, and delivers by the next
+    """Both directions between the arm and its drives. It can be cut, and delivers in the next
     cycle."""
 
     def __init__(self) -> None:
@@ -103,7 +103,7 @@ class Wire:
 
 
 class Stream:
-    """The receiving end of a set-point stream as the node gives it."""
+    """The receiving end of a set-point stream as a node provides it."""
 
     def __init__(self, rig: Rig, period: float) -> None:
         self._rig, self._period = rig, period
@@ -131,7 +131,7 @@ class Stream:
 
 
 class Rig:
-    """Arm, bus and drives in lock step; also the arm's `Ports`."""
+    """Arm, bus and drives in lock step; it is also the arm's `Ports`."""
 
     def __init__(
         self,
@@ -152,8 +152,8 @@ class Rig:
         self.commanded: list[list[float]] = []
         self.on_step: Callable[[float], None] | None = None
         self.thinking = 0.0
-        """s by which the clock is ahead of the cycle's beginning: what a real host's cycle
-        takes."""
+        """Lead of the clock over the start of the cycle (s): the time a cycle takes on a real
+        host."""
         self.arm = Arm(config or {}, self)
         self.sync = True
 
@@ -178,7 +178,7 @@ class Rig:
         raise AssertionError(path)
 
     def tick(self, arm_lives: bool = True) -> None:
-        """One cycle of arm, bus, drives and plant."""
+        """Run one cycle of arm, bus, drives and plant."""
         if arm_lives:
             self.arm.step(self.cycle * PERIOD)
             self.commanded.append(list(self.arm.state()["commanded"]))
@@ -197,7 +197,7 @@ class Rig:
         self.wire.to_arm += self.drives.drain()
 
     def run(self, seconds: float, until: Callable[[], bool] | None = None) -> bool:
-        """So many seconds, or until a condition holds; whether it did."""
+        """Run for a time (s), or until a condition holds; return whether it did."""
         for _ in range(round(seconds / PERIOD)):
             if until is not None and until():
                 return True
@@ -238,12 +238,12 @@ def make_plant() -> Callable[[], SimplePlant]:
 
 @pytest.fixture
 def make_rig() -> type[Rig]:
-    """For rigs that are not the usual one."""
+    """Return a function that makes rigs or plays with other settings."""
     return Rig
 
 
 class FakeRemote:
-    """The arm as its actions see it: commands are taken, and states published, once a cycle."""
+    """The arm as its actions see it: it accepts commands and publishes its state once per cycle."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -262,7 +262,7 @@ class FakeRemote:
         return len(self.sent)
 
     def cycle(self) -> None:
-        """What the node does between cycles."""
+        """Do the node's work between two cycles."""
         while self.handled < len(self.sent):
             self.refused = ""
             try:
@@ -275,7 +275,7 @@ class FakeRemote:
 
 
 class ArmPlay:
-    """Runs an action on a rig; also the action's context."""
+    """Runs an action on a rig; it is also the action's context."""
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
@@ -299,8 +299,8 @@ class ArmPlay:
         cancel: Callable[[], bool] | None = None,
         most: float = 20.0,
     ) -> Result | None:
-        """To the action's end; `each` acts as the world in each cycle. None if `cancel` came true
-        and ended it."""
+        """Run the action to its end; `each` acts as the world in each cycle. Return None if
+        `cancel` became true and ended it."""
         wait: Wait = action.send(None)
         until = self.now + most
         while self.now < until:
@@ -330,5 +330,5 @@ def play(rig: Rig) -> ArmPlay:
 
 @pytest.fixture
 def make_play() -> type[ArmPlay]:
-    """For rigs that are not the usual one."""
+    """Return a function that makes rigs or plays with other settings."""
     return ArmPlay

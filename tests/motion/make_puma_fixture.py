@@ -1,7 +1,7 @@
-"""Makes `puma560_golden.json` from an independent implementation: the Robotics Toolbox for Python's
+"""Make `puma560_golden.json` from an independent implementation: the Robotics Toolbox for Python's
 Puma560 (MIT licence).
 
-Run once, in an environment of its own (the toolbox is large and no dependency of this project):
+Run it once, in a separate environment (the toolbox is large and not a dependency of this project):
 
     python -m venv /tmp/rtb && /tmp/rtb/bin/pip install roboticstoolbox-python==1.5.0
     /tmp/rtb/bin/python tests/motion/make_puma_fixture.py
@@ -25,7 +25,7 @@ HOME = (18.7, 53.4, -216.3, 6.7, 48.6, 3.4)
 
 
 def main() -> None:
-    """Write the fixture beside this file."""
+    """Write the fixture next to this file."""
     puma = roboticstoolbox.models.DH.Puma560()
     rng = np.random.default_rng(560)
     poses = rng.uniform(puma.qlim[0], puma.qlim[1], (CASES, 6))

@@ -1,4 +1,4 @@
-"""The arm's actions on a simulated arm: what they end with, and what the arm does meanwhile."""
+"""The arm's actions on a simulated arm: their results, and the arm's motion meanwhile."""
 
 from __future__ import annotations
 
@@ -80,14 +80,14 @@ def test_an_interception_that_is_late_is_a_failure_and_keeps_following(play: Any
     assert play.device.state["mode"] == "follow"
 
 
-def test_intercept_without_a_ball_says_so(play: Any) -> None:
+def test_intercept_without_a_ball_reports_it(play: Any) -> None:
     result = play.play(actions.intercept_tilted(play, patience=0.5), None)
     assert (result.status, result.cause) == (Status.ERROR, "no_setpoint")
     play.rig.run(0.1)
     assert play.rig.arm.state()["mode"] == "hold"
 
 
-def test_intercept_when_vision_dies_says_so_and_the_arm_holds(play: Any) -> None:
+def test_intercept_reports_that_vision_died_and_the_arm_holds(play: Any) -> None:
     begun = play.now
     result = play.play(actions.intercept_tilted(play), PredictedBall(leaves=1.5, y=0.3, until=0.3))
     assert (result.status, result.cause) == (Status.ERROR, "no_setpoint")
@@ -124,7 +124,7 @@ def test_a_cancelled_run_leaves_the_arm_holding(play: Any, action: Callable[...,
     assert play.rig.arm.stopped()
 
 
-def test_the_two_actions_of_a_catch_hand_over(play: Any) -> None:
+def test_intercept_hands_over_to_the_second_action_of_a_catch(play: Any) -> None:
     ball = PredictedBall()
     assert play.play(actions.intercept_tilted(play), ball).status is Status.SUCCESS
     result = play.play(actions.follow_and_wait(play), ball)
@@ -156,7 +156,7 @@ def test_waiting_while_vision_dies_is_an_error(play: Any) -> None:
     assert (result.status, result.cause) == (Status.ERROR, "no_setpoint")
 
 
-def test_waiting_for_nothing_is_an_error(play: Any) -> None:
+def test_waiting_without_set_points_is_an_error(play: Any) -> None:
     result = play.play(actions.follow_and_wait(play, patience=0.3))
     assert (result.status, result.cause) == (Status.ERROR, "no_setpoint")
 
@@ -205,7 +205,7 @@ def test_reset_and_home_recovers_from_a_fault(play: Any) -> None:
     assert play.rig.arm.state()["faults"] == []
 
 
-def test_reset_and_home_says_why_it_cannot(play: Any) -> None:
+def test_reset_and_home_gives_the_reason_of_its_failure(play: Any) -> None:
     play.rig.drives.power(False)
     play.rig.run(0.3)
     result = play.play(actions.reset_and_home(play, timeout=2.0))
@@ -213,7 +213,7 @@ def test_reset_and_home_says_why_it_cannot(play: Any) -> None:
     assert result.cause in ("drive_fault", "power", "arm_timeout")
 
 
-def test_an_arm_that_cannot_get_home_past_the_table_says_so_and_does_not_touch_it(
+def test_an_arm_that_cannot_reach_home_past_the_table_reports_it_and_does_not_touch_it(
     make_rig: Any, make_play: Any
 ) -> None:
     rig = make_rig(
@@ -237,7 +237,7 @@ def test_a_pose_that_is_not_reached_in_time_is_an_error(play: Any) -> None:
     assert "home not reached in time: still under way" in result.text
 
 
-def test_actions_that_find_the_drives_off_say_so(make_rig: Any, make_play: Any) -> None:
+def test_actions_report_that_the_drives_are_off(make_rig: Any, make_play: Any) -> None:
     rig = make_rig(config={"enable": False})
     rig.run(0.5)
     play = make_play(rig)

@@ -1,5 +1,5 @@
-"""The driver `Arm` on simulated drives, in simulated time: enabling, moving, following, and
-everything that makes it stop."""
+"""The driver `Arm` on simulated drives, in simulated time: enabling, moving, following, and every
+reason to stop."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from petrobot.services.motion.model import nominal_arm, nominal_cell
 ARM = nominal_arm()
 PUMA = Puma.of(ARM)
 TOUCH = CollisionGuard(PUMA, ARM, nominal_cell(), cup_margin=0.0, arm_margin=0.0)
-"""Says what is really touched, without margins."""
+"""Reports real contact, without margins."""
 CYCLE = 0.004
 AWAY = [math.radians(angle) for angle in (-60.0, 63.0, -205.0, 40.0, 70.0, 90.0)]
-"""A pose far from home whose way is clear."""
+"""A pose far from home with a clear path to it."""
 STREAM_PERIOD = 0.02
 
 
@@ -31,7 +31,7 @@ def _point(y: float = 0.1, time_to_go: float = 1.0, speed: float = 1.2) -> list[
 
 
 def _follow(rig: Any, seconds: float, y: float = 0.1, arrival: float = 2.0) -> None:
-    """Follow a stream of one prediction that comes true `arrival` seconds from now."""
+    """Follow a stream of one prediction for a ball that arrives in `arrival` seconds."""
     begun = rig.now
     for cycle in range(round(seconds / CYCLE)):
         if cycle % 20 == 0:
@@ -42,7 +42,7 @@ def _follow(rig: Any, seconds: float, y: float = 0.1, arrival: float = 2.0) -> N
 
 
 def _check_limits(rig: Any) -> None:
-    """Commanded speeds and accelerations of the whole history are within the arm's."""
+    """Check that all commanded speeds and accelerations were within the arm's limits."""
     q = np.array(rig.commanded[1:])
     qd = np.diff(q, axis=0) / CYCLE
     assert np.all(np.abs(qd) <= ARM.speed * (1 + 1e-6))
@@ -87,7 +87,7 @@ def test_a_move_arrives_with_all_joints_at_once_and_within_limits(rig: Any) -> N
     assert max(rig.arm.state()["following_error"], 0.0) < 0.01
 
 
-def test_speed_is_a_share(rig: Any) -> None:
+def test_speed_is_a_fraction_of_the_maximum(rig: Any) -> None:
     rig.arm.command(rig.now, {"do": "move", "pose": AWAY, "speed": 0.3})
     assert rig.run(12.0, lambda: bool(rig.arm.state()["in_place"]))
     speeds = np.abs(np.diff(np.array(rig.commanded), axis=0)) / CYCLE
@@ -151,8 +151,8 @@ def test_following_brings_the_cup_to_the_predicted_point(rig: Any) -> None:
 
 @pytest.mark.parametrize("thinking", [0.001, 0.003, 0.011, 0.050])
 def test_a_cycle_that_takes_long_executes_nothing_stale(rig: Any, thinking: float) -> None:
-    """What is fresh when a cycle begins may be stale when its target leaves: the clock at the last
-    moment decides."""
+    """A set point that is fresh when a cycle begins may be stale when its target is sent: the clock
+    at the moment of sending decides."""
     _follow(rig, 0.12, y=0.3)
     rig.thinking = thinking
     assert rig.run(0.1, lambda: rig.arm.state()["reason"] == "no_setpoint")
@@ -176,12 +176,12 @@ def test_it_holds_within_three_periods_of_the_stream(rig: Any) -> None:
     assert not state["in_place"]
     _check_limits(rig)
     _follow(rig, 0.8, y=0.3)
-    assert rig.arm.state()["in_place"], "it resumes when set points come again"
+    assert rig.arm.state()["in_place"], "it resumes when set points arrive again"
 
 
 @pytest.mark.parametrize("y", [-0.3, 0.3])
 @pytest.mark.parametrize("speed", [0.38, 0.5])
-def test_slow_balls_close_to_the_edge_are_reached_by_a_way_round(
+def test_slow_balls_close_to_the_edge_are_reached_by_a_detour(
     rig: Any, y: float, speed: float
 ) -> None:
     begun = rig.now
@@ -224,7 +224,7 @@ def test_repeats_keep_a_set_point_alive(rig: Any) -> None:
     )
 
 
-def test_it_holds_when_its_action_falls_silent(rig: Any) -> None:
+def test_it_holds_when_its_action_stops_sending(rig: Any) -> None:
     _follow(rig, 0.1)
     silent = rig.now
     cycle = 0
@@ -247,7 +247,7 @@ def test_old_set_points_from_before_following_do_not_count(rig: Any) -> None:
     assert rig.arm.state()["still"]
 
 
-def test_a_ball_out_of_reach_is_said_to_be_unreachable(rig: Any) -> None:
+def test_a_ball_out_of_reach_is_reported_as_unreachable(rig: Any) -> None:
     _follow(rig, 0.1, y=1.3)
     assert rig.arm.state()["reason"] == "unreachable"
     assert rig.arm.state()["plan"] is None
@@ -266,7 +266,7 @@ def test_the_stop_routine_brakes_at_the_limits_and_holds(rig: Any) -> None:
     assert rig.arm.state()["mode"] == "hold"
 
 
-def test_the_operators_pause_and_release(rig: Any) -> None:
+def test_pause_and_release_by_the_operator(rig: Any) -> None:
     rig.arm.command(rig.now, {"do": "move", "pose": AWAY})
     rig.run(0.3)
     assert rig.arm.hold(rig.now) == "held"
@@ -278,7 +278,7 @@ def test_the_operators_pause_and_release(rig: Any) -> None:
     _check_limits(rig)
 
 
-def test_following_outlives_a_pause(rig: Any) -> None:
+def test_following_continues_after_a_pause(rig: Any) -> None:
     _follow(rig, 0.2)
     rig.arm.hold(rig.now)
     rig.run(1.5)
@@ -288,12 +288,12 @@ def test_following_outlives_a_pause(rig: Any) -> None:
     assert rig.arm.state()["in_place"]
 
 
-def test_disable_stops_first_and_then_lets_the_brakes_hold(rig: Any) -> None:
+def test_disable_stops_first_and_then_applies_the_brakes(rig: Any) -> None:
     rig.arm.command(rig.now, {"do": "move", "pose": AWAY})
     rig.run(0.3)
     rig.arm.command(rig.now, {"do": "disable"})
     assert rig.run(1.0, lambda: rig.arm.state()["mode"] == "off")
-    rig.commanded.pop()  # with the power off what is commanded is what is measured
+    rig.commanded.pop()  # With the power off, the commanded position follows the measured one.
     _check_limits(rig)
     rig.run(1.0)
     assert all(rig.plant.braked)
@@ -304,7 +304,9 @@ def test_disable_stops_first_and_then_lets_the_brakes_hold(rig: Any) -> None:
 @pytest.mark.parametrize(
     "fault", [DriveFault.OVERCURRENT, DriveFault.OVERHEATED, DriveFault.ENCODER]
 )
-def test_a_drive_fault_stops_all_and_a_reset_brings_them_back(rig: Any, fault: DriveFault) -> None:
+def test_a_drive_fault_stops_all_drives_and_a_reset_enables_them_again(
+    rig: Any, fault: DriveFault
+) -> None:
     rig.arm.command(rig.now, {"do": "move", "pose": AWAY})
     rig.run(0.3)
     rig.drives.trip(3, fault)
@@ -324,7 +326,7 @@ def test_a_drive_fault_stops_all_and_a_reset_brings_them_back(rig: Any, fault: D
     assert rig.run(4.0, lambda: bool(rig.arm.state()["in_place"]))
 
 
-def test_the_power_chain_is_a_fault_of_its_own_until_it_is_closed(rig: Any) -> None:
+def test_an_open_power_chain_is_a_fault_until_it_is_closed(rig: Any) -> None:
     rig.drives.power(False)
     assert rig.run(0.2, lambda: bool(rig.arm.state()["faults"]))
     assert all(fault[0] == "power" for fault in rig.arm.state()["faults"])
@@ -355,7 +357,7 @@ def test_a_silent_bus_is_an_error_and_the_drives_stop_by_themselves(rig: Any) ->
     rig.enable()
 
 
-def test_a_dead_bus_is_an_error_too_and_comes_back(rig: Any) -> None:
+def test_a_dead_bus_is_an_error_and_recovers(rig: Any) -> None:
     rig.wire.dead = True
     rig.run(0.1)
     assert rig.arm.state()["faults"][0] == ("bus", None, 0, "the bus is dead")
@@ -386,7 +388,7 @@ def test_a_drive_that_restarts_is_noticed(rig: Any) -> None:
     rig.enable()
 
 
-def test_drives_that_come_up_late_are_found(make_rig: Any) -> None:
+def test_drives_that_start_late_are_found(make_rig: Any) -> None:
     rig = make_rig()
     rig.wire.cut = True
     rig.run(2.0)
@@ -405,7 +407,7 @@ def test_a_blocked_joint_ends_in_a_following_error(rig: Any) -> None:
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.3])
-def test_a_slow_arm_is_driven_at_its_own_speed(make_rig: Any, factor: float) -> None:
+def test_a_slow_arm_is_driven_at_its_reduced_speed(make_rig: Any, factor: float) -> None:
     rig = make_rig()
     rig.drives.slow_down(factor)
     rig.enable()
@@ -418,9 +420,7 @@ def test_a_slow_arm_is_driven_at_its_own_speed(make_rig: Any, factor: float) -> 
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.3])
-def test_an_arm_that_slows_down_in_mid_motion_is_followed_by_its_commands(
-    rig: Any, factor: float
-) -> None:
+def test_commands_adapt_to_an_arm_that_slows_down_during_a_motion(rig: Any, factor: float) -> None:
     _follow(rig, 0.2, y=-0.3)
     rig.drives.slow_down(factor)
     _follow(rig, 3.3, y=0.3, arrival=3.5)
@@ -433,7 +433,7 @@ def test_an_arm_that_slows_down_in_mid_motion_is_followed_by_its_commands(
     begun = len(rig.commanded)
     assert rig.run(4.0, lambda: bool(rig.arm.state()["in_place"]))
     speeds = np.abs(np.diff(np.array(rig.commanded[begun:]), axis=0)) / CYCLE
-    assert np.max(speeds / ARM.speed) > 0.9, "it knows that the arm is fast again"
+    assert np.max(speeds / ARM.speed) > 0.9, "the driver must notice that the arm is fast again"
 
 
 def test_a_ball_in_the_cup_is_reported_once_when_it_stays(rig: Any) -> None:
@@ -447,7 +447,7 @@ def test_a_ball_in_the_cup_is_reported_once_when_it_stays(rig: Any) -> None:
     _follow(rig, 0.04)
     rig.drives.ball(False)
     _follow(rig, 0.2)
-    assert rig.events == [], "it bounced through"
+    assert rig.events == [], "the ball only bounced"
     rig.drives.ball(True)
     _follow(rig, 0.2)
     assert rig.events == ["ball_caught"]
@@ -455,7 +455,7 @@ def test_a_ball_in_the_cup_is_reported_once_when_it_stays(rig: Any) -> None:
     assert rig.events == ["ball_caught"]
 
 
-def test_strategies_take_their_values_from_the_command(rig: Any) -> None:
+def test_strategies_get_their_parameters_from_the_command(rig: Any) -> None:
     rig.arm.command(
         rig.now, {"do": "follow", "strategy": "tilted", "tilt": 0.2, "depths": [0.06, 0.09]}
     )
@@ -491,7 +491,7 @@ WORLD = st.lists(
 
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(WORLD)
-def test_whatever_is_commanded_and_streamed_the_limits_hold(
+def test_limits_hold_for_any_commands_and_streams(
     make_rig: Any, steps: list[tuple[Any, list[float], int]]
 ) -> None:
     rig = make_rig().enable()

@@ -1,4 +1,4 @@
-"""The python-can interface `petrobot_stream`: conformance as python-can tests its own interfaces,
+"""The python-can interface `petrobot_stream`: the conformance tests of python-can's own interfaces,
 the hub, and bad input."""
 
 from __future__ import annotations
@@ -70,14 +70,14 @@ def _open(channel: str, **settings: Any) -> can.BusABC:
 
 @pytest.fixture
 def pair(channel: str) -> Iterator[tuple[can.BusABC, can.BusABC]]:
-    """Two buses that both are known to be on the hub."""
+    """Two buses, both registered at the hub."""
     first, second = _open(channel), _open(channel)
     for sender, receiver in ((first, second), (second, first)):
         sender.send(can.Message(arbitration_id=0x7FF, is_extended_id=False))
         limit = Limit("the first message")
         while (
             receiver.recv(timeout=0.05) is None and limit.left()
-        ):  # the hub had not taken the other one in yet
+        ):  # The hub had not registered the other bus yet.
             sender.send(can.Message(arbitration_id=0x7FF, is_extended_id=False))
     _flush(first)
     _flush(second)
@@ -113,7 +113,7 @@ def test_back_to_back(pair: tuple[can.BusABC, can.BusABC], message: can.Message)
         assert message.equals(got, timestamp_delta=None, check_channel=False, check_direction=False)
         assert got.is_rx
         assert got.channel is not None
-        assert sender.recv(timeout=0.0) is None, "a port does not hear itself"
+        assert sender.recv(timeout=0.0) is None, "a port must not receive its own frames"
 
 
 def test_many_frames_arrive_in_order_and_no_frame_is_lost(
@@ -139,7 +139,7 @@ def test_receive_times_out_and_does_not_block(pair: tuple[can.BusABC, can.BusABC
     assert pair[0].recv(timeout=0.02) is None
 
 
-def test_filters_hold(pair: tuple[can.BusABC, can.BusABC]) -> None:
+def test_filters_are_applied(pair: tuple[can.BusABC, can.BusABC]) -> None:
     sender, receiver = pair
     receiver.set_filters([{"can_id": 0x200, "can_mask": 0x700, "extended": False}])
     for cob_id in (0x181, 0x201, 0x301, 0x2FF):
@@ -153,7 +153,7 @@ def test_filters_hold(pair: tuple[can.BusABC, can.BusABC]) -> None:
     assert receiver.recv(timeout=0.02) is None
 
 
-def test_own_messages_come_back_on_request(channel: str) -> None:
+def test_own_messages_are_received_on_request(channel: str) -> None:
     with _open(channel, receive_own_messages=True) as bus:
         bus.send(can.Message(arbitration_id=0x10, is_extended_id=False, data=b"\x05"))
         got = bus.recv(PATIENCE)
@@ -206,7 +206,7 @@ def test_without_a_hub_there_is_one_clear_error(tmp_path: Path) -> None:
         open_can({"interface": "petrobot_stream", "channel": f"unix://{tmp_path}/nobody"})
 
 
-def test_a_hub_that_goes_is_noticed() -> None:
+def test_a_closed_hub_is_noticed() -> None:
     running = RunningHub("tcp://127.0.0.1:0")
     bus, port = _open(running.channel), StreamPort(running.channel)
     bus.send(can.Message(arbitration_id=1, is_extended_id=False))
@@ -231,7 +231,7 @@ def _poll_until(hub: CanHub, condition: Any) -> None:
 
 
 def _collect(hub: CanHub, port: CanBus, got: list[Frame]) -> None:
-    """Poll until frames have come to a port."""
+    """Poll until a port has received frames."""
 
     def some() -> bool:
         got.extend(port.receive())
@@ -244,7 +244,9 @@ def _collect(hub: CanHub, port: CanBus, got: list[Frame]) -> None:
     "rubbish",
     [b"GET / HTTP/1.1\r\n", GREETING + b"\x00\x00\x01\x23\x09", GREETING + b"\x00\x00\x08\x00\x00"],
 )
-def test_a_port_that_talks_rubbish_is_dropped_and_the_others_go_on(rubbish: bytes) -> None:
+def test_a_port_that_sends_malformed_bytes_is_dropped_and_the_others_continue(
+    rubbish: bytes,
+) -> None:
     hub = CanHub()
     good, other = StreamPort(hub.channel), StreamPort(hub.channel)
     host, port = parse_channel(hub.channel)[1]
@@ -284,7 +286,7 @@ def test_a_port_that_does_not_read_is_dropped_and_does_not_stop_the_bus() -> Non
         each.close()
 
 
-def test_local_ports_and_python_can_and_stream_ports_hear_each_other() -> None:
+def test_local_ports_python_can_and_stream_ports_receive_each_others_frames() -> None:
     hub = CanHub()
     local, stream = hub.port(), StreamPort(hub.channel)
     foreign = PythonCanBus(_open(hub.channel))
@@ -353,7 +355,7 @@ FRAMES = st.lists(
 
 
 @given(FRAMES, st.lists(st.integers(1, 40), max_size=60))
-def test_frames_survive_any_cutting_of_the_bytes(
+def test_frames_survive_any_division_of_the_bytes(
     frames: list[tuple[int, int, bytes]], cuts: list[int]
 ) -> None:
     raw = GREETING + b"".join(encode(word, data, dlc) for word, dlc, data in frames)
@@ -383,8 +385,8 @@ def test_the_framing_byte_by_byte() -> None:
 
 @given(st.integers(0, 10_000))
 def test_one_changed_bit_is_noticed(bit: int) -> None:
-    """It becomes neither another identifier nor other data; a changed length waits for more, and
-    that is checked in its turn."""
+    """It never gives another identifier or other data; with a changed length the receiver waits for
+    more bytes, which are then checked."""
     frames = [
         (0x181, 2, b"\x01\x02"),
         (0x1ABCDEF | EXTENDED, 8, bytes(8)),

@@ -82,7 +82,7 @@ def test_mapping_is_written_in_the_order_of_the_standard() -> None:
 
 
 @given(st.integers(0x081, 0x0FF), st.binary(max_size=8))
-def test_emergencies_come_back_or_are_refused(cob_id: int, data: bytes) -> None:
+def test_emergencies_are_decoded_or_refused(cob_id: int, data: bytes) -> None:
     if len(data) != 8:
         with pytest.raises(ValueError, match="not an emergency"):
             canopen.parse_emergency(Frame(cob_id, data))
@@ -135,7 +135,7 @@ def test_client_writes_and_reads_one_after_another() -> None:
     assert client.failure == ""
 
 
-def test_client_gives_up_after_its_timeout_and_says_so() -> None:
+def test_client_gives_up_after_its_timeout_and_reports_it() -> None:
     client = SdoClient(4, timeout=0.5)
     client.begin([Transfer(0x1000, 0, DataType.UNSIGNED32)])
     client.advance(1.0)
@@ -154,7 +154,7 @@ def test_client_gives_up_after_its_timeout_and_says_so() -> None:
         (Frame(0x584, bytes.fromhex("41 00 10 00 10 00 00 00")), "command"),
     ],
 )
-def test_client_names_what_went_wrong(reply: Frame, says: str) -> None:
+def test_client_names_the_error(reply: Frame, says: str) -> None:
     client = SdoClient(4)
     client.begin(
         [Transfer(0x1000, 0, DataType.UNSIGNED32), Transfer(0x1001, 0, DataType.UNSIGNED8)]
@@ -211,7 +211,7 @@ def test_controlwords(word: int, command: DriveCommand) -> None:
     assert cia402.command_of(word) is command
 
 
-def test_every_controlword_is_a_command_and_every_command_has_its_word() -> None:
+def test_commands_and_controlwords_correspond_one_to_one() -> None:
     assert all(cia402.command_of(word) is not None for word in range(256))
     assert all(cia402.command_of(command.word) is command for command in DriveCommand)
 
@@ -230,7 +230,7 @@ def test_enabling_leads_from_every_resting_state_to_operation() -> None:
 
 
 @pytest.mark.parametrize("command", list(DriveCommand))
-def test_a_fault_is_left_by_a_reset_alone(command: DriveCommand) -> None:
+def test_only_a_reset_leaves_the_fault_state(command: DriveCommand) -> None:
     expected = (
         DriveState.SWITCH_ON_DISABLED if command is DriveCommand.FAULT_RESET else DriveState.FAULT
     )
@@ -247,11 +247,11 @@ def test_no_state_but_switched_on_and_quick_stop_leads_into_operation() -> None:
 
 
 @given(st.floats(-600.0, 600.0))
-def test_units_keep_a_micro_radian(angle: float) -> None:
+def test_units_resolve_a_micro_radian(angle: float) -> None:
     assert abs(cia402.from_units(cia402.to_units(angle)) - angle) <= 0.5e-6 + 1e-12
 
 
-def test_faults_have_words() -> None:
+def test_faults_have_descriptions() -> None:
     assert cia402.fault_text(0x8611) == "following error too large"
     assert cia402.fault_text(0x1234) == "error code 0x1234"
     assert set(cia402.FAULT_TEXT) == set(cia402.DriveFault)

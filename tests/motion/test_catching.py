@@ -1,8 +1,8 @@
-"""Closed loop in small: balls that roll off the edge, noisy predictions, the servo on its drives,
-and a cup that they fall into.
+"""The closed loop without cameras: balls that roll off the edge, noisy predictions, the servo with
+its drives, and the cup that catches them.
 
-The ball-in-cup mechanics here is the test's own: a sphere in a smooth-walled cylinder with a rim,
-restitution 0.3, friction.
+The mechanics of the ball in the cup are written for this test: a sphere in a smooth cylinder with a
+rim, restitution 0.3, friction.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ Vector = np.ndarray[Any, np.dtype[np.float64]]
 
 
 class CatchTrial(NamedTuple):
-    """A ball as it leaves the edge: at y (m), with speed and heading (m/s, rad), so many seconds
-    after its release."""
+    """A ball as it leaves the edge: position y (m), speed (m/s), heading (rad), and the time after
+    its release (s)."""
 
     y: float
     speed: float
@@ -40,8 +40,8 @@ class CatchTrial(NamedTuple):
 
 
 def throw(rng: np.random.Generator, low: float, high: float) -> CatchTrial:
-    """A nominal throw: released 0.1 m from the far edge with 70 to 100 % of the spin of rolling,
-    unknown rolling resistance."""
+    """Draw a nominal throw: released 0.1 m from the far edge with 70 to 100 % of the spin of
+    rolling and an unknown rolling resistance."""
     length = 1.5
     release, target = rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3)
     rolling = rng.uniform(low, high) * (0.6 + 0.4 * rng.uniform(0.7, 1.0))
@@ -54,7 +54,7 @@ def throw(rng: np.random.Generator, low: float, high: float) -> CatchTrial:
 
 
 class BallInCup:
-    """A ball in flight and in a cup that is held still."""
+    """A ball in flight and in a cup at rest."""
 
     def __init__(self, start: CatchTrial, mouth: Vector, axis: Vector) -> None:
         self.p = np.array([CELL.near_edge, start.y, CELL.table_top + BALL])
@@ -63,7 +63,7 @@ class BallInCup:
         self._mouth, self._axis = mouth, axis
 
     def caught(self) -> bool:
-        """Whether it lies in the cup in the end."""
+        """Return whether the ball lies in the cup at the end."""
         for _ in range(round(0.7 / STEP)):
             self.v = self.v - np.array([0.0, 0.0, CELL.gravity * STEP])
             self.p = self.p + self.v * STEP
@@ -74,7 +74,7 @@ class BallInCup:
         return -DEPTH < height < 0.01 and outward < RADIUS
 
     def _place(self) -> tuple[float, float, Vector]:
-        """Height above the mouth, distance from the axis, direction from the axis."""
+        """Return height above the mouth, distance from the axis and direction from the axis."""
         offset = self.p - self._mouth
         height = float(offset @ self._axis)
         radial = offset - height * self._axis
@@ -82,7 +82,7 @@ class BallInCup:
         return height, outward, radial / outward
 
     def _contact(self) -> tuple[Vector, float] | None:
-        """Normal and depth of the deepest contact."""
+        """Return normal and depth of the deepest contact."""
         height, outward, away = self._place()
         found: list[tuple[float, Vector]] = []
         if -DEPTH - BALL < height < 0.0 and outward < RADIUS:
@@ -112,8 +112,8 @@ class BallInCup:
 def _catch(
     rig: Any, ball: CatchTrial, strategy: str, rng: np.random.Generator, noise: float, blind: float
 ) -> bool:
-    """One throw: vision sees it after `blind` s, with errors of `noise` (m at the edge for each
-    second that is left)."""
+    """Simulate one throw: vision sees the ball after `blind` s, with errors of `noise` (m at the
+    edge per remaining second)."""
     begun = rig.now
     bias = rng.normal(0.0, 0.5 * noise)
     rig.arm.command(rig.now, {"do": "follow", "strategy": strategy})
@@ -162,11 +162,11 @@ def test_tilted_catches_nearly_all(rig: Any, regime: str, noise: float) -> None:
     )
 
 
-def test_upright_is_good_at_slow_balls(rig: Any) -> None:
+def test_the_upright_cup_catches_slow_balls(rig: Any) -> None:
     assert _caught(rig, REGIMES["A"], 4, strategy="upright", noise=0.02, blind=0.2) >= 3
 
 
-def test_a_cup_that_is_not_there_catches_nothing() -> None:
+def test_without_the_cup_in_place_nothing_is_caught() -> None:
     ball = CatchTrial(0.1, 1.5, 0.0, 1.0)
     assert not BallInCup(ball, np.array([0.5, -0.1, 0.55]), np.array([0.0, 0.0, 1.0])).caught()
 
@@ -190,8 +190,8 @@ def test_a_thousand_throws(make_rig: Callable[[], Any], regime: str, floor: floa
 
 
 def test_the_home_pose_is_near_every_ball() -> None:
-    """From home every throw of A to C can be met by the joints in 0.55 s, which leaves vision a
-    tenth of a second at the least."""
+    """From home, the joints can reach every throw of regimes A to C in 0.55 s, which leaves at
+    least 0.1 s for vision."""
     from petrobot.services.motion.interception import STRATEGIES, Interceptor, Prediction
     from petrobot.services.motion.kinematics import Puma, branch_of
     from petrobot.services.motion.limits import CollisionGuard

@@ -1,4 +1,4 @@
-"""The simulated drives and inputs as seen from the bus alone: dictionary, state machine, watchdogs
+"""The simulated drives and inputs as seen from the bus: object dictionary, state machine, watchdogs
 in simulated time."""
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class ArmDriveBench:
         return client.results.get((transfer.index, transfer.sub))
 
     def refused(self, frame: Frame) -> int:
-        """The abort code that an SDO request is answered with."""
+        """Return the abort code of the answer to an SDO request."""
         self.send(frame)
         (answer,) = [reply for reply in self.bus.drain() if reply.id > canopen.SDO_REPLY_BASE]
         assert answer.data[0] == 0x80
@@ -87,7 +87,7 @@ class ArmDriveBench:
         self.send(canopen.nmt(NmtCommand.START))
 
     def cycle(self, word: int, cycles: int = 1) -> None:
-        """Cycles with a controlword, the present target, SYNC and the master's heartbeat."""
+        """Run cycles with a controlword, the current target, SYNC and the master's heartbeat."""
         for _ in range(cycles):
             if self.beats:
                 self.send(canopen.heartbeat(0x7F, NmtState.OPERATIONAL))
@@ -135,7 +135,7 @@ def test_no_process_data_before_the_node_is_started(bench: ArmDriveBench) -> Non
     assert not [frame for frame in bench.frames if frame.id == 0x181]
 
 
-def test_the_way_to_operation_state_by_state(bench: ArmDriveBench) -> None:
+def test_enabling_passes_the_states_one_by_one(bench: ArmDriveBench) -> None:
     bench.configure()
     seen = []
     for command in (
@@ -208,7 +208,7 @@ def test_abort_codes(bench: ArmDriveBench, frame: Frame, code: AbortCode) -> Non
         (0x5FFF0010, AbortCode.NO_OBJECT),
     ],
 )
-def test_what_cannot_be_mapped_is_refused(
+def test_objects_that_cannot_be_mapped_are_refused(
     bench: ArmDriveBench, entry: int, code: AbortCode
 ) -> None:
     bench.sdo(Transfer(0x1600, 0, DataType.UNSIGNED8, 0))
@@ -224,7 +224,7 @@ def test_a_mapping_beyond_eight_bytes_is_refused(bench: ArmDriveBench) -> None:
     assert bench.refused(canopen.sdo_write_request(1, 0x1A00, 0, b"\x03")) == AbortCode.PDO_LENGTH
 
 
-def test_a_pdo_that_is_on_keeps_its_mapping(bench: ArmDriveBench) -> None:
+def test_an_active_pdo_keeps_its_mapping(bench: ArmDriveBench) -> None:
     bench.configure()
     assert bench.refused(canopen.sdo_write_request(1, 0x1A00, 0, b"\x00")) == AbortCode.STATE
 
@@ -247,7 +247,7 @@ def test_software_limits_cut_the_target(bench: ArmDriveBench) -> None:
     assert bench.status()[1] == pytest.approx(2.7, abs=1e-3)
 
 
-def test_quick_stop_ramps_down_and_holds_and_can_be_left(bench: ArmDriveBench) -> None:
+def test_quick_stop_ramps_down_holds_and_can_be_left(bench: ArmDriveBench) -> None:
     bench.enable()
     for _ in range(100):
         bench.target += 0.004
@@ -367,7 +367,7 @@ def test_reset_gives_a_boot_up_and_the_defaults_again(bench: ArmDriveBench) -> N
     assert bench.sdo(Transfer(0x1017, 0, DataType.UNSIGNED16)) == 0
 
 
-def test_slow_drives_say_so_and_cut_what_is_too_fast(bench: ArmDriveBench) -> None:
+def test_slow_drives_report_it_and_limit_targets_that_are_too_fast(bench: ArmDriveBench) -> None:
     bench.enable()
     rated = bench.sdo(Transfer(ObjectIndex.MAX_SPEED, 0, DataType.UNSIGNED32))
     bench.bus.slow_down(0.5)

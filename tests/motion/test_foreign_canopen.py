@@ -1,5 +1,5 @@
-"""Independent check by the `canopen` package: it masters our drives, and our master runs drives
-made of it."""
+"""Independent check with the `canopen` package: it controls our drives, and our master controls
+drives built with it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from petrobot.services.comm.canopen.master import MasterPhase
 from petrobot.services.motion.drive_master import DriveMaster, DriveSettings
 from petrobot.sim.catching.drives import DriveBus, ratings
 
-canopen: Any = importlib.import_module("canopen")  # it has no annotations worth the name
+canopen: Any = importlib.import_module("canopen")  # It has hardly any annotations.
 BaseNode402: Any = importlib.import_module("canopen.profiles.p402").BaseNode402
 EDS = str(files("petrobot.services.comm.canopen.eds").joinpath("joint_drive.eds"))
 INPUTS_EDS = str(files("petrobot.services.comm.canopen.eds").joinpath("digital_inputs.eds"))
@@ -36,7 +36,7 @@ PATIENCE = 10.0
 
 
 class LiveDrives:
-    """Our drives on a hub, run by a thread; simulated time follows the wall clock."""
+    """Our drives on a hub, run by a thread in wall-clock time."""
 
     def __init__(self, plant: Any, table: Any) -> None:
         self.hub = CanHub()
@@ -96,7 +96,7 @@ def _until(condition: Callable[[], bool], what: str) -> None:
         pause.wait(0.005)
 
 
-def test_the_canopen_package_masters_our_drive(live: LiveDrives, network: Any) -> None:
+def test_the_canopen_package_controls_our_drive(live: LiveDrives, network: Any) -> None:
     node = BaseNode402(1, EDS)
     network.add_node(node)
     node.sdo.RESPONSE_TIMEOUT = 2.0
@@ -201,7 +201,7 @@ def test_our_master_runs_drives_of_the_canopen_package() -> None:
     try:
         moved, now = 0, 0.0
         while moved < 50:
-            now += 0.004  # never faster than the wall's clock, by which the foreign nodes live
+            now += 0.004  # Never faster than the wall clock, which the foreign nodes use.
             assert now < PATIENCE, (
                 master.phase,
                 master.troubles,

@@ -1,4 +1,4 @@
-"""Choosing catching poses: the cup is where the ball will be, in time, clear of the table, and
+"""Choice of catching poses: the cup is where the ball will be, in time, clear of the table, and
 without jumps."""
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SPEED, ACCELERATION = ARM.speed.tolist(), ARM.acceleration.tolist()
 def _exit(
     y: float, speed: float, heading: float, time_to_go: float = 0.5, sigma_y: float = 0.0
 ) -> Prediction:
-    """A ball that leaves the edge at `y`, `heading` rad off the straight way."""
+    """Return a ball that leaves the edge at `y` with a heading of `heading` rad from straight."""
     velocity = (-speed * math.cos(heading), speed * math.sin(heading), 0.0)
     return Prediction(
         time_to_go, (CELL.near_edge, y, CELL.table_top + CELL.ball_radius), velocity, sigma_y, 0.0
@@ -49,7 +49,7 @@ THROWS = st.builds(_exit, st.floats(-0.3, 0.3), st.floats(0.4, 2.45), st.floats(
 
 @settings(max_examples=60)
 @given(THROWS, st.sampled_from(["tilted", "upright"]))
-def test_every_nominal_ball_has_a_pose_on_its_way_that_the_arm_can_take(
+def test_every_nominal_ball_has_a_reachable_pose_on_its_path(
     prediction: Prediction, strategy: str
 ) -> None:
     plan = _plan(prediction, strategy)
@@ -101,7 +101,7 @@ def test_small_changes_of_the_prediction_move_the_pose_a_little(
 
 
 def _alone(candidate: int, prediction: Prediction) -> CatchPlan | None:
-    """The plan if there were no other candidate."""
+    """Return the plan if there were no other candidate."""
     strategy = STRATEGIES["tilted"]
     depth, hand = divmod(candidate, len(strategy.hands))
     alone = replace(strategy, depths=(strategy.depths[depth],), hands=(strategy.hands[hand],))
@@ -109,7 +109,7 @@ def _alone(candidate: int, prediction: Prediction) -> CatchPlan | None:
 
 
 @pytest.mark.parametrize("strategy", ["tilted", "upright"])
-def test_a_cup_in_place_stays_there_until_the_ball_comes(strategy: str) -> None:
+def test_a_cup_in_place_stays_there_until_the_ball_arrives(strategy: str) -> None:
     far = _plan(_exit(0.1, 1.2, 0.0, time_to_go=1.0), strategy)
     assert far is not None
     for time_to_go in (0.5, 0.2, 0.05, 0.0, 0.04 - far.arrival + 1.0):
@@ -126,7 +126,7 @@ def test_a_cup_in_place_stays_there_until_the_ball_comes(strategy: str) -> None:
         assert near.candidate == far.candidate
 
 
-def test_a_late_ball_is_met_where_least_time_is_lost() -> None:
+def test_a_late_ball_is_met_where_the_delay_is_smallest() -> None:
     late = _plan(_exit(0.3, 2.4, 0.0, time_to_go=0.0))
     assert late is not None
     assert late.slack < 0.0
@@ -147,7 +147,7 @@ def test_a_ball_out_of_reach_has_no_plan() -> None:
     assert _plan(_exit(1.2, 1.5, 0.0)) is None
 
 
-def test_a_set_point_gets_older_while_it_lies() -> None:
+def test_a_set_point_ages_until_it_is_used() -> None:
     prediction = Prediction.parse([0.5, 0.62, 0.1, 0.62, -1.0, 0.0, 0.0, 0.003, 0.01], age=0.02)
     assert prediction.time_to_go == pytest.approx(0.48)
     assert prediction.sigma_y == 0.003

@@ -1,4 +1,4 @@
-"""Kinematics against two foreign implementations, and by property."""
+"""Kinematics against two independent implementations, and as properties."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def test_jacobian_agrees_with_the_robotics_toolbox() -> None:
 
 
 def _urdf() -> str:
-    """The arm as URDF: the joint of DH row i turns about z of frame i - 1, and carries Tz(d) Tx(a)
-    Rx(alpha) behind it."""
+    """Return the arm as URDF: the joint of DH row i rotates about z of frame i - 1, followed by
+    Tz(d) Tx(a) Rx(alpha)."""
     inertial = (
         '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" '
         'iyz="0"/></inertial>'
@@ -100,20 +100,20 @@ def test_every_solution_reaches_the_pose_within_the_limits(angles: tuple[float, 
 
 
 @given(ANGLES)
-def test_the_pose_that_was_asked_for_is_among_the_solutions(angles: tuple[float, ...]) -> None:
+def test_the_original_joint_angles_are_among_the_solutions(angles: tuple[float, ...]) -> None:
     q = np.array(angles)
     planar = PUMA.forward(q)[:2, 3]
     stretched = abs(math.sin(q[2] + math.atan2(PUMA.d4, PUMA.a3)))
     over_axis = abs(math.hypot(*planar) - PUMA.d3)
     if abs(math.sin(q[4])) < 1e-3 or stretched < 1e-3 or over_axis < 1e-3:
-        return  # on a singularity neighbouring solutions meet
+        return  # At a singularity neighbouring solutions coincide.
     solutions = PUMA.inverse(PUMA.forward(q), near=q)
     mine = solutions[BRANCHES.index(branch_of(PUMA, q))]
     assert np.abs(mine - q).max() < 1e-6
 
 
-def test_eight_solutions_are_eight() -> None:
-    """Without joint limits a pose inside the workspace has all eight, all different."""
+def test_there_are_eight_different_solutions() -> None:
+    """Without joint limits, a pose inside the workspace has eight different solutions."""
     free = Puma(
         PUMA.d1, PUMA.a2, PUMA.a3, PUMA.d3, PUMA.d4, np.full(6, -math.pi), np.full(6, math.pi)
     )
@@ -160,7 +160,7 @@ def test_jacobian_is_the_derivative(angles: tuple[float, ...]) -> None:
         )
 
 
-def test_batches_give_what_single_poses_give() -> None:
+def test_batches_equal_single_poses() -> None:
     q = np.array([case["q"] for case in GOLDEN["cases"][:12]])
     poses = PUMA.forward(q.reshape(3, 4, 6))
     assert poses.shape == (3, 4, 4, 4)

@@ -1,4 +1,4 @@
-"""The guard: whatever is commanded, forearm and cup stay clear of table, floor and pedestal."""
+"""The guard: for any command, forearm and cup stay clear of table, floor and pedestal."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_parts_are_where_the_kinematics_puts_them(angles: tuple[float, ...]) -> 
 
 
 def _surface(q: np.ndarray) -> np.ndarray:
-    """Points (n, 3) all over the outside of the cup."""
+    """Return points (n, 3) over the whole outside of the cup."""
     at = GUARD.place(q.tolist())
     axis = np.array(at.axis)
     first = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0])
@@ -80,7 +80,7 @@ def test_no_sequence_of_set_points_passes_the_guard(
                 np.abs(np.subtract(trajectory.qd, before)) <= ARM.acceleration * 0.004 * (1 + 1e-9)
             )
             assert np.all(np.abs(trajectory.qd) <= ARM.speed * (1 + 1e-9))
-            # 5 mm of margin are left to what happens between the poses that are looked at.
+            # A margin of 5 mm covers the motion between the checked poses.
             points = _surface(np.array(trajectory.q))
             assert not np.any((points[:, 0] > CELL.near_edge) & (points[:, 2] < CELL.table_top))
 
@@ -97,7 +97,7 @@ def test_no_sequence_of_set_points_passes_the_guard(
         ([65, 220, 25, 150, -20, 20], "wrist at the pedestal"),
     ],
 )
-def test_what_would_be_touched_is_named(pose: list[float], says: str) -> None:
+def test_the_obstacle_that_would_be_touched_is_named(pose: list[float], says: str) -> None:
     assert GUARD.violation(np.radians(pose).tolist()) == says
 
 
@@ -113,7 +113,7 @@ def test_a_refused_step_is_reported_and_the_arm_stops_before_the_table() -> None
     assert np.abs(trajectory.qd).max() < 0.1
 
 
-def test_an_arm_switched_on_in_a_forbidden_pose_may_leave_it_creeping() -> None:
+def test_an_arm_switched_on_in_a_forbidden_pose_may_leave_it_slowly() -> None:
     stuck = np.radians([18.7, 30.0, -190.0, 6.7, 48.6, 3.4])
     steering = Steering(GUARD, lambda q: None, HOME.tolist(), 0.004, ARM.acceleration)
     steering.limit(ARM.speed.tolist())
@@ -132,7 +132,7 @@ def test_an_arm_switched_on_in_a_forbidden_pose_may_leave_it_creeping() -> None:
     assert np.all(fastest <= 0.1 * ARM.speed + 1e-9)
 
 
-def test_a_closer_guard_lets_pass_what_a_wider_one_refuses() -> None:
+def test_a_guard_with_a_smaller_margin_allows_poses_that_a_wider_one_refuses() -> None:
     wide = CollisionGuard(PUMA, ARM, CELL, cup_margin=0.10, arm_margin=0.10)
     assert GUARD.violation(HOME.tolist()) == ""
     assert wide.violation(HOME.tolist()) == "cup at the table"
@@ -140,7 +140,7 @@ def test_a_closer_guard_lets_pass_what_a_wider_one_refuses() -> None:
 
 
 class Thorough(CollisionGuard):
-    """Looks at everything, however far the arm is from it."""
+    """Checks every obstacle, however far the arm is from it."""
 
     def _arm_far(self, elbow: Point, wrist: Point) -> bool:
         return False
@@ -152,7 +152,7 @@ class Thorough(CollisionGuard):
 @settings(max_examples=400)
 @given(ANGLES)
 def test_an_arm_that_is_far_from_everything_touches_nothing(angles: tuple[float, ...]) -> None:
-    """The short cuts for an arm that is far away never hide a touch."""
+    """The short cuts for an arm that is far away never miss a contact."""
     for margins in ((0.0, 0.0), (0.005, 0.01), (0.05, 0.05)):
         assert CollisionGuard(PUMA, ARM, CELL, *margins).violation(angles) == Thorough(
             PUMA, ARM, CELL, *margins
@@ -161,7 +161,7 @@ def test_an_arm_that_is_far_from_everything_touches_nothing(angles: tuple[float,
 
 @settings(max_examples=40)
 @given(NEARBY, st.integers(1, 60))
-def test_a_rest_pose_found_clear_is_not_taken_for_another_arms(
+def test_a_clear_rest_pose_is_not_reused_for_another_arm(
     offset: tuple[float, ...], cycles: int
 ) -> None:
     guard = CollisionGuard(PUMA, ARM, CELL)
@@ -186,7 +186,7 @@ SIX = st.tuples(*[st.floats(-2.0, 2.0, allow_subnormal=False)] * 6)
 @settings(max_examples=150, deadline=None)
 @given(angles=ANGLES, goal=ANGLES, share=SIX)
 def test_a_compiled_guard_gives_the_same_bits(angles: Six, goal: Six, share: Six) -> None:
-    """Commanded positions and velocities and what is found clear, compiled and as it stands."""
+    """Commanded positions, velocities and clearances are equal with compiled and plain code."""
     qd = six(0.5 * s * v for s, v in zip(share, ARM.speed.tolist(), strict=True))
     limits = six(ARM.speed), six(ARM.acceleration), six(ARM.acceleration)
     numbers = 0.004, NEAR, angles, qd, goal, *limits, *GUARD._geometry
@@ -196,8 +196,8 @@ def test_a_compiled_guard_gives_the_same_bits(angles: Six, goal: Six, share: Six
 
 @settings(max_examples=150, deadline=None)
 @given(goal=ANGLES, share=SIX)
-def test_a_clear_step_can_stop_anywhere_on_its_way(goal: Six, share: Six) -> None:
-    """The guard's one look at a step finds what looking at each of the poses finds, one by one."""
+def test_a_clear_step_can_stop_anywhere_on_its_path(goal: Six, share: Six) -> None:
+    """The guard's single check of a step agrees with checks of all its poses one by one."""
     trajectory = Trajectory(HOME.tolist(), 0.004, ARM.speed.tolist(), ARM.acceleration.tolist())
     trajectory.qd = six(0.5 * s * v for s, v in zip(share, ARM.speed.tolist(), strict=True))
     trajectory.aim(goal)

@@ -1,5 +1,5 @@
-"""The arm's numbers: the file is read whole, faults are named, and the accelerations can be had for
-the torques."""
+"""The arm's data: the file is read completely, faults are named, and the torques suffice for the
+accelerations."""
 
 from __future__ import annotations
 
@@ -76,10 +76,9 @@ def test_kinematics_refuses_another_arm() -> None:
         Puma.of(read_arm(ARM.replace("alpha = -90.0", "alpha = -80.0", 1)))
 
 
-def test_the_accelerations_can_be_had_for_the_torques() -> None:
-    """Inertia and gravity of the independent model, friction of ours: at home every joint may
-    accelerate at its limit, all together in any combination of signs, while it turns at its
-    greatest speed."""
+def test_the_torques_suffice_for_the_accelerations() -> None:
+    """With inertia and gravity of the independent model and our friction, all joints at home can
+    accelerate at their limits at once, in any combination of signs, at their maximum speeds."""
     golden = json.loads(Path(__file__).with_name("puma560_golden.json").read_text(encoding="utf-8"))
     arm = nominal_arm()
     home = golden["home"]

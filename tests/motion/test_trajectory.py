@@ -54,7 +54,7 @@ def test_limits_hold_for_any_sequence_of_targets(
 
 @settings(max_examples=40)
 @given(st.lists(STEP, max_size=6), st.lists(ANGLE, min_size=6, max_size=6))
-def test_it_arrives_exactly_and_nearly_as_soon_as_can_be(
+def test_it_arrives_exactly_and_nearly_as_early_as_possible(
     steps: list[tuple[list[float] | None, int]], target: list[float]
 ) -> None:
     trajectory = _trajectory()
@@ -80,7 +80,7 @@ def test_it_arrives_exactly_and_nearly_as_soon_as_can_be(
 
 @settings(max_examples=40)
 @given(st.lists(ANGLE, min_size=6, max_size=6), st.integers(1, 200))
-def test_braking_ends_where_it_was_said_to_end(target: list[float], cycles: int) -> None:
+def test_braking_ends_where_predicted(target: list[float], cycles: int) -> None:
     trajectory = _trajectory()
     trajectory.aim(target)
     for _ in range(cycles):
@@ -100,7 +100,7 @@ def test_braking_ends_where_it_was_said_to_end(target: list[float], cycles: int)
 
 
 @pytest.mark.parametrize("distance", [1e-9, 1e-6, 1e-4, 0.01, 0.3, 2.0])
-def test_from_rest_the_time_is_that_of_the_textbook(distance: float) -> None:
+def test_from_rest_the_time_equals_the_textbook_formula(distance: float) -> None:
     speed, acceleration = ARM.speed, ARM.acceleration
     ramp = speed * speed / acceleration
     expected = np.where(
@@ -133,7 +133,7 @@ def test_synchronised_joints_end_together(target: list[float]) -> None:
     assert np.all(acceleration <= ARM.acceleration * (1 + 1e-12))
 
 
-def test_lower_limits_are_braked_into() -> None:
+def test_a_joint_brakes_to_lowered_limits() -> None:
     trajectory = _trajectory()
     trajectory.aim([2.0] * 6)
     for _ in range(60):

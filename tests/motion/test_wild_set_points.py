@@ -1,7 +1,7 @@
-"""No set point, however wild, takes the arm past table, floor, pedestal, joint limits, speeds or
-accelerations.
+"""No set point, however extreme, makes the arm violate table, floor, pedestal, joint limits, speeds
+or accelerations.
 
-What is touched is judged by points all over cup and forearm, apart from the guard that is to
+Contact is checked with points over the whole cup and forearm, independently of the guard that must
 prevent it.
 """
 
@@ -43,7 +43,7 @@ MONSTERS = [
 
 
 def _numbers(low: float, high: float) -> st.SearchStrategy[float]:
-    """Mostly what could be a set point; sometimes what never can."""
+    """Draw numbers that are mostly plausible set points, sometimes impossible ones."""
     return st.one_of(
         st.floats(low, high), st.floats(low, high), st.floats(), st.sampled_from(MONSTERS)
     )
@@ -84,8 +84,8 @@ STEPS = st.lists(
 
 
 def _solid(q: Array) -> Array:
-    """Points (n, 3) of the outside of cup and forearm (m, base frame) at a joint pose, by the
-    kinematics alone."""
+    """Return points (n, 3) on the outside of cup and forearm (m, base frame) at a joint pose, from
+    the kinematics alone."""
     frame = PUMA.forward(q)
     turn, wrist = frame[:3, :3], frame[:3, 3]
     mouth, axis = turn @ CELL.cup.mouth + wrist, turn @ CELL.cup.axis
@@ -101,7 +101,7 @@ def _solid(q: Array) -> Array:
 
 
 def _elbow(q: Array) -> Array:
-    """Where the forearm begins: the third frame's origin, moved along its joint's offset."""
+    """Return where the forearm begins: the third frame's origin, moved along its joint's offset."""
     c1, s1 = np.cos(q[0]), np.sin(q[0])
     reach = PUMA.a2 * np.cos(q[1]) + PUMA.a3 * np.cos(q[1] + q[2])
     height = PUMA.d1 + PUMA.a2 * np.sin(q[1]) + PUMA.a3 * np.sin(q[1] + q[2])
@@ -109,7 +109,7 @@ def _elbow(q: Array) -> Array:
 
 
 def _check(commanded: list[list[float]]) -> None:
-    """Joint limits, speeds, accelerations, table and floor, in every cycle."""
+    """Check joint limits, speeds, accelerations, table and floor in every cycle."""
     q = np.array(commanded[1:])
     assert np.all(np.isfinite(q))
     assert np.all(q >= ARM.lower - 1e-6) and np.all(q <= ARM.upper + 1e-6)
@@ -133,7 +133,7 @@ def _check(commanded: list[list[float]]) -> None:
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(STEPS)
-def test_no_set_point_takes_the_arm_past_its_limits(
+def test_no_set_point_makes_the_arm_violate_its_limits(
     make_rig: Any, steps: list[tuple[Any, list[Any], int]]
 ) -> None:
     rig = make_rig().enable()

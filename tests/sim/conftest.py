@@ -1,5 +1,5 @@
-"""A laboratory on the bench: a small CANopen master of the tests' own that moves the arm, and a
-clairvoyant catcher."""
+"""Fixtures: a laboratory on the bench with a small CANopen master, written for these tests, and a
+catcher that knows where each ball will be."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ needs_bullet = pytest.mark.skipif(
     scope="session", params=[pytest.param(BULLET, marks=needs_bullet), pytest.param(PORTABLE)]
 )
 def physics(request: pytest.FixtureRequest) -> str:
-    """Each back end of the laboratory's mechanics: the same tests for both."""
+    """Each back end of the mechanics; both pass the same tests."""
     name: str = request.param
     return name
 
@@ -69,8 +69,8 @@ def arm(site: Site) -> PumaModel:
 
 
 class Master:
-    """Sets six drives up over SDO, enables them, and leads them along straight joint paths at most
-    of the joint limits."""
+    """Configures six drives over SDO, enables them, and moves them along straight joint paths at
+    nearly the joint limits."""
 
     def __init__(self, model: PumaModel, pose: Sequence[float], share: float = 0.9) -> None:
         self._speed, self._acceleration = share * model.speed, share * model.acceleration
@@ -87,7 +87,7 @@ class Master:
         self._heard = 0
 
     def heard(self) -> int:
-        """How many answers of drives have come so far."""
+        """Return the number of answers of drives so far."""
         return self._heard
 
     @staticmethod
@@ -125,7 +125,7 @@ class Master:
         if all(word & 0x08 for word in self.status):
             self._word = (
                 0x00 if self._word == 0x80 else 0x80
-            )  # a fault is reset by the bit's rising edge
+            )  # A rising edge of the bit resets a fault.
         else:
             self._word = {0x00: 0x06, 0x80: 0x06, 0x06: 0x07}.get(self._word, 0x0F)
         pack = RECEIVED[0].type.pack, RECEIVED[1].type.pack
@@ -150,11 +150,11 @@ class Master:
 
     @property
     def enabled(self) -> bool:
-        """Whether all drives are in OPERATION ENABLED."""
+        """Return whether all drives are in OPERATION ENABLED."""
         return all(word & 0x6F == 0x27 for word in self.status)
 
     def move(self, now: float, goal: Sequence[float]) -> float:
-        """Lead the arm to `goal` from where it is led now; gives the seconds that takes."""
+        """Plan a motion from the current target to `goal`; return its duration (s)."""
         begin, way = self.target.copy(), np.array(goal, dtype=float) - self.target
         size = np.abs(way).clip(1e-9)
         speed, acceleration = (
@@ -178,7 +178,7 @@ class Master:
         return duration
 
     def arrived(self, now: float) -> bool:
-        """Whether the path is at its end."""
+        """Return whether the path has ended."""
         return now >= self._ends
 
 
@@ -194,12 +194,12 @@ class CatchingBench(LaboratoryBench):
         super().__init__(self.lab, self.master, "arm")
 
     def move(self, goal: Sequence[float]) -> None:
-        """Lead the arm somewhere and wait until it is there."""
+        """Move the arm and wait until it has arrived."""
         self.wait(self.master.move(self.now, goal) + 0.1)
 
     def catch_one(self) -> dict[str, Any]:
-        """One whole cycle of a clairvoyant catcher, which knows where the oracle would catch. Gives
-        the throw's row."""
+        """Run one whole cycle of a catcher that knows the oracle's catching pose; return the
+        throw's row."""
         lab = self.lab
         count = len(lab.referee.score(self.now)["throws"])
         assert self.run(lambda: lab.world.course is not None, 3.0)
@@ -221,7 +221,7 @@ class CatchingBench(LaboratoryBench):
 
 @pytest.fixture
 def bench(site: Site, physics: str) -> Iterator[Callable[..., CatchingBench]]:
-    """Makes benches; options as for Laboratory."""
+    """Return a function that makes benches; options as for Laboratory."""
     made: list[CatchingBench] = []
 
     def make(**options: Any) -> CatchingBench:
@@ -235,12 +235,12 @@ def bench(site: Site, physics: str) -> Iterator[Callable[..., CatchingBench]]:
 
 @pytest.fixture
 def cell_master(site: Site) -> Callable[[], Master]:
-    """Makes masters for the shipped arm at home."""
+    """Return a function that makes masters for the shipped arm at home."""
     return lambda: Master(site.arm, site.arm.poses["home"].tolist())
 
 
 def run_digests(seed: int, regime: str, physics: str, prepared_before: bool = False) -> list[str]:
-    """Digests of the score, of all images and of the arm's end position after a throw."""
+    """Return digests of the score, of all images and of the arm's end position after a throw."""
     made = CatchingBench(
         read_site(CELL_FILE),
         seed=77 if prepared_before else seed,
@@ -270,5 +270,5 @@ def digests() -> Callable[..., list[str]]:
     return run_digests
 
 
-if __name__ == "__main__":  # a fresh process, to compare with
+if __name__ == "__main__":  # a new process for comparison
     print("\n".join(run_digests(int(sys.argv[1]), sys.argv[2], sys.argv[3])))

@@ -13,29 +13,29 @@ from petrobot.services.comm.protocol.messages import Call, Hello, Outcome
 
 
 class BusMaster(Protocol):
-    """Whoever leads the drives of a laboratory's bus."""
+    """The master of a laboratory's bus."""
 
     @property
     def enabled(self) -> bool:
-        """Whether all drives are in OPERATION ENABLED."""
+        """Return whether all drives are in OPERATION ENABLED."""
 
     @property
     def status(self) -> list[int]:
-        """Their statuswords."""
+        """Return the drives' statuswords."""
 
     def frames(self, now: float) -> list[Frame]:
-        """Frames of this cycle."""
+        """Return the frames of this cycle."""
 
     def take(self, frames: Sequence[Frame]) -> None:
-        """Frames of the drives and sensors."""
+        """Process the frames of the drives and sensors."""
 
 
 class LaboratoryBench:
-    """The laboratory's envelopes, its answers and images by the tick. `bus`: the device that the
-    master speaks for."""
+    """The laboratory's envelopes, answers and images by tick. `bus`: the device whose driver the
+    master replaces."""
 
     cycle = 1
-    """Ticks between two cycles of the master."""
+    """Number of ticks between two cycles of the master."""
     cut = False
     """Whether the master is silent."""
 
@@ -43,7 +43,7 @@ class LaboratoryBench:
         self._party, self._lead, self._bus = party, lead, bus
         self.tick = 0
         self.images: list[tuple[float, Any]] = []
-        """When each came, and its body."""
+        """Tick of arrival and body of each."""
         self.answers: list[Outcome] = []
         self._inbox: list[Envelope] = []
         self._calls = 0
@@ -51,7 +51,7 @@ class LaboratoryBench:
 
     @property
     def now(self) -> float:
-        """Time of the next tick (s)."""
+        """Return the time of the next tick (s)."""
         return self.tick * TICK
 
     def post(self, channel: str, source: str, body: Any) -> None:
@@ -59,7 +59,7 @@ class LaboratoryBench:
         self._inbox.append(Envelope("laboratory", source, "laboratory", channel, body))
 
     def want_images(self, rate: float) -> None:
-        """Ask for images."""
+        """Request images."""
         self.post("control", "camera", images_wanted(rate, 1))
 
     def call(self, service: str, **arguments: Any) -> Outcome:
@@ -71,7 +71,7 @@ class LaboratoryBench:
         return self.answers[-1]
 
     def step(self) -> None:
-        """One tick."""
+        """Run one tick."""
         now = self.now
         if self.tick % self.cycle == 0 and not self.cut:
             self.post("can", self._bus, can_body(self._lead.frames(now)))
@@ -89,7 +89,7 @@ class LaboratoryBench:
                 self.answers.append(envelope.body)
 
     def run(self, until: Callable[[], bool], at_most: float) -> bool:
-        """Step until it holds, at most so many seconds; says whether it held."""
+        """Step until the condition holds or the time (s) is over; return whether it held."""
         for _ in range(round(at_most / TICK)):
             if until():
                 return True
@@ -97,9 +97,9 @@ class LaboratoryBench:
         return until()
 
     def wait(self, seconds: float) -> None:
-        """Step for so many seconds."""
+        """Step for a time (s)."""
         self.run(lambda: False, seconds)
 
     def enable(self) -> None:
-        """Set up and enable the drives."""
+        """Configure and enable the drives."""
         assert self.run(lambda: self._lead.enabled, 1.0), self._lead.status

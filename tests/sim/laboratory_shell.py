@@ -1,5 +1,5 @@
-"""A laboratory on the wall clock in tests: free ports, callers, `python -m petrobot.sim` as a
-process, a party that looks at its score."""
+"""A laboratory in wall-clock time for tests: free ports, callers, `python -m petrobot.sim` as a
+process, a party that reads its score."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from petrobot.sim.realtime import LaboratoryShell
 REPOSITORY = Path(__file__).parents[2]
 NUMBERS = itertools.count(1)
 PATIENCE = 60.0
-"""s of wall time within which what must come has come, on a machine out of breath."""
+"""Longest wait (s of wall time) on a busy machine."""
 
 
 async def until(holds: Callable[[], bool]) -> None:
-    """Look every 2 ms whether it holds."""
+    """Check the condition every 2 ms."""
     pause = threading.Event()
     async with asyncio.timeout(PATIENCE):
         while not holds():
@@ -47,7 +47,7 @@ async def running(file: Path) -> AsyncIterator[LaboratoryShell]:
 
 
 async def call(address: tuple[str, int], service: str, **arguments: Any) -> Outcome:
-    """Call a service, under a name of its own: a caller of one name and boot numbers its calls from
+    """Call a service under a new caller name, because the calls of each name and boot count from
     1."""
     caller = Caller("laboratory", Hello(2, 99, "client", f"test {next(NUMBERS)}", "boot"))
     client = Client(*address, caller, on_notices=lambda now, notices: None)
@@ -74,8 +74,8 @@ def program(*arguments: str) -> subprocess.Popen[str]:
 
 
 class Looker:
-    """A party that makes some calls, ends the cell when all are answered, and keeps what the last
-    one, the score, says."""
+    """A party that makes some calls, ends the cell when all are answered, and keeps the answer of
+    the last one, the score."""
 
     name = "coordinator"
 
@@ -99,8 +99,8 @@ class Looker:
 
 
 def score_as_member(directory: Directory, calls: Sequence[Call]) -> dict[str, Any]:
-    """Be the coordinator of a lock-step cell whose laboratory is a process; gives the answer to the
-    last call."""
+    """Act as coordinator of a lock-step cell whose laboratory is a process; return the answer to
+    the last call."""
     looker = Looker(calls)
     member = Member(
         "coordinator",

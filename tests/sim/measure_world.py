@@ -1,9 +1,9 @@
-"""Measures what the laboratory costs: `python tests/sim/measure_world.py [REGIME ...]`; no test,
-figures for people.
+"""Measure the CPU time of the laboratory (not a test): `python tests/sim/measure_world.py [REGIME
+...]`.
 
-CPU milliseconds for a simulated second over whole cycles (wait, throw, catch, empty, home), by
-part, without images and with 50 images a second; beside it the machine's speed in this moment, as
-the time of a fixed piece of Python.
+CPU milliseconds per simulated second over whole cycles (wait, throw, catch, empty, home), by part,
+without images and with 50 images/s; also the machine's current speed, as the time of a fixed piece
+of Python.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ CYCLES = 10
 
 
 def reference() -> float:
-    """CPU seconds of two million additions, best of five: how fast this core is just now."""
+    """Return the CPU seconds of two million additions, best of five: the current speed of this
+    core."""
     best = 1e9
     for _ in range(5):
         begun, total = time.process_time(), 0
@@ -32,7 +33,7 @@ def reference() -> float:
 
 
 class WorldMeter:
-    """Adds up the CPU time that methods take, with what they call."""
+    """Adds up the CPU time of methods, including the functions that they call."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
@@ -86,7 +87,7 @@ def measure(regime: str, rate: float, parts: bool) -> None:
         }
         cycles.append((1000 * (time.process_time() - begun) / simulated, simulated, spent))
     lab.close()
-    # other programs on the machine slow all of a cycle down: the least disturbed one tells most
+    # Other programs slow a whole cycle down: the least disturbed cycle is the most informative.
     cost, simulated, spent = min(cycles, key=lambda cycle: cycle[0])
     told = ", ".join(f"{name} {value:.1f}" for name, value in spent.items())
     print(

@@ -1,4 +1,4 @@
-"""The ball's closed forms against the laws that they solve."""
+"""The ball's closed forms against the equations of motion."""
 
 from __future__ import annotations
 
@@ -38,15 +38,17 @@ def test_a_rolling_ball_loses_59_mm_per_second_each_second() -> None:
 
 
 @pytest.mark.parametrize(("share", "settles"), [(0.0, 0.6), (0.7, 0.88), (1.0, 1.0)])
-def test_what_speed_a_sliding_ball_settles_at(share: float, settles: float) -> None:
-    """A hollow ball without spin rolls at 3/5 of its speed: angular momentum about the contact
-    point is kept."""
+def test_the_final_speed_of_a_sliding_ball(share: float, settles: float) -> None:
+    """A hollow ball without spin ends up rolling at 3/5 of its speed: angular momentum about the
+    contact point is conserved."""
     motion = rolling(2.0, share)
     assert motion.state(motion.rolls_after).velocity[0] == pytest.approx(settles * 2.0)
 
 
 @given(start=starts)
-def test_angular_momentum_about_the_contact_line_is_kept_while_sliding(start: BallState) -> None:
+def test_angular_momentum_about_the_contact_line_is_conserved_while_sliding(
+    start: BallState,
+) -> None:
     motion = TableMotion(MODEL, start, RESISTANCE)
     inertia = MODEL.inertia_factor * MODEL.radius
 
@@ -89,14 +91,12 @@ def test_a_ball_never_gains_energy(start: BallState, moment: float) -> None:
 
 
 @given(start=starts, aim=st.floats(-2.0, 4.0), axis=st.integers(0, 1))
-def test_the_first_crossing_is_one_and_is_the_first(
-    start: BallState, aim: float, axis: int
-) -> None:
+def test_a_crossing_is_found_and_is_the_first(start: BallState, aim: float, axis: int) -> None:
     motion = TableMotion(MODEL, start, RESISTANCE)
     crossing = motion.first_crossing(axis, aim)
     side = math.copysign(1.0, start.position[axis] - aim)
     until = min(crossing, motion.rests_after, 30.0)
-    for k in range(50):  # strictly on the starting side before it
+    for k in range(50):  # Before it, the ball is strictly on the starting side.
         assert side * (motion.state(0.98 * until * k / 50).position[axis] - aim) > -1e-9
     if crossing < math.inf:
         assert motion.state(crossing).position[axis] == pytest.approx(aim, abs=1e-6)
@@ -123,8 +123,8 @@ def test_an_uneven_motion_on_an_even_table_is_the_closed_form(share: float) -> N
 
 
 @pytest.mark.parametrize("along", [-1.0, 0.5])
-def test_a_slope_drives_a_rolling_ball_as_its_inertia_says(along: float) -> None:
-    """Rolling loses nothing here: s g / (1 + k) downhill, k = 2/3."""
+def test_a_slope_accelerates_a_rolling_ball_according_to_its_inertia(along: float) -> None:
+    """Without rolling resistance the acceleration is s g / (1 + k) downhill, k = 2/3."""
     start = BallState((2.0, 0.0, 0.62), (along, 0.0, 0.0), MODEL.spin_of_rolling(along, 0.0))
     motion = UnevenMotion(MODEL, start, 0.0, lambda x, y: (0.0, 0.003))
     state = motion.state(1.0)
@@ -142,7 +142,7 @@ def test_it_comes_to_rest_and_stays() -> None:
 
 
 @given(speeds, speeds, st.floats(0.0, 1.0))
-def test_flight_keeps_energy(vx: float, vz: float, t: float) -> None:
+def test_flight_conserves_energy(vx: float, vz: float, t: float) -> None:
     start = BallState((0.0, 0.0, 1.0), (vx, 0.2, vz), (1.0, 2.0, 3.0))
     now = fly(start, t, 9.81)
 

@@ -1,5 +1,5 @@
-"""A whole cycle of the master's taken at once gives the frames that the same taken one by one give,
-also while drives rest."""
+"""A whole cycle of the master's frames processed at once gives the same answers as frame by frame,
+also while drives are idle."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ DEEDS = st.one_of(
 
 
 class Twin:
-    """One arm on its bus, with what the master sends it."""
+    """An arm on its bus, with the master's frames."""
 
     def __init__(self, site: Site) -> None:
         self.home = site.arm.poses["home"].tolist()
@@ -57,7 +57,7 @@ class Twin:
         return self.bus.drain()
 
     def suffer(self, deed: str, value: float) -> None:
-        """What happens to the laboratory rather than on the bus."""
+        """Cause an event in the laboratory, not on the bus."""
         if deed == "power":
             self.bus.power(bool(value))
         elif deed == "trip":
@@ -83,7 +83,7 @@ def _extra(deed: str) -> tuple[Frame, ...]:
     max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(st.lists(st.tuples(DEEDS, st.integers(1, 25)), min_size=1, max_size=8))
-def test_a_cycle_at_once_is_the_cycle_frame_by_frame(
+def test_a_cycle_at_once_equals_the_cycle_frame_by_frame(
     twins: Callable[[], tuple[Twin, Twin]], deeds: list[tuple[tuple[str, float], int]]
 ) -> None:
     one, other = twins()

@@ -1,4 +1,4 @@
-"""The contact space: impacts, friction, moving cup, nothing passes a wall."""
+"""The contact space: impacts, friction, moving cup; nothing passes through a wall."""
 
 from __future__ import annotations
 
@@ -46,8 +46,9 @@ def make_space(site: Site, model: BallModel, restitution: float, physics: str) -
 
 
 def drop(space: BallContact, height: float, cup_speed: float) -> list[tuple[float, float]]:
-    """Speeds (m/s, to the cup) at which a ball meets the bottom of a cup that rises or sinks, and
-    leaves it: by its energy in the cup's frame, since the impact is between two steps."""
+    """Return the speeds (m/s, relative to the cup) before and after a ball's impact on the bottom
+    of a rising or sinking cup, from its energy in the cup's frame, as the impact is between two
+    steps."""
     bottom = UPRIGHT.origin[2] - 0.07
     space.put_ball(BallState((0.3, 0.0, bottom + 0.02 + height), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     impacts, last, cup = [], space.ball(), UPRIGHT
@@ -69,7 +70,7 @@ def drop(space: BallContact, height: float, cup_speed: float) -> list[tuple[floa
 @pytest.mark.parametrize("restitution", [0.3, 0.5])
 @pytest.mark.parametrize("cup_speed", [0.0, 0.3, -0.3])
 @pytest.mark.parametrize("height", [0.05, 0.12, 0.28])
-def test_restitution_is_what_was_asked_for(
+def test_restitution_has_the_configured_value(
     site: Site,
     model: BallModel,
     physics: str,
@@ -86,7 +87,7 @@ def test_restitution_is_what_was_asked_for(
 
 
 @pytest.mark.parametrize("angle", [0.0, math.pi / 8, 1.9, math.pi])
-def test_the_cup_has_its_size(space: BallContact, angle: float) -> None:
+def test_the_cup_has_its_configured_size(space: BallContact, angle: float) -> None:
     """A ball at rest lies 20 mm over the bottom; in a cup on its side, 20 mm from the wall's inner
     face."""
     lying = rotation_from_vector(np.array([0.0, math.pi / 2, 0.0])) @ rotation_from_vector(
@@ -100,7 +101,7 @@ def test_the_cup_has_its_size(space: BallContact, angle: float) -> None:
             ball = space.step(cup, cup)
         local = turn.T @ (np.array(ball.position) - cup.origin)
         aside, height = places
-        # flat walls: a ball may also lie in an edge between two of them, 0.8 mm further out
+        # Walls are flat: a ball may also lie in an edge between two of them, 0.8 mm further out.
         assert aside - 2e-4 < math.hypot(local[0], local[1]) < aside + 1e-3
         assert height is None or local[2] == pytest.approx(height, abs=2e-4)
 
@@ -109,8 +110,8 @@ def test_the_cup_has_its_size(space: BallContact, angle: float) -> None:
 def test_sliding_on_the_table_agrees_with_the_closed_form(
     site: Site, space: BallContact, model: BallModel, share: float
 ) -> None:
-    """Two independent ways to the same motion: Bullet's contact solver, and the closed form without
-    rolling resistance."""
+    """Bullet's contact solver and the closed form without rolling resistance give the same
+    motion."""
     top = site.truth("A").table.top
     start = BallState(
         (1.6, 0.1, top + 0.02), (-1.2, 0.3, 0.0), model.spin_of_rolling(-1.2, 0.3, share)
@@ -129,8 +130,8 @@ def test_sliding_on_the_table_agrees_with_the_closed_form(
 def test_a_ball_that_slides_without_spin_ends_up_rolling(
     site: Site, model: BallModel, physics: str, factor: float, settles: float
 ) -> None:
-    """A solid ball at 5/7 of its speed, a hollow one at 3/5: friction keeps the angular momentum
-    about the line of contact."""
+    """A solid ball rolls at 5/7 of its speed, a hollow one at 3/5: friction conserves the angular
+    momentum about the line of contact."""
     space = make_space(site, replace(model, inertia_factor=factor), 0.3, physics)
     top = site.truth("A").table.top
     space.put_ball(BallState((2.0, 0.0, top + 0.02), (-1.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
@@ -144,10 +145,10 @@ def test_a_ball_that_slides_without_spin_ends_up_rolling(
 @pytest.mark.parametrize(
     ("along", "spin"), [(2.0, 0.0), (2.0, 90.0), (0.3, 0.0), (0.3, -40.0), (0.0, 60.0)]
 )
-def test_an_oblique_impact_spins_the_ball_as_coulomb_says(
+def test_an_oblique_impact_spins_the_ball_according_to_coulomb_friction(
     site: Site, space: BallContact, model: BallModel, along: float, spin: float
 ) -> None:
-    """On the table: the point of contact loses its slip, or as much of it as friction can take."""
+    """On the table the point of contact loses its slip, or as much of it as friction can remove."""
     table, restitution, friction, k = site.truth("A").table, 0.85, 0.2, model.inertia_factor
     fall = 0.045  # m
     space.put_ball(
@@ -165,7 +166,7 @@ def test_an_oblique_impact_spins_the_ball_as_coulomb_says(
 
 
 @pytest.mark.parametrize("aside", [0.030, 0.034, 0.046, 0.052, 0.058])
-def test_a_ball_that_falls_on_the_rim_leaves_along_its_normal(
+def test_a_ball_that_falls_on_the_rim_bounces_along_its_normal(
     site: Site, model: BallModel, physics: str, aside: float
 ) -> None:
     """Over the inner edge of the wall (40 mm), over the wall, and over its outer edge (43 mm), by
@@ -185,7 +186,7 @@ def test_a_ball_that_falls_on_the_rim_leaves_along_its_normal(
     push = 1.3 * math.sqrt(2.0 * 9.81 * fall) * up / 0.021
     late = 0.131 - math.sqrt(2.0 * fall / 9.81)
     expected = push * off / 0.021, push * up / 0.021 - math.sqrt(2.0 * 9.81 * fall) - 9.81 * late
-    # Bullet notices the impact where the ball overlaps the rim by up to 1 mm already.
+    # Bullet detects the impact when the ball already overlaps the rim by up to 1 mm.
     near = 0.1 if physics == BULLET else 0.01
     assert (ball.velocity[0], ball.velocity[2]) == pytest.approx(expected, abs=near)
     assert math.hypot(*ball.spin) < 1.0
@@ -204,8 +205,8 @@ def test_flight_agrees_with_the_closed_form(space: BallContact) -> None:
 
 
 def test_a_ball_rides_in_a_cup_that_turns_and_rises(space: BallContact) -> None:
-    """Contact velocities must be those of the moving cup: else the ball would be left behind or
-    thrown out."""
+    """Contact velocities must be those of the moving cup; otherwise the ball would be left behind
+    or thrown out."""
     space.put_ball(BallState((0.3, 0.0, 0.351), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     cup = UPRIGHT
     for k in range(1, 801):
@@ -221,7 +222,7 @@ def test_a_ball_rides_in_a_cup_that_turns_and_rises(space: BallContact) -> None:
 
 
 def side(cup: Frame3, ball: BallState) -> str:
-    """Where the ball's centre is: in the cup, over its mouth, or elsewhere."""
+    """Return where the ball's centre is: in the cup, over its mouth, or elsewhere."""
     local = cup.rotation().T @ (np.array(ball.position) - cup.origin)
     if math.hypot(local[0], local[1]) < 0.0415:
         if -0.0715 < local[2] < 0.0:
@@ -232,8 +233,8 @@ def side(cup: Frame3, ball: BallState) -> str:
 
 
 def shoot(space: BallContact, rng: np.random.Generator) -> set[tuple[str, str]]:
-    """A ball shot at a cup that moves and turns, from anywhere or into the mouth; gives the changes
-    of place that were seen."""
+    """Shoot a ball at a moving and turning cup, from anywhere or into the mouth; return the
+    observed changes of region."""
     velocity, spin = rng.uniform(-1.0, 1.0, 3), rng.uniform(-2.0, 2.0, 3)
     turn, place = rotation_from_vector(rng.uniform(-1.2, 1.2, 3)), np.array([0.0, 0.0, 0.5])
     middle = place - 0.035 * turn[:, 2]
@@ -258,16 +259,16 @@ def shoot(space: BallContact, rng: np.random.Generator) -> set[tuple[str, str]]:
 
 
 @pytest.mark.parametrize("seed", range(60))
-def test_nothing_passes_a_wall_or_the_bottom(space: BallContact, seed: int) -> None:
-    """In and out of the cup only by its mouth, at up to 5 m/s to a cup that moves at 1.7 m/s and
-    turns at 3.5 rad/s."""
+def test_nothing_passes_through_a_wall_or_the_bottom(space: BallContact, seed: int) -> None:
+    """The ball enters and leaves the cup only through its mouth, at up to 5 m/s relative to a cup
+    that moves at 1.7 m/s and turns at 3.5 rad/s."""
     rng = np.random.default_rng(seed)
     changes = set().union(*(shoot(space, rng) for _ in range(4)))
     assert not changes & {("in", "out"), ("out", "in")}
 
 
 @pytest.mark.proof
-def test_nothing_passes_a_wall_in_many_thousand_shots(space: BallContact) -> None:
+def test_nothing_passes_through_a_wall_in_many_thousand_shots(space: BallContact) -> None:
     rng = np.random.default_rng(2026)
     entered = 0
     for _ in range(5000):

@@ -1,5 +1,5 @@
-"""A drive's quick way through a cycle against the base class's steps: the same frames, whatever the
-master does."""
+"""A drive's fast path through a cycle against the steps of the base class: the same frames for any
+sequence of the master."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ READ = (
 
 
 class Joints:
-    """Six joints that follow their torques as flywheels do, against some friction."""
+    """Six joints that behave like flywheels with some friction."""
 
     def __init__(self) -> None:
         self.q, self.qd, self.braked = [0.0] * 6, [0.0] * 6, [True] * 6
@@ -53,7 +53,7 @@ class Joints:
         self.braked[joint] = False
 
     def slow_down(self, factor: float) -> None:
-        """Its drives tell; the flywheels do not care."""
+        """Ignore the slow-down: flywheels have none."""
 
     def step(self, dt: float, tau: Any) -> None:
         for joint, torque in enumerate(tau):
@@ -63,7 +63,7 @@ class Joints:
 
 
 class StepByStep(ServoDrive):
-    """A drive that never takes the quick way."""
+    """A drive that never uses the fast path."""
 
     def after_configuring(self) -> None:
         super().after_configuring()
@@ -71,7 +71,7 @@ class StepByStep(ServoDrive):
 
 
 class CycleBench:
-    """A bus of one kind of drives, and what they have sent."""
+    """A bus with one kind of drive, and the frames that they sent."""
 
     def __init__(self, kind: type[ServoDrive], monkeypatch: pytest.MonkeyPatch) -> None:
         with monkeypatch.context() as patch:
@@ -105,8 +105,8 @@ class CycleBench:
         assert not client.failure
 
     def cycle(self, word: int, odd: int | None, asks: bool) -> None:
-        """A cycle with this controlword (the `odd` drive gets another one); perhaps a client reads
-        objects behind it."""
+        """Run a cycle with this controlword (the `odd` drive gets another one); a client may read
+        objects after it."""
         frames = [
             Frame(
                 canopen.RPDO1_BASE + 1 + k, RPDO.pack(0x6 if k == odd else word, to_units(target))
@@ -159,7 +159,9 @@ happenings = st.tuples(
 
 @settings(max_examples=60, deadline=None)
 @given(course=st.lists(happenings, min_size=1, max_size=40))
-def test_the_quick_way_sends_what_the_steps_send(course: list[tuple[str, int, bool]]) -> None:
+def test_the_fast_path_sends_the_same_frames_as_the_steps(
+    course: list[tuple[str, int, bool]],
+) -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:
         benches = [CycleBench(kind, monkeypatch) for kind in (ServoDrive, StepByStep)]
     quick = 0
@@ -178,11 +180,11 @@ def test_the_quick_way_sends_what_the_steps_send(course: list[tuple[str, int, bo
     assert benches[0].sent == benches[1].sent
     assert benches[0].bus.plant.q == benches[1].bus.plant.q
     assert all(drive._said is None for drive in benches[1].bus.drives)
-    assert quick or any(what != "aim" for what, _, _ in course), "the quick way was never gone"
+    assert quick or any(what != "aim" for what, _, _ in course), "the fast path was never used"
 
 
-def test_a_bench_of_aims_goes_the_quick_way() -> None:
-    """Else the comparison above would compare the same with the same."""
+def test_a_bench_with_the_fast_drives_uses_the_fast_path() -> None:
+    """Otherwise the comparison above would compare the slow path with itself."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         bench = CycleBench(ServoDrive, monkeypatch)
     for word in WORDS + [WORDS[-1]] * 5:

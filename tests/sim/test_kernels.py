@@ -1,5 +1,5 @@
-"""Kernels against the laws they stand for, and, where numba is there, compiled against as they
-stand: the same to the bit."""
+"""Kernels against the physical laws that they implement and, if numba is installed, compiled
+against plain code: equal to the bit."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def sixes(low: float, high: float) -> st.SearchStrategy[Six]:
 
 
 def inverse_of(seed: int) -> Matrix:
-    """Inverse of a mass matrix: symmetric, positive."""
+    """Return the inverse of a mass matrix: symmetric, positive definite."""
     half = np.random.default_rng(seed).normal(size=(6, 6))
     matrix = np.linalg.inv(half @ half.T + 3.0 * np.eye(6))
     a, b, c, d, e, f = (tuple((0.5 * (matrix + matrix.T))[k].tolist()) for k in range(6))
@@ -50,7 +50,7 @@ def inverse_of(seed: int) -> Matrix:
 
 
 def bits(*values: Any) -> list[bytes]:
-    """The bytes of every number in nested tuples."""
+    """Return the bytes of every number in nested tuples."""
     flat: list[bytes] = []
     for value in values:
         flat += bits(*value) if isinstance(value, tuple) else [struct.pack("<d", float(value))]
@@ -66,7 +66,7 @@ def bits(*values: Any) -> list[bytes]:
         (50.0, 2.0, 10.0),  # at its greatest speed
         (50.0, 2.15, 5.0),  # half the fade of 15 %
         (50.0, 2.4, 0.0),
-        (-50.0, 2.4, -10.0),  # braking is never faded
+        (-50.0, 2.4, -10.0),  # The limit does not fade when braking.
         (-50.0, -2.15, -5.0),
         (50.0, -2.15, 10.0),
     ],
@@ -79,7 +79,9 @@ def test_a_motor_keeps_its_limits(tau: float, speed: float, given_torque: float)
 @given(
     qd=sixes(-2.0, 2.0), drive=sixes(-90.0, 90.0), bias=sixes(-40.0, 40.0), seed=st.integers(0, 99)
 )
-def test_without_friction_the_law_is_newtons(qd: Six, drive: Six, bias: Six, seed: int) -> None:
+def test_without_friction_newtons_second_law_holds(
+    qd: Six, drive: Six, bias: Six, seed: int
+) -> None:
     inverse = inverse_of(seed)
     friction, speed = accelerated(0.002, qd, drive, bias, inverse, ZERO, ZERO, ZERO)
     expected = np.array(qd) + 0.002 * np.array(inverse) @ (np.array(drive) - np.array(bias))
@@ -90,8 +92,8 @@ def test_without_friction_the_law_is_newtons(qd: Six, drive: Six, bias: Six, see
 @settings(max_examples=60, deadline=None)
 @given(qd=sixes(-2.0, 2.0), hold=sixes(0.0, 30.0), gains=sixes(0.01, 2.0))
 def test_dry_friction_brings_uncoupled_joints_to_rest(qd: Six, hold: Six, gains: Six) -> None:
-    """Joints that do not feel each other lose `hold` times their gain a second, and then stand:
-    they never turn round."""
+    """Uncoupled joints lose `hold` times their gain in speed per second and then stand still: they
+    never reverse."""
     dt, friction, speed = 0.002, ZERO, qd
     inverse: Any = tuple(map(tuple, np.diag(gains).tolist()))
     for step in range(1, 30):
@@ -168,7 +170,7 @@ def test_a_compiled_step_gives_the_same_bits(
     hold=sixes(0.0, 30.0),
     seed=st.integers(0, 99),
 )
-def test_numbers_that_come_packed_give_the_same_bits(
+def test_packed_numbers_give_the_same_bits(
     q: Six, qd: Six, tau: Six, bias: Six, friction: Six, hold: Six, seed: int
 ) -> None:
     limit, greatest, inverse = (90.0,) * 6, (2.0,) * 6, inverse_of(seed)
@@ -200,7 +202,7 @@ TRIPLE = st.tuples(*[st.floats(-1.0, 1.0, allow_subnormal=False)] * 3)
     axes=st.tuples(TRIPLE, TRIPLE, TRIPLE),
     origin=TRIPLE,
 )
-def test_what_the_flange_carries_is_where_the_arms_frames_put_it_to_the_bit(
+def test_the_pose_of_the_load_equals_that_of_the_arms_frames_to_the_bit(
     arm: PumaModel, q: Six, zero: Six, axes: tuple[Triple, Triple, Triple], origin: Triple
 ) -> None:
     numbers = numbers_of(arm, zero, axes, origin)
@@ -215,7 +217,7 @@ def test_what_the_flange_carries_is_where_the_arms_frames_put_it_to_the_bit(
     )
 
 
-def test_numbers_are_packed_for_compiled_kernels_alone() -> None:
+def test_numbers_are_packed_only_for_compiled_kernels() -> None:
     assert packed(compiled.plain(stepped_packed), [1, 2.5]) == (1.0, 2.5)
     if COMPILED:
         array: Any = packed(stepped_packed, [1, 2.5])
@@ -224,8 +226,8 @@ def test_numbers_are_packed_for_compiled_kernels_alone() -> None:
 
 @pytest.mark.processes
 def test_numba_can_be_left_out() -> None:
-    """The switch in the environment: kernels run as they stand, whether numba is installed or
-    not."""
+    """A variable of the environment makes kernels run as plain Python even if numba is
+    installed."""
     code = (
         "import sys; import petrobot.sim.catching.arm_motion as m; print(type(m.stepped).__name__, "
         "'numba' in sys.modules)"

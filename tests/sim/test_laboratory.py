@@ -35,8 +35,8 @@ Digests = Callable[..., list[str]]
 def test_the_oracles_poses_do_catch_in_the_whole_cell(
     bench: Benches, site: Site, regime: str
 ) -> None:
-    """Drives, arm, cup and ball together: a catcher that knows the oracle's pose catches what it
-    calls reachable."""
+    """Drives, arm, cup and ball together: a catcher that knows the oracle's pose catches the balls
+    that the oracle calls reachable."""
     here = bench(seed=11, regime=regime)
     here.enable()
     here.want_images(0.001)
@@ -98,7 +98,9 @@ def test_images_come_at_their_rate_with_their_true_age(bench: Benches) -> None:
 
 
 @pytest.mark.parametrize(("regime", "age"), [("A+latency200", 0.208), ("A+latency400", 0.408)])
-def test_latency_delays_images_and_they_say_so(bench: Benches, regime: str, age: float) -> None:
+def test_latency_delays_images_and_is_part_of_their_age(
+    bench: Benches, regime: str, age: float
+) -> None:
     here = bench(seed=1, regime=regime)
     here.want_images(25.0)
     here.wait(0.6)
@@ -106,7 +108,7 @@ def test_latency_delays_images_and_they_say_so(bench: Benches, regime: str, age:
     assert [body["age"] for _, body in here.images] == pytest.approx([age] * len(here.images))
 
 
-def test_stated_ages_scatter_in_the_regime_that_says_so(bench: Benches) -> None:
+def test_stated_ages_scatter_in_the_regime_of_scattered_ages(bench: Benches) -> None:
     here = bench(seed=1, regime="A+jitter")
     here.want_images(50.0)
     here.wait(4.0)
@@ -115,25 +117,25 @@ def test_stated_ages_scatter_in_the_regime_that_says_so(bench: Benches) -> None:
     assert errors.min() >= -0.008 - 1e-9
 
 
-def test_images_are_lost_in_the_regime_that_says_so(bench: Benches) -> None:
+def test_images_are_lost_in_the_regime_of_lost_images(bench: Benches) -> None:
     here = bench(seed=1, regime="A+dropped_images")
     here.want_images(50.0)
     here.wait(4.0)
     assert len(here.images) == pytest.approx(140, abs=25)
 
 
-def test_frames_are_lost_in_the_regime_that_says_so(bench: Benches) -> None:
+def test_frames_are_lost_in_the_regime_of_lost_frames(bench: Benches) -> None:
     here = bench(seed=1, regime="A")
     here.enable()
     here.lab.truth = replace(here.lab.truth, scatter=Scatter(frames_lost=0.3))
     begun = here.master.heard()
     here.wait(4.0)
-    # an answer needs the SYNC (0.7) and its own way back (0.7)
+    # An answer needs the SYNC (0.7) and its own transmission (0.7).
     assert (here.master.heard() - begun) / (1000 * 6) == pytest.approx(0.49, abs=0.04)
 
 
 def brightening(here: Bench, ball: tuple[float, float, float], velocity: Any) -> Any:
-    """By how much (grey levels) a ball changes the image around its middle."""
+    """Return by how much (grey levels) a ball changes the image around its centre."""
     camera = here.lab.camera()
     u, v, _ = (round(x) for x in camera.pixel(ball))
     window = slice(v - 30, v + 30), slice(u - 30, u + 30)
@@ -149,7 +151,7 @@ def test_a_bridge_hides_the_ball(bench: Benches) -> None:
 
 
 def test_a_blurred_ball_is_longer(bench: Benches) -> None:
-    """3 m/s for 16 ms instead of 4: 48 mm and 12 mm, beside the ball's own 40 mm."""
+    """3 m/s for 16 ms instead of 4 ms: 48 mm and 12 mm, in addition to the ball's own 40 mm."""
     lengths = []
     for regime in ("B", "B+blur"):
         change = brightening(bench(seed=3, regime=regime), (1.5, 0.0, 0.62), (-3.0, 0.0, 0.0))
@@ -158,7 +160,7 @@ def test_a_blurred_ball_is_longer(bench: Benches) -> None:
     assert 1.3 < lengths[1] / lengths[0] < 2.0
 
 
-def test_a_second_ball_rolls_beside_half_of_the_others(bench: Benches) -> None:
+def test_a_second_ball_rolls_with_half_of_the_balls(bench: Benches) -> None:
     here = bench(seed=3, regime="B+two_balls")
     seconds = [here.lab._throw_second(0.0, n) for n in range(1, 201)]
     assert sum(one is not None for one in seconds) == pytest.approx(100, abs=25)
@@ -171,12 +173,12 @@ def test_a_second_ball_rolls_beside_half_of_the_others(bench: Benches) -> None:
     assert image[v, u] - int(here.lab.camera().background[v, u]) > 25
 
 
-def test_a_cup_of_another_size_is_seen_and_touched(bench: Benches) -> None:
+def test_a_cup_of_another_size_changes_image_and_contact(bench: Benches) -> None:
     here = bench(seed=1, regime="A+cup50")
     assert here.lab.camera().cup_radius == here.lab.truth.cup.radius == 0.025
 
 
-def test_a_new_wish_drops_what_was_exposed_for_the_old_one(bench: Benches) -> None:
+def test_a_new_request_drops_images_exposed_for_the_old_one(bench: Benches) -> None:
     here = bench(seed=1, regime="A+latency200")
     here.want_images(50.0)
     here.wait(0.1)
@@ -190,7 +192,7 @@ def test_a_new_wish_drops_what_was_exposed_for_the_old_one(bench: Benches) -> No
     assert len(here.images) == count
 
 
-def test_exposures_keep_their_clock_whatever_rate() -> None:
+def test_exposures_keep_their_clock_at_any_rate() -> None:
     exposures = Exposures()
     exposures.want(0.0, 30.0, 1)
     taken = [k * TICK for k in range(2500) if exposures.due(k * TICK)]
@@ -239,10 +241,10 @@ def test_bus_off_silences_the_bus_both_ways(bench: Benches) -> None:
     here.master.move(here.now, [angle + 0.05 for angle in here.home])
     here.wait(0.09)
     assert (here.master.position == seen).all()
-    assert abs(here.lab.plant.q[0] - here.home[0]) < 0.01  # the set points did not come through
+    assert abs(here.lab.plant.q[0] - here.home[0]) < 0.01  # The set points did not arrive.
 
 
-def test_lost_frames_are_lost_at_the_share_asked_for(bench: Benches) -> None:
+def test_frames_are_lost_at_the_configured_rate(bench: Benches) -> None:
     here = bench(seed=1)
     here.enable()
     fault(here, "can_errors", share=0.3)
@@ -250,7 +252,7 @@ def test_lost_frames_are_lost_at_the_share_asked_for(bench: Benches) -> None:
     heard = here.master.heard
     begun = heard()
     here.wait(4.0)
-    # an answer needs the SYNC (0.7) and its own way back (0.7)
+    # An answer needs the SYNC (0.7) and its own transmission (0.7).
     assert (heard() - begun) / (1000 * 6) == pytest.approx(0.49, abs=0.04)
     fault(here, "clear")
     here.wait(0.1)
@@ -272,7 +274,7 @@ def test_a_slow_arm_is_slow(bench: Benches) -> None:
     assert 0.1 < fastest < 0.36 * here.lab.plant.model.speed[0]
 
 
-def test_arm_power_falls_and_comes_back(bench: Benches) -> None:
+def test_arm_power_fails_and_returns(bench: Benches) -> None:
     here = bench(seed=1)
     here.enable()
     fault(here, "arm_power", duration=0.2)
@@ -296,7 +298,7 @@ def test_arm_power_falls_and_comes_back(bench: Benches) -> None:
         ({}, "unknown fault ''"),
     ],
 )
-def test_a_fault_that_cannot_be_is_refused(
+def test_an_invalid_fault_is_refused(
     bench: Benches, arguments: dict[str, object], says: str
 ) -> None:
     outcome = bench().call("laboratory_fault", **arguments)
@@ -330,7 +332,7 @@ def test_prepare_begins_a_new_experiment(bench: Benches) -> None:
 
 
 def test_every_ball_is_counted(bench: Benches) -> None:
-    """One that is caught, one for which the arm does not move; one is still rolling."""
+    """One ball is caught, for one the arm does not move, and one is still rolling."""
     here = bench(seed=1)
     here.enable()
     here.want_images(0.001)
@@ -358,7 +360,7 @@ def test_every_ball_is_counted(bench: Benches) -> None:
     ]
 
 
-def test_a_throw_takes_the_status_of_its_cycle(bench: Benches) -> None:
+def test_a_throw_has_the_status_of_its_cycle(bench: Benches) -> None:
     here = bench(seed=1)
     here.enable()
     here.want_images(0.001)
@@ -382,7 +384,7 @@ def test_a_throw_takes_the_status_of_its_cycle(bench: Benches) -> None:
         ({"throws": 1.5}, "or none, got 1.5"),
     ],
 )
-def test_a_preparation_that_cannot_be_is_refused(
+def test_an_invalid_preparation_is_refused(
     bench: Benches, arguments: dict[str, object], says: str
 ) -> None:
     outcome = bench().call("laboratory_prepare", **arguments)
@@ -393,10 +395,10 @@ def test_a_preparation_that_cannot_be_is_refused(
 
 
 @pytest.mark.processes
-def test_the_same_seed_gives_the_same_bits_here_and_in_fresh_processes(
+def test_the_same_seed_gives_the_same_bits_here_and_in_new_processes(
     digests: Digests, physics: str
 ) -> None:
-    """Frames, pixels and score; also when the laboratory had been prepared for another run before,
+    """Frames, pixels and score are equal; also after the laboratory was prepared for another run,
     and with and without numba."""
     here = digests(3, "B+drift", physics)
     file = str(Path(__file__).with_name("conftest.py"))
@@ -419,5 +421,5 @@ def test_the_same_seed_gives_the_same_bits_here_and_in_fresh_processes(
     assert digests(4, "B+drift", physics) != here
 
 
-def test_outcomes_are_plain_words() -> None:
+def test_outcomes_have_readable_names() -> None:
     assert {str(outcome) for outcome in ThrowOutcome} == {"rolling", "caught", "missed", "dropped"}

@@ -34,7 +34,8 @@ def test_nearly_every_ball_of_the_regimes_can_be_reached(
 
 @pytest.mark.parametrize("regime", ["A", "C"])
 def test_its_poses_hold_the_cup_where_the_ball_will_be(site: Site, regime: str) -> None:
-    """By the mount's and the arm's own forward kinematics, the ball's course by its closed form."""
+    """Checked with the forward kinematics of mount and arm, and the closed form of the ball's
+    path."""
     from petrobot.sim.catching.ball import BallModel, TableMotion, fly
 
     truth = site.truth(regime)
@@ -60,8 +61,8 @@ def test_its_poses_hold_the_cup_where_the_ball_will_be(site: Site, regime: str) 
 @settings(max_examples=30, deadline=None)
 @given(way=st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6))
 def test_travel_time_is_that_of_the_slowest_joint(site: Site, way: list[float]) -> None:
-    """Integrated numerically: full acceleration, cruise at the limit, full braking covers at least
-    the way."""
+    """Integrated numerically, full acceleration, cruise at the limit and full braking cover at
+    least the distance."""
     oracle = Oracle(site.arm, site.truth("A"), site.cell)
     total = float(oracle.travel_time(np.array(way)))
     covered = []
@@ -103,8 +104,8 @@ def test_a_ball_that_never_leaves_the_near_edge_is_out_of_reach(site: Site) -> N
 
 
 def best_by_closed_form(site: Site, truth: Truth, oracle: Oracle, n: int) -> float:
-    """Best margin over finely sampled moments, tilts and turns of the cup, with motion's
-    closed-form inverse kinematics."""
+    """Return the best margin over finely sampled times, tilts and rotations of the cup, with the
+    closed-form inverse kinematics of `motion`."""
     from petrobot.services.motion.kinematics import Puma
     from petrobot.services.motion.model import nominal_arm
     from petrobot.sim.catching.ball import BallModel, TableMotion
@@ -146,7 +147,7 @@ def best_by_closed_form(site: Site, truth: Truth, oracle: Oracle, n: int) -> flo
 
 @pytest.mark.parametrize("regime", ["A", "C+arm30"])
 def test_verdicts_agree_with_closed_form_kinematics(site: Site, regime: str) -> None:
-    """The numerical search finds (nearly) what exhaustive closed-form sampling finds, and no
+    """The numerical search finds nearly the margin of exhaustive closed-form sampling, and never
     more."""
     truth = site.truth(regime)
     agreed = 0

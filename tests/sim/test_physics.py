@@ -1,5 +1,5 @@
-"""The seam between the laboratory and its mechanics: which back end is chosen, that the package
-runs without PyBullet, and that records of two back ends are never mixed."""
+"""The interface between the laboratory and its mechanics: which back end is chosen, that the
+package runs without PyBullet, and that records of two back ends are never mixed."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_without_a_name_bullet_is_chosen_where_it_is_installed(
         assert choose(PORTABLE) == PORTABLE
 
 
-def test_a_back_end_that_cannot_be_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unavailable_back_end_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(LaboratoryError, match='expected "bullet" or "portable", got \'mujoco\''):
         choose("mujoco")
     monkeypatch.setattr(seam, "find_spec", lambda name: None)
@@ -87,7 +87,7 @@ def test_services_toml_and_the_laboratory_file_name_the_back_end(
     ("key", "laboratory", "where"),
     [('physics = "ode"', "", "[nodes.laboratory]"), ("", 'physics = "ode"', "laboratory.toml")],
 )
-def test_a_wrong_name_is_refused_where_it_stands(
+def test_a_wrong_name_is_refused_with_its_position(
     tmp_path: Path, key: str, laboratory: str, where: str
 ) -> None:
     with pytest.raises(LaboratoryError) as caught:
@@ -95,12 +95,12 @@ def test_a_wrong_name_is_refused_where_it_stands(
     assert where in str(caught.value) and "'ode'" in str(caught.value)
 
 
-def test_a_laboratory_with_one_physics_names_none() -> None:
+def test_a_laboratory_with_only_one_physics_does_not_name_it() -> None:
     assert physics_of(load(ROOT / "services" / "mobile" / "track.services.toml")) == ""
 
 
 @needs_bullet
-def test_bullet_states_the_version_that_is_installed() -> None:
+def test_bullet_reports_the_installed_version() -> None:
     assert version(BULLET) == FIRST_PHYSICS
 
 
@@ -109,7 +109,7 @@ def test_old_records_count_as_bullets() -> None:
     assert not same_physics("", NOW) and not same_physics(NOW, FIRST_PHYSICS)
 
 
-def test_pybullet_is_imported_by_its_own_module_alone() -> None:
+def test_only_one_module_imports_pybullet() -> None:
     found = []
     for folder in ("coordinator", "services", "sim"):
         for file in sorted((ROOT / folder).rglob("*.py")):
@@ -128,8 +128,8 @@ def test_pybullet_is_imported_by_its_own_module_alone() -> None:
 
 @pytest.mark.processes
 def test_a_whole_run_without_pybullet_and_its_records(tmp_path: Path) -> None:
-    """As on a computer for which there is no PyBullet: two balls are caught, and journal, result
-    and estimates name the portable back end."""
+    """As on a computer without PyBullet: two balls are caught, and journal, result and estimates
+    name the portable back end."""
     program = (
         "import sys; sys.modules['pybullet'] = None\n"
         "from petrobot.coordinator.cli import main\n"
@@ -189,7 +189,7 @@ def some_estimates() -> Estimates:
 def test_estimates_of_two_physics_are_not_merged(
     tmp_path: Path, mine: str, other: str, fits: bool
 ) -> None:
-    """An empty name stands for a file that was written before files named it."""
+    """An empty name stands for a file written before files named their physics."""
     files = [EstimatesFile(tmp_path / name) for name in ("mine", "other")]
     for file, physics in zip(files, (mine, other), strict=True):
         file.add(some_estimates(), {}, physics=physics)
@@ -202,7 +202,7 @@ def test_estimates_of_two_physics_are_not_merged(
     with pytest.raises(EstimatesError, match="different physics are not pooled"):
         files[0].add(some_estimates(), {}, physics=other)
     files[0].reset()
-    files[0].add(some_estimates(), {}, physics=other)  # an emptied file takes any
+    files[0].add(some_estimates(), {}, physics=other)  # An emptied file accepts any physics.
     assert files[0].read().physics == other
 
 

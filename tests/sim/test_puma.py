@@ -1,4 +1,4 @@
-"""The arm against published values, against mechanics that no back end has a part in, and the back
+"""The arm against published values, against mechanics independent of both back ends, and the back
 ends against each other."""
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tests.sim.conftest import needs_bullet
 
 GRAVITY = 9.81
 ANGLES = st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6)
-"""Joint angles as shares of the way from the middle of the limits to their ends."""
+"""Joint angles as fractions of the range from the middle of the limits to their ends."""
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def angles(arm: PumaModel, shares: list[float]) -> Six:
 
 
 def potential_energy(arm: PumaModel, q: Sequence[float]) -> float:
-    """From masses and heights alone (J)."""
+    """Return the potential energy (J) from masses and heights alone."""
     frames = arm.frames(q)
     return sum(
         GRAVITY * link.mass * frame.point(link.centre)[2]
@@ -73,11 +73,13 @@ QN: Six = (0.0, math.pi / 4, math.pi, 0.0, math.pi / 4, 0.0)
     ("q", "torques"),
     [(QZ, [0, 37.4837, 0.2489, 0, 0, 0]), (QN, [0, 31.6399, 6.0351, 0, 0.0283, 0])],
 )
-def test_gravity_is_the_published_one(body: ArmDynamics, q: Six, torques: list[float]) -> None:
+def test_gravity_equals_the_published_values(
+    body: ArmDynamics, q: Six, torques: list[float]
+) -> None:
     assert body.bias(q, QZ) == pytest.approx(torques, abs=1e-4)
 
 
-def test_mass_matrix_is_the_published_one(arm: PumaModel, body: ArmDynamics) -> None:
+def test_the_mass_matrix_equals_the_published_one(arm: PumaModel, body: ArmDynamics) -> None:
     published = [
         [3.6594, -0.4044, 0.1006, -0.0025, 0.0, 0.0],
         [-0.4044, 4.4137, 0.3509, 0.0, 0.0024, 0.0],
@@ -93,7 +95,7 @@ def test_mass_matrix_is_the_published_one(arm: PumaModel, body: ArmDynamics) -> 
     assert mass[1:, 1:] == pytest.approx(np.array(published)[1:, 1:], abs=1e-3)
 
 
-def test_zero_pose_is_the_published_one(arm: PumaModel) -> None:
+def test_the_zero_pose_equals_the_published_one(arm: PumaModel) -> None:
     assert arm.flange_frame(QZ).origin == pytest.approx((0.4521, -0.15005, 0.4318 + 0.67183))
 
 
@@ -117,7 +119,7 @@ LOAD = PrincipalInertia(0.08, (0.01, 0.09, 0.05), (1.1e-4, 2.0e-4, 1.5e-4))
 
 
 def any_arm(arm: PumaModel, rng: np.random.Generator) -> PumaModel:
-    """An arm with all lengths, twists, masses, centres and inertias drawn anew: none is zero."""
+    """Draw an arm with random lengths, twists, masses, centres and inertias, none of them zero."""
     alpha = rng.uniform(-3.0, 3.0, 6).tolist()
     return replace(
         arm,
@@ -137,8 +139,8 @@ def any_arm(arm: PumaModel, rng: np.random.Generator) -> PumaModel:
 @needs_bullet
 @pytest.mark.parametrize("case", ["bare", "loaded", *range(6)])
 def test_the_back_ends_agree_on_the_arm(arm: PumaModel, case: str | int) -> None:
-    """The shipped arm without and with its cup, and arms that have no zero anywhere; 1,000 states
-    each, to 1e-12 of the largest torque (N m) and inertia (kg m^2)."""
+    """Tried with the shipped arm without and with its cup, and with arms without any zero; 1,000
+    states each, equal to 1e-12 of the largest torque (N m) and inertia (kg m^2)."""
     rng = np.random.default_rng(7)
     if isinstance(case, int):
         rng = np.random.default_rng(case)
@@ -158,7 +160,7 @@ def sixes(rng: np.random.Generator, most: float) -> Six:
 
 
 def any_puma(arm: PumaModel, rng: np.random.Generator) -> PumaModel:
-    """An arm with the geometry of a PUMA whose other numbers are all drawn: none is zero."""
+    """Draw an arm with the geometry of a PUMA and random other numbers, none of them zero."""
     drawn = any_arm(arm, rng)
     d, a = drawn.d, drawn.a
     return replace(
@@ -171,11 +173,11 @@ def any_puma(arm: PumaModel, rng: np.random.Generator) -> PumaModel:
 
 
 @pytest.mark.parametrize("case", range(6))
-def test_the_algorithms_without_their_zeros_agree_with_the_whole_ones(
+def test_the_algorithms_without_zero_terms_agree_with_the_general_ones(
     arm: PumaModel, case: int
 ) -> None:
-    """The shipped arm (case 0), arms with the geometry of a PUMA (1, 2) and any arms: bias and mass
-    matrix within 1e-12 of the general recursion, in plain Python and compiled to the same bits."""
+    """Tried with the shipped arm (case 0), arms with the geometry of a PUMA (1, 2) and any arms: bias
+    and mass matrix equal the general recursion within 1e-12, plain and compiled code to the bit."""
     rng = np.random.default_rng(case)
     if case:
         arm = (any_puma if case < 3 else any_arm)(arm, rng)
@@ -220,8 +222,8 @@ def test_mass_matrix_is_symmetric_and_positive(
 
 
 def test_every_published_tensor_counts(arm: PumaModel, body: ArmDynamics, physics: str) -> None:
-    """Bullet silently zeroes an impossible tensor: moments of inertia about each joint must
-    count."""
+    """Bullet silently sets an impossible tensor to zero, so the inertia about each joint is
+    checked."""
     links = tuple(
         PrincipalInertia(n.mass, n.centre, (2 * n.inertia[0], 2 * n.inertia[1], 2 * n.inertia[2]))
         for n in arm.links
@@ -252,7 +254,7 @@ def released(
     return plant
 
 
-def test_energy_is_kept_without_friction(arm: PumaModel, physics: str) -> None:
+def test_energy_is_conserved_without_friction(arm: PumaModel, physics: str) -> None:
     free = without_friction(arm)
     body, start = arm_dynamics(physics, free, GRAVITY), (0.3, 0.9, -1.6, 0.4, 0.8, 0.0)
     plant = released(physics, free, start)
@@ -293,7 +295,7 @@ def test_brakes_hold_and_stop_the_arm(arm: PumaModel, physics: str) -> None:
 def test_dry_friction_holds_up_to_its_limit(
     arm: PumaModel, torque: float, moves: bool, physics: str
 ) -> None:
-    """Joint 1 feels no gravity; its dry friction is 62.6 x 0.415 = 26 N m."""
+    """Gravity has no effect on joint 1; its dry friction is 62.6 x 0.415 = 26 N m."""
     plant = released(physics, arm, arm.poses["home"].tolist(), range(1))
     for _ in range(100):
         plant.step(0.001, [torque, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -349,8 +351,8 @@ def test_step_size_hardly_matters(arm: PumaModel, physics: str) -> None:
 
 
 def _follow(site: Site, dt: float, physics: str) -> Vector:
-    """Joint angles (n, 6) every 4 ms of an arm whose drives follow a sweep of all joints to and
-    fro, in steps of `dt` s."""
+    """Return joint angles (n, 6) every 4 ms of an arm whose drives follow a sweep of all joints
+    back and forth, in steps of `dt` s."""
     arm, home = site.arm, site.arm.poses["home"]
     plant = ArmPlant(arm, GRAVITY, home.tolist(), physics=physics)
     servos = [
@@ -373,9 +375,9 @@ def _follow(site: Site, dt: float, physics: str) -> Vector:
     return np.array(path)
 
 
-def test_steps_of_2_ms_lead_the_arm_the_same_way_as_those_of_1_ms(site: Site, physics: str) -> None:
-    """No less so than steps of 1 ms and of a quarter of that: what is left is the integration, not
-    a lag."""
+def test_steps_of_2_ms_give_the_same_motion_as_those_of_1_ms(site: Site, physics: str) -> None:
+    """They agree as well as steps of 1 ms and of a quarter of that: the remaining difference is the
+    integration error, not a lag."""
     coarse, usual, fine = (_follow(site, dt, physics) for dt in (0.002, 0.001, 0.00025))
     assert np.abs(usual - usual[0]).max() > 0.15
     assert np.abs(usual - fine).max() < 1e-3

@@ -1,4 +1,4 @@
-"""The laboratory on the wall clock, over its sockets; and as a process of its own."""
+"""The laboratory in wall-clock time, over its sockets; and as a separate process."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ async def test_world_keeps_pace_with_the_clock(shell: LaboratoryShell) -> None:
     began, world, slipped = loop.time(), lab.now, pacemaker.slipped
     await until(lambda: lab.now - world > 0.5)
     took = loop.time() - began - (pacemaker.slipped - slipped)
-    assert lab.now - world < took + 2 * TICK  # never ahead of the clock
+    assert lab.now - world < took + 2 * TICK  # It is never ahead of the clock.
     assert took - (lab.now - world) < 0.3
 
 
@@ -138,7 +138,7 @@ async def test_images_come_with_their_age_and_stop_when_asked(shell: LaboratoryS
 async def test_services_are_answered(
     shell: LaboratoryShell, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """And logged: each preparation, and each call that is refused."""
+    """Each preparation and each refused call is logged."""
     caplog.set_level(logging.INFO, "petrobot.sim")
     assert (
         await ask(shell, "laboratory_prepare", seed=7, regime="B+miscalibrated", runs=3)
@@ -157,8 +157,8 @@ async def test_services_are_answered(
     assert "of laboratory_prepare ended: error" in logged[1] and refused.text in logged[1]
 
 
-async def test_it_says_how_it_is(shell: LaboratoryShell) -> None:
-    """At once: who asks takes a node that does not answer for a frozen one."""
+async def test_it_answers_a_status_command(shell: LaboratoryShell) -> None:
+    """It answers at once: the client would treat a node that does not answer as frozen."""
     answered: list[Answer] = []
 
     def hear(_: float, notices: list[Notice]) -> None:
@@ -209,7 +209,7 @@ async def test_a_fault_of_the_world_ends_the_shell(
         ),
     ],
 )
-def test_two_buses_or_cameras_are_one_too_many(tmp_path: Path, extra: str, says: str) -> None:
+def test_a_second_bus_or_camera_is_refused(tmp_path: Path, extra: str, says: str) -> None:
     directory = load(services_file(tmp_path, extra))
     with pytest.raises(LaboratoryError, match=says):
         LaboratoryShell(directory, "laboratory")
@@ -223,7 +223,7 @@ def test_two_buses_or_cameras_are_one_too_many(tmp_path: Path, extra: str, says:
 def test_an_address_in_use_is_reported_with_file_address_and_remedy(
     tmp_path: Path, taken: str
 ) -> None:
-    """A second laboratory would meet all three."""
+    """A second laboratory would find all three in use."""
     file = services_file(tmp_path)
     directory = load(file)
     camera = camera_address(directory)

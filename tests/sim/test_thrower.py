@@ -1,4 +1,4 @@
-"""What is thrown and when: distributions, keyed draws, the thrower's patience."""
+"""What is thrown and when: distributions, keyed random draws, the thrower's waiting."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ REGIMES = {"A": (0.7, 1.5), "B": (1.5, 2.0), "C": (2.0, 2.5)}
 
 
 def uniform_p(values: Sequence[float], low: float, high: float) -> float:
-    """p-value of Kolmogorov and Smirnov's test of `values` being uniform (asymptotic)."""
+    """Return the asymptotic p-value of the Kolmogorov-Smirnov test that `values` are uniform."""
     x = np.sort((np.asarray(values) - low) / (high - low))
     n = len(x)
     steps = np.arange(n + 1) / n
@@ -26,7 +26,7 @@ def uniform_p(values: Sequence[float], low: float, high: float) -> float:
 
 
 @pytest.mark.parametrize("regime", REGIMES)
-def test_throws_are_spread_as_the_cell_says(site: Site, regime: str) -> None:
+def test_throws_are_distributed_as_the_cell_says(site: Site, regime: str) -> None:
     truth = site.truth(regime)
     throws = [draw_throw(3, n, site.cell, truth) for n in range(1, 1001)]
     nominal = site.cell["ball"]["rolling_resistance"]
@@ -55,7 +55,7 @@ def test_every_ball_leaves_the_near_edge_where_it_is_aimed(site: Site, regime: s
         assert motion.state(leaves).position[1] == pytest.approx(throw.exit_y, abs=1e-9)
 
 
-def test_a_throw_depends_on_seed_and_number_alone(site: Site) -> None:
+def test_a_throw_depends_only_on_seed_and_number(site: Site) -> None:
     truth = site.truth("B")
     alone = draw_throw(9, 17, site.cell, truth)
     for n in (1, 5, 16):
@@ -64,7 +64,7 @@ def test_a_throw_depends_on_seed_and_number_alone(site: Site) -> None:
     assert draw_throw(8, 17, site.cell, truth) != alone != draw_throw(9, 18, site.cell, truth)
 
 
-def test_it_waits_its_delay_after_all_is_ready_and_again_after_a_break(site: Site) -> None:
+def test_it_waits_its_delay_when_all_is_ready_and_again_after_an_interruption(site: Site) -> None:
     thrower = Thrower(site.cell, site.truth("A"), seed=1)
     delay = draw_throw(1, 1, site.cell, site.truth("A")).delay
     assert thrower.advance(10.0, True) is None
@@ -76,7 +76,7 @@ def test_it_waits_its_delay_after_all_is_ready_and_again_after_a_break(site: Sit
     assert thrown is not None and thrown.n == 1
 
 
-def test_it_stops_after_the_number_of_throws_asked_for(site: Site) -> None:
+def test_it_stops_after_the_requested_number_of_throws(site: Site) -> None:
     thrower = Thrower(site.cell, site.truth("A"), seed=1, throws=2)
     thrown = [t.n for k in range(4000) if (t := thrower.advance(0.004 * k, True)) is not None]
     assert thrown == [1, 2] and thrower.exhausted

@@ -1,4 +1,4 @@
-"""Regime names, disturbances, and errors that stay with the installation."""
+"""Regime names, disturbances, and errors of the installation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SETTINGS = read_toml(LABORATORY_FILE)
 
 
 def changed(one: Truth, other: Truth) -> set[str]:
-    """Names of the fields in which two truths differ."""
+    """Return the names of the fields in which two truths differ."""
     names = {f.name for f in fields(Truth)} - {"regime", "settings", "camera", "cup", "table"}
     parts = {name: (getattr(one, name), getattr(other, name)) for name in names}
     for part in ("camera", "cup", "table"):
@@ -49,9 +49,7 @@ def changed(one: Truth, other: Truth) -> set[str]:
         ("C", {"speed"}),
     ],
 )
-def test_a_disturbance_changes_what_it_names_and_nothing_else(
-    site: Site, name: str, differs: set[str]
-) -> None:
+def test_a_disturbance_changes_only_what_it_names(site: Site, name: str, differs: set[str]) -> None:
     assert changed(site.truth("A"), site.truth(name)) == differs
 
 
@@ -69,12 +67,12 @@ def test_every_disturbance_of_the_file_is_tried_here(site: Site) -> None:
         ("A+latency200+latency400", "latency200 and latency400 both set image_latency"),
     ],
 )
-def test_a_name_that_means_nothing_is_refused(site: Site, name: str, says: str) -> None:
+def test_an_unknown_name_is_refused(site: Site, name: str, says: str) -> None:
     with pytest.raises(LaboratoryError, match=says.replace("+", r"\+")):
         site.truth(name)
 
 
-def test_the_true_cell_is_near_the_nominal_one_but_not_it(site: Site) -> None:
+def test_the_true_cell_is_near_the_nominal_one_but_differs(site: Site) -> None:
     truth, cell = site.truth("A"), site.cell
     assert 1e-4 < np.linalg.norm(truth.camera.position - cell["camera"]["position"]) < 0.03
     assert 1e-4 < np.linalg.norm(truth.cup.mouth - cell["cup"]["mouth"]) < 0.005

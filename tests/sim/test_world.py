@@ -1,5 +1,4 @@
-"""The ball's world with a cup that a magic hand holds: catches, misses, edges, the light
-barrier."""
+"""The ball's world with a cup that the test moves: catches, misses, edges, the light barrier."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ AWAY = Frame3((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (-0.5, 0.0, 0.3
 
 
 def leaned(angle: float, origin: tuple[float, float, float]) -> Frame3:
-    """A cup whose mouth leans by `angle` (rad) towards the table."""
+    """Return a cup whose mouth is tilted by `angle` (rad) towards the table."""
     c, s = math.cos(angle), math.sin(angle)
     return Frame3((c, 0.0, -s), (0.0, 1.0, 0.0), (s, 0.0, c), origin)
 
@@ -44,8 +43,8 @@ class WorldByHand:
         return self.world.release(self.now, replace(thrown, **changes))  # type: ignore[arg-type]
 
     def where_it_will_be(self, throw: Throw, fall: float) -> tuple[float, BallState]:
-        """Seconds after release, and the ball's state, when it has fallen so far (m) below the
-        table's level."""
+        """Return the time after release (s) and the ball's state when it is this far (m) below the
+        table."""
         motion = TableMotion(self.world.model, throw.start, throw.rolling_resistance)
         leaves = motion.first_crossing(0, self.truth.table.near_edge)
         took = math.sqrt(2.0 * fall / 9.81)
@@ -68,8 +67,8 @@ class WorldByHand:
         assert until()
 
     def hold_under(self, course: ThrowCourse, aside: float = 0.0, lean: float = 0.5) -> Frame3:
-        """The cup where the ball comes, `aside` (m) of it along y, leaning by a share of the ball's
-        slant."""
+        """Return the cup where the ball arrives, offset by `aside` (m) along y and tilted by a
+        fraction of the ball's slope."""
         _, state = self.where_it_will_be(course.throw, 0.10)
         (x, y, z), (vx, _, vz) = state.position, state.velocity
         return leaned(lean * math.atan2(-vx, -vz), (x, y + aside, z))
@@ -127,7 +126,7 @@ def test_a_miss_is_measured_in_the_plane_of_the_mouth(
     assert course.ended_at < 12.0 and here.world.ball is None
 
 
-def test_exit_is_noted_exactly_also_with_the_cup_at_the_edge(
+def test_the_exit_is_recorded_exactly_also_with_the_cup_at_the_edge(
     hand: Callable[[str], WorldByHand],
 ) -> None:
     here = hand("C")
@@ -166,7 +165,7 @@ def test_restitution_decides_whether_fast_balls_stay_in(
     assert least <= outcomes.count(ThrowOutcome.CAUGHT) / len(outcomes) <= most
 
 
-def test_a_ball_that_is_jerked_out_of_the_cup_was_dropped(
+def test_a_ball_that_is_jerked_out_of_the_cup_counts_as_dropped(
     hand: Callable[[str], WorldByHand],
 ) -> None:
     here = hand("A")
@@ -175,13 +174,13 @@ def test_a_ball_that_is_jerked_out_of_the_cup_was_dropped(
     here.run(cup, lambda: here.world.where is Where.AT_REST)
     assert math.isfinite(course.caught_at)
     x, y, z = cup.origin
-    for k in range(1, 16):  # up at 2.5 m/s, then away from under it
+    for k in range(1, 16):  # up at 2.5 m/s, then sideways from under the ball
         here.step(cup._replace(origin=(x, y, z + 0.010 * k)))
     here.run(cup._replace(origin=(x, y + 0.3, z)), lambda: here.world.course is None)
     assert course.outcome is ThrowOutcome.DROPPED
 
 
-def test_a_turned_cup_loses_its_ball_to_the_floor_and_it_stays_caught(
+def test_a_ball_emptied_onto_the_floor_still_counts_as_caught(
     hand: Callable[[str], WorldByHand],
 ) -> None:
     here = hand("A")
@@ -227,7 +226,7 @@ def test_a_slow_ball_tips_over_the_edge_and_falls_near_it(
 
 
 @pytest.mark.parametrize(("velocity", "exits"), [((-0.1, 0.0), False), ((-0.4, 0.9), False)])
-def test_a_ball_that_stops_or_leaves_sideways_is_missed_and_taken_away(
+def test_a_ball_that_stops_or_leaves_sideways_is_missed_and_removed(
     hand: Callable[[str], WorldByHand], velocity: tuple[float, float], exits: bool
 ) -> None:
     here = hand("A")
@@ -245,7 +244,7 @@ def test_one_ball_at_a_time(hand: Callable[[str], WorldByHand]) -> None:
         here.throw(2)
 
 
-def test_two_worlds_go_the_same_way_to_the_bit(hand: Callable[[str], WorldByHand]) -> None:
+def test_two_worlds_evolve_equally_to_the_bit(hand: Callable[[str], WorldByHand]) -> None:
     traces = []
     for _ in range(2):
         here, trace = hand("B"), []

@@ -1,5 +1,5 @@
-"""A small laboratory for the vision tests: the simulated camera over an analytic rolling ball, and
-a lock-step run of actions."""
+"""A small laboratory for the vision tests: the simulated camera above an analytic rolling ball, and
+actions in lock step."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def read_cell() -> dict[str, Any]:
 
 
 def true_view(cell: Mapping[str, Any], **changes: Any) -> dict[str, Any]:
-    """The simulated camera's truth as PinholeCamera takes it."""
+    """Return the simulated camera's true parameters in the form that PinholeCamera accepts."""
     camera = read_truth(cell, "A").camera
     view = {
         key: getattr(camera, key)
@@ -41,8 +41,8 @@ def true_view(cell: Mapping[str, Any], **changes: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class RolledBall:
-    """A ball that slides, then rolls on a straight line; written from the mechanics, not from
-    services or sim.
+    """A ball that slides, then rolls on a straight line; written from the mechanics, independent of
+    services and sim.
 
     Released at time 0 from `start` towards `aim` (x, y) with `speed`; a hollow ball with spin share
     s settles at (3 + 2 s) / 5.
@@ -57,19 +57,20 @@ class RolledBall:
 
     @property
     def heading(self) -> Array:
-        """Unit vector (2,)."""
+        """Return the unit vector of the motion, shape (2,)."""
         way = np.subtract(self.aim, self.start)
         return np.asarray(way / np.hypot(*way))
 
     def _phases(self) -> tuple[float, float, float]:
-        """When sliding ends (s), the way until then (m), and the speed from then on (m/s)."""
+        """Return when sliding ends (s), the path until then (m), and the speed from then on
+        (m/s)."""
         settled = self.speed * (3.0 + 2.0 * self.spin) / 5.0
         slide = self.friction * 9.81
         until = (self.speed - settled) / slide
         return until, self.speed * until - 0.5 * slide * until**2, settled
 
     def way(self, t: float) -> tuple[float, float]:
-        """Way (m) and speed (m/s) at time t >= 0."""
+        """Return path length (m) and speed (m/s) at time t >= 0."""
         until, slid, settled = self._phases()
         if t <= until:
             slide = self.friction * 9.81
@@ -89,19 +90,19 @@ class RolledBall:
         return np.asarray(self.heading * self.way(t)[1])
 
     def arrival(self, way: float) -> float:
-        """When it has gone `way` m; it must not stop before."""
+        """Return when it has moved `way` m (s); it must not stop before."""
         until, slid, settled = self._phases()
         under = settled**2 - 2.0 * self.rolling * (way - slid)
         return until + (settled - float(np.sqrt(under))) / self.rolling
 
     def leaves(self, near_edge: float = 0.62) -> tuple[float, float]:
-        """Time (s) and y (m) at which its centre passes the near edge."""
+        """Return time (s) and y (m) at which its centre passes the near edge."""
         way = (near_edge - self.start[0]) / self.heading[0]
         return self.arrival(float(way)), float(self.start[1] + way * self.heading[1])
 
 
 def draw_ball(rng: np.random.Generator, regime: str = "A") -> RolledBall:
-    """A throw of the regime, as the cell's notes have it."""
+    """Draw a throw of the regime."""
     return RolledBall(
         start=(2.12, float(rng.uniform(-0.3, 0.3))),
         aim=(0.62, float(rng.uniform(-0.3, 0.3))),
@@ -122,9 +123,9 @@ class CameraBench:
     latency: float = 0.012
     light: Callable[[float], float] = lambda time: 1.0
     gone_after: float = float("inf")
-    """s after the release at which the ball is taken away."""
+    """When the ball is removed (s after its release)."""
     dead_from: float = float("inf")
-    """s: the camera dies."""
+    """When the camera stops sending (s)."""
     arm: tuple[Array, Sequence[float]] | None = None
     cup: Array | None = None
     now: float = 0.0
@@ -141,7 +142,7 @@ class CameraBench:
         self._rate, self._due = rate, self.now + TICK
 
     def picture(self) -> NDArray[np.uint8]:
-        """An image of the world as it is now."""
+        """Return an image of the current world."""
         since = self.now - self.release
         ball = velocity = None
         if self.ball is not None and 0.0 <= since < self.gone_after:
@@ -154,7 +155,7 @@ class CameraBench:
         )
 
     def advance(self) -> None:
-        """One tick."""
+        """Run one tick."""
         self.now = round(self.now + TICK, 9)
         if self._rate > 0.0 and self.now >= self._due - 1e-9 and self.now < self.dead_from:
             self._sent.append(Image(self.picture(), self.now, self.exposures))
@@ -165,7 +166,7 @@ class CameraBench:
 
 
 class BenchPorts:
-    """What the camera's driver may reach on the bench."""
+    """The ports of the camera's driver on the bench."""
 
     def __init__(self, bench: CameraBench, files: Mapping[str, bytes] | None = None) -> None:
         self._bench = bench
@@ -193,8 +194,8 @@ class BenchPorts:
 
 @dataclass
 class BenchContext:
-    """The context of one run, driven by `run_action`. `published` holds (time, values), values None
-    where withdrawn."""
+    """The context of one run, driven by `run_action`. `published` holds (time, values); values are
+    None where they were withdrawn."""
 
     bench: CameraBench
     device: Any
@@ -251,8 +252,8 @@ def run_action(
     limit: float = 20.0,
     cancel_at: float = float("inf"),
 ) -> Result:
-    """Drive an action's coroutine tick by tick, as the lock-step shell does. `cancel_at`: the run
-    is cancelled then (s)."""
+    """Run an action's coroutine tick by tick, as the lock-step shell does; cancel it at `cancel_at`
+    (s)."""
     begin = bench.now
     try:
         wait = action.send(None)

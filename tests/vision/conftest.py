@@ -19,7 +19,7 @@ def cell() -> dict[str, Any]:
 
 @pytest.fixture(scope="session")
 def pinhole(cell: dict[str, Any]) -> PinholeCamera:
-    """The simulated camera, as it truly hangs. Shared: its background is costly."""
+    """The simulated camera with its true pose. Shared, as its background is expensive."""
     camera = PinholeCamera(cell, true_view(cell), np.random.default_rng(7))
     assert camera.background.shape == (480, 640)
     return camera
@@ -27,12 +27,12 @@ def pinhole(cell: dict[str, Any]) -> PinholeCamera:
 
 @pytest.fixture
 def bench(pinhole: PinholeCamera) -> CameraBench:
-    """A bench whose noise restarts."""
+    """A bench whose noise starts from its seed again."""
     pinhole.reseed(np.random.default_rng(11))
     return CameraBench(pinhole)
 
 
 @pytest.fixture
 def context(bench: CameraBench) -> BenchContext:
-    """A context with a camera that knows its shipped calibration only."""
+    """A context with a camera that knows only its shipped calibration."""
     return BenchContext(bench, Camera({}, BenchPorts(bench)))

@@ -1,4 +1,4 @@
-"""Makes what docs/vision.md shows: the annotated camera image and the tables. Run it as `python -m
+"""Make the annotated camera image and the tables of docs/vision.md. Run it as `python -m
 tests.vision.figures`.
 
 With `--tables` it prints the tables (a minute or two), with `--picture` it writes
@@ -58,7 +58,7 @@ LIGHTS: dict[str, Callable[[float], float]] = {
 
 
 class TimedBench(CameraBench):
-    """A bench that knows how much CPU its own pictures took."""
+    """A bench that measures the CPU time of its own images."""
 
     own = 0.0
 
@@ -70,7 +70,7 @@ class TimedBench(CameraBench):
 
 @dataclass
 class LocatorTally:
-    """What many runs of one alternative came to."""
+    """Results of many runs of one alternative."""
 
     ends: Counter[str] = field(default_factory=Counter)
     cpu: float = 0.0
@@ -79,7 +79,7 @@ class LocatorTally:
     residuals: list[float] = field(default_factory=list)
 
     def run(self, bench: TimedBench, action: Coroutine[Any, Any, Result]) -> Result:
-        """One run, with the action's own CPU time."""
+        """Run once; add the action's own CPU time."""
         begin, own, now = time.process_time(), bench.own, bench.now
         result = run_action(bench, action)
         self.cpu += time.process_time() - begin - (bench.own - own)
@@ -91,7 +91,7 @@ class LocatorTally:
         return result
 
     def row(self) -> str:
-        """Ends, ms CPU an image, and ms CPU a simulated second."""
+        """Return the results, CPU time per image (ms), and CPU time per simulated second (ms)."""
         ends = ", ".join(f"{end} {count}" for end, count in self.ends.most_common())
         residual = f"{1e3 * np.median(self.residuals):.2f}" if self.residuals else "-"
         return (
@@ -103,7 +103,7 @@ class LocatorTally:
 def throws(
     camera: PinholeCamera, locator: str, predictor: str, regime: str, light: str, count: int
 ) -> tuple[LocatorTally, LocatorTally, Array]:
-    """Throws one after the other before one camera; errors (n, 2) of time and place at 0.45 s
+    """Throw balls one after the other; return errors (n, 2) of time and position, predicted 0.45 s
     before the ball leaves."""
     rng, located, tracked, errors = np.random.default_rng(3), LocatorTally(), LocatorTally(), []
     camera.reseed(np.random.default_rng(4))
@@ -130,7 +130,7 @@ def throws(
 
 
 def print_tables(camera: PinholeCamera) -> None:
-    """The tables of docs/vision.md."""
+    """Print the tables of docs/vision.md."""
     print("locator, light, regime | ends of 20 | ms an image | ms a simulated second | residual mm")
     for locator in LOCATORS:
         for light, regime in (
@@ -168,8 +168,8 @@ def print_tables(camera: PinholeCamera) -> None:
 def analytic(
     make: Callable[[Surface], Predictor], regime: str, count: int, rate: int
 ) -> tuple[float, float]:
-    """rms errors (ms, mm) of the exit predicted after so many images of analytic balls, places good
-    to 0.3 mm."""
+    """Return rms errors (ms, mm) of the exit predicted after some images of analytic balls, with
+    positions accurate to 0.3 mm."""
     rng, surface, errors = np.random.default_rng(6), Surface.of(read_cell()), []
     for _ in range(200):
         ball, predictor, first = (
@@ -189,8 +189,8 @@ def analytic(
 
 
 def draw_picture(camera: PinholeCamera) -> None:
-    """The camera's view with places seen, the window, and the predicted exit with two standard
-    deviations."""
+    """Draw the camera's view with the positions seen, the window, and the predicted exit with two
+    standard deviations."""
     camera.reseed(np.random.default_rng(4))
     bench = CameraBench(camera, draw_ball(np.random.default_rng(12), "A"))
     bench.cup = np.eye(4)
@@ -220,7 +220,7 @@ def draw_picture(camera: PinholeCamera) -> None:
 def annotate(
     bench: CameraBench, camera: Camera, places: list[list[float]], values: list[float]
 ) -> Any:
-    """Draw over the image of now; noise is averaged away so that the file stays small."""
+    """Draw over the current image; noise is averaged out so that the file stays small."""
     stack = np.mean([bench.picture() for _ in range(60)], axis=0)
     canvas = cv2.cvtColor(
         np.clip(np.rint(stack * 1.25 / 6) * 6, 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR
@@ -263,7 +263,7 @@ def annotate(
 
 
 def window_sees(bench: CameraBench, camera: Camera) -> Array:
-    """The ball's centre (px) as the tracker's window measures it now."""
+    """Return the ball's centre (px) as the tracker's window measures it now."""
     assert bench.ball is not None and camera.background.picture is not None
     near = camera.view.to_pixels(bench.ball.place(bench.now - bench.release)) + np.array(
         [3.0, -2.0]
@@ -276,7 +276,7 @@ def window_sees(bench: CameraBench, camera: Camera) -> Array:
 
 
 def scale(pixel: Array) -> tuple[int, int]:
-    """A pixel of the camera in the enlarged picture, in sixteenths of its pixels."""
+    """Convert a pixel of the camera to the enlarged picture, in sixteenths of its pixels."""
     u, v = (round(16 * ENLARGED * (float(c) + 0.5)) for c in pixel)
     return u, v
 

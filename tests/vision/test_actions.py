@@ -1,5 +1,5 @@
-"""The camera's actions end to end on rendered images, in lock step: what they find, what they
-stream, how they fail."""
+"""The camera's actions end to end on rendered images, in lock step: what they find and stream, and
+how they fail."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def catch(
 
 
 def streamed(context: BenchContext) -> list[tuple[float, float, float, list[float]]]:
-    """Per published set point: s before the ball really leaves, error of its time (s) and place
-    (m), and its values."""
+    """Return for each published set point the time until the ball really leaves (s), the errors of
+    its predicted time (s) and position (m), and its values."""
     ball = context.bench.ball
     assert ball is not None
     time, y = ball.leaves()
@@ -83,8 +83,8 @@ def test_a_ball_is_located_tracked_and_predicted(
         assert values[7] > 0.0 and values[8] > 0.0
     speed = bench.ball.way(bench.ball.leaves()[0])[1]
     assert np.hypot(points[-1][3][4], points[-1][3][5]) == pytest.approx(speed, abs=0.05)
-    assert points[-1][0] < 0.03, "streams until the ball leaves the table"
-    assert context.published[-1][1] is not None, "stands by its last prediction"
+    assert points[-1][0] < 0.03, "it must stream until the ball leaves the table"
+    assert context.published[-1][1] is not None, "it must keep its last prediction valid"
     assert context.device.stopped(), "images end with the run"
 
 
@@ -99,7 +99,7 @@ def test_every_predictor_tracks_a_slow_ball(context: BenchContext, predictor: st
     assert abs(early[1]) < limits[predictor]
     assert abs(early[2]) < 0.003
     if predictor == "constant_velocity":
-        assert abs(early[1]) > 0.015, "knows no resistance"
+        assert abs(early[1]) > 0.015, "this predictor assumes no resistance"
 
 
 @pytest.mark.parametrize("latency", [0.2, 0.4])
@@ -122,8 +122,8 @@ def test_late_images_of_a_fast_ball_are_a_failure_not_an_error(context: BenchCon
 
 
 def test_between_images_the_stream_continues_with_fresh_times(context: BenchContext) -> None:
-    """When images fail to come for a moment, set points still do, and their time to go runs
-    down."""
+    """When images are missing for a moment, set points are still sent with a decreasing time to
+    go."""
     bench = context.bench
     bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.2)
     located = run_action(bench, actions.locate_background(context))
@@ -169,7 +169,7 @@ def test_camera_that_dies_while_tracking(context: BenchContext) -> None:
         context.bench, actions.predict_kalman(context, ball=located.values["ball"])
     )
     assert (tracked.status, tracked.cause) == (Status.ERROR, "no_image")
-    assert context.published[-1][1] is None, "withdrawn: no action publishes it"
+    assert context.published[-1][1] is None, "it must be withdrawn, as no action publishes it"
     assert context.device.stopped()
 
 
@@ -202,7 +202,7 @@ def test_a_ball_that_stops_on_the_table(context: BenchContext) -> None:
 
 
 def test_arm_and_cup_at_the_edge_do_not_lose_the_ball(context: BenchContext) -> None:
-    """The cup waits where the ball leaves and hides the last centimetres."""
+    """The cup waits where the ball leaves and hides its last centimetres."""
     bench = context.bench
     bench.ball = RolledBall((2.12, 0.05), (0.62, 0.05), 1.2)
     bench.cup = np.eye(4)
@@ -245,7 +245,7 @@ def test_threshold_fails_in_dim_light_and_the_others_do_not(context: BenchContex
 def test_beating_lamps_make_the_stored_background_late_and_the_compensated_one_not(
     context: BenchContext,
 ) -> None:
-    """Released at eight phases of a light that goes up and down by 60 % once a second."""
+    """Balls are released at eight phases of a light that varies by 60 % once a second."""
     bench, late = context.bench, dict.fromkeys(("background", "compensated"), 0)
     bench.light = lambda time: 1.0 + 0.6 * float(np.sin(2.0 * np.pi * time))
     for name in late:
@@ -308,7 +308,7 @@ def test_cancel_ends_the_images(context: BenchContext, stage: str) -> None:
 
 
 def test_tracker_starts_from_ages_when_the_image_is_not_remembered(context: BenchContext) -> None:
-    """Another process of the camera: sequence numbers mean nothing to it, ages do."""
+    """To another process of the camera, sequence numbers mean nothing, but ages do."""
     context.bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.2)
     located = run_action(context.bench, actions.locate_background(context))
     fresh = Camera({}, BenchPorts(context.bench))

@@ -1,5 +1,5 @@
-"""Calibration: from rendered board images it finds the seeded truth; from corners alone over many
-cameras; files and command."""
+"""Calibration: it finds the true camera from rendered board images, and many cameras from corners
+alone; files and command."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ Views = list[BoardView]
 
 
 def table_error(found: Optics, camera: PinholeCamera | Optics) -> Array:
-    """Distances (m) between where balls are on the table and where the calibrated camera takes them
-    to be."""
+    """Return the distances (m) between balls on the table and their positions according to the
+    calibrated camera."""
     x, y = np.meshgrid(np.linspace(0.62, 2.22, 17), np.linspace(-0.45, 0.45, 9))
     balls = np.stack([x, y, np.full_like(x, 0.62)], axis=-1).reshape(-1, 3)
     off = found.to_plane(camera.project(balls), 0.62) - balls[:, :2]
@@ -50,7 +50,7 @@ def table_error(found: Optics, camera: PinholeCamera | Optics) -> Array:
 def folder(
     cell: dict[str, Any], pinhole: PinholeCamera, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """Board images of the simulated camera, as an operator would take them."""
+    """Take board images with the simulated camera, as an operator would."""
     pinhole.reseed(np.random.default_rng(21))
     place = tmp_path_factory.mktemp("views")
     save_board_views(place, cell, pinhole, np.random.default_rng(22))
@@ -100,7 +100,7 @@ def test_shipped_calibration_fits_the_simulated_camera(pinhole: PinholeCamera) -
 def synthetic_corners(
     optics: Optics, rng: np.random.Generator, noise: float, placement: float
 ) -> tuple[Any, Any]:
-    """Corners (px) and stated poses of boards laid and held, without images."""
+    """Return corners (px) and stated poses of boards on the table and held up, without images."""
     corners: list[Array] = []
     poses: list[Array | None] = []
     board = Board()
@@ -132,8 +132,8 @@ def test_any_camera_is_found_from_exact_corners(cell: dict[str, Any], seed: int)
 
 
 def test_stated_accuracy_is_that_of_repeated_calibrations(cell: dict[str, Any]) -> None:
-    """The standard deviation that a calibration states is that by which calibrations of one camera
-    differ."""
+    """The standard deviation that a calibration states agrees with the scatter of repeated
+    calibrations of one camera."""
     truth, errors, stated = drawn_optics(cell, 0), [], []
     for seed in range(6):
         corners, poses = synthetic_corners(truth, np.random.default_rng(seed), 0.07, 0.0003)
@@ -221,8 +221,8 @@ def test_bad_views_are_refused(
 def test_missing_images_are_taken_from_the_camera(
     folder: Path, views: Views, tmp_path: Path
 ) -> None:
-    """A folder with views.toml alone: each image is taken when the operator says so, and again when
-    the board is cut off."""
+    """For a folder with only views.toml, each image is taken when the operator confirms, and again
+    if the board is not fully visible."""
     from petrobot.services.comm.streams.image import Image
 
     lines = (folder / "views.toml").read_text(encoding="utf-8").split("[[views]]")
@@ -231,7 +231,7 @@ def test_missing_images_are_taken_from_the_camera(
     asked: list[str] = []
 
     class Hand:
-        """A camera that shows what the operator holds into it."""
+        """A camera that shows the board that the operator holds."""
 
         sequence = 0
 
@@ -264,7 +264,7 @@ def test_missing_images_are_taken_from_the_camera(
 def test_measured_places_differ_from_true_ones(
     cell: dict[str, Any], pinhole: PinholeCamera
 ) -> None:
-    """The simulated operator errs: boards do not lie exactly where they were measured."""
+    """The simulated operator makes errors: boards do not lie exactly where they were measured."""
     poses = [
         pose
         for _, pose in zip(
@@ -281,8 +281,8 @@ def test_measured_places_differ_from_true_ones(
 def test_shipped_calibration_is_what_the_command_makes(
     tmp_path: Path, pinhole: PinholeCamera, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """`--simulated` takes all images first and then calibrates, to the shipped file; it never
-    writes over what is there."""
+    """`--simulated` takes all images first and then calibrates, with the shipped file as result; it
+    never overwrites an existing file."""
     views, made = tmp_path / "views", tmp_path / "made.toml"
     told = ["calibrate", "--views", str(views), "--simulated", "--output", str(made)]
     assert main([*told, "--source", "capture:0"]) == 2

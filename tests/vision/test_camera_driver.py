@@ -1,4 +1,4 @@
-"""The camera's driver: its config, its duties towards the node, and images that it hands out."""
+"""The camera's driver: its config, its interface to the node, and the images it provides."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_bad_config_is_refused_with_name_and_remedy(
         Camera(config, BenchPorts(bench, files))
 
 
-def test_duties_towards_the_node(context: BenchContext) -> None:
+def test_the_drivers_interface_to_the_node(context: BenchContext) -> None:
     camera = context.device
     assert camera.stopped() and camera.hold(0.0) == "held"
     assert camera.start()
@@ -133,9 +133,9 @@ def test_a_source_that_cannot_be_opened_is_the_error_no_image(context: BenchCont
     camera.background.learn(np.zeros((2, 2), np.uint8))
 
 
-def test_the_operator_sees_what_was_seen(context: BenchContext) -> None:
-    """The newest image as a JPEG, the ball where it was found, the way to its predicted exit;
-    nothing before the first."""
+def test_the_operators_picture_shows_the_detections(context: BenchContext) -> None:
+    """It is the newest image as a JPEG with the detected ball and the path to its predicted exit;
+    before the first image there is none."""
     camera, bench = context.device, context.bench
     assert camera.picture() == {}
     bench.ball = draw_ball(np.random.default_rng(4), "A")

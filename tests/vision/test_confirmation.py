@@ -1,4 +1,4 @@
-"""What confirms a rolling ball, and what does not."""
+"""Which sequences of candidates confirm a rolling ball, and which do not."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def follow(
     count=st.integers(3, 7),
     seed=st.integers(0, 1000),
 )
-def test_a_rolling_ball_is_confirmed_by_the_asked_number(
+def test_a_rolling_ball_is_confirmed_after_the_required_number_of_sightings(
     speed: float, slope: float, y: float, count: int, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -47,7 +47,7 @@ def test_a_rolling_ball_is_confirmed_by_the_asked_number(
     assert len(track.times) == len(track.places) >= count
 
 
-def test_things_that_stand_still_are_never_a_ball() -> None:
+def test_objects_at_rest_are_never_a_ball() -> None:
     rng = np.random.default_rng(0)
     places = [
         [(x + rng.normal(0, 2e-3), y + rng.normal(0, 2e-3)) for x, y in STICKERS]
@@ -69,7 +69,7 @@ def test_a_ball_among_stickers_is_found() -> None:
     assert np.abs(track.places[:, 1] - 0.1).max() < 0.01
 
 
-def test_scattered_candidates_are_no_ball() -> None:
+def test_scattered_candidates_are_not_a_ball() -> None:
     rng = np.random.default_rng(2)
     places = [
         [(float(x), float(y)) for x, y in rng.uniform([0.7, -0.4], [2.1, 0.4], (2, 2))]
@@ -79,7 +79,9 @@ def test_scattered_candidates_are_no_ball() -> None:
 
 
 @pytest.mark.parametrize("velocity", [(1.5, 0.0), (0.0, 1.0), (-0.1, 0.0), (-6.0, 0.0)])
-def test_what_does_not_roll_towards_the_edge_is_not_a_ball(velocity: tuple[float, float]) -> None:
+def test_an_object_that_does_not_roll_towards_the_edge_is_not_a_ball(
+    velocity: tuple[float, float],
+) -> None:
     places = [[(1.4 + velocity[0] * 0.02 * k, velocity[1] * 0.02 * k)] for k in range(8)]
     assert not any(follow(Confirmation(4), places))
 

@@ -40,7 +40,7 @@ def view(cell: dict[str, Any]) -> TableView:
 
 @dataclass(frozen=True)
 class Scores:
-    """Share of balls found, their rms error (m), and false candidates an image."""
+    """Share of balls found, their rms error (m), and false candidates per image."""
 
     found: float
     error: float
@@ -48,7 +48,7 @@ class Scores:
 
 
 def make(name: str, view: TableView, camera: PinholeCamera, light: float = 1.0) -> BallDetector:
-    """A detector that has seen the empty table in the given light."""
+    """Make a detector that has seen the empty table in the given light."""
     background = Background()
     makers: dict[str, Callable[[TableView], BallDetector]] = {
         "background": lambda view: BackgroundSubtraction(view, background),
@@ -68,7 +68,7 @@ def make(name: str, view: TableView, camera: PinholeCamera, light: float = 1.0) 
 def balls(
     seed: int, count: int = IMAGES, x: tuple[float, float] = (0.75, 2.12)
 ) -> list[tuple[Array, Array]]:
-    """Places (3,) and velocities (3,) of rolling balls all over the table."""
+    """Draw positions (3,) and velocities (3,) of rolling balls over the whole table."""
     rng = np.random.default_rng(seed)
     return [
         (
@@ -82,7 +82,7 @@ def balls(
 def score(
     detector: BallDetector, view: TableView, camera: PinholeCamera, light: float = 1.0, **where: Any
 ) -> Scores:
-    """Judge a detector over many balls."""
+    """Test a detector on many balls."""
     errors, false = [], 0
     sample = balls(5, **where)
     for place, velocity in sample:
@@ -116,7 +116,9 @@ def test_accuracy_in_nominal_light(
     assert scores.false <= false
 
 
-def test_threshold_works_in_the_bright_part_only(view: TableView, pinhole: PinholeCamera) -> None:
+def test_the_threshold_works_only_in_the_bright_part(
+    view: TableView, pinhole: PinholeCamera
+) -> None:
     detector = FixedThreshold(view)
     near = score(detector, view, pinhole, x=(0.8, 1.6))
     far = score(detector, view, pinhole, x=(2.02, 2.12))
@@ -124,7 +126,7 @@ def test_threshold_works_in_the_bright_part_only(view: TableView, pinhole: Pinho
     assert far.found <= 0.3, "the light falls off towards the far edge"
 
 
-def test_dim_light_blinds_the_threshold_alone(view: TableView, pinhole: PinholeCamera) -> None:
+def test_only_the_threshold_fails_in_dim_light(view: TableView, pinhole: PinholeCamera) -> None:
     found = {
         name: score(make(name, view, pinhole, 0.6), view, pinhole, 0.6, count=30).found
         for name in DETECTORS
@@ -133,11 +135,11 @@ def test_dim_light_blinds_the_threshold_alone(view: TableView, pinhole: PinholeC
     assert min(share for name, share in found.items() if name != "threshold") > 0.85
 
 
-def test_light_that_changed_blinds_the_stored_background(
+def test_the_stored_background_fails_after_a_change_of_light(
     view: TableView, pinhole: PinholeCamera
 ) -> None:
-    """Learned at 0.75 of the light, looked at in 1.3 of it: the others do not mind, or have learned
-    meanwhile."""
+    """Learned at 0.75 of the light and used at 1.3: the other detectors are not affected, or have
+    adapted meanwhile."""
     assert (
         score(make("compensated", view, pinhole, 0.75), view, pinhole, 1.3, count=30).found > 0.95
     )
@@ -151,10 +153,10 @@ def test_light_that_changed_blinds_the_stored_background(
 
 
 @pytest.mark.parametrize("light", [0.45, 0.7, 1.4, 1.6])
-def test_compensated_subtraction_does_not_mind_in_which_light_it_learned(
+def test_compensated_subtraction_does_not_depend_on_the_light_it_learned_in(
     view: TableView, pinhole: PinholeCamera, light: float
 ) -> None:
-    """Neither a lost ball nor a stripe of the table's lines that is taken for one."""
+    """No ball is missed, and no part of the table's lines is mistaken for one."""
     scores = score(make("compensated", view, pinhole), view, pinhole, light, count=40)
     assert scores.found >= 0.95
     assert scores.error < 0.002
@@ -167,7 +169,7 @@ def test_an_empty_table_has_no_ball(view: TableView, pinhole: PinholeCamera, nam
     candidates = [detector.detect(pinhole.render(None)) for _ in range(10)]
     if (
         name == "hough"
-    ):  # stickers are circles too; it is `Confirmation` that rejects what does not roll
+    ):  # Stickers are circles, too; `Confirmation` rejects objects that do not roll.
         places = view.to_table(np.concatenate(candidates))
         assert len(places) and view.on_table(places).all()
     else:
@@ -175,7 +177,7 @@ def test_an_empty_table_has_no_ball(view: TableView, pinhole: PinholeCamera, nam
 
 
 @pytest.mark.parametrize("name", ["background", "compensated", "mog2"])
-def test_arm_and_cup_over_the_table_are_no_ball(
+def test_arm_and_cup_over_the_table_are_not_a_ball(
     view: TableView, pinhole: PinholeCamera, name: str
 ) -> None:
     """The cup's mouth is round too, but does not roll towards the edge."""
@@ -243,8 +245,8 @@ def test_window_with_nothing_there(
 def test_a_half_hidden_ball_is_not_measured_wrongly(
     view: TableView, pinhole: PinholeCamera, picture: np.ndarray
 ) -> None:
-    """An arm slides over the ball: as soon as it hides a part that would bias the place there is no
-    measurement."""
+    """An arm moves over the ball: as soon as it hides a part large enough to bias the position,
+    there is no measurement."""
     window, place, kept = BallWindow(view), np.array([0.90, 0.0, 0.62]), []
     for edge in np.linspace(-0.06, 0.06, 25):
         arm = np.array([[[0.90 + 0.5, edge - 0.05, 0.75], [0.90 - 0.5, edge - 0.05, 0.75]]])
@@ -256,7 +258,7 @@ def test_a_half_hidden_ball_is_not_measured_wrongly(
     assert max(kept) < 0.004
 
 
-def test_the_window_leaves_what_is_not_near(
+def test_the_window_ignores_objects_that_are_not_near(
     view: TableView, pinhole: PinholeCamera, picture: np.ndarray
 ) -> None:
     place = np.array([1.5, 0.1, 0.62])
@@ -292,7 +294,7 @@ def test_background_restarts_with_another_image_size() -> None:
     assert background.picture is not None and background.picture.shape == (6, 4)
 
 
-def test_blobs_of_other_sizes_and_shapes_are_no_balls() -> None:
+def test_blobs_of_other_sizes_and_shapes_are_not_balls() -> None:
     mask = np.zeros((120, 160), np.uint8)
     v, u = np.mgrid[0:120, 0:160]
     mask[np.hypot(u - 30, v - 30) < 7] = 255

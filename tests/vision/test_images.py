@@ -1,5 +1,5 @@
-"""Images on the wire and from files: any cutting of the bytes, bad bytes, newest wins, restarts,
-devices that are not there."""
+"""Images over sockets and from files: any division of the bytes, bad bytes, newest wins, restarts,
+missing devices."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_wire_format_byte_by_byte() -> None:
 
 
 @given(cuts=st.lists(st.integers(0, 3 * (32 + 12)), max_size=8), take=st.booleans())
-def test_any_cutting_of_the_bytes(cuts: list[int], take: bool) -> None:
+def test_any_division_of_the_bytes(cuts: list[int], take: bool) -> None:
     images = [WireImage(1, k, 0.01 * k, np.full((3, 4), k, np.uint8)) for k in range(3)]
     data = b"".join(map(encode_image, images))
     decoder, begin, seen = ImageDecoder(), 0, []
@@ -59,7 +59,7 @@ def test_any_cutting_of_the_bytes(cuts: list[int], take: bool) -> None:
 
 
 @given(st.binary(max_size=200))
-def test_random_bytes_leave_format_errors_only(data: bytes) -> None:
+def test_random_bytes_raise_only_format_errors(data: bytes) -> None:
     decoder = ImageDecoder()
     try:
         decoder.feed(data)
@@ -108,7 +108,7 @@ def until(condition: Callable[[], object], *steps: Callable[[], object]) -> obje
     raise AssertionError("it never came")
 
 
-def test_images_flow_at_the_asked_rate_and_stop(
+def test_images_arrive_at_the_requested_rate_and_stop(
     server: ImageServer, receiver: StreamImages
 ) -> None:
     receiver.start(40.0)
@@ -186,7 +186,7 @@ def test_a_camera_that_goes_away_is_found_again() -> None:
     second.close()
 
 
-def test_server_drops_who_speaks_nonsense(server: ImageServer) -> None:
+def test_the_server_disconnects_clients_that_send_malformed_bytes(server: ImageServer) -> None:
     import socket
 
     with socket.create_connection(("127.0.0.1", server.port)) as stranger:
@@ -224,7 +224,7 @@ def test_memory_images() -> None:
 
 @pytest.fixture(scope="module")
 def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten pictures, each brighter than the last."""
+    """Write a video of ten images, each brighter than the one before."""
     path = tmp_path_factory.mktemp("film") / "film.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (64, 48))
     assert writer.isOpened()
@@ -238,7 +238,7 @@ def test_a_file_is_paced_by_the_clock(film: Path) -> None:
     clock = [100.0]
     images: ImageSource = CaptureImages(str(film), lambda: clock[0])
     assert images.newest() is None
-    for _ in range(2):  # a second start begins again
+    for _ in range(2):  # A second start begins from the first image again.
         images.start(25.0)
         begin = clock[0]
         first = images.newest()
@@ -251,14 +251,14 @@ def test_a_file_is_paced_by_the_clock(film: Path) -> None:
         assert later.pixels.shape == (48, 64) and abs(float(later.pixels.mean()) - 60) < 6
         clock[0] += 5.0
         assert images.newest() is not None, "the last one"
-        assert images.newest() is None, "the film is over"
+        assert images.newest() is None, "the video has ended"
     images.stop()
     assert images.newest() is None
     images.close()
 
 
-def test_a_device_is_grabbed_as_it_comes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A device's images come when they come; only the newest is kept, stamped when it came."""
+def test_images_of_a_device_are_stamped_on_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A device sends images at its own times; only the newest is kept, with its time of arrival."""
     given_out: list[int] = []
 
     class Device:
@@ -292,7 +292,7 @@ def test_a_device_is_grabbed_as_it_comes(monkeypatch: pytest.MonkeyPatch) -> Non
     assert given_out[-1] == -1
 
 
-def test_what_cannot_be_opened_is_said(tmp_path: Path) -> None:
+def test_a_source_that_cannot_be_opened_is_reported(tmp_path: Path) -> None:
     images = CaptureImages(str(tmp_path / "none.avi"), time.monotonic)
     with pytest.raises(ConnectionError, match=r"none\.avi.*cannot be opened"):
         images.start(25.0)

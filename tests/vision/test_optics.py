@@ -1,5 +1,5 @@
-"""The calibrated camera's geometry against OpenCV, and its inverse against itself; the simulated
-camera's likewise."""
+"""Geometry of the calibrated and of the simulated camera: projection against OpenCV, and the
+inverse against the projection."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.vision.bench import true_view
 
 
 def drawn_optics(cell: dict[str, Any], seed: int) -> Optics:
-    """The nominal camera with errors larger than any installation's."""
+    """Draw a camera that differs from the nominal one by more than any installation does."""
     rng, nominal = np.random.default_rng(seed), Optics.nominal(cell)
     k1, k2, p1, p2 = (
         float(k) for k in np.array(nominal.distortion) + rng.normal(0, [0.03, 0.01, 5e-4, 5e-4])
@@ -35,7 +35,7 @@ def drawn_optics(cell: dict[str, Any], seed: int) -> Optics:
 def by_opencv(
     points: np.ndarray, rotation: np.ndarray, position: np.ndarray, matrix: Any, distortion: Any
 ) -> Any:
-    """The same pixels from cv2.projectPoints."""
+    """Return the same pixels from cv2.projectPoints."""
     turn = cv2.Rodrigues(rotation)[0]
     pixels = cv2.projectPoints(
         points, turn, -rotation @ position, np.asarray(matrix), np.asarray(distortion)
@@ -93,9 +93,9 @@ def test_nominal_camera_sees_the_whole_table(cell: dict[str, Any]) -> None:
     assert rows.start <= corners[:, 1].min() and rows.stop >= corners[:, 1].max()
 
 
-def test_view_speaks_of_the_balls_centre(cell: dict[str, Any]) -> None:
-    """A ball's centre is 20 mm above the table: taking the table top instead would be up to 9 mm
-    wrong at its ends."""
+def test_the_view_gives_the_balls_centre(cell: dict[str, Any]) -> None:
+    """A ball's centre is 20 mm above the table: projecting onto the table top instead would be
+    wrong by up to 9 mm at its ends."""
     view = TableView.of(cell, Optics.nominal(cell))
     pixel = view.optics.project([0.62, 0.0, 0.62])
     assert np.allclose(view.to_table(pixel), [0.62, 0.0], atol=1e-9)

@@ -1,5 +1,5 @@
 """Predictors against an analytic ball that slides, then rolls with an unknown resistance: accuracy,
-honesty, other ways out."""
+stated uncertainty, and balls that leave elsewhere."""
 
 from __future__ import annotations
 
@@ -34,8 +34,7 @@ NOISE = 0.0003
 def watch(
     predictor: Predictor, ball: RolledBall, count: int, rate: float, rng: np.random.Generator
 ) -> PredictedExit:
-    """The exit that is predicted after `count` images, the first within one image of the
-    release."""
+    """Return the exit predicted after `count` images, the first within one image of the release."""
     first = float(rng.uniform(0.0, 1.0 / rate))
     for k in range(count):
         t = first + k / rate
@@ -48,8 +47,8 @@ def watch(
 def errors(
     name: str, regime: str, count: int, rate: float, throws: int = 60
 ) -> tuple[float, float, float]:
-    """rms error of the time (s) and of the place (m) over throws, and rms of the time error over
-    its stated sigma."""
+    """Return the rms errors of time (s) and position (m) over throws, and the rms of the time error
+    divided by its stated sigma."""
     rng, times, places, stated = np.random.default_rng(17), [], [], []
     for _ in range(throws):
         ball = draw_ball(rng, regime)
@@ -102,13 +101,13 @@ def test_more_effort_is_more_accurate(regime: str) -> None:
 )
 @pytest.mark.parametrize("count", [6, 10, 20])
 def test_stated_uncertainty_is_correct(name: str, least: float, most: float, count: int) -> None:
-    """A predictor's own sigma of the time covers its errors without being idle, in slow and fast
-    regimes."""
+    """A predictor's sigma of the time covers its errors without being much too large, in slow and
+    fast regimes."""
     for regime in ("A", "C"):
         assert least <= errors(name, regime, count, 50)[2] <= most
 
 
-def test_even_speed_knows_not_what_it_does_not_know() -> None:
+def test_constant_speed_underestimates_its_error() -> None:
     assert errors("constant_velocity", "A", 12, 50)[2] > 5.0
 
 
@@ -181,8 +180,8 @@ def test_nothing_is_predicted_from_two_places(name: str) -> None:
 
 @pytest.mark.parametrize("friction", [0.1, 0.2, 0.4])
 def test_sliding_of_unknown_length_is_found(friction: float) -> None:
-    """The friction decides how long a ball slides; least squares averages over the moments at which
-    it may end."""
+    """The friction decides how long a ball slides; least squares averages over the possible ends of
+    sliding."""
     rng, late = np.random.default_rng(3), []
     for _ in range(40):
         ball = RolledBall(
@@ -198,9 +197,9 @@ def test_sliding_of_unknown_length_is_found(friction: float) -> None:
     assert float(np.sqrt(np.mean(np.square(late)))) < 0.006
 
 
-def test_known_resistance_is_taken_for_known() -> None:
-    """With a resistance 25 % off, a predictor that takes the nominal for known is wrong; one that
-    estimates it is not."""
+def test_a_wrong_known_resistance_biases_only_the_predictor_that_uses_it() -> None:
+    """With a resistance 25 % from nominal, a predictor that uses the nominal value is biased; one
+    that estimates it is not."""
     ball = RolledBall((2.12, 0.0), (0.62, 0.0), 0.9, spin=1.0, rolling=1.25 * SURFACE.rolling)
     time, errors_of = ball.leaves()[0], {}
     for sigma in (0.0, None):
@@ -211,8 +210,8 @@ def test_known_resistance_is_taken_for_known() -> None:
 
 
 @pytest.mark.parametrize("make", [LeastSquares, Kalman])
-def test_coarse_places_count_less(make: Callable[[Surface], Predictor]) -> None:
-    """Coarse places at the beginning (from a coarse locator) do not spoil the fine ones that
+def test_inaccurate_positions_have_less_weight(make: Callable[[Surface], Predictor]) -> None:
+    """Inaccurate positions at the start (from a coarse locator) do not spoil the accurate ones that
     follow."""
     ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.8)
     spoiled: list[float] = []
@@ -232,7 +231,7 @@ def test_coarse_places_count_less(make: Callable[[Surface], Predictor]) -> None:
 
 
 def test_cost_of_an_observation_does_not_grow() -> None:
-    """Least squares keeps sums, not places."""
+    """Least squares keeps sums, not positions."""
     predictor: Any = LeastSquares(SURFACE)
     for k in range(3):
         predictor.add(0.02 * k, 2.0 - 0.02 * k, 0.0)

@@ -15,7 +15,7 @@ from tests.vision.bench import true_view
 
 @pytest.fixture(scope="module")
 def clean(cell: dict[str, Any]) -> PinholeCamera:
-    """Even light, no noise."""
+    """Return a camera with uniform light and no noise."""
     view = true_view(cell, noise=0.0, light_gradient=(0.0, 0.0), vignetting=0.0)
     return PinholeCamera(cell, view, np.random.default_rng(0))
 
@@ -23,8 +23,8 @@ def clean(cell: dict[str, Any]) -> PinholeCamera:
 def ball_pixels(
     camera: PinholeCamera, ball: Any, velocity: Any = (0, 0, 0)
 ) -> tuple[np.ndarray, float]:
-    """Centroid (u, v) and area (px) of what a ball makes brighter by more than half its
-    contrast."""
+    """Return centroid (u, v) and area (px) of the pixels that a ball makes brighter by more than
+    half its contrast."""
     empty = camera.render(None).astype(float)
     brighter = np.clip(camera.render(ball, velocity) - empty, 0, None)
     weight = np.clip(brighter / 70.0, 0.0, 1.0)
@@ -49,7 +49,7 @@ def test_a_ball_is_where_opencv_projects_its_centre(
     assert area == pytest.approx(np.pi * (0.02 * clean.focal / depth) ** 2, rel=0.12)
 
 
-def test_a_moving_ball_is_a_streak_about_its_place_at_mid_exposure(
+def test_a_moving_ball_is_a_streak_around_its_position_at_mid_exposure(
     clean: PinholeCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("petrobot.sim.catching.camera.SHADOW_DEPTH", 0.0)
@@ -63,14 +63,14 @@ def test_a_moving_ball_is_a_streak_about_its_place_at_mid_exposure(
     )
     assert moving.sum() == pytest.approx(still.sum(), rel=0.03), "the same light, spread out"
     way = 2.5 * 0.004 * clean.focal / float(clean.to_camera(ball)[2])
-    # a blurred image's spread along the way grows by the variance of an even exposure, way^2 / 12
+    # Blur adds the variance of a uniform exposure along the path, way^2 / 12.
     grown = spread(moving, 0) - spread(still, 0)
     assert np.sqrt(12.0 * grown) == pytest.approx(way, rel=0.1)
     assert spread(moving, 1) == pytest.approx(spread(still, 1), rel=0.02)
 
 
 def spread(light: np.ndarray, axis: int) -> float:
-    """Variance of where light falls, along u (axis 0) or v (axis 1), px^2."""
+    """Return the variance of the light's position along u (axis 0) or v (axis 1), px^2."""
     profile = light.sum(axis=axis) / light.sum()
     at = np.arange(len(profile))
     return float(profile @ at**2 - (profile @ at) ** 2)
@@ -159,9 +159,7 @@ def test_unknown_truth_is_refused(cell: dict[str, Any]) -> None:
         PinholeCamera(cell, {"focal_length": 600.0}, np.random.default_rng(0))
 
 
-def test_table_that_stands_otherwise_is_drawn_otherwise(
-    cell: dict[str, Any], clean: PinholeCamera
-) -> None:
+def test_a_table_in_another_pose_is_drawn_there(cell: dict[str, Any], clean: PinholeCamera) -> None:
     view = true_view(cell, noise=0.0, light_gradient=(0.0, 0.0), vignetting=0.0, near_edge=0.70)
     other = PinholeCamera(cell, view, np.random.default_rng(0))
     u, v = (round(c) for c in clean.project([0.66, 0.1, 0.6]))
@@ -182,8 +180,8 @@ def test_board_corners_are_where_they_project(clean: PinholeCamera) -> None:
     assert np.abs(found - wanted).mean() < 0.1
 
 
-def test_noise_added_without_a_look_is_the_noise_added_with_one(cell: dict[str, Any]) -> None:
-    """Arm, cup and ball in view or not: the short way to an image gives every pixel of the long
+def test_the_fast_path_of_noise_gives_the_same_image(cell: dict[str, Any]) -> None:
+    """With and without arm, cup and ball in view, the fast path gives every pixel of the slow
     one."""
     rng = np.random.default_rng(4)
     short, long = (PinholeCamera(cell, true_view(cell), np.random.default_rng(7)) for _ in range(2))
@@ -197,7 +195,7 @@ def test_noise_added_without_a_look_is_the_noise_added_with_one(cell: dict[str, 
         assert np.array_equal(short.render(*given), long.render(*given))
 
 
-def test_a_scene_drawn_in_stripes_is_the_scene_drawn_at_once(
+def test_a_scene_drawn_in_stripes_equals_one_drawn_at_once(
     cell: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     striped, whole = (

@@ -1,5 +1,5 @@
-"""The rover's laboratory on the bench: a small CANopen master of the tests' own, and a driver who
-sees the truth."""
+"""Fixtures: the rover's laboratory on the bench with a small CANopen master, written for these
+tests, and a driver that knows the true state."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def track_site() -> TrackSite:
 
 
 class RoverMaster:
-    """Sets both drives and the sensor up over SDO, enables the drives, and sends set points of
-    speed (rad/s, left and right)."""
+    """Configures both drives and the sensor over SDO, enables the drives, and sends speed set
+    points (rad/s, left and right)."""
 
     def __init__(self) -> None:
         self.wanted = [0.0, 0.0]
@@ -96,7 +96,7 @@ class RoverMaster:
         elif any(word & 0x08 for word in self.status):
             self._word = (
                 0x00 if self._word == 0x80 else 0x80
-            )  # a fault is reset by the bit's rising edge
+            )  # A rising edge of the bit resets a fault.
         else:
             self._word = {0x00: 0x06, 0x80: 0x06, 0x06: 0x07}.get(self._word, 0x0F)
         frames = [
@@ -123,12 +123,12 @@ class RoverMaster:
 
     @property
     def enabled(self) -> bool:
-        """Whether both drives are in OPERATION ENABLED."""
+        """Return whether both drives are in OPERATION ENABLED."""
         return all(word & 0x6F == 0x27 for word in self.status)
 
 
 class RoverBench(LaboratoryBench):
-    """The rover's laboratory, its master, and a driver who sees the truth."""
+    """The rover's laboratory, its master, and a driver that knows the true state."""
 
     cycle = SYNC_TICKS
 
@@ -140,22 +140,22 @@ class RoverBench(LaboratoryBench):
         super().__init__(self.lab, self.master, "rover")
 
     def read(self, node: int, index: int, kind: DataType) -> int:
-        """An object of a node, over SDO."""
+        """Read an object of a node over SDO."""
         self.master.replies.pop((node, index), None)
         self.post("can", "rover", can_body([sdo_read_request(node, index, 0)]))
         assert self.run(lambda: (node, index) in self.master.replies, 0.1)
         return kind.unpack(self.master.replies[node, index][: kind.size])
 
     def drive(self, speed: float, turn: float) -> None:
-        """From now on so fast (m/s, rad/s), as a driver with the nominal numbers would."""
+        """Set the speeds (m/s, rad/s), using the nominal parameters."""
         self.master.wanted = [
             (speed - 0.5 * WIDTH * turn) / RADIUS,
             (speed + 0.5 * WIDTH * turn) / RADIUS,
         ]
 
     def pursue(self, speed: float, end: float, ahead: float = 0.35) -> None:
-        """Go after the point of the true centre line `ahead` metres farther, and stop beyond arc
-        length `end` (m)."""
+        """Pursue the point of the true centre line `ahead` metres ahead, and stop beyond arc length
+        `end` (m)."""
         x, y, heading = self.lab.rover.pose
         near = self.lab.track.nearest(x, y)
         there = self.lab.track.at(near.s + ahead)
@@ -167,7 +167,7 @@ class RoverBench(LaboratoryBench):
     def follow(
         self, speed: float = 0.5, end: float | None = None, at_most: float = 200.0
     ) -> dict[str, Any]:
-        """Drive along the true centre line to the T, or to `end`, and stand; gives the score."""
+        """Drive along the true centre line to the T, or to `end`, and stop; return the score."""
         goal = self.lab.track.length if end is None else end
         for _ in range(round(at_most / (SYNC_TICKS * TICK))):
             self.pursue(speed, goal - 0.02)
@@ -180,11 +180,11 @@ class RoverBench(LaboratoryBench):
 
 @pytest.fixture
 def rover_bench(track_site: TrackSite) -> Callable[..., RoverBench]:
-    """Makes benches; options as for TrackLaboratory."""
+    """Return a function that makes benches; options as for TrackLaboratory."""
     return lambda **options: RoverBench(track_site, **options)
 
 
 @pytest.fixture
 def rover_master() -> Callable[[], RoverMaster]:
-    """Makes masters for the rover's bus."""
+    """Return a function that makes masters for the rover's bus."""
     return RoverMaster

@@ -1,9 +1,9 @@
-"""Measures what the rover's laboratory costs: `python tests/sim/track/measure_track.py [REGIME
-...]`; no test, figures for people.
+"""Measure the CPU time of the rover's laboratory (not a test): `python
+tests/sim/track/measure_track.py [REGIME ...]`.
 
-CPU milliseconds for a simulated second while a driver who sees the truth goes along the track at
-0.5 m/s, by part, with 25 images/s; the cost of a tick in which nothing is due, of an image, and of
-a new experiment.
+CPU milliseconds per simulated second while a driver that knows the true state follows the track at
+0.5 m/s, by part, with 25 images/s; also the cost of an idle tick, of an image, and of a new
+experiment.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ IDLE_TICKS, IMAGES = 20_000, 500
 
 
 class TrackMeter:
-    """Adds up the CPU time that methods take, with what they call."""
+    """Adds up the CPU time of methods, including the functions that they call."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)

@@ -51,13 +51,13 @@ def rover(pose: FloorPose = ORIGIN, seed: int = 1, **changes: Any) -> RoverBody:
 
 
 def command(body: RoverBody, left: float, right: float) -> None:
-    """Wheels told so (rad/s), brakes off."""
+    """Set the wheels' speeds (rad/s), brakes off."""
     for wheel, target in zip(body.wheels, (left, right), strict=True):
         wheel.braked, wheel.target = False, target
 
 
 def settled(body: RoverBody, left: float, right: float) -> None:
-    """Wheels that turn so already."""
+    """Set the wheels' speeds as if they turned at them already."""
     command(body, left, right)
     for wheel in body.wheels:
         wheel.speed = wheel.target
@@ -68,7 +68,7 @@ speeds = st.floats(-8.0, 8.0)
 
 @given(speeds, speeds, st.floats(0.1, 5.0), st.floats(-3.0, 3.0))
 @settings(max_examples=80, deadline=None)
-def test_steady_wheels_lead_along_a_circular_arc(
+def test_constant_wheel_speeds_give_a_circular_arc(
     left: float, right: float, time: float, heading: float
 ) -> None:
     body = rover(FloorPose(1.0, 2.0, heading))
@@ -96,7 +96,7 @@ def test_a_wheel_follows_with_its_lag(target: float, time: float) -> None:
 
 @given(st.lists(st.floats(0.001, 0.09), min_size=1, max_size=30))
 @settings(max_examples=40, deadline=None)
-def test_looking_often_changes_next_to_nothing(pauses: list[float]) -> None:
+def test_the_rate_of_queries_hardly_changes_the_motion(pauses: list[float]) -> None:
     """Where the rover is depends on when it is looked at by rounding of the arcs alone, and by when
     it is first seen that a wheel is nearer to its set point than what counts as there (1e-6 rad/s,
     so less than that times its lag)."""
@@ -127,7 +127,7 @@ def test_brakes_hold() -> None:
     assert (body.x, body.speed) == (x, 0.0)
 
 
-def test_skidding_takes_turn_away_and_pushes_outwards() -> None:
+def test_skidding_reduces_the_turn_and_pushes_outwards() -> None:
     firm, skidding = rover(), rover(slip_aside=0.06, slip_turn=0.12)
     for body in (firm, skidding):
         settled(body, 4.0, 6.0)
@@ -145,7 +145,7 @@ def test_skidding_takes_turn_away_and_pushes_outwards() -> None:
     assert right_turn.y > plain.y  # outwards of a right turn is to the left
 
 
-def test_slip_has_the_spread_and_the_memory_asked_for() -> None:
+def test_slip_has_the_configured_spread_and_correlation_time() -> None:
     body = rover(slip=0.02, slip_time=0.2)
     settled(body, 5.0, 5.0)
     ways, last = [], 0.0
@@ -184,7 +184,7 @@ def test_a_rover_put_elsewhere_keeps_its_counters() -> None:
     assert body.wheels[0].angle == counted == pytest.approx(5.0)
 
 
-def test_the_same_draws_give_the_same_way() -> None:
+def test_the_same_random_draws_give_the_same_path() -> None:
     def way(seed: int) -> FloorPose:
         body = rover(slip=0.02, seed=seed)
         settled(body, 5.0, 5.2)

@@ -1,4 +1,4 @@
-"""The retroreflector sensor: what it sees, how well, and what it invents."""
+"""The retroreflector sensor: what it sees, how accurately, and its false returns."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ SERVICES_FILE = REPOSITORY / "services" / "mobile" / "track.services.toml"
 # A run
 
 
-def test_a_driver_who_sees_the_truth_finishes(rover_bench: Bench) -> None:
+def test_a_driver_that_knows_the_true_state_finishes(rover_bench: Bench) -> None:
     bench = rover_bench()
     assert (
         bench.call("laboratory_prepare", seed=5, regime="mixed", elements=9, interruptions=1).status
@@ -127,7 +127,7 @@ def test_the_image_shows_the_track_ahead(rover_bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("speed", [0, 0.0, -0.5, 1.3, 5, "fast", float("nan")])
-def test_a_speed_that_no_wheel_has_is_refused_with_what_can_be(
+def test_a_speed_beyond_the_wheels_is_refused_with_the_possible_range(
     rover_bench: Bench, speed: object
 ) -> None:
     ended = rover_bench().call("laboratory_prepare", seed=1, regime="plain", speed=speed)
@@ -135,7 +135,9 @@ def test_a_speed_that_no_wheel_has_is_refused_with_what_can_be(
 
 
 @pytest.mark.parametrize("speed", [1, 0.05, 1.2])
-def test_a_speed_that_the_wheels_have_is_taken(rover_bench: Bench, speed: float) -> None:
+def test_a_speed_within_the_range_of_the_wheels_is_accepted(
+    rover_bench: Bench, speed: float
+) -> None:
     assert (
         rover_bench().call("laboratory_prepare", seed=1, regime="plain", speed=speed).status
         == "success"
@@ -184,7 +186,7 @@ def test_interruptions_are_of_the_regimes_kind(rover_bench: Bench) -> None:
         ("laboratory_fault", {"kind": "dead_sensor", "share": 0.5}, "unknown key 'share'"),
     ],
 )
-def test_what_cannot_be_is_refused_and_changes_nothing(
+def test_invalid_requests_are_refused_and_change_nothing(
     rover_bench: Bench, service: str, arguments: dict[str, Any], text: str
 ) -> None:
     bench = rover_bench(seed=8)
@@ -216,7 +218,7 @@ def prepared(rover_bench: Bench) -> Any:
 
 
 @pytest.mark.parametrize("kind", ["dead_camera", "drop_images"])
-def test_images_stop_and_come_again(rover_bench: Bench, kind: str) -> None:
+def test_images_stop_and_return(rover_bench: Bench, kind: str) -> None:
     bench = prepared(rover_bench)
     bench.call("laboratory_fault", kind=kind, duration=1.0)
     bench.wait(0.1)
@@ -284,7 +286,7 @@ def test_a_rover_that_leaves_the_board_gets_no_power_before_the_next_experiment(
     assert bench.run(lambda: bench.master.enabled, 1.0)
 
 
-def test_every_fault_can_be_asked_for(rover_bench: Bench) -> None:
+def test_every_fault_can_be_requested(rover_bench: Bench) -> None:
     bench = prepared(rover_bench)
     for kind, keys in ROVER_FAULTS.keys.items():
         arguments = {"joint": 1} if "joint" in keys else {}

@@ -124,7 +124,7 @@ def test_a_film_is_written(
     video.release()
 
 
-def test_what_cannot_be_filmed_is_said(
+def test_the_reason_why_a_run_cannot_be_filmed_is_reported(
     score: dict[str, Any], nominal: dict[str, Any], tmp_path: Path
 ) -> None:
     with pytest.raises(FilmError, match=r"'\.mov'"):

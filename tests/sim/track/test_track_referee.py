@@ -1,4 +1,4 @@
-"""The referee on paths made up for it: what counts as left, recovered, finished, stopped."""
+"""The referee on constructed paths: what counts as left, recovered, finished, stopped."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DT, SPEED = 0.02, 0.5
 def ride(
     points: Iterable[tuple[float, float]], track: Track = TRACK, stand: float = 1.0
 ) -> tuple[TrackReferee, float]:
-    """Past points (m) at a constant speed in straight lines, then standing; gives referee and
+    """Move past points (m) in straight lines at a constant speed, then stand; return referee and
     time."""
     referee, now, at = TrackReferee(track, 1, "straight", 0.0), 0.0, None
     for x, y in points:
@@ -62,7 +62,7 @@ def test_a_clean_run() -> None:
     assert crossing["kind"] == "straight"
 
 
-def test_errors_count_by_way_on_painted_elements_alone() -> None:
+def test_errors_count_by_distance_on_painted_elements_only() -> None:
     referee, now = ride(
         [(0.0, 7.0), (0.02, 7.01), (6.0, 7.01), (6.5, 7.08), (8.0, 7.02), (13.8, 7.02)]
     )
@@ -72,7 +72,7 @@ def test_errors_count_by_way_on_painted_elements_alone() -> None:
     assert score["crossings"][0]["aside_m"] == pytest.approx(0.08, abs=0.003)
 
 
-def test_standing_at_a_bad_place_does_not_weigh() -> None:
+def test_standing_at_a_bad_place_does_not_count() -> None:
     quick, now = ride([(0.0, 7.0), (3.0, 7.05)], stand=0.0)
     slow, later = ride([(0.0, 7.0), (3.0, 7.05)], stand=60.0)
     assert quick.score(now)["rms_mm"] == slow.score(later)["rms_mm"]

@@ -1,4 +1,4 @@
-"""What the tests of campaigns share: the toy cell's files, and campaigns of it in this process."""
+"""Fixtures of the campaign tests: the toy cell's files, and its campaigns in this process."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TASK, SERVICES = HERE / "toy" / "fetch.toml", HERE / "toy" / "services.toml"
 
 
 class InlinePool:
-    """Does blocks in this process, one after the other; `fails_at` blocks in it is interrupted."""
+    """Runs blocks one after the other in this process; interrupted after `fails_at` blocks."""
 
     def __init__(self, plan: CampaignPlan, fails_at: int | None = None) -> None:
         import json
@@ -29,7 +29,7 @@ class InlinePool:
         self._plan, self._fails_at = json.dumps(plan.to_plain()), fails_at
 
     async def run(self, order: Mapping[str, Any]) -> dict[str, Any]:
-        """Do a block."""
+        """Run a block."""
         if self._fails_at is not None and self.done >= self._fails_at:
             raise KeyboardInterrupt
         self.done += 1
@@ -38,13 +38,13 @@ class InlinePool:
 
 @pytest.fixture(autouse=True)
 def _toy_actions(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Workers and this process find the toy's actions."""
+    """Let workers and this process import the toy's actions."""
     monkeypatch.syspath_prepend(str(HERE))
 
 
 @pytest.fixture
 def toy_plan() -> CampaignPlan:
-    """Twelve trials in two regimes, blocks of three."""
+    """A plan of twelve trials in two regimes, in blocks of three."""
     return CampaignPlan(
         str(TASK),
         str(SERVICES),
@@ -67,7 +67,8 @@ Conduct = Callable[..., Campaign]
 
 @pytest.fixture
 def conduct(tmp_path: Path, toy_plan: CampaignPlan) -> Iterator[Conduct]:
-    """Run a campaign of the toy in a folder of tmp_path; the plan's fields may be changed."""
+    """Return a function that runs a campaign of the toy in a folder of tmp_path, with changes to
+    the plan's fields."""
 
     def run(name: str, fails_at: int | None = None, **changes: Any) -> Campaign:
         plan = replace(toy_plan, **changes)

@@ -1,5 +1,5 @@
-"""A campaign's table is the same for any number of workers, in any order, and however often the
-campaign was interrupted."""
+"""A campaign's table is the same for any number of workers, any order of blocks, and any number of
+interruptions."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ from tests.waiting import beat, until
 
 
 def table(folder: Path) -> bytes:
-    """The table's bytes."""
+    """Return the table's bytes."""
     return (folder / TABLE).read_bytes()
 
 
-def test_blocks_cover_all_trials_whatever_their_size(toy_plan: CampaignPlan) -> None:
-    """Regimes take turns and share their seeds; numbers and seeds come from the index alone."""
+def test_blocks_of_any_size_cover_all_trials(toy_plan: CampaignPlan) -> None:
+    """Regimes alternate and share their seeds; numbers and seeds depend only on the index."""
     for runs, block in ((1, 4), (7, 3), (12, 5), (20, 1)):
         blocks = replace(toy_plan, runs=runs, block=block).blocks
         assert [b.index for b in blocks] == list(range(len(blocks)))
@@ -62,7 +62,7 @@ def test_blocks_cover_all_trials_whatever_their_size(toy_plan: CampaignPlan) -> 
 
 
 def test_columns_come_from_task_and_score(conduct: Conduct) -> None:
-    """One row a trial, with what the toy's own score says and what each run did."""
+    """The table has one row per trial, with the values of the toy's score and of each run."""
     campaign = conduct("a")
     rows = list(campaign.table.rows())
     assert [row.n for row in rows] == list(range(1, 13))
@@ -83,7 +83,7 @@ def test_columns_come_from_task_and_score(conduct: Conduct) -> None:
         assert row.trial.runs[0].place == "look"
         assert row.score["parts.n"] == row.k
         grips = [run for run in row.trial.runs if run.place == "grip"]
-        assert all(run.cost == 1.0 for run in grips)  # grip_soft costs its force
+        assert all(run.cost == 1.0 for run in grips)  # The cost of grip_soft is its force.
         assert row.trial.goals == sum(run.taken == "gripped" for run in row.trial.runs)
         assert (
             row.trial.time is not None
@@ -91,8 +91,8 @@ def test_columns_come_from_task_and_score(conduct: Conduct) -> None:
         )
 
 
-def test_a_block_is_the_mission_run_that_petrobot_run_gives(conduct: Conduct) -> None:
-    """Seed and number of a row are enough to repeat it alone."""
+def test_a_block_equals_the_mission_run_of_petrobot_run(conduct: Conduct) -> None:
+    """Seed and number of a row suffice to repeat its trial alone."""
     campaign = conduct("a")
     block = campaign.plan.blocks[2]
     setting = Setting(campaign.bench.task, {"regime": block.regime}, block.count, block.seed)
@@ -105,14 +105,14 @@ def test_a_block_is_the_mission_run_that_petrobot_run_gives(conduct: Conduct) ->
 
 
 def test_another_seed_gives_another_table(conduct: Conduct) -> None:
-    """And the same seed the same one."""
+    """The same seed gives the same table."""
     assert table(conduct("a").folder) == table(conduct("b").folder)
     assert table(conduct("a").folder) != table(conduct("c", seed=2).folder)
 
 
 @pytest.mark.parametrize("fails_at", [0, 1, 3])
 def test_interrupted_and_resumed_gives_the_same_table(conduct: Conduct, fails_at: int) -> None:
-    """Between blocks, and in the middle of writing one."""
+    """Tried between blocks, and while a block is being written."""
     whole = conduct("whole")
     with pytest.raises(KeyboardInterrupt):
         conduct("part", fails_at=fails_at)
@@ -127,29 +127,30 @@ def test_interrupted_and_resumed_gives_the_same_table(conduct: Conduct, fails_at
 
 @pytest.mark.parametrize("kept", [1, 40, 400, 1500])
 def test_a_table_cut_anywhere_is_recovered(conduct: Conduct, kept: int) -> None:
-    """Whatever the disk kept of it."""
+    """Any number of bytes may have reached the disk."""
     whole, other = conduct("whole"), conduct("other")
     (other.folder / TABLE).write_bytes(table(other.folder)[:-kept])
     assert table(conduct("other").folder) == table(whole.folder)
 
 
 def test_another_campaign_in_the_same_folder_is_refused(conduct: Conduct) -> None:
-    """With the keys that differ."""
+    """The error lists the keys that differ."""
     conduct("a")
     with pytest.raises(CampaignError, match="seed, selector differ"):
         conduct("a", seed=5, selector="random")
 
 
 def plan_cut_off(folder: Path, size: int) -> Path:
-    """A manifest of which the disk kept so many bytes."""
+    """Write a manifest of which only some bytes reached the disk."""
     path = folder / MANIFEST
     path.write_bytes(path.read_bytes()[:size])
     return path
 
 
 @pytest.mark.parametrize("size", [0, 1, 100])
-def test_a_manifest_that_was_cut_off_says_what_to_do(conduct: Conduct, size: int) -> None:
-    """Before the first block: remove it; with a table beside it: the folder. What is said helps."""
+def test_a_truncated_manifest_is_reported_with_a_remedy(conduct: Conduct, size: int) -> None:
+    """Before the first block the remedy is to remove the manifest; with a table, to remove the
+    folder. The test follows the remedy."""
     whole = conduct("whole")
     with pytest.raises(KeyboardInterrupt):
         conduct("a", fails_at=0)
@@ -170,8 +171,8 @@ def test_a_manifest_that_was_cut_off_says_what_to_do(conduct: Conduct, size: int
 
 
 @pytest.mark.parametrize("text", ["[]", "7", '{"schema": 1}', '{"schema": 1, "regimes": 3}'])
-def test_a_manifest_that_is_no_plan_is_refused(conduct: Conduct, text: str) -> None:
-    """Though it is JSON."""
+def test_a_manifest_that_is_not_a_plan_is_refused(conduct: Conduct, text: str) -> None:
+    """It is refused although it is valid JSON."""
     folder = conduct("a").folder
     (folder / MANIFEST).write_text(text, encoding="utf-8")
     with pytest.raises(CampaignError, match="not a plan"):
@@ -181,8 +182,7 @@ def test_a_manifest_that_is_no_plan_is_refused(conduct: Conduct, text: str) -> N
 def test_a_kill_while_the_manifest_is_written_leaves_the_old_one_or_the_new_one(
     conduct: Conduct, toy_plan: CampaignPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever had been written when the process died: before the file is on the disk it has
-    another name."""
+    """The process may die at any byte: until the file is complete on disk it has another name."""
     folder = conduct("a").folder
     before = (folder / MANIFEST).read_bytes()
 
@@ -199,19 +199,19 @@ def test_a_kill_while_the_manifest_is_written_leaves_the_old_one_or_the_new_one(
 
 
 def test_files_that_changed_are_refused(conduct: Conduct, tmp_path: Path) -> None:
-    """A table is of one task file."""
+    """A table belongs to one version of the task file."""
     with pytest.raises(CampaignError, match="has changed"):
         conduct("a", digests={"task": "0" * 64})
 
 
-def test_a_bad_regime_is_the_campaigns_fault(conduct: Conduct) -> None:
-    """The cell's own words, with the seed."""
+def test_a_bad_regime_is_an_error_of_the_campaign(conduct: Conduct) -> None:
+    """The error has the cell's message and the seed."""
     with pytest.raises(CampaignError, match="no regime 'steep'"):
         conduct("a", regimes=("steep",))
 
 
 def test_round_robin_tries_every_combination(conduct: Conduct) -> None:
-    """Three ways to look times two to grip, in each regime."""
+    """There are three actions to look and two to grip, in each regime."""
     rows = list(conduct("a", selector="round_robin", runs=24).table.rows())
     easy = [row.trial for row in rows if row.regime == "easy"]
     seen = {
@@ -220,11 +220,11 @@ def test_round_robin_tries_every_combination(conduct: Conduct) -> None:
         if t and len(t.runs) > 1
     }
     assert {combination[0] for combination in seen} == {"look_quick", "look_twice", "look_long"}
-    assert len(seen) >= 5  # one of six may have been unseen
+    assert len(seen) >= 5  # One of the six may not have been tried.
 
 
 def test_progress_counts_trials(tmp_path: Path, toy_plan: CampaignPlan) -> None:
-    """Up to the last one; a resumed campaign says how many it found."""
+    """It counts up to the last one; a resumed campaign reports how many it found."""
     from tests.studies.campaign.conftest import InlinePool
 
     seen: list[CampaignProgress] = []
@@ -238,7 +238,7 @@ def test_progress_counts_trials(tmp_path: Path, toy_plan: CampaignPlan) -> None:
 def test_workers_in_any_number_and_a_killed_one_change_nothing(
     conduct: Conduct, tmp_path: Path, toy_plan: CampaignPlan
 ) -> None:
-    """kill -9 of a busy worker: its block is done again by another one."""
+    """After kill -9 of a busy worker another one repeats its block."""
     alone = conduct("alone", selector="random")
     plan = alone.plan
 
@@ -259,11 +259,11 @@ def test_workers_in_any_number_and_a_killed_one_change_nothing(
     assert len(list(read_table(tmp_path / "by_3" / TABLE))) == 12
 
 
-def test_nothing_of_a_block_is_there_when_the_next_one_begins(
+def test_the_memory_of_a_block_is_freed_before_the_next_one(
     toy_plan: CampaignPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A worker's memory stays flat although a mission refers to itself in circles and the collector
-    has its own time."""
+    """A worker's memory stays constant although a mission contains reference cycles and the garbage
+    collector runs at its own times."""
     left: list[int] = []
 
     def orders() -> Iterator[str]:
@@ -274,7 +274,7 @@ def test_nothing_of_a_block_is_there_when_the_next_one_begins(
 
     monkeypatch.setattr(
         gc, "freeze", lambda: None
-    )  # for good in a worker; here it would be for all tests that follow
+    )  # A worker keeps this setting; here it would affect all later tests.
     answers = io.StringIO()
     gc.collect()
     gc.disable()
@@ -286,8 +286,8 @@ def test_nothing_of_a_block_is_there_when_the_next_one_begins(
     assert not any(left)
 
 
-def test_learning_depends_on_batches_alone(conduct: Conduct) -> None:
-    """Interrupted in the middle of a batch and resumed, it chooses and learns the same."""
+def test_learning_depends_only_on_batches(conduct: Conduct) -> None:
+    """Interrupted within a batch and resumed, it makes the same choices and learns the same."""
     learning = {"selector": "nikolic_fu_fast", "runs": 60, "batch": 12, "options": {"rho": 0.1}}
     whole = conduct("whole", **learning)
     for fails_at in (6, 8, 11):
@@ -302,8 +302,8 @@ def test_learning_depends_on_batches_alone(conduct: Conduct) -> None:
     assert set(looks[:15]) == {"look_quick", "look_twice", "look_long"}  # first trials of each
 
 
-def test_what_was_learned_can_be_judged_afresh(conduct: Conduct) -> None:
-    """By regime, from the result of the campaign that learned."""
+def test_learned_choices_can_be_evaluated_again(conduct: Conduct) -> None:
+    """They are evaluated by regime, from the result of the learning campaign."""
     import json
 
     from petrobot.coordinator.studies.campaign.policies import learned_choices
@@ -319,8 +319,8 @@ def test_what_was_learned_can_be_judged_afresh(conduct: Conduct) -> None:
                 assert run.action == best[row.regime][run.place]
 
 
-def test_parquet_where_pyarrow_is_there(conduct: Conduct) -> None:
-    """The same rows and columns as the CSV file; without pyarrow nothing is written."""
+def test_parquet_is_written_if_pyarrow_is_installed(conduct: Conduct) -> None:
+    """It has the rows and columns of the CSV file; without pyarrow no file is written."""
     from petrobot.coordinator.studies.campaign.table import write_parquet
 
     campaign = conduct("a")
@@ -334,7 +334,7 @@ def test_parquet_where_pyarrow_is_there(conduct: Conduct) -> None:
 
 
 def test_an_action_that_cannot_be_loaded_is_bad_input(conduct: Conduct, tmp_path: Path) -> None:
-    """Named by the location file, not by a lost worker."""
+    """The error names the location file and does not look like a lost worker."""
     other = tmp_path / "services.toml"
     other.write_text(
         SERVICES.read_text(encoding="utf-8").replace(
@@ -346,14 +346,14 @@ def test_an_action_that_cannot_be_loaded_is_bad_input(conduct: Conduct, tmp_path
         conduct("a", services=str(other), digests={"task": digest(TASK), "services": digest(other)})
 
 
-def test_j_is_made_with_the_target_and_rho_that_were_given(conduct: Conduct) -> None:
-    """Else with the target that the task file declares: cost is that of the hardest regime which
+def test_j_uses_the_given_target_and_rho(conduct: Conduct) -> None:
+    """Without them it uses the target of the task file: the cost is that of the hardest regime that
     still reaches it."""
     campaign = conduct("a", selector="round_robin", runs=240)
     task, plan = campaign.bench.task, campaign.plan
     assert (
         campaign.result()["judged"]["look"]["target"] == 0.9
-    )  # declared, if only by leaving it out
+    )  # A declared target, even if only by default.
     sets = []
     for options in ({}, {"target": 0.3}, {"target": 0.6}, {"target": 0.99}, {"rho": 0.25}):
         summary = Summary.of(task, campaign.table.rows(), options=options)
@@ -388,13 +388,13 @@ def test_j_is_made_with_the_target_and_rho_that_were_given(conduct: Conduct) -> 
         assert (f"no action surely reaches R {target:g}" in said) == (not judged["meet_target"])
         assert (f"(below R {target:g})" in said) == (0 < len(judged["meet_target"]) < 3)
         sets.append(sorted(map(len, inside.values())))
-    assert sets[1] == [2, 2, 2]  # the targets tell regimes and actions apart
+    assert sets[1] == [2, 2, 2]  # The targets distinguish regimes and actions.
     assert sets[2] not in (sets[1], sets[3])
     assert sets[3] == [0, 0, 0]
     one = comparisons(task, summary.estimates.tallies, "rough")["look"]
     assert one.scenarios == ("regime=rough",)
     assert all(f.admissible for f in one.figures), (
-        "in one regime the declared target rules nobody out"
+        "in one regime the declared target must exclude no action"
     )
 
 
@@ -416,8 +416,8 @@ values = { force = 4.0 }
 def test_a_count_is_a_cost_in_campaigns_and_runs_alike(
     conduct: Conduct, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Declared in the task file: how many images a run averaged, as it reports, 1 where it reports
-    nothing."""
+    """The task file declares as cost the number of images that a run reports, or 1 if it reports
+    none."""
     monkeypatch.chdir(tmp_path)
     text = TASK.read_text(encoding="utf-8").replace('"look_long"]', '"look_long"]\ncost = "count"')
     (task := tmp_path / "fetch.toml").write_text(text, encoding="utf-8")
@@ -459,11 +459,11 @@ def test_a_count_is_a_cost_in_campaigns_and_runs_alike(
 
 
 @pytest.mark.parametrize("selector", ["random", "round_robin", "ucb1"])
-def test_learned_show_judges_as_the_campaign_did(
+def test_learned_show_uses_the_criteria_of_the_campaign(
     conduct: Conduct, selector: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the cost, the target and the rho that its estimates file holds, also if no selector
-    learned by them."""
+    """It uses the cost, target and rho of the estimates file, even if no selector learned with
+    them."""
     monkeypatch.chdir(tmp_path)
     options = {"target": 0.6, "rho": 0.2}
     result = conduct("a", selector=selector, runs=120, options=options).result()
@@ -480,7 +480,9 @@ def test_learned_show_judges_as_the_campaign_did(
         assert (about["target"], about["rho"]) == (0.6, 0.2)
 
 
-def test_a_damaged_estimates_file_says_that_it_can_be_made_again(conduct: Conduct) -> None:
+def test_the_error_of_a_damaged_estimates_file_says_that_it_can_be_made_again(
+    conduct: Conduct,
+) -> None:
     """The file is derived from the table, but it is not replaced without asking: it may hold
     more."""
     campaign = conduct("a")
@@ -496,8 +498,8 @@ def test_a_damaged_estimates_file_says_that_it_can_be_made_again(conduct: Conduc
     assert EstimatesFile(path).read().estimates == whole
 
 
-def test_a_cost_that_no_result_has_is_said(conduct: Conduct, tmp_path: Path) -> None:
-    """J would be 1 - R then, without any sign of it."""
+def test_a_cost_that_no_result_reports_is_mentioned(conduct: Conduct, tmp_path: Path) -> None:
+    """Otherwise J would be 1 - R without any notice."""
     task = tmp_path / "fetch.toml"
     task.write_text(
         TASK.read_text(encoding="utf-8").replace("value:force", "value:forse"), encoding="utf-8"
@@ -507,15 +509,15 @@ def test_a_cost_that_no_result_has_is_said(conduct: Conduct, tmp_path: Path) -> 
     )
     result = campaign.result()
     assert result["judged"]["grip"]["uncosted"] == ["grip_soft"]
-    result["chosen"]["grip"]["grip_hard"] = 1  # primitive tasks without a choice are not printed
+    result["chosen"]["grip"]["grip_hard"] = 1  # Primitive tasks without a choice are not printed.
     assert "grip_soft: no run reported value:forse" in text_of(result)
 
 
 @pytest.mark.processes
-async def test_what_a_dead_worker_has_left_running_does_not_hide_its_death(
+async def test_a_child_of_a_dead_worker_does_not_hide_its_death(
     tmp_path: Path, toy_plan: CampaignPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its child holds its output and its input open; it ends with it."""
+    """The child keeps the worker's input and output open, and ends with it."""
     mark, program = tmp_path / "left", tmp_path / "worker"
     program.write_text(
         f"#!/bin/sh\nread plan\nsleep 3600 &\necho $! > {mark}\nread order\nkill -9 $$\n"

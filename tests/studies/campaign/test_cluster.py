@@ -1,4 +1,4 @@
-"""A campaign on a dask cluster of separate worker processes, one of which is killed on the way."""
+"""A campaign on a dask cluster of separate worker processes, one of which is killed meanwhile."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PATIENCE = 60.0
 
 @contextmanager
 def process(*arguments: str, log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """One process of the cluster, ended at the end."""
+    """Start one process of the cluster; end it on exit."""
     environment = {
         **os.environ,
         "PYTHONPATH": f"{ROOT}:{HERE}",
@@ -47,8 +47,7 @@ def process(*arguments: str, log: Path) -> Iterator[subprocess.Popen[bytes]]:
 def test_a_killed_worker_of_a_real_cluster_changes_nothing(
     conduct: Conduct, tmp_path: Path
 ) -> None:
-    """Scheduler and two workers are processes of their own; one worker is killed with a block in
-    hand."""
+    """The scheduler and two workers are separate processes; one worker is killed during a block."""
     pytest.importorskip(
         "distributed", reason="the extra `cluster` (dask.distributed) is not installed"
     )
@@ -85,7 +84,7 @@ def test_a_killed_worker_of_a_real_cluster_changes_nothing(
 async def _conducted(
     folder: Path, plan: CampaignPlan, where: Path, victim: subprocess.Popen[bytes]
 ) -> None:
-    """The campaign on the cluster; the victim dies after the second block that is done."""
+    """Run the campaign on the cluster; the victim dies after the second finished block."""
     import json
 
     loop = asyncio.get_running_loop()
@@ -108,7 +107,7 @@ async def _conducted(
 def test_without_dask_the_remedy_is_named(
     monkeypatch: pytest.MonkeyPatch, toy_plan: CampaignPlan
 ) -> None:
-    """One clear line."""
+    """The error is one clear line."""
     monkeypatch.setitem(sys.modules, "distributed", None)
 
     async def enter() -> None:

@@ -1,4 +1,4 @@
-"""The commands as a user meets them: campaign, resume, forecast, comparison, bad input."""
+"""The commands as a user calls them: campaign, resume, forecast, comparison, bad input."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TOY = [str(TASK), "--services", str(SERVICES)]
 
 
 def campaign(folder: Path, *arguments: str) -> dict[str, Any]:
-    """Run the command in this process (its workers are others) and give its JSON."""
+    """Run the command in this process (its workers are other processes); return its JSON."""
     out = folder.with_suffix(".json")
     assert (
         main(
@@ -59,7 +59,7 @@ def campaign(folder: Path, *arguments: str) -> dict[str, Any]:
 
 @pytest.mark.processes
 def test_train_forecast_run_and_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The whole loop on the toy cell, with the promised keys."""
+    """The whole sequence on the toy cell, with the documented keys."""
     train = campaign(
         tmp_path / "train",
         "--runs",
@@ -166,8 +166,8 @@ def test_train_forecast_run_and_compare(tmp_path: Path, capsys: pytest.CaptureFi
 def test_a_finished_campaign_is_not_run_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The same command gives the same result at once; another number of runs has a folder of its
-    own."""
+    """The same command returns the same result at once; another number of runs has its own
+    folder."""
     monkeypatch.chdir(tmp_path)
     told = ["campaign", *TOY, "--workers", "1", "--regime", "easy"]
     assert main([*told, "--runs", "4"]) == 0
@@ -182,8 +182,8 @@ def test_a_finished_campaign_is_not_run_again(
 
 
 @pytest.mark.processes
-def test_a_killed_campaign_goes_on(tmp_path: Path) -> None:
-    """SIGINT on the way, then --resume: the table of one that was never interrupted."""
+def test_a_killed_campaign_is_resumed(tmp_path: Path) -> None:
+    """SIGINT during the campaign, then --resume, gives the table of an uninterrupted campaign."""
     arguments = [
         *TOY,
         "--runs",
@@ -215,11 +215,11 @@ def test_a_killed_campaign_goes_on(tmp_path: Path) -> None:
     assert start(*arguments, "--out", "whole").wait() == 0
     assert table.read_bytes() == (tmp_path / "whole" / "table.csv").read_bytes()
     sessions = (tmp_path / "part" / "sessions.csv").read_text(encoding="utf-8").splitlines()
-    assert len(sessions) == 3  # the killed one is known, too
+    assert len(sessions) == 3  # The killed one is listed, too.
 
 
-def test_names_longer_than_their_column_stand_apart_from_what_follows() -> None:
-    """Regimes with several disturbances are long."""
+def test_names_longer_than_their_column_are_separated_from_the_next_column() -> None:
+    """Regimes with several disturbances have long names."""
     part = {"R_goal": 0.75, "wilson": [0.6, 0.9], "P_complete": 1.0, "mean": 4.0, "q90": 5.0}
     result = {
         "task": "t",
@@ -246,7 +246,7 @@ def test_names_longer_than_their_column_stand_apart_from_what_follows() -> None:
 
 @pytest.mark.processes
 def test_no_worker_outlives_a_killed_campaign(tmp_path: Path) -> None:
-    """Not even one that hangs, here because it is frozen."""
+    """Not even a hanging worker does, which is frozen here."""
     command = [
         sys.executable,
         "-m",
@@ -285,8 +285,7 @@ def test_no_worker_outlives_a_killed_campaign(tmp_path: Path) -> None:
 
 
 def _frozen_with_its_workers_at_work(campaign: subprocess.Popen[bytes], folder: Path) -> bool:
-    """Freeze a campaign that has two workers, neither of them a new one still on its way to its
-    first block."""
+    """Freeze a campaign with two workers that both have begun their first block."""
     assert campaign.poll() is None
     campaign.send_signal(signal.SIGSTOP)
     os.waitid(os.P_PID, campaign.pid, os.WSTOPPED)
@@ -298,7 +297,7 @@ def _frozen_with_its_workers_at_work(campaign: subprocess.Popen[bytes], folder: 
 
 
 def _until(condition: Callable[[], bool]) -> None:
-    """Wait for a condition, at most a minute."""
+    """Wait for the condition, at most a minute."""
     over = time.monotonic() + 60.0
     while not condition():
         assert time.monotonic() < over
@@ -348,11 +347,11 @@ def test_bad_input(
 
 
 @pytest.mark.processes
-def test_two_at_once_do_not_write_one_table(
+def test_two_processes_never_write_one_table(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The second process is told which one writes the folder, and touches nothing. A lock whose
-    holder has ended does not count."""
+    """The second process reports which one is writing to the folder, and changes nothing. A lock
+    whose holder has ended is ignored."""
     folder = tmp_path / "one"
     campaign(folder, "--runs", "3")
     before = (folder / "table.csv").read_bytes()
@@ -366,7 +365,8 @@ def test_two_at_once_do_not_write_one_table(
 
 
 def test_progress_line() -> None:
-    """Bar, share that met its goal in this session, time to go from this session's speed."""
+    """It has a bar, the share of trials that met their goal in this session, and the remaining time
+    at this session's speed."""
     shown = line(CampaignProgress(60, 100, 20, 30, 80.0))
     assert "60/100" in shown and "75.0% met" in shown and "1:20 gone, 1:20 to go" in shown
     assert line(CampaignProgress(0, 10, 0, 0, 0.0)).startswith("[....")
@@ -374,7 +374,7 @@ def test_progress_line() -> None:
 
 
 def test_progress_is_for_terminals(capsys: pytest.CaptureFixture[str]) -> None:
-    """One line written over in a terminal, nothing elsewhere."""
+    """In a terminal one line is overwritten; elsewhere nothing is printed."""
     silent = ProgressLine(sys.stderr)
     silent(CampaignProgress(1, 2, 0, 1, 1.0))
     silent.close()

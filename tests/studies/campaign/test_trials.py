@@ -1,4 +1,4 @@
-"""What is written down of a trial: by scripted missions of the shipped task, and rows there and
+"""What is recorded of a trial: scripted missions of the shipped task, and conversion to rows and
 back."""
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ TOY = load(TASK)
 
 
 def logged(lines: dict[str, list[Line]], runs: int = 3) -> tuple[TrialLog, Mission]:
-    """Trials of catch_ball with scripted actions."""
+    """Return trials of catch_ball with scripted actions."""
     task = load_task("catch_ball")
     cell, party = lockstep_cell(directory_for(task), Setting(task, runs=runs), scripts(task, lines))
     log = TrialLog(task, lambda record, values: record.seconds)
@@ -39,9 +39,9 @@ def logged(lines: dict[str, list[Line]], runs: int = 3) -> tuple[TrialLog, Missi
     return log, party.mission
 
 
-def test_a_trial_has_its_runs_and_what_took_them() -> None:
-    """Durations from the coming of the token; parallel runs both; the time ends when everything is
-    back."""
+def test_a_trial_lists_its_runs_and_the_transitions_that_took_them() -> None:
+    """Durations count from the arrival of the token; parallel runs are both listed; the trial ends
+    when all tokens are back."""
     log, _ = logged(
         {"locate_ball": [Line(seconds=(0.4, 0.4), values={"ball": [0.0], "images": 20})]}
     )
@@ -73,7 +73,7 @@ def test_a_trial_has_its_runs_and_what_took_them() -> None:
 
 
 def test_an_error_branch_belongs_to_its_trial() -> None:
-    """Recovery is part of the trial that needed it; the next one is clean."""
+    """Recovery is part of the trial that needed it, not of the next one."""
     bad = Line(ActionStatus.ERROR, (0.1, 0.1), cause="unreachable", text="too far")
     log, _ = logged({"move_to_point": [bad, Line(seconds=(0.2, 0.2)), Line(seconds=(0.2, 0.2))]})
     first, second, _ = log.trials
@@ -83,8 +83,8 @@ def test_an_error_branch_belongs_to_its_trial() -> None:
     assert second.status == "success" and "recovered" not in second.fired
 
 
-def test_giving_up_leaves_trials_unbegun() -> None:
-    """The last trial was begun and not completed; those after it never were."""
+def test_giving_up_leaves_later_trials_unstarted() -> None:
+    """The last trial was started but not completed; later ones were not started."""
     dead = [Line(ActionStatus.ERROR, (0.1, 0.1), cause="drive_fault")]
     log, mission = logged({"move_to_point": dead, "recover_arm": dead}, runs=4)
     assert len(log.trials) == 1 < mission.runs
@@ -93,7 +93,7 @@ def test_giving_up_leaves_trials_unbegun() -> None:
 
 
 def test_a_deferred_verdict_corrects_the_entry() -> None:
-    """Once, for the estimates."""
+    """It is corrected once, for the estimates."""
     log, _ = logged({}, runs=1)
     log.instruction(
         9.0,
@@ -152,11 +152,8 @@ SCORES = st.dictionaries(
 
 
 @given(TRIALS | st.none(), SCORES, st.booleans())
-def test_rows_come_back_as_they_were(
-    trial: Trial | None, score: dict[str, Any], known: bool
-) -> None:
-    """Through CSV, whatever texts hold; results that the first block did not have travel in
-    `more`."""
+def test_rows_survive_conversion(trial: Trial | None, score: dict[str, Any], known: bool) -> None:
+    """CSV keeps any text; results that the first block did not have are stored in `more`."""
     row = TrialRow(7, "easy", 1_000_000, trial.k if trial else 2, 1, 3.25, trial, score)
     names = columns(TOY, [row] if known else [])
     out = io.StringIO()
@@ -178,7 +175,7 @@ def test_rows_come_back_as_they_were(
 
 
 def test_carriage_returns_do_not_break_the_table() -> None:
-    """They become newlines, which CSV quotes."""
+    """They are converted to newlines, which CSV quotes."""
     row = TrialRow(1, "", 1, 1, 0, 1.0, Trial(1, 0.0, cause="one\rtwo\r\nthree"))
     names = columns(TOY, [])
     out = io.StringIO()
@@ -188,15 +185,16 @@ def test_carriage_returns_do_not_break_the_table() -> None:
 
 
 @given(TRIALS)
-def test_trials_travel_as_plain_data(trial: Trial) -> None:
-    """From a worker to the campaign."""
+def test_trials_survive_conversion_to_plain_data(trial: Trial) -> None:
+    """A worker sends them to the campaign."""
     import json
 
     assert Trial.from_plain(json.loads(json.dumps(trial.to_plain()))) == trial
 
 
-def test_scores_go_to_the_trial_that_they_are_of() -> None:
-    """By `run` where there is one, else by `n`; plain values serve a single trial."""
+def test_scores_are_assigned_to_their_trials() -> None:
+    """They are assigned by `run` if given, otherwise by `n`; plain values belong to a single
+    trial."""
     score = {
         "balls": [
             {"n": 1, "run": 2, "x": 0.5},
@@ -214,8 +212,8 @@ def test_scores_go_to_the_trial_that_they_are_of() -> None:
     assert scores({"time_s": 4.0}, 2) == [{}, {}]
 
 
-def test_identity_is_of_what_runs_not_where_it_lies(toy_plan: CampaignPlan) -> None:
-    """The same files elsewhere are the same campaign."""
+def test_the_identity_of_a_campaign_does_not_depend_on_its_folder(toy_plan: CampaignPlan) -> None:
+    """The same files in another folder are the same campaign."""
     from dataclasses import replace
 
     assert identity(replace(toy_plan, task="/elsewhere.toml")) == identity(toy_plan)

@@ -1,5 +1,5 @@
-"""Deferred verdicts in a campaign: table, estimates and summary hold what runs really came to,
-however it was interrupted."""
+"""Deferred verdicts in a campaign: table, estimates and summary hold the final results of runs,
+after any interruption."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BLOCKS = 3
 
 @pytest.fixture
 def plan() -> CampaignPlan:
-    """Three blocks of six parts: of each, the first, third and fourth pick turn out bad."""
+    """Three blocks of six parts; in each, the first, third and fourth pick are judged bad."""
     digests = {"task": digest(TASK), "services": digest(SERVICES)}
     return CampaignPlan(
         str(TASK), str(SERVICES), runs=6 * BLOCKS, block=6, batch=0, digests=digests, regimes=("",)
@@ -31,15 +31,13 @@ def plan() -> CampaignPlan:
 
 
 def conducted(folder: Path, plan: CampaignPlan, fails_at: int | None = None) -> Campaign:
-    """The campaign in a folder."""
+    """Run the campaign in a folder."""
     campaign = Campaign(folder, plan)
     asyncio.run(campaign.run(InlinePool(plan, fails_at)))
     return campaign
 
 
-def test_the_table_and_the_estimates_hold_what_was_judged(
-    tmp_path: Path, plan: CampaignPlan
-) -> None:
+def test_the_table_and_the_estimates_hold_the_verdicts(tmp_path: Path, plan: CampaignPlan) -> None:
     campaign = conducted(tmp_path / "a", plan)
     rows = list(campaign.table.rows())
     assert len(rows) == 6 * BLOCKS
@@ -63,7 +61,9 @@ def test_the_table_and_the_estimates_hold_what_was_judged(
     assert tally.reliability == 0.5
 
 
-def test_interrupted_and_resumed_it_is_the_same_table(tmp_path: Path, plan: CampaignPlan) -> None:
+def test_interrupted_and_resumed_it_gives_the_same_table(
+    tmp_path: Path, plan: CampaignPlan
+) -> None:
     whole = (conducted(tmp_path / "a", plan).folder / TABLE).read_bytes()
     with pytest.raises(KeyboardInterrupt):
         conducted(tmp_path / "b", plan, fails_at=1)

@@ -1,5 +1,5 @@
-"""Actions and services of the toy cell: their chance is keyed by seed and run, and a hard part is
-hard for all of them."""
+"""Actions and services of the toy cell. Their random numbers depend on seed and run, and a hard
+part is hard for all of them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ HARD = {"easy": 0.1, "rough": 0.5}
 
 
 async def look(ctx: Context, *, regime: str, seconds: float, share: float) -> Result:
-    """Look for a part; a hard one takes twice as long and is overlooked more often."""
+    """Look for a part; a hard one takes twice as long and is missed more often."""
     draw = ctx.random("look")
     hard = bool(draw.random() < HARD[regime])
     await ctx.sleep(seconds * (2.0 if hard else 1.0) * float(draw.uniform(0.8, 1.2)))
@@ -27,7 +27,7 @@ async def look(ctx: Context, *, regime: str, seconds: float, share: float) -> Re
 
 
 async def grip(ctx: Context, *, hard: bool, force: float, share: float) -> Result:
-    """Grip; a hard part is lost half of the time, and now and then the arm jams."""
+    """Grip; a hard part is lost half of the time, and sometimes the arm jams."""
     draw = ctx.random("grip")
     await ctx.sleep(float(draw.uniform(0.3, 0.5)))
     if draw.random() < 0.02:
@@ -37,7 +37,7 @@ async def grip(ctx: Context, *, hard: bool, force: float, share: float) -> Resul
 
 
 async def mend(ctx: Context) -> Result:
-    """Mend the arm; one time in four that cannot be done."""
+    """Repair the arm; one time in four this fails."""
     await ctx.sleep(1.0)
     return success() if ctx.random("mend").random() > 0.25 else error("worn")
 
@@ -52,7 +52,7 @@ def prepare(ctx: Context, *, regime: str, seed: int, runs: int) -> Result:
 
 
 def score(ctx: Context, *, cycles: Sequence[dict[str, Any]]) -> Result:
-    """A row for each part, and a picture of its own."""
+    """Return a row for each part, and a picture."""
     rows = [
         {"n": c["n"], "x": 0.1 * c["n"], "y": c["ended_ago"], "gripped": c["status"] != "error"}
         for c in cycles

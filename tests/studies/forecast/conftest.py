@@ -1,5 +1,5 @@
-"""What the tests of forecasts share: trials of a small task that are drawn here, so that the truth
-is known."""
+"""Fixtures of the forecast tests: randomly drawn trials of a small task with known
+probabilities."""
 
 from __future__ import annotations
 
@@ -74,16 +74,18 @@ Make = Callable[..., list[Trial]]
 
 @pytest.fixture
 def pair() -> Task:
-    """Two runs one after the other; an external signal ends the second one as a success."""
+    """A task of two runs, one after the other; an external signal ends the second one as a
+    success."""
     return loads(TASK, "pair.toml")
 
 
 @pytest.fixture
 def make_trials() -> Make:
-    """Trials in which a hidden difficulty (`dependence` 1) or chance (0) decides about both runs.
+    """Return a function that draws trials in which a hidden difficulty (`dependence` 1) or chance
+    (0) decides about both runs.
 
-    first: error 5 %, else failure when it was hard; second: the signal comes after 2 - (duration of
-    first) s, or it is missed.
+    First run: error in 5 %, otherwise failure if it was hard. Second run: the signal comes after
+    2 - (duration of the first) s, or it is missed.
     """
 
     def make(

@@ -1,5 +1,5 @@
-"""Forecasts of a task whose truth is known: they cover it, keep dependence, and the product rule
-does not."""
+"""Forecasts of a task with known probabilities: their intervals cover the true values and they keep
+dependence, which the product rule does not."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RUNS = 400
 
 
 def forecast(task: Task, trials: list[Trial], **given_: Any) -> dict[str, Any]:
-    """A forecast from trials with their own choices."""
+    """Make a forecast from trials with their own choices."""
     training = Training.of(task, trials)
     return predict(
         training,
@@ -42,7 +42,7 @@ def forecast(task: Task, trials: list[Trial], **given_: Any) -> dict[str, Any]:
 
 
 def test_marginals_of_the_training_are_kept(pair: Task, make_trials: Make) -> None:
-    """Whatever depends on whatever: the net composes the laws to what was measured."""
+    """With any dependence, the net composes the distributions to the measured ones."""
     trials = make_trials(1500, np.random.default_rng(1))
     found, own = forecast(pair, trials)["figures"], figures(measured(Training.of(pair, trials)))
     for name in ("R_goal", "P_complete", "R_conj"):
@@ -51,11 +51,11 @@ def test_marginals_of_the_training_are_kept(pair: Task, make_trials: Make) -> No
         assert found[name]["value"] == pytest.approx(own[name], rel=0.01)
 
 
-def test_dependence_is_found_unfolded_and_the_product_is_not_the_truth(
+def test_dependence_is_found_and_unfolded_and_the_product_is_wrong(
     pair: Task, make_trials: Make
 ) -> None:
-    """Statuses of one trial depend on each other: the product of marginals is too small, the
-    contexts are not."""
+    """Statuses within a trial depend on each other: the product of marginals is too small, the
+    forecast with contexts is not."""
     trials = make_trials(1500, np.random.default_rng(2))
     training = Training.of(pair, trials)
     assert dependences(training)[0]["p"] < 1e-6
@@ -72,7 +72,7 @@ def test_dependence_is_found_unfolded_and_the_product_is_not_the_truth(
 
 
 def test_without_dependence_the_product_is_not_rejected(pair: Task, make_trials: Make) -> None:
-    """The control discriminates: independent statuses multiply."""
+    """Control experiment: independent statuses multiply."""
     trials = make_trials(1500, np.random.default_rng(4), dependence=0.0)
     assert dependences(Training.of(pair, trials))[0]["p"] > 0.01
     found = agreement(
@@ -82,8 +82,8 @@ def test_without_dependence_the_product_is_not_rejected(pair: Task, make_trials:
     assert not found["negative_control"][0]["rejected"]
 
 
-def test_a_changed_world_is_not_agreed_with(pair: Task, make_trials: Make) -> None:
-    """The comparison can fail: it reports other times and other shares."""
+def test_the_comparison_rejects_a_changed_world(pair: Task, make_trials: Make) -> None:
+    """The comparison can fail: it reports different times and different shares."""
     made = forecast(pair, make_trials(1500, np.random.default_rng(6)))
     slower = [
         replace(t, time=t.time * 1.05 if t.time else None)
@@ -101,8 +101,8 @@ def test_a_changed_world_is_not_agreed_with(pair: Task, make_trials: Make) -> No
 
 
 def test_unfolding_keeps_the_spread_of_the_time(pair: Task, make_trials: Make) -> None:
-    """A long first run is followed by a short second one: independent draws would spread the time
-    too far."""
+    """A long first run is followed by a short second one: independent draws would make the spread
+    of the time too large."""
     trials = make_trials(1500, np.random.default_rng(9))
     training = Training.of(pair, trials)
     real = measured(training)
@@ -116,7 +116,7 @@ def test_unfolding_keeps_the_spread_of_the_time(pair: Task, make_trials: Make) -
 
 
 def test_a_choice_that_was_never_measured_is_refused(pair: Task, make_trials: Make) -> None:
-    """What-if needs at least some runs of the action; with them it works."""
+    """A what-if forecast needs at least some runs of the action; with them it works."""
     trials = make_trials(300, np.random.default_rng(11))
     other = {"first": {"first_b": 1.0}, "second": {"second_a": 1.0}}
     with pytest.raises(ValueError, match="first_b was never run"):
@@ -133,8 +133,8 @@ def test_a_choice_that_was_never_measured_is_refused(pair: Task, make_trials: Ma
 
 
 def test_predictive_intervals_cover(pair: Task, make_trials: Make) -> None:
-    """Of 40 worlds with 95 % intervals for R_goal and the mean, nearly all hold (99.9 % binomial
-    bound)."""
+    """In 40 worlds, nearly all 95 % intervals for R_goal and the mean cover the true value (99.9 %
+    binomial bound)."""
     inside = 0
     for seed in range(20):
         random = np.random.default_rng(100 + seed)
@@ -151,9 +151,9 @@ def test_predictive_intervals_cover(pair: Task, make_trials: Make) -> None:
     assert binom.cdf(inside, 40, 0.95) > 0.001
 
 
-def test_censored_runs_pass_their_weight_on(pair: Task) -> None:
-    """Aalen-Johansen by hand: ends at 1 (success), 3 (failure); one censored at 2 gives its third
-    to the end at 3."""
+def test_the_weight_of_censored_runs_goes_to_later_ends(pair: Task) -> None:
+    """Aalen-Johansen by hand: ends at 1 (success) and 3 (failure); the run censored at 2 passes its
+    third to the end at 3."""
     runs = [
         RunEntry("first", "first_a", 0.0, took, status)
         for took, status in ((1.0, "success"), (2.0, ""), (3.0, "failure"))
@@ -173,14 +173,14 @@ def test_censored_runs_pass_their_weight_on(pair: Task) -> None:
 
 
 def test_holm_by_hand() -> None:
-    """Sorted .01 .03 .04: times 3, 2, 1, never falling."""
+    """The sorted p-values .01 .03 .04 are multiplied by 3, 2, 1 and never decrease."""
     assert holm([0.03, 0.01, 0.04]) == pytest.approx([0.06, 0.03, 0.06])
     assert holm([]) == []
 
 
 @given(st.lists(st.floats(0, 1), max_size=8))
 def test_holm_lies_between_plain_and_bonferroni(p_values: list[float]) -> None:
-    """And keeps the order."""
+    """It also keeps the order."""
     adjusted = holm(p_values)
     assert all(
         p <= a <= min(1.0, len(p_values) * p) + 1e-12
@@ -190,21 +190,21 @@ def test_holm_lies_between_plain_and_bonferroni(p_values: list[float]) -> None:
 
 @given(st.floats(0.0, 1.0), st.integers(10, 5000), st.integers(1, 2000))
 def test_share_test_and_interval_agree(value: float, weight: int, n: int) -> None:
-    """What lies in the middle of the interval is never rejected at 5 %."""
+    """A share in the middle of the interval is never rejected at 5 %."""
     low, high = predictive_interval(value, weight, n)
     middle = round(n * (low + high) / 2)
     assert share_p_value(value, weight, middle, n) > 0.05
     assert 0.0 <= low <= high <= 1.0
 
 
-def test_a_share_of_one_expects_a_miss_now_and_then() -> None:
-    """999 of 1,000 do not contradict a forecast from 1,000 of 1,000; 980 do."""
+def test_a_share_of_one_tolerates_a_rare_miss() -> None:
+    """999 of 1,000 do not contradict a forecast made from 1,000 of 1,000; 980 do."""
     assert share_p_value(1.0, 1000, 999, 1000) > 0.05
     assert share_p_value(1.0, 1000, 980, 1000) < 1e-3
 
 
 def test_quantile_interval_holds_its_quantile() -> None:
-    """Uniform numbers: the 90 % point is in the 90 % interval about nine times in ten."""
+    """For uniform numbers the 90 % quantile is in its 90 % interval about nine times in ten."""
     random = np.random.default_rng(1)
     hits = sum(
         low <= 0.9 <= high
@@ -213,8 +213,8 @@ def test_quantile_interval_holds_its_quantile() -> None:
     assert 165 <= hits <= 198
 
 
-def test_distance_is_kolmogorovs() -> None:
-    """Against scipy's."""
+def test_the_distance_is_that_of_kolmogorov() -> None:
+    """It equals that of scipy."""
     from scipy.stats import ks_2samp
 
     random = np.random.default_rng(2)
@@ -230,7 +230,7 @@ def test_distance_is_kolmogorovs() -> None:
 def test_a_registered_forecast_stays_as_it_is(
     pair: Task, make_trials: Make, tmp_path: Path
 ) -> None:
-    """Never written over; a changed one is refused."""
+    """It is never overwritten; a changed file is refused."""
     training = {"": Training.of(pair, make_trials(200, np.random.default_rng(1)))}
     request = {"": Request(100, choices_of(training[""]), replicates=20, point=2000)}
     made = register(pair, training, request, {"estimates": {"campaign": "c"}})
@@ -247,14 +247,14 @@ def test_a_registered_forecast_stays_as_it_is(
 
 
 def test_the_same_seed_gives_the_same_forecast(pair: Task, make_trials: Make) -> None:
-    """All chance is seeded."""
+    """All random numbers are seeded."""
     trials = make_trials(300, np.random.default_rng(1))
     assert forecast(pair, trials) == forecast(pair, trials)
 
 
-def test_the_stochastic_view_stands_beside(pair: Task, make_trials: Make) -> None:
-    """It keeps shares and means exactly, but takes statuses for independent: its R_conj is the
-    product, not the truth."""
+def test_the_stochastic_view_is_reported_too(pair: Task, make_trials: Make) -> None:
+    """It keeps shares and means exactly, but assumes independent statuses: its R_conj is the
+    product, not the true value."""
     from petrobot.coordinator.studies.campaign.observed import estimates_of
     from petrobot.coordinator.studies.campaign.rows import TrialRow
     from petrobot.coordinator.studies.forecast.registered import exact
@@ -265,7 +265,9 @@ def test_the_stochastic_view_stands_beside(pair: Task, make_trials: Make) -> Non
     found = exact(pair, estimates_of(pair, rows, "t"), "", choices_of(training))
     own = figures(measured(training))
     assert found["R_goal"] == pytest.approx(own["R_goal"], abs=1e-3)
-    assert found["mean"] == pytest.approx(own["mean"] + 0.1, rel=0.01)  # with the wait for the tick
+    assert found["mean"] == pytest.approx(
+        own["mean"] + 0.1, rel=0.01
+    )  # includes the wait for the tick
     product = forecast(pair, trials)["product"]["R_conj"]
     assert found["R_conj"] == pytest.approx(product, abs=1e-3)
     assert found["R_conj"] < own["R_conj"] - 0.05

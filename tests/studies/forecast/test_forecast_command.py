@@ -1,5 +1,5 @@
-"""The command as a user meets it, on campaigns that are written here: doubts, what-ifs and what
-does not belong together."""
+"""The command as a user calls it, on campaigns written by the tests: doubts, what-ifs, and files
+that do not belong together."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ BOTH = ("first_a", "first_b")
 
 @pytest.fixture
 def write_campaign(tmp_path: Path) -> Write:
-    """A campaign's folder with given trials of a task file."""
+    """Return a function that writes a campaign's folder with given trials of a task file."""
 
     def write(name: str, text: str, trials: list[Trial], seed: int = 1, **more: Any) -> Path:
         task = loads(text, "task.toml")
@@ -58,8 +58,8 @@ def write_campaign(tmp_path: Path) -> Write:
 
 
 def dependent(random: np.random.Generator) -> Trial:
-    """Watching always ends a little before locating: what two independent runs would not do, and no
-    context tells."""
+    """Draw trials in which watching always ends a little before locating, which two independent
+    runs would not do and no context explains."""
     locate = float(random.uniform(0.5, 1.5))
     runs = [
         RunEntry(
@@ -76,10 +76,10 @@ def dependent(random: np.random.Generator) -> Trial:
     return Trial(1, 0.0, round(locate, 6), True, 0, runs=runs, fired={"next": 1, "found_late": 1})
 
 
-def test_a_doubtful_forecast_is_told_and_not_registered(
+def test_a_doubtful_forecast_is_reported_and_not_registered(
     write_campaign: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Exit code 1 and no file. With --doubtful it is registered, and the comparison mentions it."""
+    """Exit code 1 and no file; with --doubtful it is registered, and the comparison mentions it."""
     random = np.random.default_rng(1)
     train = write_campaign("train", ONE_WAY, [dependent(random) for _ in range(300)])
     out = tmp_path / "f.json"
@@ -112,8 +112,8 @@ def test_a_doubtful_forecast_is_told_and_not_registered(
 def test_a_what_if_is_compared_with_runs_that_choose_so(
     write_campaign: Write, make_trials: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Others are refused with the choices that fit; those that fit agree, their ways out of each
-    place too."""
+    """Others are refused with the matching choices; matching runs agree, also in the shares of
+    outgoing transitions."""
     train = write_campaign("train", TASK, make_trials(900, np.random.default_rng(1), actions=BOTH))
     out = tmp_path / "f.json"
     told = ["forecast", str(tmp_path / "pair.toml"), "--estimates", str(train), *QUICK]
@@ -137,7 +137,9 @@ def test_a_what_if_is_compared_with_runs_that_choose_so(
     assert "the campaign chooses first=first_b" in capsys.readouterr().err
 
 
-def test_ways_out_of_places_are_those_of_the_chosen_actions(pair: Task, make_trials: Make) -> None:
+def test_shares_of_outgoing_transitions_are_those_of_the_chosen_actions(
+    pair: Task, make_trials: Make
+) -> None:
     """Trials with another action say nothing about the what-if."""
     trials = make_trials(400, np.random.default_rng(5), actions=BOTH)
     training = Training.of(pair, trials)
@@ -162,11 +164,11 @@ def test_ways_out_of_places_are_those_of_the_chosen_actions(pair: Task, make_tri
         ({"a": 1.0, "b": 0.0}, {"asked": ["t"]}, {"a": 6}, True),
     ],
 )
-def test_misfits(
+def test_campaigns_that_do_not_match_a_forecast(
     choices: dict[str, float], more: dict[str, Any], run: dict[str, int], fits: bool
 ) -> None:
-    """Of 400 training trials: a mix by its shares, one action alone by the others' absence, unless
-    it was hardly ever run."""
+    """With 400 training trials, a mix of actions is rejected by its shares, and a single action
+    because the others are missing, unless they were hardly ever run."""
     said = {"choices": {"t": choices}, "training_trials": 400, **more}
     assert misfit(said, {"t": run, "of another forecast": {"x": 5}}) == ([] if fits else ["t"])
 
@@ -203,7 +205,7 @@ def test_bad_input(
 def test_estimates_of_another_task_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Also from a file of estimates."""
+    """This includes a file of estimates."""
     from petrobot.coordinator.studies.campaign.observed import estimates_of, write_estimates
 
     random = np.random.default_rng(1)

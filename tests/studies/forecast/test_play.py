@@ -1,5 +1,5 @@
-"""Playing a net: branches side by side, timers, conditions, loops, inhibitors and dead ends, each
-against what is known by hand."""
+"""Simulating a net for a forecast: parallel branches, timers, conditions, loops, inhibitors and
+dead ends, each against values computed by hand."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def play(
     n: int = 2000,
     task: str = 'final = "end == 1"\nruns_place = "jobs"',
 ) -> Played:
-    """Throws of a task played from what was measured."""
+    """Simulate trials of a task from measured runs."""
     training = Training.of(loads(HEAD.replace("{task}", task) + text, "net.toml"), throws)
     random = np.random.default_rng(1)
     drawer = Drawer(RunDistributions(training), training.waits, np.ones((1, len(throws))), random)
@@ -71,7 +71,7 @@ def play(
 def entry(
     place: str, took: float, status: str = "success", taken: str = "", **more: Any
 ) -> RunEntry:
-    """A run that ended."""
+    """Return a finished run."""
     return RunEntry(place, f"run_{place}", 0.0, took, status, taken=taken, **more)
 
 
@@ -91,8 +91,8 @@ out = ["end"]
 """
 
 
-def test_side_by_side_takes_the_longer_one() -> None:
-    """Uniform on 1, 3 beside 2: the time is 2 or 3, half each."""
+def test_parallel_branches_take_as_long_as_the_longer_one() -> None:
+    """A run of 1 or 3 s (half each) parallel to one of 2 s: the time is 2 or 3 s, half each."""
     throws = [
         Trial(1, 0.0, runs=[entry("a", took, taken="join"), entry("b", 2.0, taken="join")])
         for took in (1.0, 3.0)
@@ -103,9 +103,9 @@ def test_side_by_side_takes_the_longer_one() -> None:
     assert played.completed.all() and played.all_success.all()
 
 
-def test_what_its_runs_chose_decides_between_exits_of_one_status() -> None:
-    """Two normal exits with a condition on a variable: taken as often as they were, with the
-    durations that went with each."""
+def test_recorded_choices_decide_between_outgoing_transitions_of_one_status() -> None:
+    """Two normal outgoing transitions have conditions on a variable: each is taken as often as
+    recorded, with the durations recorded for it."""
     text = """
 [variables.found]
 type = "bool"
@@ -167,7 +167,7 @@ out = ["end"]
 
 
 def test_a_loop_is_geometric() -> None:
-    """Tried again with probability 1/2 each time: mean number of runs 2."""
+    """With a probability of 1/2 to try again, the mean number of runs is 2."""
     throws = [
         Trial(1, 0.0, runs=[entry("a", 1.0, taken="done")]),
         Trial(1, 0.0, runs=[entry("a", 1.0, "error", "again")]),
@@ -177,8 +177,9 @@ def test_a_loop_is_geometric() -> None:
     assert np.mean(played.time == 1.0) == pytest.approx(0.5, abs=0.03)
 
 
-def test_a_loop_that_is_counted_is_no_geometric_one() -> None:
-    """Always interrupted twice, then done: the number of runs before is a context of its own."""
+def test_a_loop_with_a_fixed_number_of_rounds_is_not_geometric() -> None:
+    """Each trial is interrupted twice and then succeeds: the number of earlier runs is a
+    context."""
     runs = [
         RunEntry(
             "a",
@@ -194,7 +195,7 @@ def test_a_loop_that_is_counted_is_no_geometric_one() -> None:
     assert set(played.time.tolist()) == {3.0}
 
 
-def test_a_rare_further_round_is_like_the_last_frequent_one() -> None:
+def test_a_rare_additional_round_is_like_the_last_frequent_one() -> None:
     """Five of 65 trials are interrupted a third time and then end: no trial is interrupted for
     ever."""
 
@@ -213,9 +214,9 @@ def test_a_rare_further_round_is_like_the_last_frequent_one() -> None:
     assert played.time.mean() == pytest.approx((60 * 3 + 5 * 4) / 65, abs=0.05)
 
 
-def test_branches_that_go_in_step_are_told_apart_by_their_own_rounds() -> None:
-    """Rounds of either branch tell those of the other in every throw that was run; where they are
-    played they drift apart."""
+def test_branches_with_equal_rounds_are_described_by_their_own_rounds() -> None:
+    """In every recorded trial the rounds of one branch determine those of the other; in simulated
+    trials they drift apart."""
     text = """
 [transitions.begin]
 in = ["jobs"]
@@ -252,8 +253,8 @@ out = ["end"]
 
 
 def test_timers_and_events_race() -> None:
-    """An event at 1 or 3 s against a timer of 2 s: half each; a timer that was never seen to fire
-    counts as it is declared."""
+    """An event at 1 or 3 s races with a timer of 2 s: each wins half of the time. A timer that was
+    never seen to fire has its declared time."""
     text = """
 [events.bell]
 scope = "external"
@@ -289,7 +290,7 @@ out = ["end"]
 
 
 def test_giving_up_and_dead_ends_do_not_complete() -> None:
-    """final_error, and a marking in which nothing can happen any more."""
+    """Tried with final_error, and with a dead marking."""
     text = """
 [places.broken]
 kind = "resource"
@@ -323,11 +324,11 @@ out = ["end"]
 
 
 @pytest.mark.parametrize(("priority", "completes"), [(1, True), (0, False)])
-def test_a_preemption_of_higher_priority_takes_what_has_ended_too(
+def test_a_preemption_of_higher_priority_also_takes_a_finished_run(
     priority: int, completes: bool
 ) -> None:
-    """a has ended and waits for b, which is lost: only a transition above the normal exits takes a
-    then, as in the engine."""
+    """a has finished and waits for b, which is lost: as in the engine, only a transition with a
+    priority above the normal outgoing ones then takes a."""
     text = f"""
 [places.alarm]
 kind = "control"
@@ -370,13 +371,13 @@ out = ["end"]
 
 
 def test_several_servers_are_refused_with_a_remedy() -> None:
-    """Not silently wrong."""
+    """The alternative would be a wrong forecast without notice."""
     with pytest.raises(ValueError, match="servers = 1"):
         play(FORK + SERVERS, [Trial(1, 0.0, runs=[entry("a", 1.0), entry("b", 1.0)])])
 
 
 def test_choices_without_a_single_action_are_refused() -> None:
-    """A place that is entered although nothing was measured there."""
+    """The trial enters a place in which nothing was measured."""
     with pytest.raises(ValueError, match="no action has a probability"):
         play(FORK, [Trial(1, 0.0, runs=[entry("a", 1.0)])])
 
@@ -384,9 +385,11 @@ def test_choices_without_a_single_action_are_refused() -> None:
 @pytest.mark.parametrize(
     ("threshold", "seconds"), [("busy", 3.0), ("busy*2", 2.0), ("busy*3", 1.0)]
 )
-def test_an_inhibitor_holds_back_until_its_place_holds_less(threshold: str, seconds: float) -> None:
-    """a ends after 1 s; b empties busy in steps, after 2 and 3 s; what `!busy*k` inhibits fires
-    when fewer than k are left."""
+def test_an_inhibitor_blocks_until_its_place_holds_fewer_tokens(
+    threshold: str, seconds: float
+) -> None:
+    """a ends after 1 s; b empties busy in steps, after 2 and 3 s; a transition with `!busy*k` fires
+    when fewer than k tokens are left."""
     text = """
 [places.busy]
 kind = "control"
@@ -421,10 +424,10 @@ out = ["end"]
     ("left", "right", "late"),
     [("weight = 3.0", "weight = 1.0", 0.25), ("priority = 1", "", 0.0), ("", "priority = 1", 1.0)],
 )
-def test_priority_decides_between_two_that_can_fire_then_weight(
+def test_priority_decides_between_two_fireable_transitions_and_then_weight(
     left: str, right: str, late: float
 ) -> None:
-    """The left way ends at once, the right one a second later."""
+    """The left branch ends at once, the right one a second later."""
     text = """
 [places.fork]
 kind = "control"
@@ -521,9 +524,9 @@ out = ["end"]
 """
 
 
-def test_a_full_place_bars_what_would_fill_it_as_in_the_engine() -> None:
-    """a ends after 1 s and `store` finds the shelf full, so `full` fires 5 s later: in the engine
-    and in every trial of the forecast."""
+def test_a_full_place_blocks_firing_into_it_as_in_the_engine() -> None:
+    """a ends after 1 s and `store` is blocked by the full shelf, so `full` fires 5 s later, in the
+    engine and in every trial of the forecast."""
     played = play(FULL, [Trial(1, 0.0, runs=[entry("a", 1.0)])], n=200)
     assert played.ways == {"a": {"full": 200}}
     assert played.time.tolist() == [6.0] * 200

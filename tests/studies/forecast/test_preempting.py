@@ -1,8 +1,8 @@
-"""Runs that are preempted because another one has ended: the net says when, what they would have
-come to is censored.
+"""Runs that are preempted because another one has ended: the net determines when, and their own
+results are censored.
 
-Truth is known here: two runs begin together, each draws how and when it would end, and the first
-end takes the other run.
+The true values are known: two runs begin together, each draws how and when it would end, and the
+first one to end preempts the other.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ in = ["locate:error", "watch:error"]
 out = ["idle"]
 """
 )
-"""Watching ends with locating at the latest; locating is never preempted."""
+"""A task in which the end of locating preempts watching; locating is never preempted."""
 
 BOTH_WAYS = (
     HEAD
@@ -107,11 +107,12 @@ in = ["locate:preempt=failure", "watch:error"]
 out = ["idle"]
 """
 )
-"""Whichever ends first preempts the other."""
+"""A task in which the run that ends first preempts the other."""
 
 
 def one_way(random: np.random.Generator, slow: float = 1.0) -> Trial:
-    """A trial of ONE_WAY: locating 0.5 to 1.5 s, watching exponential of `slow` s."""
+    """Draw a trial of ONE_WAY: locating takes 0.5 to 1.5 s, watching is exponential with mean
+    `slow` s."""
     locate, watch = random.uniform(0.5, 1.5), random.exponential(slow)
     status = ("success", "failure", "error")[int(random.choice(3, p=(0.6, 0.3, 0.1)))]
     seen = "success" if random.random() < 0.8 else "failure"
@@ -130,7 +131,7 @@ def one_way(random: np.random.Generator, slow: float = 1.0) -> Trial:
 
 
 def both_ways(random: np.random.Generator) -> Trial:
-    """A trial of BOTH_WAYS with the same laws."""
+    """Draw a trial of BOTH_WAYS with the same distributions."""
     locate, watch = random.uniform(0.5, 1.5), random.exponential(1.0)
     status = ("success", "failure", "error")[int(random.choice(3, p=(0.6, 0.3, 0.1)))]
     if locate < watch:
@@ -168,14 +169,14 @@ def both_ways(random: np.random.Generator) -> Trial:
 
 
 def trials_of(make: object, n: int, seed: int) -> list[Trial]:
-    """n trials."""
+    """Draw n trials."""
     random = np.random.default_rng(seed)
     assert callable(make)
     return [make(random) for _ in range(n)]
 
 
 FIRST = math.exp(-0.5) - math.exp(-1.5)
-"""Probability that a uniform time on 0.5, 1.5 comes before an exponential one of mean 1: the
+"""Probability that a uniform time on [0.5, 1.5] is shorter than an exponential one of mean 1: the
 integral of exp(-t)."""
 
 
@@ -188,11 +189,11 @@ integral of exp(-t)."""
         pytest.param(BOTH_WAYS, both_ways, 0.9 * FIRST, 0.6 * FIRST, id="both ways"),
     ],
 )
-def test_what_another_end_preempts_is_forecast_as_it_happens(
+def test_preemptions_by_the_end_of_another_run_are_forecast(
     text: str, make: object, goal: float, conj: float
 ) -> None:
-    """Against closed forms, within what 3,000 training trials tell; and played trials do not differ
-    from the training's."""
+    """The forecast agrees with closed forms within the accuracy of 3,000 training trials, and
+    simulated trials do not differ from those of the training."""
     task = loads(text, "scan.toml")
     training = Training.of(task, trials_of(make, 3000, 1))
     made = predict(training, Request(400, choices_of(training), replicates=40, point=20_000))
@@ -212,11 +213,11 @@ def test_what_another_end_preempts_is_forecast_as_it_happens(
         pytest.param(BOTH_WAYS, both_ways, 0.6 * FIRST, id="both ways"),
     ],
 )
-def test_the_stochastic_view_preempts_when_the_other_has_ended(
+def test_the_stochastic_view_preempts_when_the_other_run_has_ended(
     text: str, make: object, conj: float
 ) -> None:
-    """It always completes, and what is preempted has not ended as it was drawn to; phase-type
-    durations cost it some points."""
+    """It always completes, and a preempted run does not end as drawn; its phase-type durations are
+    approximations, which cost some accuracy."""
     task = loads(text, "scan.toml")
     rows = [
         TrialRow(i, "", i, 1, i, 1.0, trial) for i, trial in enumerate(trials_of(make, 1500, 2))
@@ -228,9 +229,9 @@ def test_the_stochastic_view_preempts_when_the_other_has_ended(
     assert found.conjunctive ** (1 / 4) == pytest.approx(conj, abs=0.06)  # of all four tokens
 
 
-def test_a_watch_that_never_ends_by_itself_is_played_and_solved() -> None:
-    """All its recorded runs were cut off, so it stays active until it is preempted, whatever the
-    other run takes."""
+def test_a_run_that_never_ends_by_itself_is_simulated_and_solved() -> None:
+    """All its recorded runs were censored, so it stays active until it is preempted, however long
+    the other run takes."""
     task = loads(ONE_WAY, "scan.toml")
     trials = [one_way(np.random.default_rng(seed), 1e9) for seed in range(400)]
     training = Training.of(task, trials)
@@ -243,9 +244,9 @@ def test_a_watch_that_never_ends_by_itself_is_played_and_solved() -> None:
     assert propagate(task, estimates_of(task, rows, "t")).complete == pytest.approx(1.0, abs=1e-9)
 
 
-def test_what_was_never_seen_is_told() -> None:
-    """No other transition takes the run now, so it stays active for longer than any recorded one:
-    the forecast says that it is doubtful."""
+def test_a_situation_without_recorded_runs_is_reported() -> None:
+    """No other transition takes the run now, so it stays active for longer than any recorded one,
+    and the forecast says that it is doubtful."""
     alone = HEAD.replace('out = ["watch", "locate"]', 'out = ["watch"]')
     text = (
         alone
@@ -279,7 +280,7 @@ out = ["idle"]
     assert any("watch" in doubt and "longer" in doubt for doubt in made["doubts"]), made["doubts"]
 
 
-# --- what is a cause --------------------------------------------------------------------------
+# --- causes -----------------------------------------------------------------------------------
 
 EVENTS = """
 [transitions.rung]
@@ -300,8 +301,10 @@ out = ["idle"]
         (', "locate:normal"', "after = 1.0", False),
     ],
 )
-def test_causes_are_events_and_timers_that_take_one_run(more: str, how: str, cause: bool) -> None:
-    """Everything else follows from the marking."""
+def test_causes_of_end_are_events_and_timers_that_take_one_run(
+    more: str, how: str, cause: bool
+) -> None:
+    """All other preemptions follow from the marking."""
     task = loads(ONE_WAY + EVENTS.format(more=more, how=how), "scan.toml")
     assert is_cause(task.flat.transitions["rung"]) is cause
     move = next(m for m in Structure.of(task).moves if m.name == "rung")
@@ -324,15 +327,18 @@ def test_causes_are_events_and_timers_that_take_one_run(more: str, how: str, cau
         ("", 'when = "dark"', "transitions.rung: when it preempts is decided by variables alone"),
     ],
 )
-def test_what_cannot_be_forecast_truly_is_refused_by_name(more: str, how: str, why: str) -> None:
-    """Rather than forecast wrongly."""
+def test_tasks_that_cannot_be_forecast_correctly_are_refused_by_name(
+    more: str, how: str, why: str
+) -> None:
+    """The alternative would be a wrong forecast."""
     task = loads(ONE_WAY + EVENTS.format(more=more, how=how), "scan.toml")
     with pytest.raises(ValueError, match=why):
         Structure.of(task)
 
 
-def test_an_event_that_preempts_and_counts_none_happens() -> None:
-    """Such runs are a way to end, not mere cut-offs: half of them ring at 1 s, half end at 2 s."""
+def test_an_event_that_preempts_and_counts_no_try_is_a_cause() -> None:
+    """Such preemptions are a way to end, not mere censoring: half of the runs ring at 1 s, half end
+    at 2 s."""
     text = HEAD.replace('out = ["watch", "locate"]', 'out = ["watch"]') + EVENTS.format(
         more="", how='event = "bell"'
     )
@@ -421,8 +427,8 @@ after = 1.0
 
 
 def test_weights_are_the_aalen_johansen_estimate() -> None:
-    """Against the estimator of the stochastic view, and the rest beyond the longest run against
-    Kaplan and Meier by hand."""
+    """They equal the estimator of the stochastic view; the rest beyond the longest run equals the
+    Kaplan-Meier estimate computed by hand."""
     random = np.random.default_rng(3)
     training = Training.of(loads(BOTH_WAYS, "scan.toml"), trials_of(both_ways, 200, 4))
     for place in (0, 1):
@@ -441,8 +447,8 @@ def test_weights_are_the_aalen_johansen_estimate() -> None:
 
 
 def test_beyond_the_longest_run_by_hand() -> None:
-    """An end at 1 s, cut off at 2 and 3 s: two thirds are left there, which a constant rate would
-    have left by 3 s."""
+    """One run ends at 1 s, two are censored at 2 and 3 s: two thirds remain, the share that a
+    constant rate would leave at 3 s."""
     task = loads(ONE_WAY, "scan.toml")
     runs = [("success", 1.0, ""), ("", 2.0, "found"), ("", 3.0, "found")]
     trials = [
@@ -461,8 +467,8 @@ def test_beyond_the_longest_run_by_hand() -> None:
     assert context.ends.rate == pytest.approx(-math.log(2 / 3) / 3.0)
 
 
-def test_the_view_without_measurements_still_races(tmp_path: object) -> None:
-    """Before any run, declared estimates do: a preempting end needs no wait of its own."""
+def test_without_measurements_declared_durations_race(tmp_path: object) -> None:
+    """Before any run, the declared estimates are used: a preempting end needs no declared wait."""
     declared = ONE_WAY.replace(
         "[primitive_tasks.watch]",
         "[primitive_tasks.locate.estimates]\nsuccess = { share = 1.0, mean = 1.0, cv = 1.0 }\n"
@@ -479,8 +485,8 @@ def test_the_view_without_measurements_still_races(tmp_path: object) -> None:
     assert found.goal_reliability == pytest.approx(0.5, abs=1e-6)
 
 
-def test_tasks_are_as_these_tests_take_them() -> None:
-    """Both are read, and neither is refused."""
+def test_the_tasks_of_these_tests_are_valid() -> None:
+    """Both are read and forecast without an error."""
     for text in (ONE_WAY, BOTH_WAYS):
         task: Task = loads(text, "scan.toml")
         assert Structure.of(task).moves

@@ -1,4 +1,4 @@
-"""When a forecast counts as doubtful: by more than chance, and by more than matters."""
+"""When a forecast is doubtful: the difference is significant and large enough to matter."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ NOTHING = Played(np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros(0, np.bo
         ("mean time", 1e-9, 0.06, True),
     ],
 )
-def test_doubts_need_chance_ruled_out_and_a_difference_that_matters(
+def test_doubts_need_a_significant_and_relevant_difference(
     of: str, p: float, off: float, doubtful: bool
 ) -> None:
-    """With many trials any model differs somewhere by more than chance; with few, a large
-    difference may be chance."""
+    """With many trials every model differs significantly somewhere; with few, a large difference
+    may be chance."""
     said = doubts([{"of": of, "p": p, "p_holm": p, "off": off}], NOTHING, 1000)
     assert bool(said) == doubtful
     assert not said or of in said[0]
 
 
-def test_how_far_off_is_the_largest_difference_of_shares_and_the_relative_one_of_means() -> None:
-    """Trials played exactly as they were run, then some that miss a goal and all that last
-    longer."""
+def test_the_distance_is_the_largest_difference_of_shares_or_relative_difference_of_means() -> None:
+    """Tried with trials simulated exactly as recorded, then with some that miss a goal, then with
+    all taking longer."""
     training = Training.of(loads(ONE_WAY, "scan.toml"), trials_of(one_way, 1000, 3))
     real = measured(training)
     same = replace(real, ways=routing(training))

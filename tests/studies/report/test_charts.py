@@ -1,4 +1,4 @@
-"""Charts: well-formed, everything inside, and marks where the numbers say."""
+"""Charts: well-formed, everything inside the picture, and marks at the right positions."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ NUMBERS = st.floats(-1e6, 1e6, allow_nan=False)
 
 
 def elements(svg: str) -> list[ElementTree.Element]:
-    """All elements of a picture; it is well-formed XML of its own."""
+    """Return all elements of a picture, which must be a well-formed XML document."""
     return list(ElementTree.fromstring(svg).iter())
 
 
 @given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=20))
-def test_lines_stay_inside_whatever_the_numbers(points: list[tuple[float, float]]) -> None:
-    """Every vertex lies within the picture."""
+def test_lines_stay_inside_for_any_numbers(points: list[tuple[float, float]]) -> None:
+    """Every vertex is inside the picture."""
     svg = charts.lines("a < b", "x", "y", {"one & two": points})
     (line,) = [e for e in elements(svg) if e.tag.endswith("polyline")]
     for pair in line.attrib["points"].split():
@@ -63,12 +63,12 @@ def test_scale_by_hand() -> None:
     ],
 )
 def test_limits(values: list[float], zero: bool, expected: tuple[float, float]) -> None:
-    """Room on both sides, from zero on if asked."""
+    """Limits leave room on both sides, or start from zero on request."""
     assert limits(values, zero=zero) == pytest.approx(expected)
 
 
 def test_histogram_counts_every_value_once() -> None:
-    """Stacked groups: the heights are the counts."""
+    """The heights of stacked groups are their counts."""
     svg = charts.histogram("t", "s", {"a": [0.0, 0.1, 1.0], "b": [1.0]}, bins=2)
     tips = [e.text or "" for e in elements(svg) if e.tag.endswith("title")]
     counts = [int(found.group(1)) for tip in tips if (found := re.match(r"\w: (\d+) from", tip))]
@@ -76,7 +76,7 @@ def test_histogram_counts_every_value_once() -> None:
 
 
 def test_intervals_name_rows_and_series() -> None:
-    """A row for each name, a mark for each estimate with its tip."""
+    """There is a row for each name, and a mark with a tooltip for each estimate."""
     svg = charts.intervals(
         "R", "R", [("act", "A", 0.2, 0.5, 0.7), ("act", "B", 0.1, 0.2, 0.3)], unit=True
     )
@@ -85,8 +85,8 @@ def test_intervals_name_rows_and_series() -> None:
     assert "act A: 0.5 [0.2, 0.7]" in svg
 
 
-def test_a_long_legend_breaks() -> None:
-    """Names never leave the picture."""
+def test_a_long_legend_is_wrapped() -> None:
+    """Names stay inside the picture."""
     chart = Chart("t", "x", "y", (0.0, 1.0), (0.0, 1.0))
     chart.names([f"a rather long name, number {i}" for i in range(8)])
     places = [
@@ -107,15 +107,15 @@ def test_a_long_legend_breaks() -> None:
 
 
 def test_shapes_differ_by_more_than_colour() -> None:
-    """Four kinds of marks."""
+    """There are four kinds of marks."""
     assert len({charts.shape(0, 0, i, "").split(" ")[0] for i in range(2)}) == 2
     corners = {re.sub(r'fill="[^"]+"', "", charts.shape(0, 0, i, "")) for i in range(4)}
     assert len(corners) == 4
 
 
-def test_a_picture_of_its_own_has_the_days_colours() -> None:
-    """A picture in a file of its own refers to no variable of the page. Colours that are not ours
-    stay as they are."""
+def test_a_picture_in_its_own_file_has_the_light_colours() -> None:
+    """A picture in its own file uses no variable of the page. Colours from elsewhere stay as they
+    are."""
     svg = charts.points("t", "x", "y", {str(i): [((float(i), 1.0), "tip")] for i in range(9)})
     assert {f"var(--{name})" for name in colours.SERIES} <= set(
         re.findall(r"var\(--[a-z0-9-]+\)", svg)
@@ -132,22 +132,22 @@ def test_a_picture_of_its_own_has_the_days_colours() -> None:
 
 
 def _luminance(colour: str) -> float:
-    """Relative luminance (WCAG 2.2)."""
+    """Return the relative luminance (WCAG 2.2)."""
     parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
     linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts]
     return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
 
 def contrast(one: str, other: str) -> float:
-    """Contrast ratio (WCAG 2.2), 1 to 21."""
+    """Return the contrast ratio (WCAG 2.2), 1 to 21."""
     low, high = sorted((_luminance(one), _luminance(other)))
     return (high + 0.05) / (low + 0.05)
 
 
 @pytest.mark.parametrize("scheme", [colours.LIGHT, colours.DARK], ids=["day", "night"])
-def test_words_and_marks_stand_out(scheme: dict[str, str]) -> None:
-    """WCAG 2.2 level AA on paper and panel: 4.5 for words; night's marks 3, day's as Okabe and Ito
-    chose them."""
+def test_text_and_marks_have_enough_contrast(scheme: dict[str, str]) -> None:
+    """WCAG 2.2 level AA on paper and panel: 4.5 for text, 3 for marks on dark; marks on light have
+    the colours of Okabe and Ito."""
     for ground in (scheme["paper"], scheme["panel"]):
         assert all(contrast(scheme[name], ground) >= 4.5 for name in ("ink", "soft"))
         if scheme is colours.DARK:
@@ -158,8 +158,8 @@ def test_words_and_marks_stand_out(scheme: dict[str, str]) -> None:
     assert colours.LIGHT.keys() == colours.DARK.keys()
 
 
-def test_a_picture_becomes_a_png_with_its_words() -> None:
-    """Twice the size, on white, and the title is drawn: the bytes are decoded again."""
+def test_a_picture_becomes_a_png_with_its_text() -> None:
+    """The decoded image has twice the size, a white background, and a title."""
     image = cv2.imdecode(
         np.frombuffer(
             raster.png(colours.standalone(charts.lines("Title", "x", "y", {}))), np.uint8
@@ -178,7 +178,7 @@ def test_a_picture_becomes_a_png_with_its_words() -> None:
 
 
 def test_without_resvg_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One line, and no picture."""
+    """One line is printed and no picture is made."""
     monkeypatch.setitem(sys.modules, "resvg_py", None)
     raster.unavailable.cache_clear()
     try:
@@ -189,7 +189,7 @@ def test_without_resvg_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_missing_font_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Words would be missing: pictures without words are not made."""
+    """No picture is made, as its text would be missing."""
     monkeypatch.setattr(raster, "FONT", tmp_path / "gone.ttf")
     raster.unavailable.cache_clear()
     try:
@@ -198,8 +198,8 @@ def test_a_missing_font_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         raster.unavailable.cache_clear()
 
 
-def test_words_are_drawn_with_the_shipped_font_alone() -> None:
-    """The font is the published one, to the byte, and no font of the host is used, whichever a
+def test_text_is_drawn_only_with_the_shipped_font() -> None:
+    """The font equals the published one to the byte, and no font of the host is used, whatever the
     picture names."""
     assert hashlib.sha256(raster.FONT.read_bytes()).hexdigest() == (
         "3fdf69cabf06049ea70a00b5919340e2ce1e6d02b0cc3c4b44fb6801bd1e0d22"

@@ -27,7 +27,7 @@ TOY = load(TASK)
 def row(
     k: int, action: str, status: str, seconds: float, goal: bool, regime: str = "easy"
 ) -> TrialRow:
-    """A trial with one run of look."""
+    """Return a trial with one run of look."""
     run = RunEntry(
         "look", action, 0.0, seconds, status, seconds=seconds, cost=seconds, taken="seen"
     )
@@ -48,8 +48,8 @@ def row(
 
 
 def test_comparison_by_hand() -> None:
-    """Ten pairs: three gained, one lost; McNemar's exact p of 3 against 1; J from the sums with one
-    rho."""
+    """Ten pairs: three better, one worse; McNemar's exact p for 3 against 1; J from the sums with
+    one rho."""
     one = [row(k, "look_quick", "success" if k < 8 else "failure", 1.0, k < 8) for k in range(10)]
     other = [
         row(
@@ -87,7 +87,7 @@ def test_comparison_by_hand() -> None:
 
 
 def test_pairs_have_equal_seeds() -> None:
-    """Trials that only one of them has are left out and counted."""
+    """Trials that only one campaign has are left out and counted."""
     one = [row(k, "look_quick", "success", 1.0, True) for k in range(4)]
     other = [row(k, "look_quick", "success", 1.0, True) for k in range(2, 8)]
     other[0].trial = None
@@ -98,7 +98,7 @@ def test_pairs_have_equal_seeds() -> None:
 
 
 def test_equal_campaigns_do_not_differ() -> None:
-    """No difference, no significance."""
+    """There is no difference and no significance."""
     rows = [
         row(k, "look_quick", "success" if k % 3 else "failure", 1.0, k % 3 > 0) for k in range(30)
     ]
@@ -108,7 +108,7 @@ def test_equal_campaigns_do_not_differ() -> None:
 
 
 def test_the_interval_of_the_difference_covers() -> None:
-    """Of 200 worlds with a difference of 0.1, 95 % intervals hold it in about 190."""
+    """In 200 worlds with a difference of 0.1, about 190 of the 95 % intervals cover it."""
     random = np.random.default_rng(1)
     hits = 0
     for _ in range(200):
@@ -127,7 +127,7 @@ def test_the_interval_of_the_difference_covers() -> None:
 
 
 def test_rho_is_one_over_the_largest_mean_cost() -> None:
-    """Over all actions of both campaigns."""
+    """The maximum is over all actions of both campaigns."""
     rows = [row(0, "look_quick", "success", 1.0, True), row(1, "look_long", "success", 4.0, True)]
     assert cost_weight(TOY, "look", rows) == 0.25
     assert cost_weight(TOY, "grip", rows) == 0.0
@@ -137,7 +137,7 @@ def test_rho_is_one_over_the_largest_mean_cost() -> None:
 
 
 def test_objective_curves_end_at_the_tables_j() -> None:
-    """The last point is J from all sums."""
+    """The last point is J computed from all sums."""
     rows = [
         row(
             k,
@@ -155,7 +155,8 @@ def test_objective_curves_end_at_the_tables_j() -> None:
 
 
 def test_declared_pictures_come_from_the_score_alone() -> None:
-    """Points, lines and histograms by column names; what has no values is left out."""
+    """Points, lines and histograms are declared by column names; those without values are left
+    out."""
     rows = [{"t.x": 0.1 * i, "t.y": float(i), "t.kind": i % 2 == 0} for i in range(10)]
     plots = {
         "points": {"x": "t.x", "y": "t.y", "colour": "t.kind", "title": "P"},
@@ -181,8 +182,8 @@ def test_a_runs_own_pictures() -> None:
     assert list(own_pictures(result)) == ["Parts"]
 
 
-def test_a_trials_story_says_what_took_what() -> None:
-    """In the order of ends, with reasons."""
+def test_the_log_of_a_trial_says_which_transition_took_which_run() -> None:
+    """Runs are listed in the order of their ends, with reasons."""
     runs = [
         RunEntry("look", "look_quick", 0.0, 1.0, "success", taken="seen"),
         RunEntry("grip", "grip_soft", 1.0, 0.5, "error", "jammed", "stuck fast", taken="stuck"),
@@ -202,7 +203,8 @@ def test_a_trials_story_says_what_took_what() -> None:
 def test_report_of_campaigns(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One self-contained page with every promised picture, also as files; a comparison of two."""
+    """One self-contained page has every documented picture, also as files; and a comparison of two
+    campaigns."""
     monkeypatch.syspath_prepend(str(HERE))
     for name, selector in (("learnt", "nikolic_fu"), ("fixed", "fixed")):
         arguments = [
@@ -270,7 +272,7 @@ def test_report_of_campaigns(
 def test_learned_probabilities_are_derived_from_the_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The last point of the curve is what the selector knew at the end."""
+    """The last point of the curve is the selector's final state."""
     import asyncio
 
     from petrobot.coordinator.studies.campaign.conduct import Campaign
@@ -299,8 +301,8 @@ def test_learned_probabilities_are_derived_from_the_table(
 
 
 def test_combinations_by_hand() -> None:
-    """Two combinations judged with one rho; the lower J first; a trial that ended early counts for
-    what was planned."""
+    """Two combinations are compared with one rho, the lower J first; a trial that ended early
+    counts as planned."""
     from petrobot.coordinator.studies.report.campaign_page import by_combination
 
     rows = [
@@ -316,7 +318,7 @@ def test_combinations_by_hand() -> None:
     planned = [
         {"look": "look_quick" if k % 2 else "look_long", "grip": "grip_soft"} for k in range(40)
     ]
-    assert by_combination(TOY, rows) == []  # grip was never run
+    assert by_combination(TOY, rows) == []  # Grip was not run.
     best, other = by_combination(TOY, rows, planned)
     assert (
         dict(best.combination)["look"] == "look_long"
@@ -329,7 +331,7 @@ def test_combinations_by_hand() -> None:
 def test_report_of_a_recorded_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """From the journal alone, with the task's own pictures once there is a result."""
+    """It is made from the journal alone, and with the task's own pictures if there is a result."""
     from petrobot.coordinator.launch import Setting, lockstep_party, make_mission, with_runs
     from petrobot.coordinator.run.folder import JOURNAL, RESULT, header
     from petrobot.coordinator.run.journal import JournalWriter
@@ -376,8 +378,8 @@ def test_report_of_a_recorded_run(
 def test_report_of_a_run_that_learned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The learned probabilities of each trial, as `run` learned them; without its estimates file
-    the rest is still drawn."""
+    """It shows the learned probabilities of each trial as `run` learned them; without the estimates
+    file the rest is still drawn."""
     monkeypatch.syspath_prepend(str(HERE))
     learned, journals = tmp_path / "learned.db", tmp_path / "runs"
     told = [
