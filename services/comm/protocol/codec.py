@@ -31,6 +31,7 @@ from petrobot.services.comm.protocol.messages import Call, Executed, Message, Ou
 from petrobot.services.comm.protocol.plain import (
     LARGEST,
     MAX_CONTAINERS,
+    SCALARS,
     NotPlainError,
     inspect,
     is_numpy,
@@ -441,7 +442,7 @@ def encode(message: Message) -> bytes:
     except (TypeError, ValueError, OverflowError) as fault:
         raise _unpackable(message, fault) from None
     if len(body) > LIMITS[kind] or len(body) > UNCOUNTED:
-        return _small_enough(message, body)
+        return _small_enough(message, body, row)
     return body
 
 
@@ -452,13 +453,13 @@ def _unpackable(message: Message, fault: Exception) -> ProtocolError:
     return ProtocolError("unencodable", f"{type(message).__name__}: {fault}")
 
 
-def _small_enough(message: Message, body: bytes) -> bytes:
+def _small_enough(message: Message, body: bytes, row: Sequence[Any] = ()) -> bytes:
     limit = LIMITS[message.KIND]
     if len(body) > limit:
         text = f"a {type(message).__name__} of {len(body):,} bytes is above its limit of {limit:,}"
         raise ProtocolError("too_large", text)
     if len(body) > UNCOUNTED and message.KIND in _COUNTED:
-        _refuse_too_many(body, message)
+        _refuse_too_many(message, row)
     return body
 
 
@@ -486,15 +487,25 @@ def _row(message: Message) -> list[Any]:
     return row[:-1] if kind in _SELDOM and not row[-1] else row
 
 
-def _refuse_too_many(body: bytes, message: Message) -> None:
+def _refuse_too_many(message: Message, row: Sequence[Any]) -> None:
     """Raise ProtocolError for a message with too many values; the receiver would break the
     connection for it."""
     try:
-        _unpack_counted(body, message.KIND)
-    except Exception as fault:
-        raise ProtocolError(
-            "too_large", f"a {type(message).__name__}: {_not_readable(fault)}"
-        ) from None
+        _count_in(row, _Counter(MAX_CONTAINERS))
+    except _FieldError as fault:
+        raise ProtocolError("too_large", f"a {type(message).__name__}: {fault}") from None
+
+
+def _count_in(value: Any, counter: _Counter) -> None:
+    """Count the arrays and maps of data that is to be sent as the receiver will. To decode the
+    bytes for that would take ten times as long."""
+    counter(value)
+    if isinstance(value, dict):
+        value = value.values()
+    if not SCALARS.issuperset(map(type, value)):
+        for item in value:
+            if isinstance(item, dict | list | tuple):
+                _count_in(item, counter)
 
 
 def encode_all(messages: Iterable[Message]) -> list[bytes]:
@@ -651,7 +662,7 @@ class _Counter:
         self.left -= 1
         if self.left < 0:
             raise _FieldError(f"more than {self.most} arrays and maps")
-        self.values -= len(container) * (ENTRY if type(container) is dict else 1)
+        self.values -= len(container) * (ENTRY if isinstance(container, dict) else 1)
         if self.values < 0:
             raise _FieldError(_TOO_MANY)
         return container
