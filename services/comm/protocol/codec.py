@@ -4,10 +4,11 @@ Every field is checked in both directions by the same rules, so a message that t
 is never refused by the other side.
 
 There are two code paths. `_Spec` describes every kind as a table built from the dataclass
-annotations. CALL and RESULT, which make up nearly all traffic, also have hand-written readers and
-writers (`READERS`, `WRITERS`) that produce the same bytes in a third of the time. A fast path only
-handles what is valid and ordinary; whatever it does not accept goes to the table, which finds the
-fault and words the error. So each rule is worded in one place, and tests compare the two paths.
+annotations. CALL, RESULT and SET POINT, which make up nearly all traffic, also have hand-written
+readers and writers (`READERS`, `WRITERS`) that produce the same bytes in a third of the time. A
+fast path only handles what is valid and ordinary; whatever it does not accept goes to the table,
+which finds the fault and words the error. So each rule is worded in one place, and tests compare
+the two paths.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
-from math import inf
+from math import inf, isfinite
 from operator import attrgetter
 from types import ModuleType
 from typing import Any, Final, NamedTuple, get_args
@@ -27,7 +28,14 @@ import msgpack
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.lockstep.party import Envelope, Posted
 from petrobot.services.comm.protocol import messages as m
-from petrobot.services.comm.protocol.messages import Call, Executed, Message, Outcome, Tick
+from petrobot.services.comm.protocol.messages import (
+    Call,
+    Executed,
+    Message,
+    Outcome,
+    SetPoint,
+    Tick,
+)
 from petrobot.services.comm.protocol.plain import (
     LARGEST,
     MAX_CONTAINERS,
@@ -102,7 +110,33 @@ def _outcome(fields: list[Any], short: bool) -> Message | None:
     return None
 
 
-READERS: Mapping[int, Reader] = {Call.KIND: _call, Outcome.KIND: _outcome}
+_FLOAT = frozenset((float,))
+
+
+def _set_point(fields: list[Any], short: bool) -> Message | None:
+    """Read a set point whose numbers are all floats."""
+    if len(fields) != 5:
+        return None
+    _, number, values, held, elapsed = fields
+    if (
+        type(number) is int
+        and 0 <= number < COUNT_END
+        and type(values) is list
+        and _FLOAT.issuperset(map(type, values))
+        and all(map(isfinite, values))
+        and type(held) is type(elapsed) is float
+        and 0.0 <= held < inf
+        and 0.0 <= elapsed < inf
+    ):
+        return SetPoint(number, tuple(values), held, elapsed)
+    return None
+
+
+READERS: Mapping[int, Reader] = {
+    Call.KIND: _call,
+    Outcome.KIND: _outcome,
+    SetPoint.KIND: _set_point,
+}
 """Fast reader by kind: turns the array of a body into a message, or returns None if the table must
 look at it.
 
@@ -158,9 +192,27 @@ def _outcome_row(end: Any) -> tuple[Any, ...] | None:
     return None
 
 
+def _set_point_row(point: Any) -> tuple[Any, ...] | None:
+    """Return a set point as the array that is its body; None if the table must look at it."""
+    number, values, held, elapsed = point.number, point.values, point.held, point.elapsed
+    if (
+        type(number) is int
+        and 0 <= number < COUNT_END
+        and type(values) is tuple
+        and _FLOAT.issuperset(map(type, values))
+        and all(map(isfinite, values))
+        and type(held) is type(elapsed) is float
+        and 0.0 <= held < inf
+        and 0.0 <= elapsed < inf
+    ):
+        return (22, number, values, held, elapsed)
+    return None
+
+
 WRITERS: Mapping[int, Callable[[Any], tuple[Any, ...] | None]] = {
     Call.KIND: _call_row,
     Outcome.KIND: _outcome_row,
+    SetPoint.KIND: _set_point_row,
 }
 """Fast writer by kind: returns the array that is the body, or None if the table must look at the
 message."""
