@@ -216,9 +216,9 @@ def _cut(analysis: Analysis) -> str:
 def _reasons(analysis: Analysis) -> list[str]:
     """Return the reason of each verdict that does not hold, with the stimuli and firings that lead
     there, and what is assumed by those that hold."""
-    from petrobot.coordinator.analysis.execution.progress import MENDED
+    from petrobot.coordinator.analysis.execution.progress import AGAIN, MENDED
 
-    lines, against = list[str](), analysis.objections
+    lines, against, told = list[str](), analysis.objections, list[object]()
     mended = analysis.progress.mended if analysis.progress else {}
     mendable = [name for name, verdict in mended.items() if verdict.holds]
     refused = {
@@ -226,13 +226,22 @@ def _reasons(analysis: Analysis) -> list[str]:
         for n, v in analysis.verdicts().items()
         if v.holds is False and n != "safe" and n not in mendable
     }
+    if "deadlock_free" in against:  # then these fail too, for the same reason
+        stuck = [name for name in AGAIN if refused.pop(name, None)]
+    else:
+        stuck = []
     for name in sorted(refused, key=lambda name: name not in against):
         verdict = refused[name]
         word = "error" if name in against else "warning"
         lines.append(f"{word:8}{name.replace('_', ' ')}: {verdict.reason}")
+        if verdict.witness in told:
+            continue
         if verdict.witness is not None and name in against:
+            told.append(verdict.witness)
             path = "; ".join(verdict.witness.steps) or " ".join(verdict.witness.firings)
             lines.append(f"        by: {path or '(initial marking)'}")
+    if stuck:
+        lines.append(f"{'warning':8}{', '.join(stuck)}: the task can get stuck")
     unknown = [v.reason for v in analysis.verdicts().values() if v.holds is None]
     lines += [f"{'warning':8}{reason}" for reason in dict.fromkeys(unknown)]
     if mendable:
