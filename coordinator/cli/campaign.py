@@ -7,7 +7,7 @@ import argparse
 import asyncio
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -334,6 +334,18 @@ def _pair(option: str, text: str) -> tuple[str, str]:
     return name, value
 
 
+def _task_line(found: Mapping[str, Any], wide: int) -> list[str]:
+    """R_conj, C and J of the whole task, where it is hardest."""
+    shown = [
+        f"{name} {found[name]:.4g} [{found[f'{name}_interval'][0]:.4g}, "
+        f"{found[f'{name}_interval'][1]:.4g}]"
+        for name in ("R_conj", "C", "J")
+        if found.get(name) is not None
+    ]
+    where = f" in {found['regime']}, where it is hardest" if found.get("regime") else ""
+    return [f"  {'the task':{wide}}{'  '.join(shown)}{where}"] if shown else []
+
+
 def text_of(result: dict[str, Any]) -> str:
     """The result for people."""
     lines = [
@@ -357,6 +369,7 @@ def text_of(result: dict[str, Any]) -> str:
         for table, sums in part.get("counts", {}).items():
             counted = ", ".join(f"{column} {number}" for column, number in sums.items())
             lines.append(f"  {'':{wide}}{table}: {counted}")
+    lines += _task_line(result.get("task_figures") or {}, wide)
     for task, actions in result["chosen"].items():
         if len(actions) > 1:
             shown = ", ".join(

@@ -4,6 +4,7 @@ reset a primitive task."""
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -50,7 +51,11 @@ def figures(kept: FileContents, name: str, options: argparse.Namespace) -> dict[
     context = options.context
     known = {name: kept.estimates.of(name, context) for name in task.primitive_tasks}
     refuse_unknown_cost({name: of for name, of in known.items() if of}, options)
-    asked = {name: asked_question(kept, name, options) for name in known}
+    # R of the task is that of one scenario, and so is its cost: the targets by which actions were
+    # judged count only if they are asked for.
+    asked = {
+        name: replace(asked_question(kept, name, options), target=options.target) for name in known
+    }
     try:
         found = propagate(task, kept.estimates, context, questions=asked, rho=options.rho)
     except (NoEstimate, ValueError) as fault:
@@ -108,7 +113,8 @@ def _print(found: dict[str, Any]) -> None:
         title=found["task"], title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
     )
     table.show_edge = table.pad_edge = False
-    for column in ("primitive task", "runs", "R", "C", "J"):
+    declared = any(part["declared_costs"] for part in found["primitive_tasks"])
+    for column in ("primitive task", "runs", "R", "C", *(["C declared"] if declared else []), "J"):
         table.add_column(
             column, justify="left" if column == "primitive task" else "right", no_wrap=True
         )
@@ -118,6 +124,7 @@ def _print(found: dict[str, Any]) -> None:
             _cell(part["runs"]),
             _cell(part["R"], part["R_interval"]),
             _cell(part["C"], part["C_interval"]),
+            *([_declared(part["declared_costs"])] if declared else []),
             _cell(part["J"]),
         )
     console.print(table)
@@ -139,6 +146,10 @@ def _print(found: dict[str, Any]) -> None:
         )
     for assumption in found["assumptions"]:
         console.print(f"  assumed: {assumption}", highlight=False, style="dim")
+
+
+def _declared(costs: dict[str, float]) -> str:
+    return ", ".join(f"{action} {cost:.4g}" for action, cost in costs.items()) or "-"
 
 
 def _why_no_cost(found: dict[str, Any]) -> str:

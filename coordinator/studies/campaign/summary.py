@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import t as student
 
 from petrobot.coordinator.learning.estimate import Tally, TallyKey
 from petrobot.coordinator.learning.learning import Estimates
-from petrobot.coordinator.learning.objective import Comparison, Question, compare
-from petrobot.coordinator.learning.statistics import wilson
+from petrobot.coordinator.learning.objective import Comparison, Question, compare, objective
+from petrobot.coordinator.learning.statistics import Moments, wilson
 from petrobot.coordinator.studies.campaign.observed import ESTIMATES, add_row, context_of, regime_of
 from petrobot.coordinator.studies.campaign.plan import TABLE, CampaignPlan
 from petrobot.coordinator.studies.campaign.rows import TrialRow
@@ -35,6 +36,13 @@ class TrialCounts:
     all_success: int = 0
     times: list[float] = field(default_factory=list)
     """Durations of the completed trials (s)."""
+    cost: Moments = field(default_factory=Moments)
+    """Cost of a trial: the sum over its runs, those of parallel branches included; only trials all
+    of whose runs reported one."""
+    good_cost: Moments = field(default_factory=Moments)
+    """The same of the trials in which every run was a SUCCESS."""
+    run_counts: dict[str, int] = field(default_factory=dict)
+    """Number of runs of each primitive task."""
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     """Sums of the whole numbers that the task's score gives for each trial, by table and column:
     of all things counted, not of the first one of each trial."""
@@ -51,6 +59,16 @@ class TrialCounts:
         self.all_success += row.trial.all_success
         if row.trial.completed and row.trial.time is not None:
             self.times.append(row.trial.time)
+        costs = [run.cost for run in row.trial.runs]
+        known = [c for c in costs if c is not None]
+        if len(known) == len(costs):
+            self.cost = self.cost.adding(sum(known))
+            if row.trial.all_success:
+                self.good_cost = self.good_cost.adding(sum(known))
+
+    def count_run(self, primitive: str) -> None:
+        """Count a run of a primitive task."""
+        self.run_counts[primitive] = self.run_counts.get(primitive, 0) + 1
 
     def _add_up(self, row: TrialRow) -> None:
         for key, value in row.score.items():
@@ -161,6 +179,7 @@ class Summary:
         self._see(row)
         for run in row.trial.runs if row.trial is not None else ():
             primitive = self.task.primitive_task_of(run.place).name
+            self.by_regime[row.regime].count_run(primitive)
             actions = self.chosen.setdefault(primitive, {})
             actions[run.action] = actions.get(run.action, 0) + 1
         add_row(self.estimates, self.task, row, self.salt)
@@ -205,11 +224,73 @@ class Summary:
             "uncosted": list(found.uncosted),
         }
 
+    def task_figures(self) -> dict[str, Any]:
+        """Return R_conj, C and J of the whole task, as its trials measured them, with intervals.
+
+        The definition is that of `learned task`, which composes them from the actions' estimates:
+        over several regimes the task is judged in the one in which its R_conj is lowest, C is the
+        expected cost of a trial there, and rho is the given one, else 1 / C with the alternatives
+        that cost most. C and J are None if the primitive tasks measure different costs, or if not
+        all trials reported theirs.
+        """
+        begun = {name: counts for name, counts in self.by_regime.items() if counts.runs}
+        if not begun:
+            return {}
+        regime = min(begun, key=lambda name: (begun[name].all_success / begun[name].runs, name))
+        hardest = begun[regime]
+        # the lowest of m shares: each interval at level 1 - 0.05 / m, so that all hold together
+        level = 1.0 - 0.05 / len(begun)
+        n, r = hardest.runs, hardest.all_success / hardest.runs
+        low, high = wilson(hardest.all_success, n, level)
+        out: dict[str, Any] = {
+            "regime": regime,
+            "trials": n,
+            "R_conj": round(r, 6),
+            "R_conj_interval": [round(low, 6), round(high, 6)],
+            "C": None,
+            "C_interval": None,
+            "rho": None,
+            "J": None,
+            "J_interval": None,
+        }
+        alike = len({self.task.primitive_tasks[name].cost for name in hardest.run_counts}) == 1
+        cost = hardest.cost
+        if not alike or cost.n < n or n < 2:
+            return out
+        # a target decides between actions; the whole task has none
+        found = comparisons(
+            self.task, self.estimates.tallies, options={**self.options, "target": None}
+        )
+        largest = sum(
+            k / n * max((f.cost for f in found[name].figures if math.isfinite(f.cost)), default=0.0)
+            for name, k in hardest.run_counts.items()
+        )
+        given = self.options.get("rho")
+        rho = float(given) if given is not None else 1.0 / largest if largest > 0 else 0.0
+        z = float(student.ppf((1.0 + level) / 2.0, n - 1))
+        half = z * cost.deviation / math.sqrt(n)
+        # correlation of success and cost within a trial: they come from the same trials
+        spread = math.sqrt(r * (1.0 - r)) * cost.deviation
+        joint = r * (hardest.good_cost.mean - cost.mean) / spread if spread > 0 else 0.0
+        j = objective(r, cost.mean, rho)
+        sides = [
+            math.sqrt(max(0.0, side**2 + (rho * half) ** 2 - 2.0 * joint * side * rho * half))
+            for side in (high - r, r - low)
+        ]
+        return out | {
+            "C": round(cost.mean, 6),
+            "C_interval": [round(cost.mean - half, 6), round(cost.mean + half, 6)],
+            "rho": round(rho, 9),
+            "J": round(j, 6),
+            "J_interval": [round(j - sides[0], 6), round(j + sides[1], 6)],
+        }
+
     def to_plain(self) -> dict[str, Any]:
         """Return plain data."""
         has_goal, found = bool(self.task.goal_transitions), self.comparisons()
         return {
             **self.whole.to_plain(has_goal),
+            "task_figures": self.task_figures(),
             "by_regime": {
                 name: counts.to_plain(has_goal) for name, counts in self.by_regime.items()
             },

@@ -28,6 +28,10 @@ PIVOTS = 2000
 """Bootstrap samples of the mean."""
 AT_ONCE = 2_000_000
 """Largest number of drawn times that are kept at the same time."""
+LARGEST = 5.0
+"""Largest standardised difference of means. It is exceeded where one very long trial makes up most
+of the spread: samples without it have almost none. By simulation, the limit costs no coverage and
+saves a tenth of the mean width (lognormal times with sigma 1.5, 300 trials)."""
 MANY = 4000
 """Number of new trials beyond which their mean is drawn from the normal distribution."""
 SCORES: Values = np.array([-3.0, -2.6, -2.2, norm.ppf(0.025), -1.6, -1.2, -0.8, -0.4, 0.0])
@@ -120,7 +124,9 @@ def _moments(times: Values, weights: Values) -> tuple[Values, Values, Values]:
 
 def _quantiles(pivots: Values, levels: Values) -> Values:
     known = pivots[np.isfinite(pivots)]  # a sample of equal times has no standard error
-    return np.quantile(known, levels) if len(known) else np.zeros(len(levels))
+    if not len(known):
+        return np.zeros(len(levels))
+    return np.asarray(np.clip(np.quantile(known, levels), -LARGEST, LARGEST))
 
 
 # --- quantiles ---

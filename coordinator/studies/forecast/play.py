@@ -47,6 +47,9 @@ class Played:
     astray: Mapping[str, int] = field(default_factory=dict)
     """By transition: trials in which its measured preemption came when the marking did not allow
     it."""
+    barred: Mapping[str, int] = field(default_factory=dict)
+    """By transition: trials that came to a stop where it could have started a run in a place of
+    which nothing was measured. It never fires."""
     ways: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     """By action place: how often each transition took a token out of it."""
 
@@ -68,8 +71,11 @@ class Play:
         self._s, self._drawer = structure, drawer
         n, q = len(replicate), len(structure.vocabulary.places)
         self._choices = [self._choice(choices, name) for name in structure.vocabulary.places]
-        self._quick = [m for m in structure.moves if not m.waits]
-        self._slow = [m for m in structure.moves if m.waits and not m.cause]
+        known = [len(codes) > 0 for codes, _ in self._choices]
+        self._barred = [m for m in structure.moves if not all(known[q] for q in m.starts)]
+        free = [m for m in structure.moves if all(known[q] for q in m.starts)]
+        self._quick = [m for m in free if not m.waits]
+        self._slow = [m for m in free if m.waits and not m.cause]
         self._column = np.arange(n)
         self._replicate = replicate
         self._tokens = np.repeat(structure.initial[:, None], n, axis=1)
@@ -121,6 +127,11 @@ class Play:
                 name: len(columns)
                 for (kind, name), columns in self._odd.items()
                 if kind == "astray"
+            },
+            barred={
+                name: len(columns)
+                for (kind, name), columns in self._odd.items()
+                if kind == "barred"
             },
             ways=self._ways,
         )
@@ -202,7 +213,10 @@ class Play:
         """Choose an action and draw how its run will end."""
         codes, bounds = self._choices[q]
         if not len(codes):
-            raise ValueError(f"{self._s.vocabulary.places[q]}: no action has a probability above 0")
+            raise ValueError(
+                f"{self._s.vocabulary.places[q]}: the task begins there, but no training run "
+                "entered it; train with more trials"
+            )
         which = np.searchsorted(bounds, self._drawer.chance(len(columns)), side="right")
         action = codes[np.minimum(which, len(codes) - 1)]
         ends = self._drawer.ends(q, action, self._replicate[columns], self._seen.of(columns))
@@ -298,6 +312,8 @@ class Play:
         self._want[:, stuck[held]] = -1
         dead = np.zeros(len(self._column), np.bool_)
         dead[stuck[~held]] = True
+        for move in self._barred:
+            self._note_odd("barred", move.name, np.flatnonzero(dead & self._enabled(move)))
         self._finish(np.where(dead, -1, 0))
 
     # --- ends ---------------------------------------------------------------------------------

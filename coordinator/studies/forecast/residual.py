@@ -223,6 +223,13 @@ def doubts(residual: Sequence[Mapping[str, Any]], played: Played, trials: int) -
                 f"in {n / trials:.1%} of the simulated trials {name} comes when the marking does "
                 "not allow it: when a run is preempted depends on more than the run"
             )
+    for name, n in sorted(played.barred.items()):
+        if n > NEGLIGIBLE * trials:
+            out.append(
+                f"{n / trials:.1%} of the simulated trials stop where only {name} could continue, "
+                "but it starts a run in a place that no training run entered; train with more "
+                "trials"
+            )
     if played.endless > NEGLIGIBLE * trials:
         out.append(
             f"{played.endless / trials:.1%} of the simulated trials never end; branches that "

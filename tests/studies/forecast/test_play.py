@@ -23,6 +23,7 @@ from petrobot.coordinator.studies.forecast.distributions import Drawer, RunDistr
 from petrobot.coordinator.studies.forecast.history import Training
 from petrobot.coordinator.studies.forecast.net_arrays import Structure
 from petrobot.coordinator.studies.forecast.play import Play, Played
+from petrobot.coordinator.studies.forecast.residual import doubts
 from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.file import loads
 
@@ -376,10 +377,44 @@ def test_several_servers_are_refused_with_a_remedy() -> None:
         play(FORK + SERVERS, [Trial(1, 0.0, runs=[entry("a", 1.0), entry("b", 1.0)])])
 
 
-def test_choices_without_a_single_action_are_refused() -> None:
-    """The trial enters a place in which nothing was measured."""
-    with pytest.raises(ValueError, match="no action has a probability"):
-        play(FORK, [Trial(1, 0.0, runs=[entry("a", 1.0)])])
+SIDEWAYS = FORK.replace(
+    "[transitions.a_lost]",
+    """[places.c]
+kind = "action"
+task = "c"
+[primitive_tasks.c]
+goal = "c"
+alternatives = ["run_c"]
+deadline = 99.0
+[transitions.c_done]
+in = ["c:normal"]
+out = ["end"]
+[transitions.c_lost]
+in = ["c:error"]
+out = ["end"]
+[transitions.aside]
+in = ["jobs"]
+out = ["c"]
+[transitions.a_lost]""",
+)
+
+
+def test_a_place_that_training_never_entered_is_never_entered() -> None:
+    """It is as likely as in the training, whatever the net allows: `aside` takes no job from
+    `begin`."""
+    both = [entry("a", 1.0, taken="join"), entry("b", 2.0, taken="join")]
+    played = play(SIDEWAYS, [Trial(1, 0.0, runs=both)])
+    assert played.completed.all() and not played.barred
+    assert set(played.ways) == {"a", "b"}
+
+
+def test_trials_that_can_only_go_on_in_such_a_place_are_told() -> None:
+    """They come to a stop, and the forecast is doubtful."""
+    played = play(FORK, [Trial(1, 0.0, runs=[entry("a", 1.0)])])
+    assert not played.completed.any()
+    assert played.barred == {"begin": 2000}
+    (doubt,) = doubts([], played, 2000)
+    assert "100.0% of the simulated trials stop where only begin could continue" in doubt
 
 
 @pytest.mark.parametrize(
