@@ -95,10 +95,21 @@ def _code(thing: Any) -> _Code | None:
             if node.name == thing.__name__:
                 first = min([node.lineno, *(d.lineno for d in node.decorator_list)])
                 if first == lines[1]:
-                    return _Code(node, str(file), vars(module))
+                    return _Code(node, str(file), {**vars(module), **dict(_imported(node))})
     except (OSError, TypeError, SyntaxError, KeyError, AttributeError):
         pass
     return None
+
+
+def _imported(tree: ast.AST) -> Iterator[tuple[str, Any]]:
+    """Yield the names that a function imports for itself, as far as they are imported already."""
+    for node in ast.walk(tree):
+        for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
+            if isinstance(node, ast.Import) and (alias.asname or "." not in alias.name):
+                yield alias.asname or alias.name, sys.modules.get(alias.name)
+            elif isinstance(node, ast.ImportFrom):
+                module = sys.modules.get(node.module or "")
+                yield alias.asname or alias.name, getattr(module, alias.name, None)
 
 
 def _reachable(thing: Any) -> Iterator[_Code]:

@@ -209,7 +209,7 @@ def _time(key: str, seconds: float) -> Iterator[Fault]:
         yield Fault(
             key,
             f"expected a time above 0 and at most {LONGEST:g} s, got {seconds:g} s",
-            "give a number of seconds between them",
+            "give a positive number of seconds",
         )
 
 
