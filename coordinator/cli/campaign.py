@@ -24,7 +24,7 @@ from petrobot.coordinator.cli.loading import (
     write_json,
 )
 from petrobot.services.comm.location_file import physics_of
-from petrobot.services.host.command_line import number, probability, whole
+from petrobot.services.host.command_line import LARGEST_SEED, MOST_RUNS, number, probability, whole
 
 if TYPE_CHECKING:
     from petrobot.coordinator.studies.campaign.conduct import Campaign
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--runs",
-        type=whole(),
+        type=whole(most=MOST_RUNS),
         default=100,
         metavar="N",
         help="in all regimes together (%(default)s)",
@@ -101,7 +101,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="workers of this dask scheduler instead, as tcp://host:8786",
     )
     parser.add_argument(
-        "--seed", type=whole(0), default=1, metavar="S", help="of all chance (%(default)s)"
+        "--seed",
+        type=whole(0, LARGEST_SEED),
+        default=1,
+        metavar="S",
+        help="of all chance (%(default)s)",
     )
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task"
@@ -307,7 +311,13 @@ def _physics(services: Path) -> str:
 def _block(task: Task, wanted: int | None) -> int:
     if not task.runs_place:
         return 1
-    return wanted or max(1, task.places[task.runs_place].tokens)
+    place = task.places.get(task.runs_place)
+    tokens = 1 if place is None else place.tokens
+    most = None if place is None else place.capacity
+    if wanted is not None and most is not None and wanted > most:
+        text = f"--block {wanted}: {task.runs_place!r} holds at most {most}, its capacity"
+        raise CommandError(2, f"{text}; give a smaller block")
+    return wanted or max(1, tokens)
 
 
 def _selector_options(options: argparse.Namespace) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import argparse
 import asyncio
 from typing import TYPE_CHECKING, Any
 
+from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     MISSING_CELL,
     add_services_argument,
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from petrobot.coordinator.analysis.report import Analysis
     from petrobot.coordinator.task import Task
     from petrobot.coordinator.task.check import CheckReport
+    from petrobot.services.comm.location_file import Directory
 
 EXAMPLE = "petrobot check catch_ball"
 NO_CELL = "no-cell"
@@ -58,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
         services = cell_path(services, options.task, task)
     judged, report = _checked(task, services)
     missing = _missing(task, services) if options.live else []
-    analysis, ok = judged.analysis, judged.ok
+    analysis, ok = judged.analysis, judged.ok and report.ok
     live = {"live": missing} if options.live else {}
     if options.json:
         found = {} if analysis is None else _plain_analysis(analysis)
@@ -97,7 +99,36 @@ def _checked(task: Task, services: Path | None) -> tuple[MayRun, CheckReport]:
         {action: entry.task for action, entry in directory.actions.items() if entry.task},
     )
     judged = may_run(task, cell, BUDGET)
-    return judged, judged.report
+    return judged, _with_code(task, directory, judged.report)
+
+
+def _with_code(task: Task, directory: Directory, report: CheckReport) -> CheckReport:
+    """The findings with those about the code that the location file names. Raises CommandError for
+    what is wrong in that file."""
+    from petrobot.coordinator.task.check import CheckReport, Severity
+    from petrobot.coordinator.task.check.code import code_findings
+    from petrobot.services.comm.location_file import read_text
+    from petrobot.services.comm.location_file.code import code_faults, read_code
+
+    code = read_code(directory)
+    if faults := code_faults(directory, code, read_text(directory.source)):
+        raise CommandError(2, "\n".join(faults))
+    actions = directory.actions.values()
+    by_action = {
+        action.name: {**code[action.run], "device": code.get(_driver(directory, action.device), {})}
+        for action in actions
+        if action.run in code
+    }
+    args = {action.name: action.args for action in actions}
+    found = list(code_findings(task, by_action, args, directory.services))
+    errors = [f for f in found if f.severity is Severity.ERROR]
+    warnings = [f for f in found if f.severity is not Severity.ERROR]
+    return CheckReport((*errors, *report.findings, *warnings))
+
+
+def _driver(directory: Directory, device: str) -> str:
+    """The import path of a device's driver, empty without one."""
+    return directory.devices[device].driver if device else ""
 
 
 def _noted(report: CheckReport, said: str) -> CheckReport:
@@ -170,7 +201,11 @@ def _lines(report: CheckReport, name: str) -> list[int | None]:
     from petrobot.coordinator.task.file.errors import key_lines, line_of
 
     lines = key_lines(task_path(name).read_text(encoding="utf-8"))
-    return [None if f.code == NO_CELL else line_of(f.key, lines) for f in report.findings]
+    elsewhere = [f.code == NO_CELL or (f.code == "code" and ":" in f.key) for f in report.findings]
+    return [
+        None if other else line_of(f.key, lines)
+        for f, other in zip(report.findings, elsewhere, strict=True)
+    ]
 
 
 def _text(name: str, analysis: Analysis | None, ok: bool) -> str:

@@ -33,7 +33,7 @@ from petrobot.coordinator.cli.recorded_runs import (
     recorded,
     tidy,
 )
-from petrobot.services.host.command_line import probability, whole
+from petrobot.services.host.command_line import LARGEST_SEED, MOST_RUNS, probability, whole
 
 if TYPE_CHECKING:
     from petrobot.coordinator.learning.session import LearningSetting
@@ -82,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--runs",
-        type=whole(),
+        type=whole(most=MOST_RUNS),
         metavar="N",
         help="how many times to run the task (default: the tokens in its runs place)",
     )
@@ -91,7 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--seed",
-        type=whole(0),
+        type=whole(0, LARGEST_SEED),
         metavar="S",
         help=f"seed of all random numbers (default: {SEED}, with --from that of the recorded run)",
     )

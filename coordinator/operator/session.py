@@ -141,6 +141,7 @@ def prepare(request: RunRequest, task: Task, text: str, directory: Directory) ->
     Raises EstimatesError or RequestError for what it cannot learn or replace, JournalError or
     OSError when its journal cannot be written, KeyFileError. No folder is left behind then.
     """
+    _refuse_too_many(request.runs, task)
     seed = SEED if request.seed is None else request.seed
     learning = None
     physics = _physics(directory)
@@ -167,6 +168,17 @@ def prepare(request: RunRequest, task: Task, text: str, directory: Directory) ->
         {"chosen": dict(request.chosen), **more},
         learning,
     )
+
+
+def _refuse_too_many(runs: int | None, task: Task) -> None:
+    """Raise RequestError if the place of the runs does not hold so many tokens."""
+    place = task.places.get(task.runs_place)
+    most = None if place is None else place.capacity
+    if runs is not None and most is not None and runs > most:
+        raise RequestError(
+            f"runs: expected at most {most}, the capacity of {task.runs_place!r}, found {runs}; "
+            f"ask for fewer, or raise places.{task.runs_place}.capacity in the task file"
+        )
 
 
 def prepare_from(request: RunRequest, found: Recorded) -> RunSession:

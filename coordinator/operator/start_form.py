@@ -34,10 +34,9 @@ from petrobot.coordinator.operator.start_from import AGAIN
 from petrobot.coordinator.page.task_store import StoreError, TaskStore
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import loads
+from petrobot.services.host.command_line import LARGEST_SEED, MOST_RUNS
 
 LONGEST_TEXT: Final = 10_000
-MOST_RUNS: Final = 1_000_000
-LARGEST_SEED: Final = 2**63 - 1
 SUFFIX: Final = ".db"
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,63}")
 _KINDS: Final = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}

@@ -91,8 +91,8 @@ def _name_key(what: str, *, required: bool = False) -> KeySpec:
     return KeySpec(f"the name of {what}", _text, required)
 
 
-_POSITIVE = KeySpec("a number of seconds above 0", lambda v: _number(v) and v > 0)
-_NOT_NEGATIVE = KeySpec("a number of seconds, 0 or more", lambda v: _number(v) and v >= 0)
+_POSITIVE = KeySpec("a number of seconds above 0 and below 1e9", lambda v: _number(v) and v > 0)
+_NOT_NEGATIVE = KeySpec("a number of seconds from 0 to 1e9", lambda v: _number(v) and v >= 0)
 _PERIOD = _POSITIVE._replace(required=True)
 
 SHAPES: Mapping[str, Mapping[str, KeySpec]] = {
