@@ -72,7 +72,7 @@ def nodes_with_devices(directory: Directory) -> list[str]:
 
 def buses_of(directory: Directory, node: str) -> list[Mapping[str, Any]]:
     """Return the CAN buses of a node's devices, in the form that
-    `services.comm.can_ports.open_can` accepts."""
+    `services.comm.canopen.ports.open_can` accepts."""
     found = []
     for device in directory.devices.values():
         can = device.config.get("can") or {

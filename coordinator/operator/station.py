@@ -237,8 +237,8 @@ class Station:
             self._show(text, task)
             return refusal(
                 "changed",
-                f"another program changed {name} after it was shown; the new version is shown now: "
-                "start it again",
+                f"{name} was changed by another program after it was shown; the new version is "
+                "shown now: start it again",
             )
         if (faulty := await self._faults(text)) is not None:
             return faulty
