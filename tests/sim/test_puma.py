@@ -177,7 +177,7 @@ def test_the_algorithms_without_zero_terms_agree_with_the_general_ones(
     arm: PumaModel, case: int
 ) -> None:
     """The shipped arm (case 0), arms with the geometry of a PUMA (1, 2), any arms: bias and mass
-    matrix equal the general recursion within 1e-12; plain and compiled code are equal to the bit."""
+    matrix equal the general recursion within 1e-12; plain and compiled code equal to the bit."""
     rng = np.random.default_rng(case)
     if case:
         arm = (any_puma if case < 3 else any_arm)(arm, rng)
