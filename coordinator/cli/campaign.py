@@ -126,7 +126,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--resume",
         metavar="FOLDER",
         type=Path,
-        help="go on with this one; the same as giving its --out again",
+        help="continue this campaign; the same as giving its --out again",
     )
     parser.add_argument(
         "--check",
