@@ -38,7 +38,15 @@ EXAMPLE = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
+    _add_trials(parser)
+    _add_choices(parser)
+    _add_execution(parser)
+    _add_output(parser)
+    add_services_argument(parser)
+
+
+def _add_trials(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "task", nargs="?", help="a task file, or the name of a task that comes with petrobot"
     )
@@ -53,8 +61,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--regime",
         default="",
         metavar="A,B",
-        help="regimes that take turns, with the same seeds in each",
+        help="regimes that alternate, with the same seeds in each",
     )
+
+
+def _add_choices(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--selector",
         default="fixed",
@@ -82,6 +93,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="X",
         help="weight of cost in J (1 / largest mean cost)",
     )
+
+
+def _add_execution(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--workers",
         type=whole(),
@@ -95,7 +109,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="workers of this dask scheduler instead, as tcp://host:8786",
     )
     parser.add_argument(
-        "--seed", type=whole(0), default=1, metavar="S", help="of all chance (%(default)s)"
+        "--seed", type=whole(0), default=1, metavar="S", help="of all random numbers (%(default)s)"
     )
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task"
@@ -116,6 +130,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
     )
+
+
+def _add_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="FOLDER",
@@ -138,7 +155,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--json", metavar="FILE", help="write the result as JSON (- for standard output)"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
-    add_services_argument(parser)
 
 
 def run(options: argparse.Namespace) -> int:
