@@ -38,7 +38,15 @@ EXAMPLE = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
+    _add_trials(parser)
+    _add_choices(parser)
+    _add_execution(parser)
+    _add_output(parser)
+    add_services_argument(parser)
+
+
+def _add_trials(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "task", nargs="?", help="a task file, or the name of a task that comes with petrobot"
     )
@@ -53,9 +61,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--regime",
         default="",
         metavar="A,B",
-        help="regimes that take turns, with the same seeds in each; C@1-5: regime C in the "
+        help="regimes that alternate, with the same seeds in each; C@1-5: regime C in the "
         "simulated installations 1 to 5",
     )
+
+
+def _add_choices(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--selector",
         default="fixed",
@@ -88,6 +99,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="X",
         help="weight of cost in J (1 / largest mean cost)",
     )
+
+
+def _add_execution(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--workers",
         type=whole(),
@@ -105,7 +119,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=whole(0, LARGEST_SEED),
         default=1,
         metavar="S",
-        help="of all chance (%(default)s)",
+        help="of all random numbers (%(default)s)",
     )
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task"
@@ -126,6 +140,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
     )
+
+
+def _add_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="FOLDER",
@@ -136,7 +153,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--resume",
         metavar="FOLDER",
         type=Path,
-        help="go on with this one; the same as giving its --out again",
+        help="continue this campaign; the same as giving its --out again",
     )
     parser.add_argument(
         "--check",
@@ -148,7 +165,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--json", metavar="FILE", help="write the result as JSON (- for standard output)"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
-    add_services_argument(parser)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -187,9 +187,8 @@ class LeastSquares:
     The model is a straight line in space; along it a start, a speed, the rolling deceleration (with
     a prior), and sliding that ends at one of several moments. For each moment this is a linear
     model with its own normal equations, which grow by addition. The models are weighted by their
-    evidence (Bayesian model averaging; Hoeting et al. 1999), so no moment has to be guessed, and
-    the cost per place never grows.
-    """
+    evidence (J. A. Hoeting et al., Bayesian model averaging: a tutorial, Statistical Science 14,
+    1999), so no moment has to be guessed, and the cost per place never grows."""
 
     MOMENTS = np.array([0.0, 0.02, 0.04, 0.06, 0.08, 0.10, 0.13, 0.16, 0.20, 0.26])
     """s after the first place at which sliding may end."""

@@ -159,7 +159,7 @@ FAULTS = [
     (
         "[actions.look_twice]",
         "[actions.look]",
-        "actions.look: is placed twice; each name stands on one node only",
+        "actions.look: is placed twice; a name may belong to one node only",
     ),
     (
         "[actions.add]",
@@ -218,7 +218,7 @@ FAULTS = [
     ),
     ("[devices.hand]", '[devices."a hand"]', "a name has letters, digits, _ and - only"),
     ("port = 7301", "port = ", ":6: not valid TOML"),
-    (GOOD, "schema = 1\n", "nodes: there is no node; write at least one [nodes.NAME]"),
+    (GOOD, "schema = 1\n", "nodes: no node here; write at least one [nodes.NAME]"),
     ("[links]\ncall = 0.008\n", "[links_]\n", "links_: unknown table; did you mean 'links'?"),
 ]
 
