@@ -99,6 +99,7 @@ COMMANDS = (
     Subcommand("sim", "start the simulated laboratory"),
     Subcommand("calibrate", "calibrate a camera from images of a board"),
     Subcommand("keys", "make the shared key or the certificates that several hosts need"),
+    Subcommand("test", "check that a driver keeps the rules of drivers, with its device"),
     Subcommand("new", "write a working robot, or a skeleton of a driver, an action or a task"),
 )
 PLAIN = (

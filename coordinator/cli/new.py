@@ -219,7 +219,12 @@ DRIVER_TEST = '''\
 """Tests of {name} on a simulated clock."""
 
 from {module} import {Class}
-from petrobot import Context, Remote, Result, rehearse, success
+from petrobot import Context, Remote, Result, check_driver, rehearse, success
+
+
+def test_it_keeps_the_rules_of_drivers():
+    there_and_back = [{{"to": 0.9}}, {{"to": 0.1}}]
+    assert check_driver(lambda: {Class}({{}}, None), there_and_back, simulated=True).faults == []
 
 
 async def drive(ctx: Context[Remote], *, to: float) -> Result:
@@ -328,7 +333,7 @@ import sys
 from pathlib import Path
 
 from {name} import Axis, grip, move
-from petrobot import rehearse
+from petrobot import check_driver, rehearse
 
 HERE = Path(__file__).parent
 
@@ -342,6 +347,11 @@ def test_it_moves():
     axis = Axis({"speed": 0.5}, None)
     played = rehearse(move, device=axis, to=0.5)
     assert played.result.status == "success" and 0.9 < played.seconds < 1.1
+
+
+def test_the_driver_keeps_the_rules_of_drivers():
+    there_and_back = [{{"to": 0.9}}, {{"to": 0.1}}]
+    assert check_driver(lambda: Axis({{}}, None), there_and_back, simulated=True).faults == []
 
 
 def test_what_is_out_of_reach_is_refused():

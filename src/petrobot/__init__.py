@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         provisional,
         success,
     )
+    from petrobot.services.conformance import DriverCheck, check_driver
     from petrobot.services.device import Driver, Ports, Remote, Setpoint, key
     from petrobot.services.rehearsal import Rehearsal, rehearse
 
@@ -32,12 +33,14 @@ __all__ = [
     "CommandRefused",
     "Context",
     "Driver",
+    "DriverCheck",
     "Ports",
     "Rehearsal",
     "Remote",
     "Result",
     "Setpoint",
     "Status",
+    "check_driver",
     "error",
     "failure",
     "key",
@@ -48,6 +51,7 @@ __all__ = [
 
 _HOMES = {
     **dict.fromkeys(("Driver", "Ports", "Remote", "Setpoint", "key"), "petrobot.services.device"),
+    **dict.fromkeys(("DriverCheck", "check_driver"), "petrobot.services.conformance"),
     **dict.fromkeys(("Rehearsal", "rehearse"), "petrobot.services.rehearsal"),
 }
 

@@ -1,0 +1,79 @@
+"""Check that the driver of a device keeps the rules of drivers (docs/drivers.md).
+
+The device moves: give commands that are safe where it stands now.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import add_services_argument, load_directory
+from petrobot.services.host.command_line import number
+
+EXAMPLE = """petrobot test driver axis --command '{"to": 0.2}' --command '{"to": 0.4}'"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("what", choices=["driver"], help="what to test")
+    parser.add_argument("device", help="name of the device in services.toml")
+    add_services_argument(parser)
+    parser.add_argument(
+        "--command",
+        dest="commands",
+        type=_command,
+        action="append",
+        default=[],
+        metavar="JSON",
+        help="a command that moves the device; give two or more, there and back",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=number(least=0.1),
+        default=5.0,
+        metavar="S",
+        help="the longest that one of the movements takes (default: %(default)g s)",
+    )
+    parser.add_argument(
+        "--within",
+        type=number(least=0.01),
+        default=1.0,
+        metavar="S",
+        help="how soon the device stands still after a stop (default: %(default)g s)",
+    )
+
+
+def _command(text: str) -> Mapping[str, Any]:
+    try:
+        body = json.loads(text)
+    except ValueError as fault:
+        raise argparse.ArgumentTypeError(f"expected JSON, got {text!r}: {fault}") from fault
+    if not isinstance(body, dict):
+        raise argparse.ArgumentTypeError(f"expected a JSON object, got {text!r}")
+    return body
+
+
+def run(options: argparse.Namespace) -> int:
+    """Test, and print what was found."""
+    from petrobot.services.conformance import check_device
+
+    directory = load_directory(options.services)
+    try:
+        found = check_device(
+            directory,
+            options.device,
+            options.commands,
+            seconds=options.seconds,
+            within=options.within,
+        )
+    except (ValueError, OSError) as fault:
+        raise CommandError(2, f"{directory.source}: devices.{options.device}: {fault}") from fault
+    for text in (*found.faults, *found.notes):
+        print(text)
+    if not found.faults:
+        print(f"{options.device}: its driver keeps the rules")
+    return 1 if found.faults else 0

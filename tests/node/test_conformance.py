@@ -1,0 +1,205 @@
+"""Drivers that keep the rules pass; each broken rule is named."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any, cast
+
+import pytest
+
+from petrobot.services.conformance import DriverCheck, check_driver
+from petrobot.services.device import Driver, Ports
+
+
+class Axis(Driver):
+    """Moves at 0.1 m/s; keeps all rules."""
+
+    period = 0.01
+    plugged = True
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        super().__init__(config, ports)
+        self.at = self.goal = 0.0
+        self.paused = False
+        self.cycles = 0
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        if not isinstance(body.get("to"), float):
+            raise ValueError(f"to: expected metres, got {body.get('to')!r}")
+        self.goal = body["to"]
+
+    def step(self, now: float) -> None:
+        if not self.plugged:
+            raise OSError("no answer")
+        self.cycles += 1
+        if not self.paused:
+            self.at += max(-0.001, min(0.001, self.goal - self.at))
+
+    def state(self) -> Mapping[str, Any]:
+        return {"axis": [{"at": self.at}], "cycles": self.cycles, "ready": True}
+
+    def stop(self, now: float) -> None:
+        self.goal = self.at
+
+    def stopped(self) -> bool:
+        return self.at == self.goal
+
+    def hold(self, now: float) -> str:
+        self.paused = True
+        return "held"
+
+    def release(self, now: float) -> None:
+        self.paused = False
+
+
+COMMANDS = [{"to": 0.2}, {"to": 0.0}]
+
+
+def checked(kind: type[Axis], **more: Any) -> DriverCheck:
+    """Check a driver, in simulated time unless it waits."""
+    simulated = {"simulated": kind is not Waits}
+    return check_driver(lambda: kind({}, cast(Ports, None)), COMMANDS, **simulated | more)
+
+
+def test_a_good_driver_passes() -> None:
+    found = checked(Axis)
+    assert found.faults == []
+    assert found.notes == ["not checked: a pulled cable: give `cable`"]
+
+
+class NeverStops(Axis):
+    def stop(self, now: float) -> None:
+        pass
+
+
+class SaysItStands(Axis):
+    def stopped(self) -> bool:
+        return True
+
+
+class RunsOnAfterStop(Axis):
+    """It says that it stands, and rolls on."""
+
+    said = False
+
+    def stop(self, now: float) -> None:
+        self.said = True
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        super().command(now, body)
+        self.said = False
+
+    def stopped(self) -> bool:
+        return self.said or super().stopped()
+
+
+class StopsOnce(Axis):
+    ever = 0
+
+    def stop(self, now: float) -> None:
+        self.ever += 1
+        if self.ever == 2:
+            raise RuntimeError("already stopped")
+        super().stop(now)
+
+
+class TakesAll(Axis):
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        if "to" in body:
+            super().command(now, body)
+
+
+class HoldsInWords(Axis):
+    def hold(self, now: float) -> str:
+        return "held"
+
+
+class HoldsForGood(Axis):
+    def release(self, now: float) -> None:
+        pass
+
+
+class WrongAnswer(Axis):
+    def hold(self, now: float) -> str:
+        super().hold(now)
+        return "ok"
+
+
+class Waits(Axis):
+    def step(self, now: float) -> None:
+        super().step(now)
+        time.sleep(0.02)
+
+
+class StrangeState(Axis):
+    def state(self) -> Mapping[str, Any]:
+        return {"at": self.at, "port": object()}
+
+
+class CannotBeMadeAgain(Axis):
+    made = 0
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        type(self).made += 1
+        if type(self).made > 1:
+            raise OSError("port is busy")
+        super().__init__(config, ports)
+
+
+class Deaf(Axis):
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        if not isinstance(body.get("to"), float):
+            raise ValueError("to")
+
+
+@pytest.mark.parametrize(
+    ("kind", "fault"),
+    [
+        (NeverStops, "stop during a movement: stopped() is still False after 1 s"),
+        (SaysItStands, "stopped: True during {'to': 0.2}, while axis[0].at changed"),
+        (RunsOnAfterStop, "stop during a movement: stopped() is True, and axis[0].at still"),
+        (StopsOnce, "stop, a second time: RuntimeError: already stopped"),
+        (TakesAll, "command: accepted"),
+        (HoldsInWords, "hold: answered 'held', and axis[0].at still changes"),
+        (HoldsForGood, "release: the movement that was held does not continue"),
+        (WrongAnswer, 'hold: expected "held", "cannot hold" or "stopped", got \'ok\''),
+        (Waits, "took longer than the period of 0.01 s, the longest"),
+        (StrangeState, "state: expected plain data"),
+        (CannotBeMadeAgain, "close and a second driver of the same configuration: OSError: port"),
+        (Deaf, "{'to': 0.2}: no number of state changes"),
+    ],
+)
+def test_each_broken_rule_is_named(kind: type[Axis], fault: str) -> None:
+    found = checked(kind).faults
+    assert any(fault in one for one in found), found
+
+
+class Unplugged(Axis):
+    """Its step raises without the cable."""
+
+
+class NoticesNothing(Axis):
+    """It stands whatever happens to its cable."""
+
+    def step(self, now: float) -> None:
+        type(self).plugged = True
+        super().step(now)
+
+
+@pytest.mark.parametrize(
+    ("kind", "faults"),
+    [(Unplugged, []), (NoticesNothing, ["cable pulled: stopped() is still True after 5 s"])],
+)
+def test_a_cable_that_is_pulled_and_put_back(kind: type[Axis], faults: list[str]) -> None:
+
+    def cable(there: bool) -> None:
+        kind.plugged = there
+
+    found = checked(kind, cable=cable)
+    assert found.faults == faults and not found.notes
+
+
+def test_a_driver_without_cycles_has_no_movements_to_check() -> None:
+    found = check_driver(lambda: Driver({}, cast(Ports, None)), simulated=True)
+    assert found.faults == [] and "has no `period`" in found.notes[0]
