@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 
 def pin(core: int) -> bool:
@@ -48,7 +49,11 @@ def start(
 ) -> subprocess.Popen[str]:
     """A script of the benchmark again, in another part; its input and its output are pipes."""
     command = [python, script, *arguments, "--pin" if pinned else "--no-pin"]
-    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    # A checkout that is not installed as a wheel finds its own packages from its own folder.
+    folder = Path(script).resolve().parents[2]
+    return subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=folder
+    )
 
 
 def quantile(values: Sequence[float], q: float) -> float:

@@ -73,6 +73,7 @@ class ResultTable:
         self._askers = {one.name: Asker(__file__, one.name, pinned) for one in contenders}
         for one in OURS if older is not None else ():
             assert older is not None
+            older = older.resolve()
             script = next(older / f for f in SCRIPTS if (older / f).exists())
             python = str(older / ".venv" / "bin" / "python")
             self._askers[f"{one.name} (older)"] = Asker(str(script), one.name, pinned, python)
