@@ -102,6 +102,11 @@ class ExecutionChain:
     """The most phases of a duration."""
     assumptions: tuple[str, ...]
 
+    @property
+    def taken(self) -> Values:
+        """How often a mission run takes each edge (in what it does not repeat for ever)."""
+        return self._weights[0]
+
     @cached_property
     def _weights(self) -> tuple[Values, Values]:
         """By edge: how often it is taken in one mission run, and how often in the long run of a
