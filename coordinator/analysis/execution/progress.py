@@ -189,7 +189,13 @@ class Progress:
             f"stuck with {describe(x, i)}: {explain(x, i)}; {_by(x, i)}"
             for i in list(stuck.values())[:GROUPS]
         ]
-        return [f"only if the operator moves tokens: {text}" for text in said]
+        said = [f"only if the operator moves tokens: {text}" for text in said]
+        if not said and not x.complete:
+            said = [
+                "what is possible only if the operator moves tokens was searched in "
+                f"{x.expanded} states, not to the end: nothing found"
+            ]
+        return said
 
     # --- stuck, or for ever on its way ------------------------------------------------------
 
