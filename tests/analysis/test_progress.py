@@ -534,6 +534,27 @@ def test_a_preempting_event_races_with_the_run() -> None:
     assert p == pytest.approx(0.75, abs=1e-9) and mean == pytest.approx(0.75, abs=1e-9)
 
 
+def test_causes_of_an_error_are_told_apart_where_they_matter() -> None:
+    """After a drive fault nothing mends the arm; after any other error something does."""
+    net: dict[str, dict[str, Any]] = {
+        "good": {"in": "act:normal", "out": "done"},
+        "fault": {"in": "act:error", "out": "stopped"},
+        "mend": {"in": "stopped", "out": "done", "when": "act.reason != 'drive'", "after": 1.0},
+        "leave": {"in": "stopped", "out": "lost", "when": "act.reason == 'drive'", "after": 1.0},
+    }
+    task = make_task(
+        "act!=1 stopped done lost", net, final="done == 1", final_error=parse("lost == 1")
+    )
+    found = judged(with_estimates(task, {"act": (0.5, 1.0, 1.0)}))
+    named = {r.name: r for r in found.recoveries}
+    assert named["fault ('drive')"].possible.holds is False
+    others = [r for r in named.values() if r.cause and r.cause != "'drive'"]
+    assert others and all(r.almost_sure.holds for r in others)
+    assert found.odds.by_exit["fault ('drive')"][0] == 0.0
+    p, mean = found.odds.by_exit[others[0].name]
+    assert p == 1.0 and mean == pytest.approx(1.0)
+
+
 def test_measured_numbers_replace_declared_ones() -> None:
     task = with_estimates(arm(1), {"move": (0.1, 1.0, 2.0), "recover": (0.5, 6.0, 3.0)})
     ends = {Status.SUCCESS: Estimate(0.9, 1.0, 0.5), Status.ERROR: Estimate(0.1, 1.0, 0.5)}
