@@ -624,9 +624,10 @@ def _sizes(net: Net) -> dict[str, int]:
 
 
 def _recovery(r: Recovery, odds: Odds) -> Mapping[str, Any]:
-    p, time = odds.by_exit.get(r.error_exit, (None, None))
+    p, time = odds.by_exit.get(r.name, (None, None))
     return {
         "error_exit": r.error_exit,
+        "cause": r.cause,
         "possible": r.possible.to_json(),
         "almost_sure": r.almost_sure.to_json(),
         "kappa": r.kappa,
@@ -667,13 +668,13 @@ def _recovery_lines(progress: Progress) -> list[str]:
     found, odds = progress.recoveries, progress.odds
     if not found:
         return []
-    wide = max(14, *(len(r.error_exit) for r in found))
+    wide = max(14, *(len(r.name) for r in found))
     heads = ("back", "sure", "probability", "mean time", "further errors", "runs lost", "by")
     lines = ["", f"{'error exits':{wide + 2}}{_columns(heads)}"]
     for alone, title in ((True, ""), (False, "only while another error is being handled:")):
         rows = [r for r in found if r.alone is alone]
         lines += [title] if rows and title else []
-        lines += [f"  {r.error_exit:{wide}}{_columns(_recovery_row(r, odds))}" for r in rows]
+        lines += [f"  {r.name:{wide}}{_columns(_recovery_row(r, odds))}" for r in rows]
     if odds.missing:
         return [*lines, f"  no probability: {odds.missing}"]
     told = [text for text in odds.assumptions if not text.endswith(", not measured")]
@@ -696,7 +697,7 @@ def _recovery_row(r: Recovery, odds: Odds) -> tuple[str, ...]:
     named = {None: "any number", -1: "not recoverable", 0: "no further error tolerated"}
     if r.possible.holds:
         named[-1] = "not recoverable for certain"
-    p, time = odds.by_exit.get(r.error_exit, (None, None))
+    p, time = odds.by_exit.get(r.name, (None, None))
     path = " ".join(r.strategy) or ("(immediate)" if r.possible.holds and r.kappa != -1 else "-")
     return (
         "some" if r.possible.holds is False and r.strategy else _word(r.possible.holds),

@@ -94,7 +94,8 @@ def settle(
         forget_flags(draft)
     if draft.retime and draft.mode is not Mode.FINISHED:
         refresh_timers(draft)
-    if draft.compiled.contested and policy.first_come and draft.suspended is None:
+    first_come = policy.first_come and not policy.ask_undecided
+    if draft.compiled.contested and first_come and draft.suspended is None:
         _note_waits(draft)
     _explain_waiting(draft)
     _end_if_over(draft, policy)

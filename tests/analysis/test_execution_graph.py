@@ -13,7 +13,9 @@ from hypothesis import HealthCheck, Phase, assume, event, given, settings
 from hypothesis import strategies as st
 
 from petrobot.coordinator.analysis.execution.causes import explain, settled
+from petrobot.coordinator.analysis.execution.chain import TooLarge, chain_of
 from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, TooManyValues, execute
+from petrobot.coordinator.analysis.time.stochastic import NoEstimate
 from petrobot.coordinator.engine import (
     ArmTimer,
     Begin,
@@ -38,7 +40,17 @@ from petrobot.coordinator.engine import (
 )
 from petrobot.coordinator.engine.firing import DEAD_END
 from petrobot.coordinator.engine.state import ACTIVE
-from petrobot.coordinator.task import End, Executed, Kind, Place, Scope, Status, Task, Transition
+from petrobot.coordinator.task import (
+    End,
+    Estimate,
+    Executed,
+    Kind,
+    Place,
+    Scope,
+    Status,
+    Task,
+    Transition,
+)
 from petrobot.coordinator.task.conditions import parse
 from petrobot.coordinator.task.file import loads
 from petrobot.coordinator.task.validation import faults
@@ -358,6 +370,35 @@ def graph_and_engine_agree(task: Task, data: st.DataObject) -> None:
 @given(whole_tasks(), st.data())
 def test_every_play_of_the_engine_is_a_path(task: Task, data: st.DataObject) -> None:
     graph_and_engine_agree(task, data)
+
+
+ESTIMATES = {
+    Status.SUCCESS: Estimate(0.6, 1.0, 0.5),
+    Status.FAILURE: Estimate(0.1, 2.0, 1.5),
+    Status.ERROR: Estimate(0.3, 0.5, 0.3),
+}
+
+
+@settings(COMMON, max_examples=20)
+@given(whole_tasks())
+def test_the_chain_of_a_graph_stops_only_where_the_graph_does(task: Task) -> None:
+    """And its probabilities add up."""
+    primitives = {n: replace(p, estimates=ESTIMATES) for n, p in task.primitive_tasks.items()}
+    events = {n: replace(e, mean_wait=2.0) for n, e in task.events.items()}
+    try:
+        x = execute(replace(task, primitive_tasks=primitives, events=events), limit=LIMIT)
+        assume(x.complete)
+        chain = chain_of(x, size=2_000)
+    except (TooManyValues, TooLarge, NoEstimate):
+        assume(False)
+    out = np.bincount(chain.graph.source, chain.probability, minlength=chain.graph.n)
+    leaves = np.bincount(chain.graph.source, minlength=chain.graph.n) > 0
+    assert np.allclose(out[leaves], 1.0, atol=1e-9)
+    assert (chain.probability > 0).all() and (chain.sojourn >= 0).all()
+    assert not np.isin(chain.at[~leaves], x.source[x.source != x.target]).any()
+    for t in x.engine.compiled.transitions:
+        back = chain.back(np.flatnonzero(x.firing([t.name])), x.final)
+        assert back is None or 0.0 <= back[0] <= 1.0
 
 
 @pytest.mark.parametrize("text", [TRIES, LISTEN, SETS])

@@ -534,12 +534,67 @@ def test_a_preempting_event_races_with_the_run() -> None:
     assert p == pytest.approx(0.75, abs=1e-9) and mean == pytest.approx(0.75, abs=1e-9)
 
 
+def test_causes_of_an_error_are_told_apart_where_they_matter() -> None:
+    """After a drive fault nothing mends the arm; after any other error something does."""
+    net: dict[str, dict[str, Any]] = {
+        "good": {"in": "act:normal", "out": "done"},
+        "fault": {"in": "act:error", "out": "stopped"},
+        "mend": {"in": "stopped", "out": "done", "when": "act.reason != 'drive'", "after": 1.0},
+        "leave": {"in": "stopped", "out": "lost", "when": "act.reason == 'drive'", "after": 1.0},
+    }
+    task = make_task(
+        "act!=1 stopped done lost", net, final="done == 1", final_error=parse("lost == 1")
+    )
+    found = judged(with_estimates(task, {"act": (0.5, 1.0, 1.0)}))
+    named = {r.name: r for r in found.recoveries}
+    assert named["fault ('drive')"].possible.holds is False
+    others = [r for r in named.values() if r.cause and r.cause != "'drive'"]
+    assert others and all(r.almost_sure.holds for r in others)
+    assert found.odds.by_exit["fault ('drive')"][0] == 0.0
+    p, mean = found.odds.by_exit[others[0].name]
+    assert p == 1.0 and mean == pytest.approx(1.0)
+
+
 def test_measured_numbers_replace_declared_ones() -> None:
     task = with_estimates(arm(1), {"move": (0.1, 1.0, 2.0), "recover": (0.5, 6.0, 3.0)})
     ends = {Status.SUCCESS: Estimate(0.9, 1.0, 0.5), Status.ERROR: Estimate(0.1, 1.0, 0.5)}
     measured = Measured(runs={("recover", "do_recover"): ends})
     odds = progress_of(OrdinaryView(task), 10_000, measured).odds
     assert odds.by_exit["fault"][0] == pytest.approx(0.99, abs=1e-12)
+
+
+def test_a_measured_preemption_is_a_cause_by_which_its_run_ends() -> None:
+    """The chain takes each transition as often as the stochastic view does."""
+    ends = {
+        "intercept_upright": {Status.SUCCESS: Estimate(0.8, 1.0, 0.3)},
+        "intercept_tilted": {Status.SUCCESS: Estimate(0.6, 1.0, 0.3)},
+        "follow_and_wait": {Status.FAILURE: Estimate(0.05, 1.2, 0.3)},
+    }
+    error = {Status.ERROR: Estimate(0.1, 0.5, 0.5)}
+    shares = {"intercept_upright": 0.1, "intercept_tilted": 0.3, "follow_and_wait": 0.85}
+    places = {"move_to_point": "caught_early", "catch_ball": "caught"}
+    of = {name: "catch_ball" if name == "follow_and_wait" else "move_to_point" for name in ends}
+    measured = Measured(
+        runs={(of[name], name): {**given, **error} for name, given in ends.items()},
+        preempted={
+            (of[name], name): {places[of[name]]: Estimate(share, 0.5, 0.4)}
+            for name, share in shares.items()
+        },
+        choice={"move_to_point": {"intercept_upright": 0.25, "intercept_tilted": 0.75}},
+    )
+    task = load(TASKS / "catch_ball.toml")
+    x = judged(task).x
+    chain = chain_of(x, measured)
+    view = stochastic_view(task, measured, stages=chain.stages, timer_stages=chain.stages)
+    expected = forecast(view)
+    begin = chain.back(np.flatnonzero(x.source == 0), x.final)
+    assert begin is not None
+    assert begin[0] == pytest.approx(expected.completion_probability, abs=1e-9)
+    taken = chain.taken
+    for name in ("move_failed", "catch_failed", "caught", "caught_early", "missed"):
+        edges = np.flatnonzero(x.firing([name]))
+        found = taken[np.isin(chain.edge, edges)].sum()
+        assert found == pytest.approx(expected.firings[name], rel=1e-9), name
 
 
 def test_without_an_estimate_there_is_no_probability() -> None:

@@ -7,11 +7,15 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from petrobot.coordinator.engine import (
     AddTokens,
+    Begin,
     CancelRun,
     Chosen,
+    Engine,
     EventOccurred,
     Finished,
     Fired,
@@ -28,6 +32,7 @@ from petrobot.coordinator.engine import (
 )
 from petrobot.coordinator.engine.step import RECORDED
 from petrobot.coordinator.task import Executed, Status
+from tests.engine.conftest import Play, make_task
 
 Plays = Callable[..., Any]
 
@@ -229,6 +234,18 @@ def test_a_conflict_over_a_resource_is_settled_first_come_first_served(
     assert [wait.since for wait in p.state.waits.values()] and p.fired == ["hold"]
     p(ended("c#1"))
     assert p.fired == ["hold", "free", *served] and p.reports == [] and not p.state.waits
+
+
+@given(st.permutations(range(4)))
+def test_a_queue_for_a_resource_is_served_in_the_order_of_its_arrivals(order: list[int]) -> None:
+    net = {"hold": {"in": "go arm", "out": "c"}, "free": {"in": "c:normal", "out": "arm"}}
+    net |= {f"take{i}": {"in": f"a{i}:normal arm", "out": "c"} for i in range(4)}
+    places = "go=1 arm~=1 c! " + " ".join(f"a{i}!=1" for i in range(4))
+    p = Play(Engine(make_task(places, net), {}, Policy(end_when_dead=False)))
+    p(Begin(), *(ended(f"a{i}#1") for i in order))
+    p(*(ended(f"c#{n}") for n in range(1, 5)))
+    assert [name for name in p.fired if name.startswith("take")] == [f"take{i}" for i in order]
+    assert p.reports == []
 
 
 def test_who_waits_from_the_same_stimulus_goes_by_the_order_in_the_file(play: Plays) -> None:

@@ -102,6 +102,11 @@ class ExecutionChain:
     """The most phases of a duration."""
     assumptions: tuple[str, ...]
 
+    @property
+    def taken(self) -> Values:
+        """How often a mission run takes each edge (in what it does not repeat for ever)."""
+        return self._weights[0]
+
     @cached_property
     def _weights(self) -> tuple[Values, Values]:
         """By edge: how often it is taken in one mission run, and how often in the long run of a
@@ -420,7 +425,7 @@ class _Builder:
             elif isinstance(stimulus, EventOccurred):
                 self.event(state, stimulus.event, outcome, number, ends, events)
             elif isinstance(stimulus, RunRaised):
-                if outcome.state != i:
+                if outcome.edge >= 0:
                     events.append((self.rate(stimulus.event), outcome))
             elif isinstance(stimulus, VariableChanged):
                 raise NoEstimate(f"no rate at which the variable `{stimulus.name}` changes")
@@ -441,14 +446,16 @@ class _Builder:
     ) -> None:
         """Add an external event: as a cause that its run has drawn, or after a wait."""
         compiled = self.x.engine.compiled
+        kept, others = event in compiled.kept, False
         for t in compiled.waiting[event]:
             name = compiled.transitions[t].name
             drawn = self.slots_of_cause(state, name, number)
             for k in drawn:
                 ends[k, f"by.{name}"] = [outcome]
-            awaits = all(state.marking[p] >= w for p, w in compiled.transitions[t].needs)
-            if awaits and not drawn and (not events or events[-1][1] is not outcome):
-                events.append((self.rate(event), outcome))
+            enabled = all(state.marking[p] >= w for p, w in compiled.transitions[t].needs)
+            others |= not drawn and (kept or enabled)
+        if others and outcome.edge >= 0:
+            events.append((self.rate(event), outcome))
 
     def slots_of_cause(
         self, state: State, transition: str, number: dict[tuple[str, str], int]

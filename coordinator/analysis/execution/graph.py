@@ -16,7 +16,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.coordinator.analysis.execution.names import Cause, Names, Orders, TooManyValues
+from petrobot.coordinator.analysis.execution.names import (
+    REASON,
+    Cause,
+    Names,
+    Orders,
+    TooManyValues,
+)
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.engine import (
     Begin,
@@ -44,6 +50,11 @@ class Step:
 
     text: str
     firings: tuple[str, ...]
+
+    @property
+    def reason(self) -> str:
+        """The reason of a run that ended, as it is written; empty where nothing reads it."""
+        return self.text.partition(REASON)[2].partition(",")[0]
 
     def __str__(self) -> str:
         firings = self.firings[:SHOWN]

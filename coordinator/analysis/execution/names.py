@@ -46,6 +46,9 @@ OUTCOMES = 256
 BY_HAND = "the operator"
 """How the operator's commands begin in words."""
 
+REASON = "reason "
+"""How the reason of a run begins in the words of a stimulus."""
+
 Orders = frozenset[tuple[str, str]]
 """Pairs of armed timers, by their transitions: the first elapses before the second."""
 
@@ -297,7 +300,7 @@ class Names:
             for cause, was, *values in product(reasons, executed, *choices):
                 given = {r: v for r, v in zip(read, values, strict=True) if v is not MISSING}
                 told = [f"{read[r]} = {v!r}" for r, v in given.items()]
-                told += [f"reason {cause!r}"] if len(reasons) > 1 else []
+                told += [f"{REASON}{cause!r}"] if len(reasons) > 1 else []
                 told += [f"executed = {was}"] if len(executed) > 1 else []
                 text = status.value + (f" with {', '.join(told)}" if told else "")
                 if status is not Status.ERROR:

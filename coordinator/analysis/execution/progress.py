@@ -18,7 +18,7 @@ from the graph as a Markov chain (`chain.py`).
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -89,6 +89,18 @@ class Recovery:
     is no way."""
     alone: bool = True
     """Whether it can fire in the nominal flow; False: only while another error is handled."""
+    cause: str = ""
+    """The cause of the error (`'lost'`), where another has other verdicts; else empty."""
+
+    @property
+    def name(self) -> str:
+        """The error exit, with the cause where it matters."""
+        return f"{self.error_exit} ({self.cause})" if self.cause else self.error_exit
+
+    @property
+    def verdicts(self) -> tuple[bool | None, bool | None, int | None]:
+        """Possible, sure, and kappa."""
+        return self.possible.holds, self.almost_sure.holds, self.kappa
 
 
 @dataclass(frozen=True)
@@ -96,8 +108,8 @@ class Odds:
     """How probable the way back from each error exit is, and how long it takes."""
 
     by_exit: Mapping[str, tuple[float, float]]
-    """Probability, and mean time (s) given that there is a way back (nan if there is none). Exits
-    that fire with probability 0 are not in it."""
+    """By `Recovery.name`: probability, and mean time (s) given that there is a way back (nan if
+    there is none). Exits that fire with probability 0 are not in it."""
     stages: int
     """The most phases by which a duration is approximated."""
     assumptions: tuple[str, ...] = ()
@@ -189,7 +201,13 @@ class Progress:
             f"stuck with {describe(x, i)}: {explain(x, i)}; {_by(x, i)}"
             for i in list(stuck.values())[:GROUPS]
         ]
-        return [f"only if the operator moves tokens: {text}" for text in said]
+        said = [f"only if the operator moves tokens: {text}" for text in said]
+        if not said and not x.complete:
+            said = [
+                "what is possible only if the operator moves tokens was searched in "
+                f"{x.expanded} states, not to the end: nothing found"
+            ]
+        return said
 
     # --- stuck, or for ever on its way ------------------------------------------------------
 
@@ -411,16 +429,29 @@ class Progress:
         for t in self.x.engine.compiled.transitions:
             if t.name in self.view.error_exits:
                 edges, alone = self._first_errors(t.name)
-                if len(edges):
-                    found.append(self._recovery(t.name, edges, alone, back, caught, nested))
+                if not len(edges):
+                    continue
+                whole = self._recovery(t.name, edges, alone, back, caught, nested)
+                parts = [
+                    replace(self._recovery(t.name, some, alone, back, caught, nested), cause=cause)
+                    for cause, some in self._by_cause(edges).items()
+                ]
+                found += parts if any(p.verdicts != whole.verdicts for p in parts) else [whole]
         return tuple(found)
 
-    def _first_errors(self, name: str) -> tuple[NDArray[np.int64], bool]:
+    def _first_errors(self, name: str, cause: str = "") -> tuple[NDArray[np.int64], bool]:
         """Return the edges by which an error exit fires in the nominal flow, and True; if there are
-        none, all by which it fires, and False."""
+        none, all by which it fires, and False. `cause`: only those after that cause of the
+        error."""
         edges = np.flatnonzero(self.x.firing([name]))
         first = edges[self._nominal[self.x.source[edges]]]
-        return (first, True) if len(first) else (edges, False)
+        found, alone = (first, True) if len(first) else (edges, False)
+        return (self._by_cause(found)[cause] if cause else found), alone
+
+    def _by_cause(self, edges: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+        """Return the edges by the cause of the error, where the conditions tell causes apart."""
+        causes = np.array([self.x.steps[n].reason for n in self.x.label[edges]])
+        return {str(cause): edges[causes == cause] for cause in np.unique(causes)}
 
     def _recovery(
         self,
@@ -532,9 +563,10 @@ class Progress:
             chain = chain_of(self.x, self.measured)
             found = {}
             for r in self.recoveries:
-                back = chain.back(self._first_errors(r.error_exit)[0], self._nominal)
+                edges, _ = self._first_errors(r.error_exit, r.cause)
+                back = chain.back(edges, self._nominal)
                 if back is not None:
-                    found[r.error_exit] = (1.0 if r.almost_sure.holds else back[0], back[1])
+                    found[r.name] = (1.0 if r.almost_sure.holds else back[0], back[1])
             return Odds(found, chain.stages, chain.assumptions)
         except (NoEstimate, TooLarge, OutOfTime, ArithmeticError, MemoryError) as why:
             return Odds({}, 0, (), str(why) or "the memory was used up")
