@@ -332,8 +332,9 @@ class Pairs:
         if self.dense:
             every = np.broadcast_to(np.arange(self.shape[1], dtype=np.int32), self.shape)
             label: Labels = every.ravel().take(self.flat)
-            return label
-        return self.flat - self.source * self.shape[1]
+        else:
+            label = self.flat - self.source * self.shape[1]
+        return label
 
     def sums(self, rows: Words, columns: Words) -> Words:
         """Return rows[marking] + columns[transition] for each pair."""
