@@ -352,8 +352,10 @@ class Analysis:
                 f"  dead end       {d.count} x: {d.reason}" for d in self.progress.dead_ends[:SHOWN]
             ]
             lines += _recovery_lines(self.progress)
-        assumed = dict.fromkeys(
-            v.assumption for v in self.verdicts().values() if v.holds and v.assumption
+        assumed = dict.fromkeys(  # a net of another tool is not executed
+            v.assumption
+            for v in self.verdicts().values()
+            if v.holds and v.assumption and self.ends is not None
         )
         lines += (
             ["", *(f"These hold for the executed task if {text}." for text in assumed)]

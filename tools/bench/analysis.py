@@ -410,6 +410,7 @@ def bench_stochastic(quick: bool) -> None:
         for what, said in (("numpy and scipy", ours), ("Storm", storm)):
             if said:
                 line(what, said, "states", ours["states"] / ours["seconds"] if ours else None)
+                tell(f"    precision {said['precision']:g}, {said['measures']} measures")
     for name in ("stages-4",) if quick else ("stages-4", "stages-8", "stages-16"):
         said = measured("completion", name, "auto")
         if said:

@@ -218,7 +218,8 @@ class NetDraft:
             return evaluate(text, self.constants)
         except (ValueError, ZeroDivisionError) as error:
             remedy = "use numbers and declared constants with + - * / ( )"
-            raise self.fault(element, f"{_short(text)!r} has no value: {error}", remedy) from error
+            why = "division by zero" if isinstance(error, ZeroDivisionError) else error
+            raise self.fault(element, f"{_short(text)!r} has no value: {why}", remedy) from error
 
     def whole(self, element: str, text: str) -> int:
         """Return an expression as a whole number. Raises NetFileError."""

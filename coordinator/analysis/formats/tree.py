@@ -97,6 +97,8 @@ class _Parsing:
                 "the file is incomplete or not XML",
                 line=error.lineno,
             ) from error
+        except NetFileError:  # a ValueError too, and complete
+            raise
         except (ValueError, LookupError) as error:  # an encoding that is unknown, or of many bytes
             raise self._fault(str(error), "save the file as UTF-8") from error
         assert self.root is not None  # expat accepts no document without an element

@@ -15,7 +15,7 @@ or adds tokens where the other has an inhibitor or a capacity.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from petrobot.coordinator.analysis.limits import overtime
@@ -155,7 +155,7 @@ HUNT_EFFORT = 100_000
 class Hunt:
     """Result of a search for a deadlock.
 
-    `firings` lead to a dead marking that is not final. If they are None and `complete` is True,
+    `firings` lead to a dead marking. If they are None and `complete` is True,
     there is no such marking.
     """
 
@@ -190,10 +190,8 @@ class _Relations:
         return cls(tuple(tuple(sorted(c)) for c in conflicts), raising, lowering, limits)
 
 
-def hunt_deadlock(
-    net: Net, *, final: Callable[[Marking], bool] | None = None, effort: int = HUNT_EFFORT
-) -> Hunt:
-    """Search for a dead marking that is not final, depth first along stubborn sets.
+def hunt_deadlock(net: Net, *, effort: int = HUNT_EFFORT) -> Hunt:
+    """Search for a dead marking, depth first along stubborn sets.
 
     In nets with priorities a transition depends on all transitions above it, so no stubborn set
     would be small: these nets are searched in full.
@@ -207,7 +205,7 @@ def hunt_deadlock(
             return Hunt(None, len(seen), False)
         marking = stack.pop()
         enabled = net.enabled(marking)
-        if not enabled and not (final and final(marking)):
+        if not enabled:
             return Hunt(_way(net, came, marking), len(seen), True)
         for t in _stubborn(net, relations, marking, enabled) if relations else enabled:
             after = net.fire(marking, t)

@@ -446,12 +446,14 @@ def judged(
         bounded = replace(bounded, reason=text + "s" * (max(seen, default=0) != 1))
     highest = None if None in bounds else max((b or 0 for b in bounds), default=0)
     reached = space.complete or highest == max(seen, default=0)
-    fired = {n.origin.get(space.net.transitions[t]) for t in np.unique(space.label).tolist()}
+    fired = {
+        n.origin.get(t) for t, some in zip(n.net.transitions, space.fired, strict=True) if some
+    }
     never = space.complete
     unknown = PropertyVerdict(None, f"unknown: {space.reason}", complete=False)
     return Qualitative(
         space,
-        Graph(len(space), space.source, space.target),
+        Graph(len(space), space.source, space.target, space.row, rooted=True),
         bounds,
         highest if reached else None,
         bounded,
@@ -463,7 +465,6 @@ def judged(
         unknown,
         tuple(0 if never and t not in fired else None for t in n.task.net.transitions),
         unknown,
-        None,
         None,
     )
 
@@ -493,9 +494,15 @@ def proven(n: EndsNet, space: Space, view: OrdinaryView) -> dict[str, PropertyVe
         fires = np.array([name in n.origin for name in n.net.transitions] or [False])
         alive = np.array([view.is_end(tuple(m)) for m in markings], dtype=np.bool_)
         alive[space.source[fires[space.label]]] = True
-        if Graph(len(space), space.source, space.target).backward(alive).all():
+        if (
+            Graph(len(space), space.source, space.target, space.row, rooted=True)
+            .backward(alive)
+            .all()
+        ):
             holds("deadlock_free", "a transition or an end can be reached from everywhere")
-    fired = {n.origin.get(space.net.transitions[t]) for t in np.unique(space.label).tolist()}
+    fired = {
+        n.origin.get(t) for t, some in zip(n.net.transitions, space.fired, strict=True) if some
+    }
     idle = [t for t in flat.net.transitions if t not in fired]
     if idle:
         text = f"can never fire: {', '.join(idle)} (shown on the ends net)"

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ Index = NDArray[np.int64]
 
 SMALL = 20_000
 """Vertices plus edges up to which plain Python is faster than importing scipy."""
+SWEPT = 1 << 17
+"""Edges of a block of a sweep."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +33,67 @@ class Graph:
     n: int
     source: NDArray[np.int32]
     target: NDArray[np.int32]
+    starts: Index | None = None
+    """`row`, if it is known already."""
+    rooted: bool = False
+    """Whether it is known that every vertex can be reached from vertex 0."""
 
     @cached_property
     def row(self) -> Index:
         """Number of the first edge of each vertex, and the number of edges; shape (n + 1,)."""
+        if self.starts is not None:
+            return self.starts
         return np.searchsorted(self.source, np.arange(self.n + 1)).astype(np.int64)
+
+    @cached_property
+    def returning(self) -> Mask:
+        """The vertices from which vertex 0 can be reached, shape (n,).
+
+        Sweeps over blocks of vertices, down and up in turn, without the reversed edges, whose
+        sorting would take longer. A sweep down follows edges to higher numbers as far as they go
+        (in breadth-first order most lead there), a sweep up those to lower ones.
+        """
+        if len(self.target) + self.n <= SMALL:
+            return self.backward([0])
+        row, reached = self.row, np.zeros(self.n, dtype=np.bool_)
+        reached[0] = True
+        cuts = np.unique(np.searchsorted(row, np.arange(0, row[-1] + SWEPT, SWEPT)).clip(0, self.n))
+        blocks = list(pairwise(sorted({0, *cuts.tolist(), self.n})))
+        while True:
+            left = []
+            grown = 0
+            for first, last in reversed(blocks):
+                keep_time("verdicts")
+                new, rest = self._sweep(reached, first, last)
+                grown += new
+                if rest:
+                    left.append((first, last))
+            if not grown or not left:
+                return reached
+            blocks = left  # in reversed order, so the next sweep runs the other way
+
+    def _sweep(self, reached: Mask, first: int, last: int) -> tuple[int, int]:
+        """Add the vertices first to last - 1 that have an edge to a reached one. Return how many
+        were added and how many are left."""
+        row = self.row
+        todo = first + np.flatnonzero(
+            ~reached[first:last] & (row[first + 1 : last + 1] > row[first:last])
+        )
+        bare = int(np.count_nonzero(~reached[first:last])) - len(todo)
+        if not len(todo):
+            return 0, bare
+        begin, end = row[todo], row[todo + 1]
+        if 2 * int((end - begin).sum()) > int(row[last] - row[first]):
+            hits = reached.take(self.target[row[first] : row[last]])
+            full = first + np.flatnonzero(row[first + 1 : last + 1] > row[first:last])
+            some = np.logical_or.reduceat(hits, row[full] - row[first])
+            new = full[some & ~reached[full]]
+        else:
+            hits = reached.take(self.target[ranges(begin, end)])
+            offsets = np.concatenate(([0], np.cumsum(end - begin)[:-1]))
+            new = todo[np.logical_or.reduceat(hits, offsets)]
+        reached[new] = True
+        return len(new), len(todo) - len(new) + bare
 
     @cached_property
     def into(self) -> tuple[Index, Index]:
@@ -114,6 +173,8 @@ class Graph:
         """
         if len(self.target) + self.n <= SMALL:
             return _tarjan(self.n, self.row.tolist(), self.target.tolist())
+        if self.rooted and self.returning.all():
+            return np.zeros(self.n, dtype=np.int32)
         keep_time("verdicts")
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import connected_components
@@ -126,8 +187,15 @@ class Graph:
         return labels
 
     @cached_property
+    def strong(self) -> bool:
+        """Whether every vertex can be reached from every other one."""
+        return self.n > 0 and not self.components.any()
+
+    @cached_property
     def bottom(self) -> Mask:
         """Which strong components no edge leaves, shape (components,)."""
+        if self.strong:
+            return np.ones(1, dtype=np.bool_)
         ours, theirs = self.components[self.source], self.components[self.target]
         bottom = np.ones(int(self.components.max()) + 1, dtype=np.bool_)
         bottom[ours[ours != theirs]] = False
@@ -136,6 +204,8 @@ class Graph:
     @cached_property
     def inner(self) -> Mask:
         """Which edges stay inside a strong component, i.e. lie on a cycle; shape (edges,)."""
+        if self.strong:
+            return np.ones(len(self.target), dtype=np.bool_)
         inside: Mask = self.components[self.source] == self.components[self.target]
         return inside
 

@@ -1,4 +1,4 @@
-"""Boundedness, liveness, deadlocks, reversibility, home markings and soundness of a net.
+"""Boundedness, liveness, deadlocks, reversibility and home markings of a net.
 
 All verdicts come from one pass over its reachability graph. Liveness levels after T. Murata, Proc.
 IEEE 77 (1989), section IV: a transition is L0 (dead) if it never fires, L1 if it can fire, L2 if
@@ -9,7 +9,6 @@ the same: the transition labels an edge on a cycle.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,11 +21,11 @@ from petrobot.coordinator.analysis.net.deadlocks import (
     empty_siphon,
     hunt_deadlock,
 )
-from petrobot.coordinator.analysis.net.graph import Graph, Mask
+from petrobot.coordinator.analysis.net.graph import Graph
 from petrobot.coordinator.analysis.net.space import Space
 from petrobot.coordinator.analysis.net.structure import place_bounds
 from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
-from petrobot.coordinator.task.net import Marking, Net
+from petrobot.coordinator.task.net import Net
 
 SAFETY = ""
 """No assumption: every marking of the executed task is one of the ordinary net, so what never
@@ -69,7 +68,7 @@ class Qualitative:
     deadlock_free: PropertyVerdict
     deadlocks: tuple[Deadlock, ...]
     dead_markings: int
-    """Number of dead, not final markings among those found."""
+    """Number of dead markings among those found."""
     quasi_live: PropertyVerdict
     live: PropertyVerdict
     levels: tuple[int | None, ...]
@@ -77,8 +76,6 @@ class Qualitative:
     reversible: PropertyVerdict
     home_states: int | None
     """Number of markings that can be reached from every reachable marking; None if unknown."""
-    sound: PropertyVerdict | None
-    """None without a `final` predicate."""
 
     @property
     def dead_transitions(self) -> tuple[str, ...]:
@@ -93,24 +90,22 @@ class Qualitative:
 def examine(
     space: Space,
     *,
-    final: Callable[[Marking], bool] | None = None,
     cover: Coverability | None = None,
     in_haste: bool = False,
 ) -> Qualitative:
     """Return all verdicts on the net of a space.
 
-    `final` identifies the designed ends: a dead marking that is not final is a deadlock. `cover`
-    passes a coverability result that is already known; otherwise it is computed if the space is not
-    complete. `in_haste` leaves out everything that takes long and judges the markings found only.
+    `cover` passes a coverability result that is already known; otherwise it is computed if the
+    space is not complete. `in_haste` leaves out everything that takes long and judges the markings
+    found only.
     """
-    graph = Graph(len(space), space.source, space.target)
+    graph = Graph(len(space), space.source, space.target, space.row, rooted=True)
     if in_haste and cover is None:
         cover = Coverability(None, (None,) * len(space.net.places), space.reason, 0, False)
     bounds, bounded, safe, cover = boundedness(space, cover)
-    ends = space.where(final) if final else np.zeros(len(space), dtype=np.bool_)
-    dead = space.dead[~ends[space.dead]]
+    dead = space.dead
     settled = space.complete or len(dead) or in_haste
-    hunt = None if settled else hunt_deadlock(space.net, final=final, effort=HUNT)
+    hunt = None if settled else hunt_deadlock(space.net, effort=HUNT)
     levels = _levels(space, graph, cover)
     return Qualitative(
         space,
@@ -119,7 +114,7 @@ def examine(
         _most(space, bounds),
         bounded,
         safe,
-        _deadlock_free(space, dead, final is not None, hunt),
+        _deadlock_free(space, dead, hunt),
         _grouped(space, dead) + _hunted(space.net, hunt),
         len(dead),
         _quasi_live(space, levels, cover),
@@ -127,7 +122,6 @@ def examine(
         levels,
         _reversible(space, graph, hunt),
         _home_states(space, graph),
-        _sound(space, graph, ends, levels) if final else None,
     )
 
 
@@ -246,10 +240,7 @@ def _hunted(net: Net, hunt: Hunt | None) -> tuple[Deadlock, ...]:
     return (Deadlock(tuple(marked), 1, Witness(hunt.firings, marked), emptied),)
 
 
-def _deadlock_free(
-    space: Space, dead: NDArray[np.int64], has_final: bool, hunt: Hunt | None
-) -> PropertyVerdict:
-    other = " that is not a designed end" if has_final else ""
+def _deadlock_free(space: Space, dead: NDArray[np.int64], hunt: Hunt | None) -> PropertyVerdict:
     if len(dead):
         first = int(dead[0])
         reason = f"nothing can happen any more in {space.net.describe(space.marking(first))}"
@@ -267,19 +258,17 @@ def _deadlock_free(
             f"{always} needs no token and nothing disables it: it can always fire",
             assumption=FAIRNESS,
         )
-    if hunt is not None and not hunt.complete and not has_final and _siphons_suffice(space.net):
+    if hunt is not None and not hunt.complete and _siphons_suffice(space.net):
         reason = (
             "every siphon contains an initially marked trap, so some transition is always enabled"
         )
         return PropertyVerdict(True, reason, assumption=FAIRNESS)
     if hunt is not None and hunt.complete:
-        reason = (
-            f"no reachable marking{other} is dead (checked {hunt.states} markings by stubborn sets)"
-        )
+        reason = f"no reachable marking is dead (checked {hunt.states} markings by stubborn sets)"
         return PropertyVerdict(True, reason, assumption=FAIRNESS)
     if not space.complete:
-        return _unknown(space, f"no dead marking{other} among the {space.expanded} examined")
-    return PropertyVerdict(True, f"no reachable marking{other} is dead", assumption=FAIRNESS)
+        return _unknown(space, f"no dead marking among the {space.expanded} examined")
+    return PropertyVerdict(True, "no reachable marking is dead", assumption=FAIRNESS)
 
 
 def _never_barred(net: Net) -> str | None:
@@ -323,7 +312,9 @@ def _levels(space: Space, graph: Graph, cover: Coverability | None) -> tuple[int
     if not space.complete:
         never = set(cover.never if cover is not None else ())
         return tuple(0 if name in never else None for name in space.net.transitions)
-    fired = np.bincount(space.label, minlength=count) > 0
+    if graph.strong:
+        return tuple(4 if fired else 0 for fired in space.fired.tolist())
+    fired = space.fired
     cyclic = np.bincount(space.label[graph.inner], minlength=count) > 0
     everywhere = np.ones(count, dtype=np.bool_)
     ours = graph.components[space.source]
@@ -340,7 +331,7 @@ def _levels(space: Space, graph: Graph, cover: Coverability | None) -> tuple[int
 def _quasi_live(
     space: Space, levels: tuple[int | None, ...], cover: Coverability | None
 ) -> PropertyVerdict:
-    fired = np.bincount(space.label, minlength=len(levels)) > 0
+    fired = space.fired
     if fired.all():
         return PropertyVerdict(
             True, "every transition can fire", assumption=FAIRNESS, complete=space.complete
@@ -426,7 +417,7 @@ def _reversible(space: Space, graph: Graph, hunt: Hunt | None) -> PropertyVerdic
                 complete=False,
             )
         return _unknown(space)
-    away = np.flatnonzero(~graph.backward([0]))
+    away = np.flatnonzero(~graph.returning)
     if not len(away):
         return PropertyVerdict(
             True, "the initial marking can be reached again from everywhere", assumption=FAIRNESS
@@ -444,34 +435,3 @@ def _home_states(space: Space, graph: Graph) -> int | None:
         return None
     bottoms = np.flatnonzero(graph.bottom)
     return int((graph.components == bottoms[0]).sum()) if len(bottoms) == 1 else 0
-
-
-def _sound(
-    space: Space, graph: Graph, ends: Mask, levels: tuple[int | None, ...]
-) -> PropertyVerdict:
-    """Sound: an end is reachable from every marking, no transition is enabled at an end, and every
-    transition can fire."""
-    busy = np.flatnonzero(ends[: space.expanded] & (np.diff(space.row[: space.expanded + 1]) > 0))
-    if len(busy):
-        first = int(busy[0])
-        goes_on = space.net.transitions[space.label[space.row[first]]]
-        reason = (
-            f"the task is not finished at its end {space.net.describe(space.marking(first))}: "
-            f"{goes_on} can still fire"
-        )
-        return PropertyVerdict(False, reason, witness(space, first), complete=space.complete)
-    if not space.complete:
-        return _unknown(space)
-    lost = np.flatnonzero(~graph.backward(ends))
-    if len(lost):
-        first = int(lost[0])
-        reason = f"from {space.net.describe(space.marking(first))} no designed end can be reached"
-        return PropertyVerdict(False, reason, witness(space, first))
-    useless = [t for t, level in zip(space.net.transitions, levels, strict=True) if level == 0]
-    if useless:
-        return PropertyVerdict(False, f"useless, can never fire: {', '.join(useless)}")
-    reason = (
-        "an end can be reached from every marking, no transition is enabled there, and every "
-        "transition can fire"
-    )
-    return PropertyVerdict(True, reason, assumption=FAIRNESS)

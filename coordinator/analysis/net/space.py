@@ -37,6 +37,8 @@ NARROW = 8
 little)."""
 
 
+BLOCK = 1 << 17
+"""Markings or edges that are looked at together, so that they stay in the cache."""
 JUDGED = 6
 """Peak memory of a search and all verdicts on its space, relative to what the engine held at its
 end (5.2 for Kanban-5: the strong components, reversed edges and columns of tokens)."""
@@ -140,9 +142,25 @@ class Space:
     @cached_property
     def bounds(self) -> tuple[int, ...]:
         """The most tokens seen in each place."""
-        return tuple(
-            int(self.layout.tokens(self.words, p).max()) for p in range(len(self.net.places))
-        )
+        layout, most = self.layout, [0] * len(self.net.places)
+        for start in range(0, len(self), BLOCK):
+            words = np.ascontiguousarray(self.words[start : start + BLOCK].T)
+            for p, (w, at, bits) in enumerate(
+                zip(layout.word, layout.shift, layout.width, strict=True)
+            ):
+                field = np.uint64(((1 << bits) - 1) << at)
+                most[p] = max(most[p], int((words[w] & field).max()) >> at)
+        return tuple(most)
+
+    @cached_property
+    def fired(self) -> NDArray[np.bool_]:
+        """Which transitions label an edge, shape (transitions,)."""
+        fired = np.zeros(len(self.net.transitions), dtype=np.bool_)
+        for start in range(0, len(self.label), BLOCK):
+            fired[self.label[start : start + BLOCK]] = True
+            if fired.all():
+                break
+        return fired
 
     @cached_property
     def most_tokens(self) -> int:
@@ -160,7 +178,7 @@ class Space:
         while goal:
             edge = int(self.parent_edge[goal])
             sequence.append(self.net.transitions[self.label[edge]])
-            goal = int(self.source[edge])
+            goal = int(np.searchsorted(self.row, edge, side="right")) - 1
         return sequence[::-1]
 
     @cached_property
@@ -169,9 +187,15 @@ class Space:
 
         Breadth-first numbering makes it the last edge of a shortest path.
         """
-        parent = np.full(len(self), -1, dtype=np.int64)
-        parent[self.target[::-1]] = np.arange(len(self.target) - 1, -1, -1)
-        return parent
+        # Each marking gets the next number when it is found, so the edges that found one are those
+        # that lead to a higher number than all before.
+        found, highest = [np.full(min(1, len(self)), -1, dtype=np.int64)], 0
+        for start in range(0, len(self.target), BLOCK):
+            target = self.target[start : start + BLOCK]
+            before = np.maximum.accumulate(np.concatenate(([highest], target[:-1])))
+            found.append(start + np.flatnonzero(target > before))
+            highest = max(int(before[-1]), int(target[-1]))
+        return np.concatenate(found)
 
 
 def explore(

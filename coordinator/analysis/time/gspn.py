@@ -229,7 +229,10 @@ class Chain:
     @cached_property
     def graph(self) -> Graph:
         """The edges of the chain as a graph."""
-        return Graph(self.n, self.source, self.target)
+        whole = len(self.source) == self.space.edges  # no edge was cut at an absorbing marking
+        return Graph(
+            self.n, self.source, self.target, self.space.row if whole else None, rooted=whole
+        )
 
     @cached_property
     def total(self) -> Values:

@@ -211,8 +211,8 @@ def stationary(n: int, rows: Index, columns: Index, value: Values) -> Values:
         swept = factor.solve(lower @ x)
         swept /= swept.sum()
         change = swept - x
-        moved = float(np.max(np.abs(change)))
-        if moved <= TOLERANCE * float(np.max(swept)):
+        moved = max(float(change.max()), -float(change.min()))
+        if moved <= TOLERANCE * float(swept.max()):
             return np.asarray(swept[::-1].copy())
         if coarse.is_due(k):
             x = swept * coarse.scale(value, swept)
@@ -241,22 +241,33 @@ class Mixing:
         self.last: tuple[Values, Values] | None = None
         self.results: list[Values] = []
         self.changes: list[Values] = []
+        self.gram = np.zeros((0, 0))
 
     def next(self, result: Values, change: Values) -> Values:
         """Return the next x from g(x) and g(x) - x."""
         if self.last is not None:
             self.results = [*self.results, result - self.last[0]][-self.DEPTH :]
             self.changes = [*self.changes, change - self.last[1]][-self.DEPTH :]
+            kept = self.gram[-(self.DEPTH - 1) :, -(self.DEPTH - 1) :]
+            new = [_dot(a, self.changes[-1]) for a in self.changes]
+            self.gram = np.zeros((len(new), len(new)))
+            self.gram[:-1, :-1] = kept
+            self.gram[-1, :] = self.gram[:, -1] = new
         self.last = result, change
         if not self.changes:
             return result
-        gram = np.array([[a @ b for b in self.changes] for a in self.changes])
-        right = np.array([a @ change for a in self.changes])
-        weight = np.linalg.lstsq(gram, right, rcond=1e-14)[0]
+        right = np.array([_dot(a, change) for a in self.changes])
+        weight = np.linalg.lstsq(self.gram, right, rcond=1e-14)[0]
         out = result.copy()
         for w, step in zip(weight.tolist(), self.results, strict=True):
             out -= w * step
         return out
+
+
+def _dot(a: Values, b: Values) -> float:
+    """Return the scalar product, on one core: the threads of BLAS wait for each other longer than
+    they compute."""
+    return float(np.einsum("i,i->", a, b))
 
 
 class Coarse:
