@@ -79,7 +79,18 @@ class Ports(Protocol):
         """A file named in services.toml, relative to it."""
 
 
-PORT_KEYS = ("interface", "channel", "bitrate", "can", "source", "address", "latency")
+CAMERA_KEYS = (
+    "source",
+    "address",
+    "latency",
+    "fps",
+    "width",
+    "height",
+    "fourcc",
+    "exposure",
+    "colour",
+)
+PORT_KEYS = ("interface", "channel", "bitrate", "can", *CAMERA_KEYS)
 """Keys of a device's table that its ports read: what bus and which images it has."""
 
 
@@ -213,20 +224,29 @@ def keys_of(driver: type) -> dict[str, Key]:
 def read_keys(driver: type, config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of the keys that a driver's class declares. Raises ValueError with every
     key that is missing, unknown or of another type."""
-    own = keys_of(driver)
-    values: dict[str, Any] = {}
-    faults: list[str] = []
+    if faults := _faults_of_keys(driver, config):
+        raise ValueError("; ".join(text for _, text in faults))
+    return {name: declared.read(config) for name, declared in keys_of(driver).items()}
+
+
+def faults_of_keys(driver: type, config: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return each wrong key of a device's table, and what is wrong with it, without making the
+    driver; empty for a driver that declares no keys and reads them itself."""
+    reads_itself = driver.__init__ is not Driver.__init__ and not keys_of(driver)  # type: ignore[misc]
+    return [] if reads_itself else _faults_of_keys(driver, config)
+
+
+def _faults_of_keys(driver: type, config: Mapping[str, Any]) -> list[tuple[str, str]]:
+    own, faults = keys_of(driver), list[tuple[str, str]]()
     for name, declared in own.items():
         try:
-            values[name] = declared.read(config)
+            declared.read(config)
         except ValueError as fault:
-            faults.append(str(fault))
+            faults.append((name, str(fault)))
     for name in config:
         if name not in own and name not in PORT_KEYS:
-            faults.append(f"unknown key {name!r}{nearest(name, [*own, *PORT_KEYS])}")
-    if faults:
-        raise ValueError("; ".join(faults))
-    return values
+            faults.append((name, f"unknown key {name!r}{nearest(name, [*own, *PORT_KEYS])}"))
+    return faults
 
 
 @runtime_checkable

@@ -1,4 +1,4 @@
-"""The pages: what they name exists, and their links lead somewhere."""
+"""Files, functions and modules that pages and docstrings name exist, and links work."""
 
 from __future__ import annotations
 
@@ -9,18 +9,21 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+CODE = [ROOT / folder for folder in ("coordinator", "services", "sim", "tests", "tools")]
 NAMED = re.compile(
     r"`((?:coordinator|services|sim|tests|tools)/[\w./-]+?)(?:::([\w.]+))?(?:\(\))?`"
 )
+IN_SHORT = re.compile(r"`((?:[\w-]+/)*[\w-]+\.(?:py|js))`")
+DOTTED = re.compile(r"`((?:coordinator|services|sim|tests|tools)(?:\.[A-Za-z_]\w*)+)")
 LINK = re.compile(r"\]\((?!https?:)([^)#]+)(?:#[^)]*)?\)")
 LONGEST_PAGE = 300
 LONGER = {"protocol.md": 350}
-"""A reference for those who write the other end: it is searched, not read."""
+"""A reference for authors of another implementation: they search it and do not read it through."""
 
 
 @cache
 def names_in(path: Path) -> frozenset[str]:
-    """Functions, classes, methods and constants of a module, `Class.method` for methods."""
+    """Return functions, classes, methods (`Class.method`) and constants of a module."""
     found: set[str] = set()
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
@@ -34,7 +37,7 @@ def names_in(path: Path) -> frozenset[str]:
     return frozenset(found)
 
 
-def test_what_a_page_names_is_there() -> None:
+def test_files_and_functions_named_by_pages_exist() -> None:
     """Files as `folder/file.py`, functions as `folder/file.py::Class.function`."""
     wrong = []
     for page in PAGES:
@@ -45,15 +48,57 @@ def test_what_a_page_names_is_there() -> None:
     assert not wrong, "\n".join(wrong)
 
 
-def test_the_life_of_a_run_names_its_hops() -> None:
-    """The page would say nothing if it named no function."""
+def test_files_named_in_short_exist() -> None:
+    """A page may leave out the first folders of a file: `net/qualitative.py`."""
+    known = {"/" + path.relative_to(ROOT).as_posix() for path in _sources("*.py", "*.js")}
+    known |= {f"/{path.relative_to(ROOT)}" for path in (ROOT / "examples").rglob("*.py")}
+    wrong = [
+        f"{page.relative_to(ROOT)}: {name}"
+        for page in [*PAGES, ROOT / "CHANGELOG.md"]
+        for name in IN_SHORT.findall(page.read_text(encoding="utf-8"))
+        if not any(path.endswith(f"/{name}") for path in known)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_modules_named_by_docstrings_exist() -> None:
+    """Modules as `folder.module`, and names in them as `folder.module.name`."""
+    wrong = [
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in _sources("*.py")
+        for name in DOTTED.findall(path.read_text(encoding="utf-8"))
+        if not _exists(name)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def _sources(*patterns: str) -> list[Path]:
+    return [path for folder in CODE for pattern in patterns for path in folder.rglob(pattern)]
+
+
+@cache
+def _exists(dotted: str) -> bool:
+    """Return whether a dotted name is a module or package, or occurs in one."""
+    parts = dotted.split(".")
+    for used in range(len(parts), 0, -1):
+        path = ROOT.joinpath(*parts[:used])
+        module = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+        if path.is_dir() and used == len(parts):
+            return True
+        if module.is_file():
+            return used == len(parts) or parts[used] in module.read_text(encoding="utf-8")
+    return False
+
+
+def test_the_life_of_a_run_names_its_functions() -> None:
+    """The test above would check nothing if the page named no function."""
     text = (ROOT / "docs" / "life-of-a-run.md").read_text(encoding="utf-8")
     hops = [name for _, name in NAMED.findall(text) if name]
     assert len(hops) >= 30
 
 
-def test_links_lead_to_files() -> None:
-    """Links between pages, and pictures."""
+def test_links_point_to_files() -> None:
+    """This includes links between pages, and pictures."""
     wrong = [
         f"{page.relative_to(ROOT)}: {target}"
         for page in PAGES
@@ -64,7 +109,7 @@ def test_links_lead_to_files() -> None:
 
 
 def test_no_page_is_too_long() -> None:
-    """A page that is longer should be two."""
+    """A longer page should be divided."""
     lengths = {page.name: len(page.read_text(encoding="utf-8").splitlines()) for page in PAGES}
     long = {name: n for name, n in lengths.items() if n > LONGER.get(name, LONGEST_PAGE)}
     assert long == {}

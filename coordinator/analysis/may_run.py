@@ -139,19 +139,17 @@ def _contest(contest: Contest) -> Finding:
     names, over = " and ".join(contest.transitions), " and ".join(contest.over)
     text = (
         f"{names} may both want the last token of {over}, and the task does not say which one "
-        "gets it"
+        "gets it: the one that has waited longer, or else the first in the file"
     )
     key = f"transitions.{first}"
     if not contest.matters:
-        more = (
-            f"; {first} is first in the file and gets it, so {', '.join(others)} may have to wait"
-        )
-        return Finding(Severity.NOTE, "unsettled-conflict", key, f"{text}{more}")
+        text += f" ({first}, so that {' and '.join(others)} may have to wait)"
+        return Finding(Severity.NOTE, "unsettled-conflict", key, text)
     told = "; ".join(
         f"{name.replace('_', ' ')}: {reason}" for name, reason in contest.matters.items()
     )
     remedy = "give one a higher `priority`, each a `weight`, or exclusive conditions"
-    text = f"{text}; {first} is first in the file and gets it, but if another did: {told}"
+    text = f"{text} ({first}); if it went the other way: {told}"
     return Finding(Severity.ERROR, "unsettled-conflict", key, text, remedy)
 
 

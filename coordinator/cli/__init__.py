@@ -19,6 +19,12 @@ exit codes:
     2  bad input (check: the task may not run)
     3  a node cannot be reached
   130  interrupted"""
+SHORT_EXIT_CODES = """\
+exit codes:
+    0  done
+    2  bad input
+    3  a node cannot be reached
+  130  interrupted"""
 
 
 FILE_FAULTS = {
@@ -93,8 +99,13 @@ COMMANDS = (
     Subcommand("sim", "start the simulated laboratory"),
     Subcommand("calibrate", "calibrate a camera from images of a board"),
     Subcommand("keys", "make the shared key or the certificates that several hosts need"),
-    Subcommand("new", "write a working skeleton of an action or a task"),
+    Subcommand("new", "write a working robot, or a skeleton of a driver, an action or a task"),
 )
+PLAIN = (
+    *("calibrate", "convert", "keys", "learned", "log", "new", "node", "nodes", "report"),
+    *("serve", "show", "sim", "up"),
+)
+"""Commands that neither run nor judge anything: their exit codes are few."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -136,10 +147,11 @@ def _overview(arguments: Sequence[str]) -> int:
 
 def _dispatch(command: Subcommand, arguments: Sequence[str]) -> int:
     module = importlib.import_module(f"petrobot.coordinator.cli.{command.module or command.name}")
+    codes = SHORT_EXIT_CODES if command.name in PLAIN else EXIT_CODES
     parser = argparse.ArgumentParser(
         prog=f"petrobot {command.name}",
         description=module.__doc__,
-        epilog=f"example:\n  {module.EXAMPLE}\n\n{EXIT_CODES}",
+        epilog=f"example:\n  {module.EXAMPLE}\n\n{codes}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     module.add_arguments(parser)

@@ -28,7 +28,7 @@ def run(options: argparse.Namespace) -> int:
     """Take images if asked to; calibrate."""
     from petrobot.coordinator.launch import load_object
 
-    if options.simulated:
+    if options.simulated and options.views is not None:
         _take(options)
     return int(load_object(f"{ROOM}:run")(options))
 

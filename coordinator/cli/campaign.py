@@ -24,7 +24,7 @@ from petrobot.coordinator.cli.loading import (
     write_json,
 )
 from petrobot.services.comm.location_file import physics_of
-from petrobot.services.host.command_line import number, probability, whole
+from petrobot.services.host.command_line import LARGEST_SEED, MOST_RUNS, number, probability, whole
 
 if TYPE_CHECKING:
     from petrobot.coordinator.studies.campaign.conduct import Campaign
@@ -38,13 +38,21 @@ EXAMPLE = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
+    _add_trials(parser)
+    _add_choices(parser)
+    _add_execution(parser)
+    _add_output(parser)
+    add_services_argument(parser)
+
+
+def _add_trials(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "task", nargs="?", help="a task file, or the name of a task that comes with petrobot"
     )
     parser.add_argument(
         "--runs",
-        type=whole(),
+        type=whole(most=MOST_RUNS),
         default=100,
         metavar="N",
         help="in all regimes together (%(default)s)",
@@ -53,8 +61,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--regime",
         default="",
         metavar="A,B",
-        help="regimes that take turns, with the same seeds in each",
+        help="regimes that alternate, with the same seeds in each; C@1-5: regime C in the "
+        "simulated installations 1 to 5",
     )
+
+
+def _add_choices(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--selector",
         default="fixed",
@@ -77,11 +89,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="learn and judge by this reliability, not the declared one",
     )
     parser.add_argument(
+        "--credit",
+        choices=("action", "task"),
+        help="what judges a choice: how its own run ended (default), or whether the goal was met",
+    )
+    parser.add_argument(
         "--rho",
         type=number(least=0.0),
         metavar="X",
         help="weight of cost in J (1 / largest mean cost)",
     )
+
+
+def _add_execution(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--workers",
         type=whole(),
@@ -95,7 +115,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="workers of this dask scheduler instead, as tcp://host:8786",
     )
     parser.add_argument(
-        "--seed", type=whole(0), default=1, metavar="S", help="of all chance (%(default)s)"
+        "--seed",
+        type=whole(0, LARGEST_SEED),
+        default=1,
+        metavar="S",
+        help="of all random numbers (%(default)s)",
     )
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task"
@@ -116,6 +140,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
     )
+
+
+def _add_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="FOLDER",
@@ -126,7 +153,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--resume",
         metavar="FOLDER",
         type=Path,
-        help="go on with this one; the same as giving its --out again",
+        help="continue this campaign; the same as giving its --out again",
     )
     parser.add_argument(
         "--check",
@@ -138,7 +165,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--json", metavar="FILE", help="write the result as JSON (- for standard output)"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
-    add_services_argument(parser)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -261,13 +287,11 @@ async def _conduct(campaign: Campaign, options: argparse.Namespace) -> None:
 
 def _plan(options: argparse.Namespace, task: Task) -> CampaignPlan:
     from petrobot.coordinator.cli.options import parameter_of
-    from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest
+    from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest, regimes_of
     from petrobot.coordinator.studies.campaign.policies import learns
 
     given = dict(_pair("--set", text) for text in options.set)
-    regimes = tuple(name for name in options.regime.split(",") if name) or (
-        str(task.parameters.get("regime", "")),
-    )
+    regimes = regimes_of(options.regime) or (str(task.parameters.get("regime", "")),)
     if regimes != ("",) and "regime" not in task.parameters:
         raise CommandError(2, f"--regime {options.regime}: {task.name} has no parameter regime")
     if len(set(regimes)) < len(regimes):
@@ -303,14 +327,22 @@ def _physics(services: Path) -> str:
 def _block(task: Task, wanted: int | None) -> int:
     if not task.runs_place:
         return 1
-    return wanted or max(1, task.places[task.runs_place].tokens)
+    place = task.places.get(task.runs_place)
+    tokens = 1 if place is None else place.tokens
+    most = None if place is None else place.capacity
+    if wanted is not None and most is not None and wanted > most:
+        text = f"--block {wanted}: {task.runs_place!r} holds at most {most}, its capacity"
+        raise CommandError(2, f"{text}; give a smaller block")
+    return wanted or max(1, tokens)
 
 
 def _selector_options(options: argparse.Namespace) -> dict[str, Any]:
     from petrobot.coordinator.studies.campaign.policies import learned_choices
 
     found: dict[str, Any] = {
-        name: value for name in ("target", "rho") if (value := getattr(options, name)) is not None
+        name: value
+        for name in ("target", "rho", "credit")
+        if (value := getattr(options, name)) is not None
     }
     if options.learned is not None:
         if options.selector != "fixed":

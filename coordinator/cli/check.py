@@ -7,6 +7,7 @@ import argparse
 import asyncio
 from typing import TYPE_CHECKING, Any
 
+from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     MISSING_CELL,
     add_services_argument,
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from petrobot.coordinator.analysis.report import Analysis
     from petrobot.coordinator.task import Task
     from petrobot.coordinator.task.check import CheckReport
+    from petrobot.services.comm.location_file import Directory
 
 EXAMPLE = "petrobot check catch_ball"
 NO_CELL = "no-cell"
@@ -58,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
         services = cell_path(services, options.task, task)
     judged, report = _checked(task, services)
     missing = _missing(task, services) if options.live else []
-    analysis, ok = judged.analysis, judged.ok
+    analysis, ok = judged.analysis, judged.ok and report.ok
     live = {"live": missing} if options.live else {}
     if options.json:
         found = {} if analysis is None else _plain_analysis(analysis)
@@ -97,7 +99,36 @@ def _checked(task: Task, services: Path | None) -> tuple[MayRun, CheckReport]:
         {action: entry.task for action, entry in directory.actions.items() if entry.task},
     )
     judged = may_run(task, cell, BUDGET)
-    return judged, judged.report
+    return judged, _with_code(task, directory, judged.report)
+
+
+def _with_code(task: Task, directory: Directory, report: CheckReport) -> CheckReport:
+    """The findings with those about the code that the location file names. Raises CommandError for
+    what is wrong in that file."""
+    from petrobot.coordinator.task.check import CheckReport, Severity
+    from petrobot.coordinator.task.check.code import code_findings
+    from petrobot.services.comm.location_file import read_text
+    from petrobot.services.comm.location_file.code import code_faults, read_code
+
+    code = read_code(directory)
+    if faults := code_faults(directory, code, read_text(directory.source)):
+        raise CommandError(2, "\n".join(faults))
+    actions = directory.actions.values()
+    by_action = {
+        action.name: {**code[action.run], "device": code.get(_driver(directory, action.device), {})}
+        for action in actions
+        if action.run in code
+    }
+    args = {action.name: action.args for action in actions}
+    found = list(code_findings(task, by_action, args, directory.services))
+    errors = [f for f in found if f.severity is Severity.ERROR]
+    warnings = [f for f in found if f.severity is not Severity.ERROR]
+    return CheckReport((*errors, *report.findings, *warnings))
+
+
+def _driver(directory: Directory, device: str) -> str:
+    """The import path of a device's driver, empty without one."""
+    return directory.devices[device].driver if device else ""
 
 
 def _noted(report: CheckReport, said: str) -> CheckReport:
@@ -170,7 +201,11 @@ def _lines(report: CheckReport, name: str) -> list[int | None]:
     from petrobot.coordinator.task.file.errors import key_lines, line_of
 
     lines = key_lines(task_path(name).read_text(encoding="utf-8"))
-    return [None if f.code == NO_CELL else line_of(f.key, lines) for f in report.findings]
+    elsewhere = [f.code == NO_CELL or (f.code == "code" and ":" in f.key) for f in report.findings]
+    return [
+        None if other else line_of(f.key, lines)
+        for f, other in zip(report.findings, elsewhere, strict=True)
+    ]
 
 
 def _text(name: str, analysis: Analysis | None, ok: bool) -> str:
@@ -216,9 +251,9 @@ def _cut(analysis: Analysis) -> str:
 def _reasons(analysis: Analysis) -> list[str]:
     """Return the reason of each verdict that does not hold, with the stimuli and firings that lead
     there, and what is assumed by those that hold."""
-    from petrobot.coordinator.analysis.execution.progress import MENDED
+    from petrobot.coordinator.analysis.execution.progress import AGAIN, MENDED
 
-    lines, against = list[str](), analysis.objections
+    lines, against, told = list[str](), analysis.objections, list[object]()
     mended = analysis.progress.mended if analysis.progress else {}
     mendable = [name for name, verdict in mended.items() if verdict.holds]
     refused = {
@@ -226,13 +261,22 @@ def _reasons(analysis: Analysis) -> list[str]:
         for n, v in analysis.verdicts().items()
         if v.holds is False and n != "safe" and n not in mendable
     }
+    if "deadlock_free" in against:  # then these fail too, for the same reason
+        stuck = [name for name in AGAIN if refused.pop(name, None)]
+    else:
+        stuck = []
     for name in sorted(refused, key=lambda name: name not in against):
         verdict = refused[name]
         word = "error" if name in against else "warning"
         lines.append(f"{word:8}{name.replace('_', ' ')}: {verdict.reason}")
+        if verdict.witness in told:
+            continue
         if verdict.witness is not None and name in against:
+            told.append(verdict.witness)
             path = "; ".join(verdict.witness.steps) or " ".join(verdict.witness.firings)
             lines.append(f"        by: {path or '(initial marking)'}")
+    if stuck:
+        lines.append(f"{'warning':8}{', '.join(stuck)}: the task can get stuck")
     unknown = [v.reason for v in analysis.verdicts().values() if v.holds is None]
     lines += [f"{'warning':8}{reason}" for reason in dict.fromkeys(unknown)]
     if mendable:

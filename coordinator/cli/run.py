@@ -33,7 +33,7 @@ from petrobot.coordinator.cli.recorded_runs import (
     recorded,
     tidy,
 )
-from petrobot.services.host.command_line import probability, whole
+from petrobot.services.host.command_line import LARGEST_SEED, MOST_RUNS, probability, whole
 
 if TYPE_CHECKING:
     from petrobot.coordinator.learning.session import LearningSetting
@@ -82,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--runs",
-        type=whole(),
+        type=whole(most=MOST_RUNS),
         metavar="N",
         help="how many times to run the task (default: the tokens in its runs place)",
     )
@@ -91,7 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--seed",
-        type=whole(0),
+        type=whole(0, LARGEST_SEED),
         metavar="S",
         help=f"seed of all random numbers (default: {SEED}, with --from that of the recorded run)",
     )
@@ -175,6 +175,12 @@ def add_learning_arguments(parser: argparse.ArgumentParser) -> None:
         type=probability,
         metavar="R",
         help="choose only among actions that reach this reliability (with --learn)",
+    )
+    parser.add_argument(
+        "--credit",
+        choices=("action", "task"),
+        help="what judges a choice: how its own run ended (default), or whether the goal of the "
+        "task was met (with --learn)",
     )
     parser.add_argument(
         "--context",
@@ -429,18 +435,23 @@ def _parameters(task: Task, options: argparse.Namespace) -> Mapping[str, Any]:
 def _learning(options: argparse.Namespace) -> LearningSetting | None:
     """How the run learns. None if it does not learn; then no estimates file is read."""
     if options.learn is None:
-        for name in ("selector", "target", "context", "frozen"):
+        for name in ("selector", "target", "credit", "context", "frozen"):
             if getattr(options, name):
                 raise CommandError(
                     2, f"--{name} needs --learn FILE: without it nothing is read or learned"
                 )
         return None
-    from petrobot.coordinator.learning.selectors import DEFAULT
+    from petrobot.coordinator.learning.selectors import ACTION, DEFAULT
     from petrobot.coordinator.learning.session import LearningSetting
 
     contexts = None if options.context is None else tuple(part for part in options.context if part)
     return LearningSetting(
-        options.learn, options.selector or DEFAULT, options.target, contexts, frozen=options.frozen
+        options.learn,
+        options.selector or DEFAULT,
+        options.target,
+        contexts,
+        frozen=options.frozen,
+        credit=options.credit or ACTION,
     )
 
 

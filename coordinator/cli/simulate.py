@@ -7,7 +7,7 @@ import argparse
 from typing import Any
 
 from petrobot.coordinator.cli.loading import add_estimates_argument, measurements, task_path
-from petrobot.services.host.command_line import number, whole
+from petrobot.services.host.command_line import LARGEST_SEED, number, whole
 
 EXAMPLE = "petrobot simulate catch_ball --replicas 2000 --seed 1"
 
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--seed",
-        type=whole(0),
+        type=whole(0, LARGEST_SEED),
         default=1,
         metavar="S",
         help="seed of all random numbers (default: %(default)s)",

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import getpass
 import signal
+import sys
 from collections.abc import Awaitable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -53,6 +55,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
     )
     parser.add_argument("--no-respawn", action="store_true", help="do not restart a node that died")
+    parser.add_argument(
+        "--print-unit",
+        action="store_true",
+        help="only print a systemd unit that runs this command when the host starts",
+    )
     add_log_level_argument(parser, "info")
 
 
@@ -61,7 +68,48 @@ def run(options: argparse.Namespace) -> int:
     directory = load_directory(options.services)
     refuse_misplaced(directory, scripted=options.mock is not None)
     refuse_script(options.mock, directory)
+    if options.print_unit:
+        print(unit(directory, options.logs), end="")
+        return 0
     return asyncio.run(_up(directory, options))
+
+
+UNIT = """\
+[Unit]
+Description=petrobot nodes of {services}
+Wants=network-online.target
+After=network-online.target
+
+[Service]
+User={user}
+WorkingDirectory={folder}
+ExecStart="{petrobot}" up --services "{services}" --logs "{logs}"
+Restart=on-failure
+RestartSec=1
+# petrobot stops its nodes itself, devices first; what is left is killed.
+KillMode=mixed
+TimeoutStopSec=10
+# Real-time priority for threads that ask for it (docs/deploy.md):
+#LimitRTPRIO=50
+#LimitMEMLOCK=infinity
+
+[Install]
+WantedBy=multi-user.target
+"""
+
+
+def unit(directory: Directory, logs: Path) -> str:
+    """Return a systemd unit that starts this host's nodes, with absolute paths."""
+    services = directory.source.resolve()
+    paths = {
+        "services": services,
+        "folder": services.parent,
+        "logs": logs.absolute(),
+        "petrobot": Path(sys.executable).with_name("petrobot"),
+    }
+    # In a unit, "%" begins a specifier.
+    texts = {name: str(path).replace("%", "%%") for name, path in paths.items()}
+    return UNIT.format(user=getpass.getuser(), **texts)
 
 
 async def _up(directory: Directory, options: argparse.Namespace) -> int:

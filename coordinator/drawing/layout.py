@@ -22,7 +22,7 @@ Edge = tuple[str, str]
 WayPoint = tuple[str, str, int]
 """A way point of an arc: its two ends and its column."""
 Spot = str | WayPoint
-"""What takes up room in a column: a node, by its name, or a way point."""
+"""Occupant of a column: a node, by its name, or a way point."""
 HUB = 14
 """A node with more arcs than this is a hub: its long arcs get no way points and run straight,
 because so many way points would push the columns apart."""

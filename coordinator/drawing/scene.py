@@ -184,7 +184,7 @@ class DrawnNode:
 
 @dataclass(frozen=True, slots=True)
 class Caption:
-    """What a drawing says of one node of a net: its label, its tooltip, and CSS classes."""
+    """Label, tooltip and CSS classes of one node of a net."""
 
     lines: tuple[str, ...]
     hint: str
@@ -399,7 +399,8 @@ def _place_node(sheet: Sheet, p: Place, at: Point) -> DrawnNode:
 
 
 def _in_short(p: Place) -> str:
-    """What the place says in short and the drawing therefore does not show as net elements."""
+    """Return what the short forms of the place declare, which the drawing does not show as net
+    elements."""
     parts = (
         f"{p.tries} tries" if p.tries > 1 else "",
         f"{p.timeout:g} s" if p.timeout is not None else "",

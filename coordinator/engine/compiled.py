@@ -3,8 +3,9 @@ again when a token, a variable or an event changes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 from typing import Final
 
 from petrobot.coordinator.task import EarlyEvent, Kind, Place, PrimitiveTask, Task
@@ -48,6 +49,9 @@ class Compiled:
     """By event: transitions that wait for it."""
     kept: frozenset[str]
     """Latched events that are kept when nothing waits for them."""
+    contested: Mapping[int, frozenset[int]]
+    """By transition: resource, control and plain places of which others of the same rank take
+    tokens too, so that first come, first served may have to settle who gets one."""
     devices: Mapping[str, str]
     """By action: the device that it uses."""
     domains: Mapping[str, Domain]
@@ -97,6 +101,7 @@ def compile_task(task: Task, devices: Mapping[str, str]) -> Compiled:
         reading=_index((x.index, sorted(x.when.names)) for x in transitions if x.when is not None),
         waiting=_index((net.transition_index[t.name], t.events) for t in flat.transitions.values()),
         kept=frozenset(e.name for e in flat.events.values() if e.early is EarlyEvent.KEEP),
+        contested=_contested(transitions),
         devices=dict(devices),
         domains=condition_domains(flat),
         free=frozenset(flat.variables)
@@ -125,6 +130,18 @@ def _firing_limit(flat: Task, net: Net) -> int:
         return FIRINGS_OF_A_FINITE_NET
     tokens = sum(net.initial) + sum(weight for arcs in net.produce for _, weight in arcs)
     return min(1_000 + len(net.transitions) * tokens, FIRINGS_OF_A_FINITE_NET)
+
+
+def _contested(transitions: Sequence[CompiledTransition]) -> dict[int, frozenset[int]]:
+    """Transitions that wait for a pulse or a time do not wait for a token: they are left out."""
+    found: dict[int, set[int]] = {}
+    for x, y in permutations(transitions, 2):
+        both = {p for p, _ in x.plain} & {p for p, _ in y.plain}
+        drawn = x.weight is not None and y.weight is not None
+        waits = not x.pulse and x.after is None and not x.never
+        if both and waits and not drawn and x.rank == y.rank:
+            found.setdefault(x.index, set()).update(both)
+    return {t: frozenset(places) for t, places in found.items()}
 
 
 def _index(pairs: Iterable[tuple[int, Iterable[str]]]) -> dict[str, tuple[int, ...]]:

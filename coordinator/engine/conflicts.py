@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from math import inf
 
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import Claims, Match, eligible_runs, match
@@ -33,8 +34,8 @@ def choose_step(
     fire after the others.
 
     `choices` are the outcomes of earlier draws for this same step. With `ask` a conflict that is
-    else left to the order in the file is drawn too, with the weight 0 for its transitions. Looks at
-    the dirty transitions and forgets them.
+    else settled first come, first served, is drawn too, with the weight 0 for its transitions.
+    Looks at the dirty transitions and forgets them.
     """
     fireable = [found for x in _marked(draft, pulse, only) if (found := match(draft, x, pulse))]
     draft.dirty.clear()
@@ -80,11 +81,31 @@ def _settle(
                 drawn = choices.pop(0)
                 head = next((m for m in contest if m.transition.name == drawn), head)
             else:
-                _report(draft, contest)
+                head = _first_come(draft, head, contest, rest, claims)
         step.append(head)
         claims.add(head)
         rest = [m for m in rest if m.transition is not head.transition]
     return step
+
+
+def _first_come(
+    draft: Draft, head: Match, contest: list[Match], rest: list[Match], claims: Claims
+) -> Match:
+    """Return the one that has lacked only the contested tokens for the longest; at a tie the first
+    in the file, with a report."""
+    places = draft.compiled.net.places
+    over = {places[p] for p, _ in _scarce(draft, rest, claims)}
+
+    def since(m: Match) -> float:
+        wait = draft.waits.get(m.transition.name)
+        return wait.since if wait is not None and wait.place in over else inf
+
+    longest = min(map(since, contest))
+    tied = [m for m in contest if since(m) == longest]
+    if len(tied) > 1:
+        _report(draft, tied)
+    # `head` is the first in the file that bars no other one-sidedly.
+    return head if head in tied else tied[0]
 
 
 def _rank(m: Match) -> tuple[int, bool]:
@@ -163,7 +184,7 @@ def _scarce(draft: Draft, rest: list[Match], claims: Claims) -> set[tuple[int, s
 def _report(draft: Draft, contest: list[Match]) -> None:
     names = ", ".join(m.transition.name for m in contest)
     text = (
-        f"nothing settles the conflict of {names}; {contest[0].transition.name} fires, being "
-        "first in the file"
+        f"nothing settles the conflict of {names}, which came together; "
+        f"{contest[0].transition.name} fires, being first in the file"
     )
     draft.report(Severity.WARNING, "undecided", text, names)

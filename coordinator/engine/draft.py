@@ -36,6 +36,7 @@ class Draft:
         self.seen = dict(state.seen)
         self.timers = dict(state.timers)
         self.timer_order = state.timer_order
+        self.waits = state.waits  # like `deferred` replaced when it changes
         self.suspended = state.suspended
         self.backlog = list(state.backlog)
         self.breakpoints = state.breakpoints
@@ -66,6 +67,7 @@ class Draft:
             seen=self.seen,
             timers=self.timers,
             timer_order=self.timer_order,
+            waits=self.waits,
             suspended=self.suspended,
             backlog=tuple(self.backlog),
             breakpoints=self.breakpoints,

@@ -106,6 +106,23 @@ def arcs_satisfied(draft: Draft, x: CompiledTransition) -> tuple[Run, ...] | Non
     )
 
 
+def awaited_place(draft: Draft, x: CompiledTransition) -> int | None:
+    """Return the one place of whose tokens the transition has too few while it has all else; None
+    if there is no such place."""
+    short = [p for p, w in x.needs if draft.marking[p] < w]
+    if len(short) != 1 or any(draft.occupied(p) >= k for p, k in x.bars):
+        return None
+    if any(flag not in draft.flags for flag in x.flags):
+        return None
+    eligible = [eligible_runs(draft, arc, _NOTHING) for arc in x.actions]
+    if any(len(runs) < arc.weight for arc, runs in zip(x.actions, eligible, strict=True)):
+        return None
+    ready = x.when is None or any(
+        _condition_holds(draft, x, runs, tell=False) for runs in _selections(x, eligible)
+    )
+    return short[0] if ready else None
+
+
 def token_enabled(draft: Draft, x: CompiledTransition) -> bool:
     """Whether tokens, inhibitors and room enable the transition in the ordinary sense, whatever its
     runs do."""
@@ -171,12 +188,21 @@ def obstacles(draft: Draft, x: CompiledTransition) -> list[Obstacle]:
             found.append(Obstacle(arc.place, "event", text))
     for p, k in x.bars:
         if draft.occupied(p) >= k:
-            found.append(
-                Obstacle(p, "full", f"is barred by {places[p]}, which holds {draft.occupied(p)}")
+            text = (
+                f"is barred by {places[p]}{_room(draft, x, p, k)}, which holds {draft.occupied(p)}"
             )
+            found.append(Obstacle(p, "full", text))
     if not found and not can_still_fire(draft, x):
         found.append(Obstacle(None, "condition", f"has a false condition ({x.when})"))
     return found
+
+
+def _room(draft: Draft, x: CompiledTransition, place: int, threshold: int) -> str:
+    """Return in words that a capacity bars the transition; empty where an inhibitor arc does."""
+    capacity, gain = draft.compiled.net.capacity[place], dict(x.changes).get(place, 0)
+    if capacity is None or gain <= 0 or capacity - gain + 1 != threshold:
+        return ""
+    return f" (capacity {capacity}, and it adds {gain})" if gain > 1 else f" (capacity {capacity})"
 
 
 _ENDED = {
@@ -216,6 +242,8 @@ def fire(draft: Draft, fireable: Match, cause: str) -> None:
         draft.touch(p)
     taken = tuple(r.id for r in _take_runs(draft, fireable))
     draft.flags.difference_update(x.flags)
+    if x.name in draft.waits:
+        draft.waits = {name: wait for name, wait in draft.waits.items() if name != x.name}
     _forget_lost(draft, x)
     places = draft.compiled.net.places
     for p, w, is_action in x.produce:
@@ -327,7 +355,7 @@ def _selections(
 
 
 def _condition_holds(
-    draft: Draft, x: CompiledTransition, runs: tuple[tuple[Run, ...], ...]
+    draft: Draft, x: CompiledTransition, runs: tuple[tuple[Run, ...], ...], tell: bool = True
 ) -> bool:
     values = draft.variables
     if x.judges_runs:
@@ -338,7 +366,8 @@ def _condition_holds(
         return x.when is None or x.when.holds(values)
     except ConditionFault as fault:
         text = f"the condition of {x.name} has no truth value: {fault}; it counts as false"
-        draft.report_once(Severity.WARNING, "condition", text, x.name)
+        if tell:
+            draft.report_once(Severity.WARNING, "condition", text, x.name)
         return False
 
 

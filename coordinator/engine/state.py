@@ -123,6 +123,15 @@ class Suspended:
 
 
 @dataclass(frozen=True, slots=True)
+class Wait:
+    """A transition that lacks nothing but tokens of one place that others take too."""
+
+    place: str
+    since: int
+    """Number of the stimulus since which that is so: first come, first served."""
+
+
+@dataclass(frozen=True, slots=True)
 class Deferred:
     """A run whose verdict is still to come."""
 
@@ -168,6 +177,8 @@ class State:
     timers: Mapping[str, Timer] = field(default_factory=dict)
     """By transition."""
     timer_order: int = 0
+    waits: Mapping[str, Wait] = field(default_factory=dict)
+    """By transition; only of transitions that may compete (`Compiled.contested`)."""
     suspended: Suspended | None = None
     backlog: tuple[Stimulus, ...] = ()
     """Stimuli that came while a draw was outstanding."""

@@ -13,6 +13,7 @@ from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import (
     DEAD_END,
     Match,
+    awaited_place,
     can_still_fire,
     cancel,
     fire,
@@ -31,7 +32,7 @@ from petrobot.coordinator.engine.instructions import (
     Subject,
 )
 from petrobot.coordinator.engine.runs import admit, take_arguments
-from petrobot.coordinator.engine.state import ACTIVE, UNSTARTED, Mode, Phase, Run, Suspended
+from petrobot.coordinator.engine.state import ACTIVE, UNSTARTED, Mode, Phase, Run, Suspended, Wait
 from petrobot.coordinator.engine.timers import (
     disarm_all,
     hold_timers,
@@ -58,14 +59,19 @@ class Policy:
     report_dead_ends: bool = True
     """Report every state from which neither a firing nor an end can be reached; journals with
     `semantics` 2 in their header were recorded without that."""
+    first_come: bool = True
+    """Settle a conflict over a token that neither priority nor weight settles first come, first
+    served; journals with `semantics` 3 or less in their header were recorded with the order in the
+    file alone."""
     ask_undecided: bool = False
-    """Ask with `Choose` for each conflict that is else left to the order in the file. The analysis
+    """Ask with `Choose` for each conflict that neither priority nor weight settles. The analysis
     does so to learn whether a verdict depends on it."""
 
 
 RECORDED: Final[Mapping[int, Policy]] = {
-    1: Policy(firing_limit=1000, report_dead_ends=False),
-    2: Policy(report_dead_ends=False),
+    1: Policy(firing_limit=1000, report_dead_ends=False, first_come=False),
+    2: Policy(report_dead_ends=False, first_come=False),
+    3: Policy(first_come=False),
 }
 """How the engine treated the runs of older journals, by the `semantics` of their header."""
 
@@ -88,8 +94,24 @@ def settle(
         forget_flags(draft)
     if draft.retime and draft.mode is not Mode.FINISHED:
         refresh_timers(draft)
+    if draft.compiled.contested and policy.first_come and draft.suspended is None:
+        _note_waits(draft)
     _explain_waiting(draft)
     _end_if_over(draft, policy)
+
+
+def _note_waits(draft: Draft) -> None:
+    """Keep since when each transition that may compete for a token lacks nothing else."""
+    places, waits = draft.compiled.net.places, dict[str, Wait]()
+    for t, contested in draft.compiled.contested.items():
+        x = draft.compiled.transitions[t]
+        p = awaited_place(draft, x)
+        if p is not None and p in contested:
+            new = Wait(places[p], draft.stimuli)
+            old = draft.waits.get(x.name, new)
+            waits[x.name] = old if old.place == new.place else new
+    if waits != draft.waits:
+        draft.waits = waits
 
 
 def pause(draft: Draft, reason: str) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ import numpy as np
 from petrobot.coordinator.engine import State
 from petrobot.coordinator.engine.instructions import (
     Corrected,
+    Finished,
     Fired,
     Instruction,
     RunRecorded,
@@ -29,8 +30,9 @@ from petrobot.coordinator.engine.stimuli import Chosen, RunEnded, Stimulus
 from petrobot.coordinator.learning.estimate import Observation
 from petrobot.coordinator.learning.learning import Learning
 from petrobot.coordinator.learning.records import Choice, Correction, Passage, Record, RunEnd
+from petrobot.coordinator.learning.selectors import TASK, verdicts_of_task
 from petrobot.coordinator.run.interfaces import FirstAlternative
-from petrobot.coordinator.task import Task
+from petrobot.coordinator.task import Status, Task
 from petrobot.coordinator.task.conditions import ConditionError, ConditionFault, Expression
 from petrobot.coordinator.task.conditions import parse as parse_condition
 from petrobot.services.comm.protocol.messages import Feedback
@@ -108,6 +110,19 @@ class _ActiveRun:
     ended: RunEnded | None = None
 
 
+@dataclass
+class _Trial:
+    """A token on its way, from the runs place until every token is back."""
+
+    begun: float
+    goals: int = 0
+    met: bool | None = None
+    """The verdict; None while there is none."""
+    seconds: float = 0.0
+    runs: list[tuple[str, str, str, Observation]] = field(default_factory=list)
+    """Primitive task, action, context and end of each run that served it."""
+
+
 class LearningSelector(FirstAlternative):
     """Implements `Selector` and `Observer` with a `Learning`.
 
@@ -145,6 +160,12 @@ class LearningSelector(FirstAlternative):
         and context up to its end."""
         self._trials: Counter[tuple[str, str]] = Counter()
         self._waiting: dict[str, float] = {}
+        self._goals = frozenset(learning.task.flat.goal_transitions)
+        runs_place = learning.task.flat.runs_place
+        self._own = learning.task.net.place_index[runs_place] if runs_place else None
+        self._trial: _Trial | None = None
+        self._served: dict[str, _Trial] = {}
+        """The trial of each active run."""
         self._watched = _waits_for_events(learning.task)
 
     @property
@@ -192,6 +213,8 @@ class LearningSelector(FirstAlternative):
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Remember the context of a choice, and what a run's result contains beside its status."""
+        if self._trial is None and self._own is None:
+            self._trial = _Trial(now)
         if isinstance(stimulus, Chosen):
             self._choice(now, stimulus)
         elif isinstance(stimulus, RunEnded):
@@ -203,8 +226,12 @@ class LearningSelector(FirstAlternative):
             self._fired(now, instruction)
         elif isinstance(instruction, StartRun):
             self._run(now, instruction.run)
+            if self._trial is not None:
+                self._served[instruction.run] = self._trial
         elif isinstance(instruction, RunRecorded):
             self._ended(now, instruction)
+        elif isinstance(instruction, Finished):
+            self._finished(now, instruction)
         elif isinstance(instruction, Corrected):
             self._corrected(instruction)
 
@@ -249,6 +276,7 @@ class LearningSelector(FirstAlternative):
         for run in fired.runs:
             if run in self._active:
                 self._active[run].taken_by, self._active[run].taken_at = fired.transition, now
+        self._pass(now, fired)
         since = self._waiting.pop(fired.transition, None)
         waited = None if since is None else round(now - since, 6)
         self._note(Passage(fired.transition, self.context, waited))
@@ -286,6 +314,53 @@ class LearningSelector(FirstAlternative):
         if record.deferred:
             self._deferred[record.run] = (end, self._trials[where])
         self._note(end)
+        trial = self._served.pop(record.run, self._trial)
+        if trial is not None:
+            known = [run[:3] for run in trial.runs]
+            trial.runs.append((end.primitive_task, end.action, context, outcome))
+            if trial.met is not None and trial.runs[-1][:3] not in known:
+                self._credit(trial, trial.runs[-1:])  # its node was slow to say that it ended
+
+    # --- the task's verdict on choices --------------------------------------------------------
+
+    def _pass(self, now: float, fired: Fired) -> None:
+        """Follow a token from the runs place until every token is back, and count goals. As in
+        campaigns, what happens belongs to the token taken last."""
+        own, trial = self._own, self._trial
+        if own is not None and fired.after[own] < fired.before[own]:
+            if trial is not None and trial.met is None and trial.goals:
+                self._judge(now, trial, True)  # otherwise nobody can say whether it met the goal
+            self._trial = trial = _Trial(now)
+        if trial is None:
+            return
+        trial.goals += fired.transition in self._goals
+        initial = self.learning.task.net.initial
+        if own is not None and trial.met is None:
+            back = fired.after[:own] + fired.after[own + 1 :]
+            if back == initial[:own] + initial[own + 1 :]:
+                self._judge(now, trial, trial.goals > 0 or not self._goals)
+
+    def _finished(self, now: float, finished: Finished) -> None:
+        """Judge the last token if the task came to its end, or if the goal was met before it was
+        given up. What was given up otherwise is censored."""
+        trial = self._trial
+        if trial is None or trial.met is not None:
+            return
+        if finished.status is Status.SUCCESS or trial.goals:
+            self._judge(now, trial, trial.goals > 0 or not self._goals)
+
+    def _judge(self, now: float, trial: _Trial, met: bool) -> None:
+        trial.met, trial.seconds = met, round(max(0.0, now - trial.begun), 6)
+        self._credit(trial, trial.runs)
+
+    def _credit(self, trial: _Trial, runs: Sequence[tuple[str, str, str, Observation]]) -> None:
+        """Record the verdict on the actions of these runs, if the task is to judge them."""
+        if self.learning.credit != TASK:
+            return
+        for verdict in verdicts_of_task(
+            runs, bool(trial.met), trial.seconds, lambda name: self.learning.question(name).measure
+        ):
+            self._note(verdict)
 
     def _cpu(self, record: RunRecorded, result: RunEnded | None) -> float | None:
         """Return the measured CPU seconds; the declared ones in lock step where they are the cost,

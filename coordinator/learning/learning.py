@@ -24,8 +24,15 @@ from petrobot.coordinator.learning.estimate import (
     merge_tallies,
 )
 from petrobot.coordinator.learning.objective import Comparison, Question, compare
-from petrobot.coordinator.learning.records import Choice, Correction, Passage, Record, RunEnd
-from petrobot.coordinator.learning.selectors import DEFAULT, RuleSelector, make
+from petrobot.coordinator.learning.records import (
+    Choice,
+    Correction,
+    Credit,
+    Passage,
+    Record,
+    RunEnd,
+)
+from petrobot.coordinator.learning.selectors import ACTION, DEFAULT, TASK, RuleSelector, make
 from petrobot.coordinator.task import Task
 
 NOTHING = Tally()
@@ -94,7 +101,11 @@ class Estimates:
 
 class Learning:
     """The learning state of one task. `known`: estimates from before; `gained`: those of this
-    session alone."""
+    session alone.
+
+    `credit`: what judges a choice for the selectors, the end of its own run ("action") or the
+    task's goal ("task"). Estimates count the ends of runs in both cases.
+    """
 
     def __init__(
         self,
@@ -103,8 +114,9 @@ class Learning:
         question: Question | None = None,
         known: Estimates | None = None,
         salt: str = "",
+        credit: str = ACTION,
     ) -> None:
-        self.task, self.salt = task, salt
+        self.task, self.salt, self.credit = task, salt, credit
         self.known, self.gained = known or Estimates(), Estimates()
         self.applied = 0
         """Number of records applied in this session."""
@@ -112,7 +124,8 @@ class Learning:
         self.selectors: dict[str, RuleSelector] = {}
         for p in task.primitive_tasks.values():
             if len(p.alternatives) > 1:
-                self.selectors[p.name] = make(selector, p.alternatives, self.question(p.name))
+                question_of = self.question(p.name)
+                self.selectors[p.name] = make(selector, p.alternatives, question_of, credit)
 
     def question(self, primitive_task: str) -> Question:
         """Return measure, target and rho for a primitive task: as given, with the cost measure that
@@ -147,7 +160,9 @@ class Learning:
             return
         if isinstance(record, Choice):
             selector.chosen(record.context, record.action)
-        elif isinstance(record, RunEnd):
+        elif isinstance(record, Credit) is not (self.credit == TASK):
+            return
+        elif isinstance(record, RunEnd | Credit):
             selector.update(record.context, record.action, record.outcome)
         elif record.was.status is not None:
             selector.correct(
@@ -203,7 +218,9 @@ class Learning:
 
     def prime(self) -> None:
         """Let the selectors take their sums from the known estimates, which may contain runs of
-        other machines."""
+        other machines. Not those that the task judges: estimates hold no verdicts of the task."""
+        if self.credit == TASK:
+            return
         for name, selector in self.selectors.items():
             for context in self.known.contexts(name):
                 by_action = self.known.of(name, context)

@@ -1,5 +1,5 @@
-"""The records that a task learns from: choices, ends of runs, corrected verdicts and firings; as
-plain data and back."""
+"""The records that a task learns from: choices, ends of runs, corrected verdicts, verdicts of the
+task on choices, and firings; as plain data and back."""
 
 from __future__ import annotations
 
@@ -46,6 +46,17 @@ class Correction:
 
 
 @dataclass(frozen=True, slots=True)
+class Credit:
+    """The task's verdict on an action that was chosen for a token: SUCCESS if the token met the
+    task's goal, with the cost of the whole trial."""
+
+    primitive_task: str
+    action: str
+    context: str
+    outcome: Observation
+
+
+@dataclass(frozen=True, slots=True)
 class Passage:
     """A transition fired."""
 
@@ -56,7 +67,7 @@ class Passage:
     events."""
 
 
-Record = Choice | RunEnd | Correction | Passage
+Record = Choice | RunEnd | Correction | Credit | Passage
 
 
 def to_plain(record: Record) -> dict[str, Any]:
@@ -75,6 +86,8 @@ def to_plain(record: Record) -> dict[str, Any]:
     }
     if isinstance(record, RunEnd):
         return {"kind": "End", **about, "outcome": _observation(record.outcome)}
+    if isinstance(record, Credit):
+        return {"kind": "Credit", **about, "outcome": _observation(record.outcome)}
     if isinstance(record, Correction):
         verdict = {"status": record.status.value, "cause": record.cause, "age": record.age}
         return {"kind": "Correction", **about, "was": _observation(record.was), **verdict}
@@ -91,10 +104,12 @@ def of_plain(data: Mapping[str, Any]) -> Record:
         return Choice(*about)
     if kind == "End":
         return RunEnd(*about, _observed(data["outcome"]))
+    if kind == "Credit":
+        return Credit(*about, _observed(data["outcome"]))
     if kind == "Correction":
         verdict = (Status(data["status"]), str(data["cause"]), int(data.get("age", 0)))
         return Correction(*about, _observed(data["was"]), *verdict)
-    raise ValueError(f"kind: expected Choice, End, Correction or Passage, got {kind!r}")
+    raise ValueError(f"kind: expected Choice, End, Correction, Credit or Passage, got {kind!r}")
 
 
 def _observation(seen: Observation) -> dict[str, Any]:

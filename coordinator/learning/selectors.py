@@ -8,7 +8,7 @@ ends of runs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from petrobot.coordinator.learning.batch import SUMS, Batch, Mask, Response
 from petrobot.coordinator.learning.estimate import COUNT, Observation, Tally
 from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.learning.records import Credit
 from petrobot.coordinator.learning.rules import (
     UCB1,
     DiscretisedPursuit,
@@ -290,6 +291,45 @@ def _is_missing(outcome: Observation) -> bool:
     return outcome.executed is Executed.NO and outcome.preempted_by is None
 
 
+def verdicts_of_task(
+    runs: Iterable[tuple[str, str, str, Observation]],
+    met: bool,
+    seconds: float,
+    measure: Callable[[str], str],
+) -> Iterator[Credit]:
+    """Return the task's verdict on each action that ran for a token, once.
+
+    `runs`: primitive task, action, context and end of each run; `met`: whether the goal was met;
+    `seconds`: duration of the trial, nan if it never came to its end; `measure`: the cost measure
+    of a primitive task. The cost is the trial's: its duration, or the sum of all its runs by the
+    measure. A run that its node never began is judged by that, as always; one that was cancelled
+    before it began could not matter.
+    """
+    runs, seen = list(runs), set()
+    for primitive_task, action, context, outcome in runs:
+        missing, key = _is_missing(outcome), (primitive_task, action, context)
+        if key in seen or (outcome.executed is Executed.NO and not missing):
+            continue
+        if missing:
+            yield Credit(*key, outcome)
+            continue
+        seen.add(key)
+        asked = measure(primitive_task)
+        costs = [cost_of(end, asked) for *_, end in runs if end.executed is not Executed.NO]
+        known = [cost for cost in costs if cost == cost]  # nan: not measured
+        whole = sum(known) if known else float("nan")
+        status = Status.SUCCESS if met else Status.FAILURE
+        yield Credit(
+            *key,
+            Observation(
+                status,
+                seconds,
+                cpu_seconds=whole if asked == "cpu" and known else None,
+                values={} if asked in ("wall", "cpu") else {asked.removeprefix("value:"): whole},
+            ),
+        )
+
+
 def cost_of(outcome: Observation, measure: str) -> float:
     """Return the cost of a run by a measure; nan if it was not measured."""
     if measure == "wall":
@@ -301,11 +341,30 @@ def cost_of(outcome: Observation, measure: str) -> float:
     return float(outcome.values.get(measure.removeprefix("value:"), float("nan")))
 
 
-def make(name: str, actions: Iterable[str], question: Question | None = None) -> RuleSelector:
+ACTION, TASK = CREDITS = ("action", "task")
+"""What judges a choice: the status of the run itself, or whether the task's goal was met."""
+
+
+def credited(name: str, credit: str) -> str:
+    """Return the name under which the state of a selector is kept: what it learned by one credit is
+    nothing that it would have learned by the other. Raises ValueError for an unknown credit."""
+    if credit not in CREDITS:
+        raise ValueError(f"credit: expected {' or '.join(CREDITS)}, got {credit!r}")
+    return name if credit == ACTION else f"{name} by task"
+
+
+def make(
+    name: str,
+    actions: Iterable[str],
+    question: Question | None = None,
+    credit: str = ACTION,
+) -> RuleSelector:
     """Create a selector by its name. Raises ValueError for an unknown one."""
     if name not in RULES:
         raise ValueError(f"unknown selector {name!r}; choose one of {', '.join(RULES)}")
-    return RuleSelector(RULES[name](), actions, question)
+    made = RuleSelector(RULES[name](), actions, question)
+    made.name = credited(name, credit)
+    return made
 
 
 def _of(context: str) -> str:

@@ -14,7 +14,7 @@ from petrobot.coordinator.learning.learner import Contexts, LearningSelector, us
 from petrobot.coordinator.learning.learning import Estimates, Learning
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.records import Correction, RunEnd
-from petrobot.coordinator.learning.selectors import DEFAULT, RULES
+from petrobot.coordinator.learning.selectors import ACTION, DEFAULT, RULES, credited
 from petrobot.coordinator.task import Task
 
 
@@ -38,6 +38,8 @@ class LearningSetting:
     physics: str = ""
     """Name and version of the simulated laboratory's physics; empty: it has only one, or is
     real."""
+    credit: str = ACTION
+    """What judges a choice: the end of its own run ("action"), or the task's goal ("task")."""
 
     def to_plain(self) -> dict[str, Any]:
         """Return plain data for a journal's header."""
@@ -50,6 +52,7 @@ class LearningSetting:
             "frozen": self.frozen,
             "declared": None if self.declared is None else dict(self.declared),
             "physics": self.physics,
+            "credit": self.credit,
         }
 
     @classmethod
@@ -64,7 +67,8 @@ class LearningSetting:
             data["frozen"],
             data["declared"],
         )
-        return cls(Path(data["path"]), *given, data.get("physics", ""))
+        more = data.get("physics", ""), data.get("credit", ACTION)
+        return cls(Path(data["path"]), *given, *more)
 
 
 class LearningSession:
@@ -167,9 +171,10 @@ def _learning(
     """Create the learning state. `salt` names the session, so that its runs in the sample differ
     from those of any other session, including one on a copied file."""
     question = Question(target=setting.target)
-    learning = Learning(task, setting.selector, question, kept.estimates, salt)
+    learning = Learning(task, setting.selector, question, kept.estimates, salt, setting.credit)
+    name = credited(setting.selector, setting.credit)
     try:
-        learning.restore(kept.states(setting.selector) if states is None else states)
+        learning.restore(kept.states(name) if states is None else states)
     except ValueError as fault:
         raise EstimatesError(
             f"{setting.path}: the state of selector {setting.selector} does not fit: {fault}; "

@@ -1,2 +1,1 @@
-"""The operator's hand and eye: live missions, simulated runs, and how they are started and
-steered."""
+"""Live missions and simulated runs for operators: how they are started, shown and controlled."""

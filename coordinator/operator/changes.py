@@ -1,9 +1,8 @@
-"""How changes alter a snapshot, and how those that a client has not got yet are merged into one;
-pure.
+"""Apply changes to a snapshot, and merge the changes that a client has not received yet (pure
+functions).
 
-`page/state.js` holds the same rules for browsers. A test applies random changes one by one and
-merged: same state.
-"""
+`page/state.js` has the same rules for browsers. A test applies random changes one by one and
+merged, and compares the states."""
 
 from __future__ import annotations
 
@@ -19,12 +18,12 @@ ENDED_KEPT = 200
 SAMPLES_KEPT = 300
 NOTICES_KEPT = 30
 PENDING_LIMIT = 400
-"""Entries that may wait for one client; one that is further behind gets a fresh snapshot
+"""Most entries that wait for one client; a client that is further behind gets a new snapshot
 instead."""
 
 
 def empty_state() -> State:
-    """A snapshot of nothing: no task, no run, nobody at the controls."""
+    """Return an empty snapshot: no task, no run, controls free."""
     return {
         "sequence": 0,
         "mission": {"id": "", "state": "idle", "mode": "realtime"},
@@ -129,9 +128,9 @@ _RULES: dict[str, Callable[[State, Change], None]] = {
     "result": _whole("result"),
 }
 SNAPSHOT_KEYS = tuple(key for key in empty_state() if key != "sequence")
-"""The parts of a snapshot, besides its number."""
+"""The parts of a snapshot, apart from its number."""
 KINDS = frozenset(_RULES) | {"reset"}
-"""Kinds of change. `reset` says that so much is new (another mission) that clients get a snapshot
+"""Kinds of change. `reset` means that so much is new (another mission) that clients get a snapshot
 instead."""
 
 _NAMED = frozenset({"node", "event", "variable", "device", "image", "report", "selector"})
@@ -139,8 +138,8 @@ _WHOLE = frozenset({"breakpoints", "paused", "controls", "result"})
 
 
 def apply(state: State, change: Change) -> None:
-    """Alter a state by one change. Unknown kinds alter nothing but the number, so that old clients
-    live with new servers."""
+    """Apply one change to a state. An unknown kind changes only the number, so that old clients
+    work with new servers."""
     rule = _RULES.get(str(change["kind"]))
     if rule is not None:
         rule(state, change)
@@ -151,10 +150,10 @@ def apply(state: State, change: Change) -> None:
 
 
 def copy_state(state: State) -> State:
-    """A state that later changes to the first do not reach.
+    """Return a copy of a state that later changes to the original do not affect.
 
-    Two levels are copied: the rules above alter no value that lies deeper, they replace it. A whole
-    copy of a task of 300 places would take 20 ms.
+    Two levels are copied: the rules above replace deeper values and never modify them. A full copy
+    of a task of 300 places would take 20 ms.
     """
     return {
         key: copy(value) if isinstance(value, dict | list) else value
@@ -163,11 +162,10 @@ def copy_state(state: State) -> State:
 
 
 class Pending:
-    """The one merged delta that waits for a client: newest value of what has a newest value, all of
-    what must not be lost.
+    """The merged delta that waits for a client: the newest value where only that counts, and every
+    entry that must not be lost.
 
-    Its size is bounded: past `PENDING_LIMIT` entries, or after a `reset`, it holds nothing and says
-    `stale`.
+    Its size is bounded: above `PENDING_LIMIT` entries, or after a `reset`, it is empty and `stale`.
     """
 
     __slots__ = ("_entries", "_first", "_last", "_time", "stale")
@@ -183,7 +181,7 @@ class Pending:
         return self.stale or self._last != 0
 
     def add(self, change: Change) -> None:
-        """Take in the next change."""
+        """Add the next change."""
         self._first = self._first or change["sequence"]
         self._last = change["sequence"]
         self._time = change.get("time", self._time)
@@ -199,7 +197,8 @@ class Pending:
         self._entries[key] = change if before is None else _merge(before, change)
 
     def take(self) -> dict[str, Any]:
-        """The merged delta {type, first, last, time, changes}; nothing is pending afterwards."""
+        """Return the merged delta {type, first, last, time, changes}; nothing is pending
+        afterwards."""
         delta = {
             "type": "delta",
             "first": self._first,
@@ -211,7 +210,7 @@ class Pending:
         return delta
 
     def clear(self) -> None:
-        """Nothing is pending, as after a snapshot."""
+        """Forget everything pending, as after a snapshot."""
         self._entries = {}
         self._first = self._last = 0
         self.stale = False

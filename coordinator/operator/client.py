@@ -1,5 +1,5 @@
-"""A client of the operator's protocol (docs/operator-protocol.md): the snapshot kept up to date,
-and commands answered."""
+"""A client of the operator protocol (docs/operator-protocol.md): it keeps the snapshot up to date
+and sends commands."""
 
 from __future__ import annotations
 
@@ -15,21 +15,20 @@ from petrobot.coordinator.operator.port import PROTOCOL
 from petrobot.coordinator.page.sessions import LARGEST_SNAPSHOT
 
 LOST_AFTER = 3.0
-"""Seconds of silence after which the connection counts as lost: the server says `alive` every
-second."""
+"""Silence after which the connection counts as lost (s); the server sends `alive` every second."""
 ANSWER = 10.0
-"""Seconds that a command's answer may take."""
+"""Longest wait for the answer to a command (s)."""
 
 
 class OperatorError(Exception):
-    """The coordinator cannot be reached, does not answer, or let the connection go."""
+    """The coordinator cannot be reached, does not answer, or closed the connection."""
 
 
 class OperatorClient:
     """One operator at one mission run: `async with OperatorClient(url, token, name, secret) as
     hand: ...`.
 
-    `name` is shown to all; who comes back with the same name and `secret` is the same operator.
+    `name` is shown to all; a client with the same name and `secret` is the same operator.
     Raises OperatorError.
     """
 
@@ -37,7 +36,7 @@ class OperatorClient:
         self.state: State = empty_state()
         """The snapshot, up to date."""
         self.who = ""
-        """How all others see this operator."""
+        """The name under which all others see this operator."""
         self._url = url
         self._headers = {"Authorization": f"Bearer {token}"}
         self._hello = {"type": "hello", "protocol": PROTOCOL, "name": name, "tab": secret}
@@ -52,7 +51,7 @@ class OperatorClient:
         self._over = ""
 
     async def __aenter__(self) -> Self:
-        """Connect, say hello, and wait for the snapshot."""
+        """Connect, send hello, and wait for the snapshot."""
         self._http = aiohttp.ClientSession(headers=self._headers, trust_env=False)
         try:
             async with asyncio.timeout(LOST_AFTER):
@@ -74,11 +73,11 @@ class OperatorClient:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Leave."""
+        """Close the connection."""
         await self.close()
 
     async def close(self) -> None:
-        """Leave."""
+        """Close the connection."""
         if self._socket is not None:
             await self._socket.close()
         if self._reader is not None:
@@ -88,7 +87,7 @@ class OperatorClient:
             await self._http.close()
 
     async def command(self, verb: str, data: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Give a command; its answer {ok, ...}, after it was carried out and journaled."""
+        """Give a command; return its answer {ok, ...} after it was carried out and journaled."""
         if self._socket is None or self._over:
             raise OperatorError(self._over or "not connected")
         self._numbers += 1
@@ -108,7 +107,7 @@ class OperatorClient:
             self._answers.pop(number, None)
 
     async def until(self, holds: Callable[[State], bool], timeout: float) -> bool:
-        """Whether the state comes to hold this within so many seconds."""
+        """Wait at most this long (s) until the condition holds; return whether it does."""
         try:
             async with asyncio.timeout(timeout):
                 while not holds(self.state):
@@ -121,8 +120,7 @@ class OperatorClient:
         return True
 
     async def changes(self) -> AsyncIterator[dict[str, Any]]:
-        """Every change as it comes, until the connection ends; `reset` when there is a new
-        snapshot."""
+        """Yield every change until the connection ends; `reset` when there is a new snapshot."""
         self._watched = True
         while not self._over and (change := await self._changes.get()) is not None:
             yield change

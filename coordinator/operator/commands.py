@@ -1,9 +1,9 @@
-"""The operator's side of a live mission run: what clients see, and their commands turned into
+"""The operator's side of a live mission run: the state that clients see, and their commands as
 stimuli.
 
-Implements `coordinator.operator.port.MissionPort` over a mission run in real time. Every command is
-a journaled stimulus; who holds the controls is settled here. The emergency stop waits for nobody:
-it goes straight to the nodes.
+Implements `coordinator.operator.port.MissionPort` for a mission run in real time. Every command is
+a journaled stimulus; this module also decides which client holds the controls. The emergency stop
+waits for nothing and is sent directly to the nodes.
 """
 
 from __future__ import annotations
@@ -49,33 +49,33 @@ from petrobot.services.comm.protocol.messages import Feedback
 _log = logging.getLogger(__package__)
 
 ANSWERS = 1.5
-"""Seconds that nodes have to answer a pause."""
+"""Time for nodes to answer a pause (s)."""
 REFUSED = frozenset({"refused"})
 _BEFORE = (Stage.CONNECTING, Stage.PREPARING)
 _MAY_COME_EARLY = (SetBreakpoints, Override)
-"""What only says how the run shall go, and moves nothing."""
+"""Commands that only configure the run and move nothing."""
 
 
 class Shell(Protocol):
-    """What drives a mission run, in real time or in lock step."""
+    """Interface to the driver of a mission run, in real time or in lock step."""
 
     mission: Mission
 
     def now(self) -> float:
-        """The mission's clock (s)."""
+        """Return the mission's clock (s)."""
 
     def settle(self) -> None:
-        """Something was said: send it, and go on in time."""
+        """Send new messages and continue."""
 
     def flush(self, node: str) -> None:
-        """Send what was said to a node."""
+        """Send the messages to a node."""
 
     def fail(self, fault: Exception) -> None:
-        """The run cannot go on: it ends with this fault, and nothing more leaves."""
+        """End the run with this fault; nothing more is sent."""
 
 
 class Operation:
-    """One mission run as its operators see it; `name` shows in the snapshot."""
+    """One mission run as its operators see it; `name` is shown in the snapshot."""
 
     def __init__(
         self,
@@ -87,8 +87,8 @@ class Operation:
         starts: bool = False,
         mode: str = "realtime",
     ) -> None:
-        """`feed` and `controls` are those of a page that outlives this run; `starts` says that it
-        can begin another."""
+        """`feed` and `controls` belong to a page that outlives this run; `starts` tells whether the
+        page can start another one."""
         self.shell = shell
         self.mission = shell.mission
         self.executor = shell.mission.executor
@@ -96,7 +96,7 @@ class Operation:
         self.controls = controls or Controls(self.feed)
         self._refusals: list[str] = []
         self._holding: dict[str, str] = {}
-        """Runs that were asked to hold and have not answered, each with its node."""
+        """Runs that have not answered yet whether they hold, each with its node."""
         self._all_held = asyncio.Event()
         self._stopping: asyncio.Task[None] | None = None
         self._live = mode == "realtime"
@@ -118,7 +118,7 @@ class Operation:
         self.executor.observers.append(self.watching)
 
     async def close(self) -> None:
-        """Ask the nodes no more."""
+        """Stop asking the nodes."""
         if self._stopping is not None:
             await asyncio.gather(self._stopping, return_exceptions=True)
         await self.watching.close()
@@ -126,8 +126,7 @@ class Operation:
     # --- an observer of the executor ----------------------------------------------------------
 
     def instruction(self, now: float, instruction: Instruction) -> None:
-        """Keep what the engine refuses, for the answer to the command; and which runs are asked to
-        hold."""
+        """Note refusals of the engine, for the answer to the command, and runs asked to hold."""
         if isinstance(instruction, Report) and instruction.key in REFUSED:
             self._refusals.append(instruction.text)
         elif isinstance(instruction, HoldRun):
@@ -136,15 +135,15 @@ class Operation:
             self._holding.pop(instruction.run, None)
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
-        """Note that a run has answered whether it holds."""
+        """Note the answer of a run that was asked to hold."""
         if isinstance(stimulus, RunHeld):
             self._holding.pop(stimulus.run, None)
 
     def progress(self, now: float, run: str, notice: Feedback) -> None:
-        """Nothing to keep."""
+        """Ignore progress."""
 
     def settled(self, now: float, state: State) -> None:
-        """Let a pause answer once every run has."""
+        """Answer a pause once every run has answered."""
         if self._holding:
             self._all_held.clear()
         else:
@@ -157,15 +156,15 @@ class Operation:
     # --- the port -----------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
-        """The state now."""
+        """Return the current state."""
         return self.feed.snapshot()
 
     def subscribe(self, receive: Callable[[dict[str, Any]], None]) -> Callable[[], None]:
-        """Give every later change to `receive`."""
+        """Call `receive` with every later change."""
         return self.feed.subscribe(receive)
 
     async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer:
-        """Carry out a command; answers after it is journaled."""
+        """Carry out a command; return its answer after it is journaled."""
         answer = self.controls.fault(who, verb) or self.controls.carry_out(who, verb, data)
         if answer is not None:
             return answer
@@ -173,7 +172,7 @@ class Operation:
             self, f"_do_{verb}", None
         )
         if carry_out is None:
-            return refusal("unknown", f"no command {verb!r} for a mission run that goes on")
+            return refusal("unknown", f"no command {verb!r} for an active mission run")
         try:
             answer = await carry_out(who, data)
         except (KeyError, TypeError, ValueError) as fault:
@@ -194,8 +193,8 @@ class Operation:
         return {**answer, "nodes": dict((self.feed.state["paused"] or {}).get("nodes", {}))}
 
     def _complete_pause(self) -> None:
-        """Say of every node with devices how it is: `lost` if it did not answer, `idle` if it had
-        nothing to hold."""
+        """Report the state of every node with devices: `lost` if it did not answer, `idle` if it
+        had nothing to hold."""
         paused = self.feed.state["paused"]
         if paused is None:
             return
@@ -220,7 +219,7 @@ class Operation:
         return self.abort(f"by {who}")
 
     def abort(self, reason: str) -> Answer:
-        """Give the run up, whoever holds the controls."""
+        """Abort the run, regardless of the controls."""
         return self._order(Abort(reason))
 
     async def _do_breakpoint(self, who: str, data: Mapping[str, Any]) -> Answer:
@@ -265,7 +264,7 @@ class Operation:
         self.shell.settle()
         return refusal("refused", self._refusals[0]) if self._refusals else {"ok": True}
 
-    # --- straight to the nodes ----------------------------------------------------------------
+    # --- directly to the nodes ----------------------------------------------------------------
 
     async def _do_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
         for node in self.mission.callers:
@@ -279,8 +278,8 @@ class Operation:
         return answer if answer["ok"] or answer["code"] != "idle" else {"ok": True}
 
     async def _stop_again(self) -> None:
-        """The same past this process's own connections: a node that is away or frozen is stopped by
-        its bus and latched."""
+        """Repeat the stop over separate connections: a node that is not connected or frozen is
+        stopped over its bus, and the stop is latched."""
         directory = self.executor.directory
         for told in await order_all(directory, credentials_of(directory)):
             if not told.answered:
@@ -292,7 +291,7 @@ class Operation:
                 )
 
     async def _do_clear_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
-        """Devices take orders again; nothing moves by that alone. Refused with the reason when a
+        """Let devices accept orders again; this alone moves nothing. Refused with the reason if a
         node still has them stopped."""
         if not self._live:
             for node in self.mission.callers:

@@ -1,5 +1,5 @@
-"""Who holds the controls of a mission: one operator acts, the others watch and can ask. It outlives
-mission runs."""
+"""The controls of a mission: one operator holds them, the others watch and may ask for them. They
+outlive mission runs."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any
 from petrobot.coordinator.operator.feed import Feed
 
 FREE = frozenset({"estop", "take_controls", "ask_controls", "release_controls"})
-"""What everybody may say, whoever holds the controls."""
+"""Commands for every client, with or without the controls."""
 
 Answer = dict[str, Any]
 
 
 class Controls:
-    """The holder and those who ask; every change is told on the feed."""
+    """The holder and the clients that ask; every change is published on the feed."""
 
     def __init__(self, feed: Feed) -> None:
         self._feed = feed
@@ -23,11 +23,11 @@ class Controls:
         self._asking: list[str] = []
 
     def plain(self) -> dict[str, Any]:
-        """As in a snapshot."""
+        """Return the state as in a snapshot."""
         return {"holder": self.holder, "asking": list(self._asking)}
 
     def fault(self, who: str, verb: str) -> Answer | None:
-        """Why somebody may not give a command; None if he may."""
+        """Return why a client may not give a command; None if it may."""
         if verb in FREE or self.holder == who:
             return None
         return refusal(
@@ -36,25 +36,26 @@ class Controls:
         )
 
     def take(self, who: str) -> Answer:
-        """Take them when nobody has them."""
+        """Take the controls if they are free."""
         if self.holder not in (None, who):
             return refusal("held", f"{self.holder} holds the controls; ask for them")
         return self._hand_over(who)
 
     def ask(self, who: str) -> Answer:
-        """Tell whoever holds them that somebody would like to."""
+        """Notify the holder that another client asks for the controls."""
         if who != self.holder and who not in self._asking:
             self._asking.append(who)
         return self._hand_over(self.holder)
 
     def release(self, who: str, to: object = None) -> Answer:
-        """Free them, or hand them to one who asks; from anybody else it does nothing."""
+        """Free the controls, or hand them to a client that asks; ignored from a client without
+        them."""
         if who != self.holder:
             return {"ok": True}
         return self._hand_over(to if isinstance(to, str) and to in self._asking else None)
 
     def carry_out(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer | None:
-        """Answer the commands that are about the controls; None for every other."""
+        """Answer commands about the controls; return None for every other command."""
         if verb == "take_controls":
             return self.take(who)
         if verb == "ask_controls":
@@ -69,5 +70,5 @@ class Controls:
 
 
 def refusal(code: str, text: str) -> Answer:
-    """The answer to a command that is not carried out."""
+    """Return the answer to a command that is not carried out."""
     return {"ok": False, "code": code, "text": text}

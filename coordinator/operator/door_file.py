@@ -1,5 +1,5 @@
-"""Where a mission run that goes on can be steered: address and token, in its run folder, for its
-owner's eyes alone."""
+"""Address and token with which an active mission run can be controlled: a file in its run folder
+that only its owner can read."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ DOOR = "operator.json"
 
 @dataclass(frozen=True, slots=True)
 class Door:
-    """How to reach the coordinator of a mission run."""
+    """Address of the coordinator of a mission run."""
 
     run: str
     url: str
-    """Without the token: http://127.0.0.1:PORT."""
+    """URL without the token: http://127.0.0.1:PORT."""
     token: str
     process: int
     """Process id of the coordinator."""
@@ -34,8 +34,8 @@ class Door:
 
 @contextmanager
 def door_open(folder: Path, door: Door) -> Iterator[Path]:
-    """Leave the door's address in a run folder for as long as it is open; its owner alone may read
-    it (mode 600)."""
+    """Keep the address in a run folder as long as the run can be controlled; only its owner may
+    read it (mode 600)."""
     path = folder / DOOR
     make_folder(folder)
     write_whole(path, json_text(asdict(door)), mode=0o600)
@@ -46,17 +46,17 @@ def door_open(folder: Path, door: Door) -> Iterator[Path]:
 
 
 def find_door(name: str | None = None, folder: Path = DEFAULT) -> Door:
-    """The door of the named mission run (None: of the newest that goes on). Raises NoRunError."""
+    """Return the door of the named mission run (None: the newest active one). Raises NoRunError."""
     if name is not None:
         run = journal_of(name, folder).parent
         door = _read(run / DOOR)
         if door is None:
-            raise NoRunError(f"{run.name} does not go on: only a run that goes on can be steered")
+            raise NoRunError(f"{run.name} is not active: only an active run can be controlled")
         return door
     doors = [door for path in _newest_first(folder) if (door := _read(path)) is not None]
     if not doors:
         raise NoRunError(
-            f"no run in {folder} goes on; begin one with `petrobot run`, or name its folder "
+            f"no run in {folder} is active; start one with `petrobot run`, or name its folder "
             "with --journal"
         )
     return doors[0]
@@ -71,7 +71,7 @@ def _newest_first(folder: Path) -> list[Path]:
 
 
 def _read(path: Path) -> Door | None:
-    """The door in a file; None when there is none, or when its coordinator is no more."""
+    """Return the door in a file; None if there is none, or if its coordinator has ended."""
     try:
         door = Door(**json.loads(path.read_text(encoding="utf-8")))
         os.kill(door.process, 0)

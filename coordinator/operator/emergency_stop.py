@@ -1,12 +1,11 @@
-"""The emergency stop: straight to the nodes that own devices, and to their bus where a node does
+"""The emergency stop: sent directly to the nodes that own devices, and to their bus if a node does
 not answer.
 
-No coordinator is needed, and none can delay it: each node is asked over a connection of its own,
-stops its devices at once (a drive's quick stop goes out with the next bus cycle) and lets no action
-use them until `CLEAR` comes. Where a node that owns a CAN bus of this host does not answer in time,
-all CANopen devices of that bus are stopped by NMT (CiA 301: a drive that leaves OPERATIONAL while
-it moves stops, object 6007h).
-"""
+It needs no coordinator, and no coordinator can delay it: each node receives it over a separate
+connection, stops its devices at once (a drive's quick stop is sent with the next bus cycle) and
+lets no action use them until `CLEAR`. If a node that owns a CAN bus of this host does not answer in
+time, all CANopen devices of that bus are stopped by NMT (CiA 301: a drive that leaves OPERATIONAL
+while it moves stops, object 6007h)."""
 
 from __future__ import annotations
 
@@ -29,34 +28,34 @@ from petrobot.services.host.emergency_latch import ALL, LatchError, latch_of
 STOP = "emergency_stop"
 CLEAR = "clear_emergency"
 NODE_LATE = 0.15
-"""Seconds after which a node that has not answered is passed by, over its bus."""
+"""Wait for a node's answer before its bus is stopped instead (s)."""
 STANDSTILL = 1.5
-"""Seconds that devices have to come to rest before their last answer is given as it is."""
+"""Time for devices to come to rest before their last answer is reported as it is (s)."""
 ASK_AGAIN = 0.02
 BUS_PATIENCE = 0.5
 BUS_TIMES, BUS_PAUSE = 3, 0.01
-"""How often the order goes on the bus, and the pause between (s): one frame may be lost."""
+"""How often the order is sent on the bus, and the pause between (s): one frame may be lost."""
 
 
 @dataclass
 class Stopped:
-    """What became of one node's devices."""
+    """Result of the stop for one node's devices."""
 
     node: str
     devices: dict[str, str] = field(default_factory=dict)
     """Each device's answer: stopped, stopping, cleared, not ready, no answer."""
     seconds: float | None = None
-    """From the order to the first answer; None without one."""
+    """Time from the order to the first answer (s); None without an answer."""
     why: str = ""
     """Why there is no answer."""
     bus: str = ""
-    """What was done on the bus in the node's place."""
+    """What was done on the bus instead of the node."""
     note: str = ""
-    """What else the node says: that the stop is not kept on its disk."""
+    """Further report of the node: that the stop is not stored on its disk."""
     latch: str = ""
-    """What was kept or cleared on disk in the node's place."""
+    """What was stored or cleared on disk instead of the node."""
     cleared: bool = False
-    """Whether the stop of a node that does not run was cleared on its disk."""
+    """Whether the stop of a node that is not running was cleared on its disk."""
 
     @property
     def answered(self) -> bool:
@@ -65,14 +64,15 @@ class Stopped:
 
 
 def nodes_with_devices(directory: Directory) -> list[str]:
-    """The nodes that own devices with a driver: those that an emergency stop goes to."""
+    """Return the nodes that own devices with a driver: those that receive an emergency stop."""
     return list(
         dict.fromkeys(device.node for device in directory.devices.values() if device.driver)
     )
 
 
 def buses_of(directory: Directory, node: str) -> list[Mapping[str, Any]]:
-    """CAN buses of a node's devices, as `services.comm.can_ports.open_can` takes them."""
+    """Return the CAN buses of a node's devices, in the form that
+    `services.comm.canopen.ports.open_can` accepts."""
     found = []
     for device in directory.devices.values():
         can = device.config.get("can") or {
@@ -87,8 +87,8 @@ _CAN_KEYS = ("interface", "channel", "bitrate")
 
 
 class EmergencyLine:
-    """A connection to one node for emergency stops alone. It fits every services.toml: a stop must
-    not fail for a hash."""
+    """A connection to one node only for emergency stops. The node accepts it with any
+    services.toml: a stop must not fail because of a hash."""
 
     def __init__(self, directory: Directory, node: str, credentials: Credentials) -> None:
         name = f"estop-{secrets.token_hex(4)}"
@@ -114,7 +114,8 @@ class EmergencyLine:
         )
 
     async def connect(self, timeout: float) -> bool:
-        """Whether the node lets us in within so many seconds; `why` says why not."""
+        """Connect within this time (s); return whether the node accepted, otherwise `why` has the
+        reason."""
         self.client.start()
         up = self.reached = await self.client.connected(timeout)
         if not up and not self.why:
@@ -125,7 +126,7 @@ class EmergencyLine:
         return up
 
     async def order(self, verb: str, timeout: float) -> dict[str, str] | None:
-        """Give an order; each device's answer, or None when there was none in time."""
+        """Give an order; return each device's answer, or None without an answer in time."""
         self._numbers += 1
         identity = f"{self._name}/{verb}#{self._numbers}"
         told = self._answers[identity] = asyncio.get_running_loop().create_future()
@@ -143,17 +144,17 @@ class EmergencyLine:
         answers = data.get("answers")
         if isinstance(answers, Mapping):
             return {str(device): str(answer) for device, answer in answers.items()}
-        self.why = str(data.get("text") or data.get("cause") or "an answer that says nothing")
+        self.why = str(data.get("text") or data.get("cause") or "an empty answer")
         return None
 
     def devices_of(self, answers: Mapping[str, str]) -> dict[str, str]:
-        """Answers of devices: that under the node's own name is of its actions without one, unless
-        a device is called so."""
+        """Return the answers of devices. The one under the node's own name is of its actions
+        without a device, unless a device has that name."""
         own = {self.node} - self._device_names
         return {device: answer for device, answer in answers.items() if device not in own}
 
     async def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         await self.client.close()
 
     def _hear(self, _: float, notices: list[Notice]) -> None:
@@ -169,8 +170,8 @@ class EmergencyLine:
 async def order_all(
     directory: Directory, credentials: Credentials, verb: str = STOP, *, bus: bool = False
 ) -> list[Stopped]:
-    """Give an order to every node that owns devices, all at once; with `bus` stop their buses
-    without waiting for them."""
+    """Give an order to every node that owns devices, all at once; with `bus`, stop their buses
+    without waiting for the nodes."""
     nodes = nodes_with_devices(directory)
     return list(
         await asyncio.gather(*(_order(directory, credentials, n, verb, bus) for n in nodes))
@@ -188,8 +189,8 @@ async def _order(
             if not bus:
                 await _answered(stopped, asking, NODE_LATE)
             if not bus and not stopped.answered:
-                # The processes of its devices look at the latch themselves: they stop although the
-                # node may be frozen.
+                # The processes of its devices check the latch themselves: they stop even if the
+                # node is frozen.
                 stopped.latch = await _latch(directory, node)
             if bus or not stopped.answered:
                 stopped.bus = await _stop_buses(directory, node)
@@ -197,7 +198,7 @@ async def _order(
         if verb == STOP and not stopped.answered:
             stopped.latch = stopped.latch or await _latch(directory, node)
         elif stopped.answered:
-            stopped.latch = ""  # it was only late, and keeps the stop itself
+            stopped.latch = ""  # The node was only late, and stores the stop itself.
         if verb == CLEAR and not stopped.answered and not line.reached:
             stopped.latch, stopped.cleared = await _unlatch(directory, node)
     finally:
@@ -206,7 +207,7 @@ async def _order(
 
 
 async def _answered(stopped: Stopped, asking: asyncio.Task[None], timeout: float) -> None:
-    """Wait for the node's first answer, at most so many seconds."""
+    """Wait for the node's first answer, at most this long (s)."""
     deadline = asyncio.get_running_loop().time() + timeout
     while (
         not stopped.answered and not asking.done() and asyncio.get_running_loop().time() < deadline
@@ -215,7 +216,7 @@ async def _answered(stopped: Stopped, asking: asyncio.Task[None], timeout: float
 
 
 async def _ask(line: EmergencyLine, stopped: Stopped, verb: str) -> None:
-    """Order until all devices stand; the first answer counts for `seconds`."""
+    """Repeat the order until all devices stand still; `seconds` is the time of the first answer."""
     loop = asyncio.get_running_loop()
     begun = loop.time()
     if await line.connect(STANDSTILL):
@@ -233,8 +234,8 @@ async def _ask(line: EmergencyLine, stopped: Stopped, verb: str) -> None:
 
 
 async def _latch(directory: Directory, node: str) -> str:
-    """Keep on disk that the devices of a node are stopped that did not answer: it heeds that when
-    it goes on, or is started."""
+    """Store on disk that the devices of a silent node are stopped; the node obeys when it continues
+    or is started."""
     if not await asyncio.to_thread(is_local, directory.nodes[node].host):
         return (
             f"not latched: {node} is on another host; run `petrobot estop` there before "
@@ -244,12 +245,12 @@ async def _latch(directory: Directory, node: str) -> str:
         path = await asyncio.to_thread(latch_of(directory.source, node).stop, [ALL])
     except LatchError as fault:
         return f"not latched: {fault}; do not start {node} again before the cell is safe"
-    return f"latched: {path} keeps its devices stopped until `petrobot estop --clear` is said"
+    return f"latched: {path} keeps its devices stopped until `petrobot estop --clear`"
 
 
 async def _unlatch(directory: Directory, node: str) -> tuple[str, bool]:
-    """Clear on disk the stop of a node that does not run; what was done in words, and whether it is
-    cleared."""
+    """Clear the stop of a node that is not running on its disk; return what was done, and whether
+    the stop is cleared."""
     if node not in await asyncio.to_thread(still_stopped, directory):
         return "", False
     devices = [name for name, device in directory.devices.items() if device.node == node]
@@ -258,21 +259,21 @@ async def _unlatch(directory: Directory, node: str) -> tuple[str, bool]:
     except LatchError as fault:
         return f"not cleared: {fault}", False
     return (
-        "it does not run; its stop is cleared on disk, so its devices take orders when it is "
+        "it is not running; its stop is cleared on disk, so its devices accept orders when it is "
         "started",
         True,
     )
 
 
 def still_stopped(directory: Directory) -> list[str]:
-    """The nodes of this host whose devices an emergency stop still holds, as their disks say."""
+    """Return the nodes of this host whose devices are still stopped according to their disks."""
     nodes = nodes_with_devices(directory)
     here = [node for node in nodes if is_local(directory.nodes[node].host)]
     return [node for node in here if latch_of(directory.source, node).stopped()]
 
 
 async def _stop_buses(directory: Directory, node: str) -> str:
-    """Stop every CANopen device on the node's buses by NMT; says what was done."""
+    """Stop every CANopen device on the node's buses by NMT; return what was done."""
     buses = buses_of(directory, node)
     if not buses:
         return ""
@@ -295,7 +296,7 @@ def _stop_bus(can: Mapping[str, Any]) -> str:
             for _ in range(BUS_TIMES):
                 port.send(nmt(NmtCommand.STOP))
                 time.sleep(BUS_PAUSE)
-                # what is left unread when a socket closes may cost the other end what we have sent
+                # If a socket is closed with unread bytes, the other end may lose what we have sent.
                 port.receive()
         finally:
             port.close()

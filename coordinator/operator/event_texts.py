@@ -1,4 +1,4 @@
-"""Stimuli and ends of runs in words that an operator reads; pure."""
+"""Describe stimuli and ends of runs for the operator (pure functions)."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ LONGEST_TEXT = 400
 
 
 def place_of(run: str) -> str:
-    """The place of a run's id (`place#3`)."""
+    """Return the place of a run's id (`place#3`)."""
     return run.rpartition("#")[0] or run
 
 
 def told(stimulus: Stimulus | None, cause: str = "") -> str:
-    """What happened. `cause` is that of a firing: `stability` means that it followed from
-    another."""
+    """Describe what happened. `cause` is that of a firing: `stability` means that it followed from
+    another one."""
     if cause == "stability":
         return "followed at once"
     match stimulus:
@@ -67,7 +67,7 @@ def told(stimulus: Stimulus | None, cause: str = "") -> str:
         case RaiseEvent(event):
             return f"event {event}, raised by the operator"
         case TimerFired():
-            return "its time had passed"
+            return "its time has passed"
         case VariableChanged(name):
             return f"{name} changed"
         case AddTokens(place, tokens):
@@ -83,7 +83,7 @@ def told(stimulus: Stimulus | None, cause: str = "") -> str:
         case Pause(reason):
             return f"paused{': ' + reason if reason else ''}"
         case Resume():
-            return "operator let it go on"
+            return "continued by the operator"
         case Step():
             return "operator's step"
         case SetBreakpoints():
@@ -103,7 +103,7 @@ def told(stimulus: Stimulus | None, cause: str = "") -> str:
 
 
 def reason_of(status: Status | None, cause: str, text: str, executed: Executed) -> dict[str, Any]:
-    """Why a run ended as it did: {status, code, text, executed}."""
+    """Return why a run ended as it did: {status, code, text, executed}."""
     return {
         "status": status.value if status is not None else "none",
         "code": cause,
@@ -113,7 +113,7 @@ def reason_of(status: Status | None, cause: str, text: str, executed: Executed) 
 
 
 def plain_value(value: Any, depth: int = 4) -> Any:
-    """A variable's value for people: bytes become their size, long things are cut."""
+    """Return a variable's value for display: bytes as their size, long values shortened."""
     if isinstance(value, bytes):
         return f"{len(value)} bytes"
     if isinstance(value, str):

@@ -1,5 +1,5 @@
-"""Numbers changes, keeps the snapshot that they lead to, and hands them to subscribers: the half of
-a mission port that is the same for every mission."""
+"""Number changes, keep the resulting snapshot, and pass them to subscribers: the part of a mission
+port that is the same for every mission."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ Receive = Callable[[dict[str, Any]], None]
 
 
 class Feed:
-    """The state of a mission as its clients see it. Not for threads: one loop owns it.
+    """The state of a mission as its clients see it. Not thread-safe: it belongs to one event loop.
 
-    `emit` costs some microseconds a subscriber; nothing is encoded or sent in it.
+    `emit` costs some microseconds per subscriber; it encodes and sends nothing.
     """
 
     def __init__(self) -> None:
@@ -24,16 +24,16 @@ class Feed:
 
     @property
     def state(self) -> State:
-        """The state now; look, do not alter."""
+        """The current state; read only."""
         return self._state
 
     @property
     def watched(self) -> bool:
-        """Whether anybody follows."""
+        """Whether there is a subscriber."""
         return bool(self._receivers)
 
     def emit(self, kind: str, *, time: float | None = None, **fields: Any) -> None:
-        """Something changed. `time` is the mission's clock (s); without it the clock stays."""
+        """Publish a change. `time` is the mission's clock (s); without it the clock stays."""
         if kind not in KINDS:
             raise ValueError(f"no change of kind {kind!r}")
         change = {"kind": kind, "sequence": self._state["sequence"] + 1, **fields}
@@ -43,8 +43,8 @@ class Feed:
             receive(change)
 
     def replace(self, **parts: Any) -> None:
-        """Begin anew, as for another mission: clients get a fresh snapshot. Parts not given are
-        empty."""
+        """Start from a new state, as for another mission: clients get a new snapshot. Parts not
+        given are empty."""
         sequence = self._state["sequence"]
         unknown = parts.keys() - self._state.keys()
         if unknown:
@@ -53,11 +53,11 @@ class Feed:
         self.emit("reset")
 
     def snapshot(self) -> dict[str, Any]:
-        """The whole state; later changes do not reach it."""
+        """Return a copy of the whole state."""
         return copy_state(self._state)
 
     def subscribe(self, receive: Receive) -> Callable[[], None]:
-        """Give every later change to `receive`; call what is returned to stop."""
+        """Call `receive` with every later change, until the returned function is called."""
         self._tickets += 1
         ticket = self._tickets
         self._receivers[ticket] = receive

@@ -1,4 +1,5 @@
-"""Journals of mission runs as the page's history: every record with its marking, told in words."""
+"""Journals of mission runs as the page's history: every record with its marking and a
+description."""
 
 from __future__ import annotations
 
@@ -24,20 +25,20 @@ RUNS_AT_MOST = 300
 
 @dataclass(frozen=True, slots=True)
 class JournalHistory:
-    """The runs of one folder (`coordinator.record.runfolder`). Fits
+    """The runs of one folder (`coordinator.run.folder`). Fits
     `coordinator.operator.port.HistoryPort`."""
 
     folder: Path
 
 
 def _runs(folder: str) -> list[dict[str, Any]]:
-    """Every run, newest first: {id, task, state, started (ISO 8601 text), seconds}."""
+    """Return every run, newest first: {id, task, state, started (ISO 8601 text), seconds}."""
     paths = sorted(Path(folder).glob(f"*/{JOURNAL}"), key=lambda p: p.stat().st_mtime, reverse=True)
     return [_listed(path) for path in paths[:RUNS_AT_MOST]]
 
 
 def _run(folder: str, run: str) -> dict[str, Any]:
-    """One run, derived again from its journal: {id, task (as in a snapshot), initial (marking),
+    """Return one run, replayed from its journal: {id, task (as in a snapshot), initial (marking),
     records}."""
     if run not in {path.parent.name for path in Path(folder).glob(f"*/{JOURNAL}")}:
         raise RefusedError(404, "no such run")
@@ -45,7 +46,7 @@ def _run(folder: str, run: str) -> dict[str, Any]:
 
 
 def _listed(path: Path) -> dict[str, Any]:
-    """What the list of runs says of one; the journal itself is read only when it is opened."""
+    """Return the entry of a run in the list; its journal is read only when it is opened."""
     entry: dict[str, Any] = {
         "id": path.parent.name,
         "task": "",
@@ -68,8 +69,8 @@ def _listed(path: Path) -> dict[str, Any]:
 
 
 def opened(path: Path, run: str) -> dict[str, Any]:
-    """A journal as the page's history. A journal that cannot be derived again says so in `fault`,
-    with what could be."""
+    """Return a journal as the page's history. If it cannot be replayed, `fault` has the reason, and
+    the records hold what could be."""
     try:
         journal = read_journal(path)
         task = task_of(journal)
@@ -104,7 +105,7 @@ def opened(path: Path, run: str) -> dict[str, Any]:
 
 
 def _source(header: Mapping[str, Any]) -> dict[str, Any] | None:
-    """From which point of which run this one set out."""
+    """Return the recorded run, and its point, from which this one started."""
     source = header.get("from")
     return (
         {key: source[key] for key in ("run", "record", "going") if key in source}
@@ -114,11 +115,11 @@ def _source(header: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def task_of(journal: Journal) -> Task:
-    """The task that a journal ran, with the number of runs that it was given.
+    """Return the task of a journal with its number of runs.
 
-    Its flat net is the recorded one, so that a later petrobot, which may expand short forms in
-    another way, derives the same run again. Journals without one are expanded now. Raises
-    TaskFileError, KeyError.
+    Its flat net is the recorded one, so that a later petrobot that expands short forms in another
+    way still replays the same run. Journals without one are expanded now. Raises TaskFileError,
+    KeyError.
     """
     from petrobot.coordinator.launch import with_runs
 
@@ -141,7 +142,7 @@ def _devices(journal: Journal) -> dict[str, str]:
 
 
 class _Teller:
-    """Turns steps into records; keeps which run had which action, for the reasons of firings."""
+    """Converts steps to records; keeps the action of each run, for the reasons of firings."""
 
     def __init__(self, task: Task) -> None:
         self._places = task.net.places
@@ -155,8 +156,8 @@ class _Teller:
         }
 
     def record(self, step: RecordedStep) -> dict[str, Any]:
-        """{number, t, text, firings, marking (what changed), notes, error, going (places whose runs
-        go on)}."""
+        """Return {number, t, text, firings, marking (changed places), notes, error, going (places
+        with active runs)}."""
         firings, notes = [], []
         for instruction in step.instructions:
             if isinstance(instruction, StartRun):

@@ -1,5 +1,5 @@
-"""A task as the page draws it: plain data of places, transitions and arcs with all that they mean;
-pure."""
+"""A task as the page draws it: places, transitions and arcs with their properties as plain data
+(pure functions)."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from petrobot.coordinator.task import (
 
 
 def picture(task: Task) -> dict[str, Any]:
-    """The snapshot's `task`: the flat net (its names are those of markings and firings) and the
-    macro places above it. `made_from` names the element that stands for one of a short form: it
-    is drawn in its place."""
+    """Return the snapshot's `task`: the flat net (with the names used in markings and firings) and
+    its macro places. `made_from` of an element names the short form that it was made from, which is
+    drawn instead."""
     flat = task.flat
     errors = flat.error_elements
     macros = dict(_macros(task, task.places, ""))
@@ -48,7 +48,7 @@ def picture(task: Task) -> dict[str, Any]:
 def _macros(
     task: Task, places: Mapping[str, Place], prefix: str
 ) -> Iterator[tuple[str, tuple[Place, str]]]:
-    """Each macro place by its full name, with the full name of the one around it."""
+    """Return each macro place by its full name, with the full name of the one around it."""
     for place in places.values():
         if place.kind is Kind.MACRO:
             around = prefix + place.macro if place.macro else prefix.removesuffix(".")

@@ -1,8 +1,8 @@
-"""What operators see beside the net: how nodes and devices are, what cameras see, how old set
-points are, what is learned.
+"""What operators see apart from the net: states of nodes and devices, camera images, ages of set
+points, and learning.
 
-Nodes are asked only while somebody looks, a few times a second; what they answer goes to the feed
-as plain data.
+Nodes are polled a few times a second, only while a client is watching; their answers are published
+on the feed as plain data.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from petrobot.coordinator.task import Task
 from petrobot.services.comm.protocol.messages import Command, Feedback
 
 POLL = 0.2
-"""Seconds between questions to a node, each asked only when the one before is answered."""
+"""Time between requests to a node (s); each is sent only after the answer to the one before."""
 PATIENCE = 2.0
-"""Seconds after which a question that was not answered is asked again."""
+"""Time after which an unanswered request is repeated (s)."""
 CURVE_KEPT = 500
-"""Trials that a learning curve shows."""
+"""Number of trials in a learning curve."""
 IN_CURVES = {"probability": "probability", "j": "J"}
-"""Figures of the alternatives that have a curve, and how they are called on it."""
+"""Figures of the alternatives that have a curve, and their names on it."""
 
 
 def shown_selectors(task: Task, selector: FirstAlternative) -> dict[str, Any]:
-    """Every primitive task's alternatives with what is known of them."""
+    """Return every primitive task's alternatives with their estimates."""
     return {
         name: {"alternatives": shown_alternatives(task, selector, name), "override": None}
         for name in task.primitive_tasks
@@ -39,27 +39,27 @@ def shown_selectors(task: Task, selector: FirstAlternative) -> dict[str, Any]:
 
 
 def shown_alternatives(task: Task, selector: FirstAlternative, name: str) -> list[dict[str, Any]]:
-    """The alternatives of one primitive task: {action, probability, reliability, cost, j}, as far
-    as known."""
+    """Return the alternatives of one primitive task: {action, probability, reliability, cost, j},
+    as far as known."""
     figures = selector.figures(name)
     return [{"action": a, **figures.get(a, {})} for a in task.primitive_tasks[name].alternatives]
 
 
 class WatchedShell(Protocol):
-    """What drives a mission run: its clock, and the way to the nodes."""
+    """Interface to the driver of a mission run: its clock, and sending to nodes."""
 
     mission: Mission
 
     def now(self) -> float:
-        """The mission's clock (s)."""
+        """Return the mission's clock (s)."""
 
     def flush(self, node: str) -> None:
-        """Send what was said to a node."""
+        """Send the messages to a node."""
 
 
 class Watching:
-    """Asks the nodes and observes the executor for one mission run; `watched` says whether anybody
-    looks."""
+    """Polls the nodes and observes the executor for one mission run; `watched` tells whether a
+    client is watching."""
 
     def __init__(
         self,
@@ -79,23 +79,23 @@ class Watching:
         self._watched = watched
         self._numbers = 0
         self._asked: dict[tuple[str, str], float] = {}
-        """When each node was asked what it has not answered yet."""
+        """When each node was sent the requests that it has not answered yet."""
         self._curves: dict[str, list[dict[str, float]]] = {}
         self._mission.executor.on_status = self._told
         self._polling = asyncio.get_running_loop().create_task(self._poll())
 
     async def close(self) -> None:
-        """Ask the nodes no more."""
+        """Stop asking the nodes."""
         self._polling.cancel()
         await asyncio.gather(self._polling, return_exceptions=True)
 
-    # --- questions ----------------------------------------------------------------------------
+    # --- requests -----------------------------------------------------------------------------
 
     def ask(self, node: str, verb: str) -> None:
-        """Send a node an operator's command that is no stimulus: nothing waits for its answer."""
+        """Send a node a command that is not a stimulus: nothing waits for its answer."""
         self._numbers += 1
         now = self._shell.now()
-        epoch = self._mission.callers[node].hello.epoch  # a resumed run counts from 1 again
+        epoch = self._mission.callers[node].hello.epoch  # A resumed run counts from 1 again.
         id_ = f"{self._mission.executor.mission}/{epoch}/operator/{verb}#{self._numbers}"
         self._mission.callers[node].command(now, Command(id_, verb))
         self._shell.flush(node)
@@ -118,7 +118,8 @@ class Watching:
             self._feed.emit("node", name=node, node=entry)
 
     def _question(self, node: str, verb: str) -> None:
-        """Ask unless an answer is still to come: a node that is busy is not asked ever more."""
+        """Send a request unless an answer is outstanding, so that requests to a busy node do not
+        pile up."""
         now = asyncio.get_running_loop().time()
         if now - self._asked.get((node, verb), -PATIENCE) >= PATIENCE:
             self._asked[node, verb] = now
@@ -127,7 +128,7 @@ class Watching:
     # --- answers ------------------------------------------------------------------------------
 
     def _told(self, data: Mapping[str, Any]) -> None:
-        """A node's answer about its devices: their states, or the pictures of those that see."""
+        """Handle a node's answer about its devices: their states, or camera images."""
         answers, devices = dict(data.get("answers", {})), dict(data.get("devices", {}))
         for name, about in devices.items():
             entry = self._directory.devices.get(name)
@@ -159,7 +160,7 @@ class Watching:
         self._setpoint(name, state.get("setpoint_age"))
 
     def _setpoint(self, device: str, age: object) -> None:
-        """How old the newest set point of the device's stream is, while one is followed."""
+        """Return the age of the newest set point of the device's stream while it is used."""
         if not isinstance(age, float) or not isfinite(age):
             return
         now = self._shell.now() - self._origin
@@ -169,17 +170,19 @@ class Watching:
                     "setpoint", stream=stream.name, samples=[[round(now, 3), round(age, 6)]]
                 )
 
-    # --- an observer of the executor: what is learned -----------------------------------------
+    # --- an observer of the executor: learning ------------------------------------------------
 
     def instruction(self, now: float, instruction: Instruction) -> None:
-        """Show what was learned of a run's end."""
+        """Show what was learned from a run's result."""
         if isinstance(instruction, RunRecorded):
             self._learned(instruction.primitive_task)
-        elif isinstance(instruction, Corrected):  # no trial more, so nothing is added to the curves
+        elif isinstance(
+            instruction, Corrected
+        ):  # This is not another trial, so nothing is added to the curves.
             self._shown(self._mission.executor.task.primitive_task_of(instruction.place).name)
 
     def _shown(self, name: str) -> list[dict[str, Any]]:
-        """Show what is known of the alternatives of a primitive task now."""
+        """Show the current estimates of the alternatives of a primitive task."""
         if not self._selector.figures(name):
             return []
         shown = shown_alternatives(self._mission.executor.task, self._selector, name)
@@ -196,7 +199,7 @@ class Watching:
                 )
 
     def _curve(self, name: str, figure: str, word: str, values: dict[str, float]) -> None:
-        """One more trial of a primitive task on one of its curves."""
+        """Add a trial of a primitive task to one of its curves."""
         key = name if word == "probability" else f"{name}: {word}"
         rows = [*self._curves.get(key, []), values]
         trial = (
@@ -221,10 +224,10 @@ class Watching:
         self._feed.emit("report", name=key, report=report)
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
-        """Nothing to show that the narrator does not tell."""
+        """Do nothing: the narrator reports it."""
 
     def progress(self, now: float, run: str, notice: Feedback) -> None:
-        """Nothing to show that the narrator does not tell."""
+        """Do nothing: the narrator reports it."""
 
     def settled(self, now: float, state: State) -> None:
-        """Nothing to show that the narrator does not tell."""
+        """Do nothing: the narrator reports it."""

@@ -1,7 +1,7 @@
-"""What the page needs of a mission: a snapshot, its numbered changes, and commands; all plain data.
+"""Interface between the page and a mission: a snapshot, its numbered changes, and commands, all as
+plain data.
 
-The shapes are written out in docs/operator-protocol.md, which is also what browsers and the command
-line speak.
+docs/operator-protocol.md defines the format, which browsers and the command line use, too.
 """
 
 from __future__ import annotations
@@ -34,50 +34,50 @@ VERBS = frozenset(
         "override_selector",
     }
 )
-"""All commands. Anybody may say `estop`, `take_controls`, `ask_controls` and `release_controls` (a
-no-op for one who does not hold them); the others are for the holder of the controls."""
+"""All commands. Every client may give `estop`, `take_controls`, `ask_controls` and
+`release_controls` (which does nothing without the controls); the others need the controls."""
 
 
 class MissionPort(Protocol):
-    """A mission as the page sees it. All methods are called in the coordinator's own loop and give
-    plain JSON data."""
+    """A mission as the page sees it. All methods are called in the coordinator's event loop and
+    return plain JSON data."""
 
     def snapshot(self) -> dict[str, Any]:
-        """The whole state now, with `sequence`, the number of the last change in it."""
+        """Return the whole state with `sequence`, the number of the last change in it."""
 
     def subscribe(self, receive: Callable[[dict[str, Any]], None]) -> Callable[[], None]:
-        """Give every later change to `receive`, numbered without gaps; call what is returned to
-        stop.
+        """Call `receive` with every later change, numbered without gaps, until the returned
+        function is called.
 
-        `receive` never blocks and never raises. A change must not be altered after it was given
-        out.
+        `receive` never blocks and never raises. A change must not be modified after it was passed
+        on.
         """
 
     async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> dict[str, Any]:
-        """Carry out a command; answers after it is journaled: {"ok": True, ...} or {"ok": False,
+        """Carry out a command; return after it is journaled: {"ok": True, ...} or {"ok": False,
         "code", "text"}."""
 
 
 class HistoryPort(Protocol):
-    """Where the page finds finished and running journals."""
+    """Journals of finished and active runs for the page."""
 
     @property
     def folder(self) -> Path:
-        """Where each run has a folder of its own."""
+        """The folder that has a folder for each run."""
 
 
 class StartsPort(Protocol):
-    """What may be asked for when a task is started."""
+    """Options of the start of a task."""
 
     def __call__(self, name: str, /) -> Awaitable[Mapping[str, Any]]:
-        """{task, runs ({default, place} or None), seed, modes, parameters: [{name, type, default,
-        text}], learn: {selectors, selector, contexts, estimates}} of a task file. Raises
+        """Return {task, runs ({default, place} or None), seed, modes, parameters: [{name, type,
+        default, text}], learn: {selectors, selector, contexts, estimates}} of a task file. Raises
         StoreError, TaskFileError."""
 
 
 class OffersPort(Protocol):
-    """What the nodes offer now, for the designer."""
+    """Current offers of the nodes, for the designer."""
 
     def __call__(self) -> Sequence[Mapping[str, Any]]:
-        """One entry for each action: {action, primitive_task, node, device, args ({name: default}),
-        up}."""
+        """Return one entry for each action: {action, primitive_task, node, device, args ({name:
+        default}), up}."""

@@ -1,5 +1,5 @@
-"""Tells a mission run as changes of the page's state: an observer of the executor, and of journals
-read back."""
+"""Publish a mission run as changes of the page's state: an observer of the executor, and of
+replayed journals."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ _LEVEL = {Severity.NOTE: "info", Severity.WARNING: "warning", Severity.ERROR: "e
 
 
 class Narrator:
-    """Fills a feed. `where` gives the node of each action. Fits
-    `coordinator.mission.executor.Observer`.
+    """Publishes changes on a feed. `where` gives the node of each action. Implements
+    `coordinator.run.interfaces.Observer`.
 
-    `settled` is to be called after each stimulus that the engine has handled, with the new state:
-    it tells what no instruction says (latched events, variables, breakpoints).
+    Call `settled` with the new state after each stimulus that the engine has handled: it publishes
+    what no instruction reports (latched events, variables, breakpoints).
     """
 
     def __init__(
@@ -91,11 +91,11 @@ class Narrator:
         }
 
     def begin(self, mission: str, mode: str, *, starts: bool = True, **parts: Any) -> None:
-        """A mission run begins: clients get a snapshot with the task at its initial marking.
+        """Begin a mission run: clients get a snapshot with the task in its initial marking.
 
-        `starts` says whether another mission run can be started when this one has ended. `parts`
-        are further parts of the snapshot that outlive a mission run, such as `controls`, `nodes`
-        and `selectors`.
+        `starts` tells whether another mission run can be started after this one. `parts` are
+        further parts of the snapshot that outlive a mission run, such as `controls`, `nodes` and
+        `selectors`.
         """
         flat = self.task.flat
         events = {
@@ -123,10 +123,10 @@ class Narrator:
         }
         self.feed.replace(**(state | parts))
 
-    # --- what the executor tells --------------------------------------------------------------
+    # --- an observer of the executor ----------------------------------------------------------
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
-        """The engine takes a stimulus in."""
+        """Publish a stimulus that the engine receives."""
         time = now - self.origin
         self._stimulus = stimulus
         if isinstance(stimulus, RunEnded):
@@ -146,19 +146,19 @@ class Narrator:
             self._answered(time, stimulus)
 
     def instruction(self, now: float, instruction: Instruction) -> None:
-        """The engine gave an instruction or a record."""
+        """Publish an instruction or a record of the engine."""
         tell = self._tell.get(type(instruction))
         if tell is not None:
             tell(now - self.origin, instruction)
 
     def progress(self, now: float, run: str, notice: Feedback) -> None:
-        """A run says how far it is."""
+        """Publish the progress of a run."""
         self.feed.emit(
             "run_progress", time=now - self.origin, id=run, progress=round(notice.fraction, 4)
         )
 
     def settled(self, now: float, state: State) -> None:
-        """The engine has handled a stimulus."""
+        """Publish what changed after the engine has handled a stimulus."""
         time, seen = now - self.origin, self._seen
         if seen is None or seen.flags != state.flags:
             self._flags(time, seen.flags if seen else frozenset(), state.flags)
@@ -188,7 +188,7 @@ class Narrator:
         self._seen = state
 
     def adopt(self, now: float, state: State) -> None:
-        """Take over a state that another process left: all of it is told."""
+        """Take over and publish the whole state that another process left."""
         time = now - self.origin
         self._marking(time, (-1,) * len(state.marking), state.marking)
         self.feed.emit("mission", time=time, mission={"firings": state.firings})
@@ -212,7 +212,7 @@ class Narrator:
             self._paused(time, Paused("as another process left it"))
         self.settled(now, state)
 
-    # --- in the words of the protocol ---------------------------------------------------------
+    # --- in the terms of the protocol ---------------------------------------------------------
 
     def _fired(self, time: float, fired: Fired) -> None:
         ends = [self._ends[run] for run in fired.runs if run in self._ends]
@@ -270,7 +270,7 @@ class Narrator:
         before = self._held.get(node, Hold.HELD.value)
         self._held[node] = (
             before if before == Hold.CANNOT.value else held.answer.value
-        )  # the worst of a node's runs
+        )  # the worst answer among a node's runs
         paused = self.feed.state["paused"]
         if paused is not None:
             self.feed.emit("paused", time=time, paused={**paused, "nodes": dict(self._held)})
@@ -317,7 +317,7 @@ class Narrator:
         state = "aborted" if self._aborted else finished.status.value
         self.feed.emit("paused", time=time, paused=None)
         if self.feed.state["mission"]["state"] == "stopped":
-            return  # the emergency stop stands until it is cleared, whatever the run came to
+            return  # The emergency stop holds until it is cleared, whatever the run's result.
         self.feed.emit("mission", time=time, mission={"state": state, "reason": finished.reason})
 
     def _flags(self, time: float, before: frozenset[str], after: frozenset[str]) -> None:

@@ -1,10 +1,10 @@
-"""One mission run, from what is asked for to its result. The command line and the page both start
-and lead their runs through it.
+"""One mission run, from the request to its result. The command line and the page both start and
+control their runs with it.
 
     prepare, prepare_from or resume  ->  connect  ->  operate  ->  lead  ->  result
 
-`prepare` opens what the run learns into and its journal; `connect` reaches the nodes (real time);
-`operate` lets operators see and steer it; `lead` runs it to its end, saves what was learned and
+`prepare` opens the estimates and the journal of the run; `connect` reaches the nodes (real time);
+`operate` lets operators see and control it; `lead` runs it to its end, saves what was learned and
 closes the journal. A run that cannot be led after `prepare` is given up with `abandon`.
 docs/decisions/one-session.md says what this replaced.
 """
@@ -82,16 +82,16 @@ MODES: Final = (REALTIME, LOCKSTEP)
 SEED: Final = 1
 ONE_PROCESS, LAUNCHED, JOINED = "one process", "launched", "joined"
 """Where the nodes of a lock-step cell run: in this process, in processes that the session launches
-and ends, or in processes that wait for it already (`petrobot up --lockstep`)."""
+and ends, or in processes that are already waiting (`petrobot up --lockstep`)."""
 SLICE: Final = 0.008
-"""Seconds of wall time that a lock-step cell may tick before the event loop serves others."""
+"""Longest wall time for which a lock-step cell ticks before the event loop serves others (s)."""
 TELL: Final = 0.1
-"""Seconds of wall time between two reports of the simulated time, and of the progress."""
+"""Wall time between two reports of the simulated time and of the progress (s)."""
 AHEAD: Final = 0.01
-"""Seconds of wall time by which a paced lock-step run may be ahead before it waits."""
+"""Wall time by which a paced lock-step run may be ahead before it waits (s)."""
 
 Watch = Callable[[Mission, float], None]
-"""Receives the mission and its clock (s) now and then, to show progress."""
+"""Called regularly with the mission and its clock (s), to show progress."""
 
 _log = logging.getLogger(__package__)
 
@@ -103,35 +103,35 @@ class RecordedPoint:
     run: str
     record: int
     going: Mapping[str, str] | str = AGAIN
-    """What becomes of the runs that were active then: one word for all, or words by place."""
+    """What happens to the runs that were active then: one word for all, or words by place."""
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What a mission run is asked for, by the options of `petrobot run` or by the page."""
+    """Request for a mission run, from the options of `petrobot run` or from the page."""
 
     mode: str = REALTIME
     runs: int | None = None
-    """None: as many as the task file says."""
+    """Number of runs; None: the number in the task file."""
     seed: int | None = SEED
-    """None, with `start`: that of the recorded run."""
+    """Seed; None with `start`: that of the recorded run."""
     parameters: Mapping[str, Any] = field(default_factory=dict)
     chosen: Mapping[str, str] = field(default_factory=dict)
     """Actions that the user fixed, by primitive task."""
     learning: LearningSetting | None = None
-    """`chosen` and the declared compute times of lock step are filled in by the session."""
+    """The session fills in `chosen` and the declared compute times of lock step."""
     pace: float = 1.0
-    """In lock step: simulated seconds per second at most; 0: as fast as possible."""
+    """In lock step: highest number of simulated seconds per second; 0: as fast as possible."""
     start: RecordedPoint | None = None
-    """Where a simulated run starts, if not at the task's beginning."""
+    """Recorded point at which a simulated run starts; None: the task's beginning."""
     folder: Path | None = DEFAULT
-    """The run gets a folder of its own in this one; None: nothing is kept (lock step only)."""
+    """The run gets its own folder in this one; None: nothing is stored (lock step only)."""
     durable: bool = False
     """Sync the journal before every start, also of actions that move no hardware."""
     mock: Path | None = None
     """File of scripted actions."""
     nodes: str = ONE_PROCESS
-    """Of a lock-step cell: ONE_PROCESS, LAUNCHED or JOINED."""
+    """Kind of lock-step cell: ONE_PROCESS, LAUNCHED or JOINED."""
 
 
 def prepare(request: RunRequest, task: Task, text: str, directory: Directory) -> RunSession:
@@ -141,6 +141,7 @@ def prepare(request: RunRequest, task: Task, text: str, directory: Directory) ->
     Raises EstimatesError or RequestError for what it cannot learn or replace, JournalError or
     OSError when its journal cannot be written, KeyFileError. No folder is left behind then.
     """
+    _refuse_too_many(request.runs, task)
     seed = SEED if request.seed is None else request.seed
     learning = None
     physics = _physics(directory)
@@ -167,6 +168,17 @@ def prepare(request: RunRequest, task: Task, text: str, directory: Directory) ->
         {"chosen": dict(request.chosen), **more},
         learning,
     )
+
+
+def _refuse_too_many(runs: int | None, task: Task) -> None:
+    """Raise RequestError if the place of the runs does not hold so many tokens."""
+    place = task.places.get(task.runs_place)
+    most = None if place is None else place.capacity
+    if runs is not None and most is not None and runs > most:
+        raise RequestError(
+            f"runs: expected at most {most}, the capacity of {task.runs_place!r}, found {runs}; "
+            f"ask for fewer, or raise places.{task.runs_place}.capacity in the task file"
+        )
 
 
 def prepare_from(request: RunRequest, found: Recorded) -> RunSession:
@@ -201,7 +213,7 @@ def prepare_from(request: RunRequest, found: Recorded) -> RunSession:
 
 def resume(found: Recorded) -> RunSession:
     """Continue a run whose coordinator was killed. A lock-step cell that ended with its coordinator
-    is made again from its seed; nodes that wait for their coordinator are joined.
+    is built again from its seed; nodes that wait for their coordinator are joined.
 
     Raises EstimatesError, RequestError, JournalError, ReplayError, KeyFileError.
     """
@@ -245,7 +257,7 @@ def _physics(directory: Directory) -> str:
 
 
 def _refuse_other_physics(found: Recorded) -> None:
-    """Raise RequestError if a recorded run would go on in a laboratory with another physics."""
+    """Raise RequestError if a recorded run would continue in a laboratory with another physics."""
     then, now = found.journal.header.get("physics", ""), _physics(found.directory)
     if now and not same_physics(then, now):
         raise RequestError(
@@ -264,9 +276,9 @@ def _new(
     more: Mapping[str, Any],
     learning: LearningSession | None,
 ) -> RunSession:
-    """A run that no journal knows yet; `texts` are those of the task file and of services.toml."""
+    """Make a new run; `texts` are those of the task file and of services.toml."""
     lockstep = request.mode == LOCKSTEP
-    script = scripted_actions(request.mock, directory)  # refused before a folder is made
+    script = scripted_actions(request.mock, directory)  # Refused before a folder is made.
     physics = _physics(directory)
     identity = mission_id(setting.task)
     folder = None if request.folder is None else request.folder / identity
@@ -312,8 +324,8 @@ def _new(
 
 
 class RunSession(ABC):
-    """One mission run: connect, operate, lead, result. Use `prepare`, `prepare_from` or `resume` to
-    make one."""
+    """One mission run: connect, operate, lead, result. Make it with `prepare`, `prepare_from` or
+    `resume`."""
 
     mode: ClassVar[str]
 
@@ -327,7 +339,7 @@ class RunSession(ABC):
         *,
         resumed: bool = False,
     ) -> None:
-        """`timeline` is one that has seen the recorded steps of a resumed run already."""
+        """`timeline` already holds the recorded steps of a resumed run."""
         self.mission = mission
         self.selector = selector
         self.folder = folder
@@ -337,7 +349,8 @@ class RunSession(ABC):
             mission.executor.observers.append(self.timeline)
         self.operation: Operation | None = None
         self.door: Door | None = None
-        """Where the run can be steered; its address stands in the run's folder while it is led."""
+        """Where the run can be controlled; the address is in the run's folder while the run is
+        active."""
         self.origin: Mapping[str, Any] = {}
         """The point of a recorded run at which this one started."""
         self._learning = learning
@@ -358,9 +371,9 @@ class RunSession(ABC):
         stops: Collection[str] = (),
         choices: Mapping[str, str] | None = None,
     ) -> Operation:
-        """Let operators see and steer it. `feed`, `controls` and `starts` as for `Operation`;
+        """Let operators see and control it. `feed`, `controls` and `starts` as for `Operation`;
         `stops` are breakpoints, `choices` the alternatives that the operator fixed by primitive
-        task, both from the beginning."""
+        task, both from the start."""
 
     def _operated(
         self, operation: Operation, stops: Collection[str], choices: Mapping[str, str] | None
@@ -372,11 +385,11 @@ class RunSession(ABC):
 
     @abstractmethod
     async def connect(self) -> None:
-        """Reach every node. Raises UnreachableError (real time only: in lock step the cell comes
-        together when it is led)."""
+        """Connect to every node. Raises UnreachableError (only in real time: in lock step the cell
+        forms when it is led)."""
 
     async def lead(self, watch: Watch | None = None) -> None:
-        """Lead it to its end; also when it fails, what was learned is saved and the journal closed.
+        """Run it to its end; even if it fails, what was learned is saved and the journal is closed.
 
         Raises MissionError, JournalError, ReplayError, CellError, LaunchError, EstimatesError.
         """
@@ -400,8 +413,8 @@ class RunSession(ABC):
         _log.info("run %s: finished, %s", self.identity, self.result()["status"])
 
     async def abandon(self) -> None:
-        """Give up a run that was never led: a new one leaves no folder, a resumed one stays as it
-        was. Does nothing once it has been led."""
+        """Give up a run that was not led: a new one leaves no folder, a resumed one stays as it
+        was. Does nothing after `lead`."""
         if self._led:
             return
         self._led = True
@@ -413,12 +426,12 @@ class RunSession(ABC):
             shutil.rmtree(self.folder, ignore_errors=True)
 
     def result(self) -> dict[str, Any]:
-        """The result, once it has been led; also of a run that failed."""
+        """Return the result after `lead`; also of a run that failed."""
         origin = {"from": dict(self.origin)} if self.origin else {}
         return {**self.mission.result(self.mode, self._seconds), **self._learned, **origin}
 
     def keep_result(self) -> None:
-        """Write the result beside the journal. Raises OSError."""
+        """Write the result next to the journal. Raises OSError."""
         if self.folder is not None:
             text = json_text(self.result(), indent=2, ensure_ascii=False) + "\n"
             write_whole(self.folder / RESULT, text)
@@ -429,7 +442,7 @@ class RunSession(ABC):
 
     @abstractmethod
     async def _lead(self, watch: Watch | None) -> None:
-        """Run it to its end, `_first` before all else."""
+        """Run it to its end, with `_first` before anything else."""
 
     @abstractmethod
     async def _leave(self) -> None:
@@ -441,7 +454,8 @@ class RunSession(ABC):
             store.writer.close()
 
     def _saved(self, session: LearningSession) -> dict[str, Any]:
-        """Save what it learned, also when it was interrupted: what the result says of it."""
+        """Save what it learned, also after an interruption; return the part of the result about
+        it."""
         make_folder(session.setting.path.parent)
         counted = session.save(interrupted=self.mission.stage is not Stage.OVER)
         learning, values = session.learning, session.selector.context
@@ -465,7 +479,7 @@ class RunSession(ABC):
 
 
 class RealtimeSession(RunSession):
-    """A run over the nodes of the cell, on the wall clock."""
+    """A run with the nodes of the cell in wall-clock time."""
 
     mode = REALTIME
 
@@ -493,12 +507,12 @@ class RealtimeSession(RunSession):
         stops: Collection[str] = (),
         choices: Mapping[str, str] | None = None,
     ) -> Operation:
-        """Let operators see and steer it."""
+        """Let operators see and control it."""
         operation = Operation(self.shell, self.selector, feed, controls, starts=starts)
         return self._operated(operation, stops, choices)
 
     async def connect(self) -> None:
-        """Reach every node. Raises UnreachableError."""
+        """Connect to every node. Raises UnreachableError."""
         await self.shell.connect()
 
     async def _lead(self, watch: Watch | None) -> None:
@@ -557,7 +571,7 @@ class LockstepSession(RunSession):
         stops: Collection[str] = (),
         choices: Mapping[str, str] | None = None,
     ) -> Operation:
-        """Let operators see and steer it: only a cell in this process can be."""
+        """Let operators see and control it, which is possible only for a cell in this process."""
         assert self.shell is not None
         operation = Operation(
             self.shell, self.selector, feed, controls, starts=starts, mode=LOCKSTEP
@@ -578,7 +592,7 @@ class LockstepSession(RunSession):
                 await asyncio.to_thread(self._lead_member)
 
     async def connect(self) -> None:
-        """Do nothing: the cell comes together when it is led."""
+        """Do nothing: the cell forms when it is led."""
 
     async def _leave(self) -> None:
         """Do nothing: the cell has ended with the run."""
@@ -617,10 +631,10 @@ def interruptible() -> Iterator[None]:
 
 class SlicedCell:
     """A lock-step cell in this process that ticks in slices of the event loop, at a pace, so that
-    operators see the run and step in as in real time.
+    operators see and control the run as in real time.
 
-    Nothing of the lock step depends on the slices, the pace or who watches. While the net is paused
-    and every node has answered, simulated time stands still. Implements `commands.Shell`.
+    Nothing in lock step depends on the slices, the pace or the clients. While the net is paused and
+    every node has answered, simulated time does not advance. Implements `commands.Shell`.
     """
 
     def __init__(self, cell: LockStepCell, party: CoordinatorParty, pace: float) -> None:
@@ -632,7 +646,7 @@ class SlicedCell:
         self._fault: Exception | None = None
 
     def now(self) -> float:
-        """Simulated time (s)."""
+        """Return the simulated time (s)."""
         return self._cell.now
 
     def settle(self) -> None:
@@ -649,7 +663,7 @@ class SlicedCell:
 
     @property
     def still(self) -> bool:
-        """Whether time stands still: the net is paused and no node has to answer any more."""
+        """Return whether time does not advance: the net is paused and every node has answered."""
         state = self.mission.executor.state
         return (
             state.mode is Mode.PAUSED
@@ -661,7 +675,7 @@ class SlicedCell:
         """Tick until the mission run is finished; report its time on the feed. Raises MissionError,
         JournalError, CellError."""
         told = begun = time.perf_counter()
-        paused = 0.0  # wall time that does not count for the pace
+        paused = 0.0  # wall time that the pace ignores
         while not self._party.over:
             if self._fault is not None:
                 raise self._fault
@@ -689,7 +703,7 @@ class SlicedCell:
             feed.emit("mission", time=self.now(), mission={})
 
     def _rest(self, begun: float) -> float:
-        """How long to leave the loop to others (s)."""
+        """Return how long to leave the event loop to others (s)."""
         if not self._pace or self._party.over:
             return 0.0
         return max(0.0, self.now() / self._pace - (time.perf_counter() - begun))

@@ -1,7 +1,7 @@
-"""The form with which an operator starts a run on the page: offered with types and defaults, read
-from plain data, refused with the field that is wrong.
+"""The form with which an operator starts a run on the page: its fields with types and defaults,
+reading it from plain data, and refusals that name the wrong field.
 
-The page can ask for what `petrobot run` can: real time or lock step, number of runs, seed, the
+The page offers the options of `petrobot run`: real time or lock step, number of runs, seed, the
 task's own parameters, learning into an estimates file; and, in lock step, a point of a recorded run
 to start from.
 """
@@ -34,10 +34,9 @@ from petrobot.coordinator.operator.start_from import AGAIN
 from petrobot.coordinator.page.task_store import StoreError, TaskStore
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import loads
+from petrobot.services.host.command_line import LARGEST_SEED, MOST_RUNS
 
 LONGEST_TEXT: Final = 10_000
-MOST_RUNS: Final = 1_000_000
-LARGEST_SEED: Final = 2**63 - 1
 SUFFIX: Final = ".db"
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,63}")
 _KINDS: Final = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
@@ -48,8 +47,8 @@ _KNOWN: Final = frozenset(
 
 
 def read_start(task: Task, data: Mapping[str, Any], estimates: Path) -> RunRequest:
-    """What a client asked for; `estimates` is the folder of estimates files. Raises ValueError that
-    names the field, what is wrong with it, and what would do."""
+    """Read a client's request; `estimates` is the folder of estimates files. Raises ValueError with
+    the field, the fault and the remedy."""
     _refuse_unknown(data)
     mode = data.get("mode") or REALTIME
     if mode not in MODES:
@@ -70,8 +69,8 @@ def read_start(task: Task, data: Mapping[str, Any], estimates: Path) -> RunReque
 
 
 def read_depart(task: Task, data: Mapping[str, Any]) -> RunRequest:
-    """A start with `from`: {run, record, going}; without a seed, that of the recorded run. Raises
-    ValueError."""
+    """Read a start with `from`: {run, record, going}; the default seed is that of the recorded run.
+    Raises ValueError."""
     _refuse_unknown(data)
     source = data["from"]
     if not isinstance(source, Mapping) or not isinstance(source.get("run"), str):
@@ -103,7 +102,7 @@ def read_depart(task: Task, data: Mapping[str, Any]) -> RunRequest:
 
 
 def read_parameters(task: Task, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameters that a client gave, in the task's own types. Raises ValueError."""
+    """Return a client's parameters in the types of the task. Raises ValueError."""
     made = {}
     for name, value in given.items():
         if name not in task.parameters:
@@ -123,7 +122,7 @@ def read_parameters(task: Task, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def start_form(task: Task, text: str, estimates: Path) -> dict[str, Any]:
-    """What may be asked for when this task is started, with types and defaults; `text` is the task
+    """Return the options for starting this task, with types and defaults; `text` is the task
     file's."""
     place = task.places.get(task.runs_place) if task.runs_place else None
     remarks = _remarks(text)
@@ -162,7 +161,7 @@ def _refuse_unknown(data: Mapping[str, Any]) -> None:
 
 
 def _shown(value: Any) -> str:
-    """A value for a refusal: what came from outside is cut, however long or deep it is."""
+    """Return a value for an error message, shortened, however long or deep it is."""
     return _SHORT.repr(value)
 
 
@@ -235,7 +234,7 @@ def _learn(given: Any, folder: Path) -> LearningSetting:
 
 
 def _remarks(text: str) -> dict[str, str]:
-    """The comments behind the task file's parameters: what they mean, in its author's words."""
+    """Return the comments on the task file's parameters, in which its author explains them."""
     try:
         table = tomlkit.parse(text)["task"]["parameters"]
     except (TOMLKitError, KeyError, TypeError):

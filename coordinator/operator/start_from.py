@@ -1,13 +1,12 @@
-"""Where a simulated run sets out from a recorded one: the state after one of its records, and what
-becomes of runs that went on.
+"""Start a simulated run from a point of a recorded one: the state after one of its records, and
+what happens to the actions active at that point.
 
-A marking says where the task stood, not where the world stood. So the laboratory of the new run is
-prepared as for any run, and an action that went on at that moment begins again (the default), or
-counts as ended if the operator says how. Runs that had ended and whose token still waited stay
-ended, with their status and cause. Variables and latched events are as they were; timers begin
-anew; what the operator wanted (pause, breakpoints, choices) is not taken over. Record 0 is the
-run's own beginning.
-"""
+A marking describes the state of the task, not that of the world. The laboratory of the new run is
+therefore prepared as for any run, and an action active at that point starts again (the default), or
+counts as ended if the operator gives its result. Runs that had ended and whose token still waited
+stay ended, with their status and cause. Variables and latched events keep their values; timers
+start again; the operator's settings (pause, breakpoints, choices) are not kept. Record 0 is the
+start of the run."""
 
 from __future__ import annotations
 
@@ -37,18 +36,18 @@ from petrobot.coordinator.task import Kind, Status, Task
 from petrobot.services.comm.location_file import Directory, parse
 
 AGAIN = "again"
-"""A run that went on begins anew."""
+"""An active run starts again."""
 ENDS = (AGAIN, *(status.value for status in Status))
-"""What may become of a run that went on; an end may be followed by a colon and a cause."""
+"""What can happen to an active run; an end may be followed by a colon and a cause."""
 
 
 HEADER = ("mission", "mode", "task", "services", "services_path", "seed", "runs", "parameters")
-"""What a journal's header must say for its run to be derived again."""
+"""Keys of a journal's header that are needed to replay its run."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A recorded mission run and what it ran with."""
+    """A recorded mission run with its task, cell and engine."""
 
     journal: Journal
     task: Task
@@ -56,7 +55,7 @@ class Recorded:
     engine: Engine
 
     def steps(self) -> Iterator[RecordedStep]:
-        """Derive every stimulus again."""
+        """Replay every stimulus."""
         return replay(self.journal, self.engine)
 
 
@@ -80,7 +79,7 @@ def read_recorded(path: Path) -> Recorded:
 
 
 class DepartureError(ValueError):
-    """No run can set out there: which record or which word is wrong, and what is possible."""
+    """No run can start there: which record or word is wrong, and what is possible."""
 
 
 @dataclass(frozen=True)
@@ -90,13 +89,13 @@ class Departure:
     run: str
     record: int
     time: float = 0.0
-    """On the recorded run's clock (s)."""
+    """Time on the recorded run's clock (s)."""
     going: Mapping[str, str] = field(default_factory=dict)
-    """What becomes of the runs that went on, by place."""
+    """What happens to the runs active at that point, by place."""
     point: Point | None = None
 
     def plain(self) -> dict[str, Any]:
-        """For the header of the new run's journal."""
+        """Return the data for the header of the new run's journal."""
         plain = {
             "run": self.run,
             "record": self.record,
@@ -109,12 +108,11 @@ class Departure:
 def departure(
     journal: Journal, engine: Engine, run: str, record: int, going: Mapping[str, str] | str = AGAIN
 ) -> Departure:
-    """The state after a record (of those between two stimuli, the earlier), as a point to set out
-    from.
+    """Return the state after a record (of those between two stimuli, the earlier one) as a point to
+    start from.
 
-    `going` is one word for all runs that went on, or words by place; places that are not named
-    begin again. Raises DepartureError, and what `replay` raises when the journal cannot be derived
-    again.
+    `going` is one word for all active runs, or words by place; runs in places that are not named
+    start again. Raises DepartureError, and what `replay` raises if the journal cannot be replayed.
     """
     numbers = [r.number for r in journal.records if r.kind == STIMULUS]
     last = numbers[-1] if numbers else 0
@@ -135,8 +133,8 @@ def departure(
 
 
 def departed(then: Mapping[str, Any]) -> Point | None:
-    """The point at which a run set out, from its journal's header; None if at the task's own
-    beginning."""
+    """Return the point at which a run started, from its journal's header; None if it started at the
+    beginning of the task."""
     plain = then.get("from", {}).get("point")
     return None if plain is None else point_from_plain(plain)
 
@@ -149,11 +147,11 @@ def departing(
     seed: int | None = None,
     parameters: Mapping[str, Any] | None = None,
 ) -> Setting:
-    """The setting of the new run: that of the recorded one, but for a `seed` and `parameters` that
-    are given.
+    """Return the setting of the new run: that of the recorded one, except for a given `seed` and
+    `parameters`.
 
-    Who chooses is as at that moment: a selector that learned is brought there, and what it learns
-    from here on is not kept. Raises ValueError, EstimatesError.
+    The selector has its state of that point; what it learns later is not saved. Raises ValueError,
+    EstimatesError.
     """
     then = journal.header
     session = session_of(task, then)
@@ -177,7 +175,7 @@ def _bring(selector: Observer, journal: Journal, engine: Engine, record: int) ->
 
 
 def point_of(engine: Engine, state: State, words: Mapping[str, str]) -> Point:
-    """A state as a point to set out from; `words` say what becomes of the runs that go on, by
+    """Return a state as a point to start from; `words` give what happens to the active runs, by
     place."""
     task, places = engine.compiled.task, engine.compiled.net.places
     tokens = {place: n for place, n in zip(places, state.marking, strict=True) if n}
@@ -191,7 +189,7 @@ def point_of(engine: Engine, state: State, words: Mapping[str, str]) -> Point:
     verdicts: dict[str, Any] = {}
     for s in ended:
         verdicts |= {f"{s.place}.status": str(s.status), f"{s.place}.reason": s.cause}
-    # an aborted run leaves tokens without runs: they begin again, too
+    # An aborted run leaves tokens without runs: they start again, too.
     held = {place: sum(r.place == place for r in runs) for place in tokens}
     bare = [
         Standing(p)

@@ -1,10 +1,9 @@
-"""A coordinator that stays: one page over any number of mission runs, idle until the operator
-starts one.
+"""A permanent coordinator: one page for any number of mission runs, idle until the operator starts
+one.
 
-Implements `coordinator.operator.port.MissionPort`. The feed and the holder of the controls outlive
-each run, which a `RunSession` leads. While no run is active, the station looks after the rest:
-which nodes are up, breakpoints and choices for the next run, and the emergency stop.
-"""
+Implements `coordinator.operator.port.MissionPort`. The feed and the controls outlive each run,
+which a `RunSession` leads. While no run is active, the station itself handles the states of the
+nodes, breakpoints and choices for the next run, and the emergency stop."""
 
 from __future__ import annotations
 
@@ -49,22 +48,21 @@ from petrobot.services.comm.location_file import Directory, DirectoryError
 _log = logging.getLogger(__package__)
 
 FAULTS = (JournalError, ReplayError, TaskFileError, DirectoryError, EstimatesError, OSError)
-"""What a start may break on beside ValueError and KeyError: files that are not what they should
-be."""
+"""Exceptions of a start apart from ValueError and KeyError: faulty files."""
 
 
 LOOK, PATIENCE = 2.0, 1.5
-"""Seconds between questions to idle nodes, and for their answers."""
+"""Time between requests to idle nodes, and for their answers (s)."""
 LAST_WORDS = 10.0
-"""Seconds that a run has to end when the station closes."""
+"""Time for a run to end when the station closes (s)."""
 FAULTS_TOLD = 3
 OVER = frozenset({"success", "failure", "error", "aborted", "stopped"})
 """States of a mission run that has ended."""
 
 
 class Station:
-    """One cell's coordinator; `runs` is where journals are kept, `door` gives the address that each
-    run leaves in its folder."""
+    """The coordinator of one cell; `runs` is the folder of journals, `door` gives the address that
+    each run writes to its folder."""
 
     def __init__(
         self,
@@ -94,13 +92,13 @@ class Station:
         )
 
     async def close(self) -> None:
-        """Abort the run that goes on and leave."""
+        """Abort the active run and close."""
         self._looking.cancel()
         await asyncio.gather(self._looking, self._apart.close(), return_exceptions=True)
         going, run = self._going, self._run
         if going is None or run is None or run.operation is None:
             return
-        run.operation.abort("petrobot is told to end")
+        run.operation.abort("petrobot is ending")
         _, late = await asyncio.wait({going}, timeout=LAST_WORDS)
         for task in late:
             task.cancel()
@@ -109,15 +107,15 @@ class Station:
     # --- the port -----------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
-        """The state now."""
+        """Return the current state."""
         return self.feed.snapshot()
 
     def subscribe(self, receive: Callable[[dict[str, Any]], None]) -> Callable[[], None]:
-        """Give every later change to `receive`."""
+        """Call `receive` with every later change."""
         return self.feed.subscribe(receive)
 
     async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer:
-        """Carry out a command, the run's own by the run."""
+        """Carry out a command; pass those about the active run to the run."""
         answer = self.controls.fault(who, verb) or self.controls.carry_out(who, verb, data)
         if answer is not None:
             return answer
@@ -131,7 +129,7 @@ class Station:
             simulated = self._run.mode == LOCKSTEP
             answer = await self._run.operation.command(who, verb, data)
             if verb == "estop" and simulated:
-                return await self._estop(who, data)  # the operator means the real devices, too
+                return await self._estop(who, data)  # The operator means the real devices, too.
             return answer
         idle: dict[str, Callable[[str, Mapping[str, Any]], Awaitable[Answer]]] = {
             "breakpoint": self._breakpoint,
@@ -140,7 +138,7 @@ class Station:
             "clear_estop": self._clear_estop,
         }
         if verb not in idle:
-            return refusal("idle", "no mission run goes on: choose a task and start it")
+            return refusal("idle", "No mission is running. Choose a task and start it.")
         return await self._guarded(idle[verb], verb, who, data)
 
     async def _guarded(
@@ -159,7 +157,7 @@ class Station:
         return answer
 
     def offers(self) -> Sequence[Mapping[str, Any]]:
-        """Every action that services.toml places, and whether its node is up and says that it
+        """Return every action that services.toml assigns to a node, and whether the node is up and
         offers it."""
         return offered(
             self.directory,
@@ -167,7 +165,7 @@ class Station:
         )
 
     async def form(self, name: str) -> Mapping[str, Any]:
-        """What may be asked for when a task is started. Raises RefusedError."""
+        """Return the options for starting a task. Raises RefusedError."""
         given = {**self._tasks.folders, "name": name, "estimates": str(self._estimates)}
         said: dict[str, Any] = json.loads(await self._apart.do("form", given))
         return said
@@ -175,7 +173,7 @@ class Station:
     # --- a task, and a run of it --------------------------------------------------------------
 
     async def _load(self, who: str, data: Mapping[str, Any]) -> Answer:
-        """Show a task at its initial marking, to look at it and set breakpoints before it is
+        """Show a task in its initial marking, so that breakpoints can be set before it is
         started."""
         if (busy := self._busy()) is not None:
             return busy
@@ -184,7 +182,7 @@ class Station:
             task = await asyncio.to_thread(_prepared, text)
         except (StoreError, TaskFileError) as fault:
             return refusal("task", str(fault))
-        if (busy := self._busy()) is not None:  # a run was started meanwhile
+        if (busy := self._busy()) is not None:  # A run was started meanwhile.
             return busy
         self._show(text, task)
         return {"ok": True}
@@ -201,12 +199,14 @@ class Station:
 
     async def _start(self, who: str, data: Mapping[str, Any]) -> Answer:
         if self._going is not None and self.feed.state["mission"]["state"] in OVER:
-            await asyncio.wait({self._going}, timeout=LAST_WORDS)  # it only hangs up yet
+            await asyncio.wait(
+                {self._going}, timeout=LAST_WORDS
+            )  # It is only closing its connections.
         if (busy := self._busy()) is not None:
             return busy
         if self._stopped:
-            return refusal("stopped", "the emergency stop stands; clear it first")
-        self._starting = True  # nobody else may come in between
+            return refusal("stopped", "the emergency stop is active; clear it first")
+        self._starting = True  # No other start may come in between.
         try:
             return await self._started(who, data)
         finally:
@@ -217,7 +217,8 @@ class Station:
             return None
         mission = self.feed.state["mission"]
         return refusal(
-            "running", f"{mission['id'] or 'a mission run'} goes on; abort it, or wait for its end"
+            "running",
+            f"{mission['id'] or 'a mission run'} is active; abort it, or wait for its end",
         )
 
     async def _started(self, who: str, data: Mapping[str, Any]) -> Answer:
@@ -236,8 +237,8 @@ class Station:
             self._show(text, task)
             return refusal(
                 "changed",
-                f"{name} was changed outside since it was shown; now it is shown as it is: "
-                "start it again",
+                f"{name} was changed by another program after it was shown; the new version is "
+                "shown now: start it again",
             )
         if (faulty := await self._faults(text)) is not None:
             return faulty
@@ -257,10 +258,12 @@ class Station:
         return self._follow(run)
 
     async def _departed(self, data: Mapping[str, Any]) -> Answer:
-        """A simulated run from a point of a recorded one."""
+        """Start a simulated run from a point of a recorded one."""
         run = await asyncio.to_thread(self._prepared_from, data)
         task = run.mission.executor.task.name
-        name = task if task in self._tasks.names() else ""  # its file may be gone or renamed
+        name = (
+            task if task in self._tasks.names() else ""
+        )  # Its file may have been deleted or renamed.
         if name != self._loaded:
             self._forget(name)
         return self._follow(run)
@@ -273,11 +276,11 @@ class Station:
         return prepare_from(self._own(read_depart(found.task, data), mock=False), found)
 
     def _own(self, request: RunRequest, *, mock: bool = True) -> RunRequest:
-        """A request with what every run of this station has in common."""
+        """Return a request with the settings of all runs of this station."""
         return replace(request, folder=self._runs, mock=self._mock if mock else None)
 
     async def _faults(self, text: TaskText) -> Answer | None:
-        """Why a task may not run: what the check finds."""
+        """Return why a task may not run: the findings of the check."""
         where = {action: entry.node for action, entry in self.directory.actions.items()}
         given = {"text": text.text, "filename": f"{text.name}.toml", "where": where}
         found = json.loads(await self._apart.do("findings", given))
@@ -289,7 +292,7 @@ class Station:
         return {**refusal("faults", f"{text.name} may not run: {told}{more}"), "findings": faults}
 
     def _follow(self, run: RunSession) -> Answer:
-        """Let operators see and steer a run, and lead it to its end."""
+        """Let operators see and control a run, and lead it to its end."""
         run.operate(self.feed, self.controls, starts=True, stops=self._stops, choices=self._choices)
         run.door = self.door(run.identity) if self.door is not None else None
         self._tell_file()
@@ -305,10 +308,10 @@ class Station:
                 self._tell_error(str(fault), str(fault))
             await asyncio.to_thread(run.keep_result)
             self.feed.emit("result", result=run.result())
-        except Exception as fault:  # a run that breaks must not take the station with it
+        except Exception as fault:  # An exception in a run must not end the station.
             reason = f"{type(fault).__name__}: {fault}"
             _log.exception("run %s broke", run.identity)
-            self._tell_error(reason, f"the mission run broke: {reason}")
+            self._tell_error(reason, f"the mission run failed: {reason}")
         finally:
             self._run = self._going = None
 
@@ -323,19 +326,19 @@ class Station:
         )
 
     def _kept(self, task: Task) -> dict[str, Any]:
-        """Parts of the snapshot that outlive a mission run."""
+        """Return the parts of the snapshot that outlive a mission run."""
         nodes = dict(self.feed.state["nodes"])
         selectors = shown_selectors(task, FirstAlternative())
         return {"nodes": nodes, "controls": self.controls.plain(), "selectors": selectors}
 
-    # --- what may be said while idle ----------------------------------------------------------
+    # --- commands while idle ------------------------------------------------------------------
 
     def _forget(self, name: str) -> None:
         self._loaded, self._revision = name, ""
         self._stops, self._choices = set(), {}
 
     async def _breakpoint(self, who: str, data: Mapping[str, Any]) -> Answer:
-        """Breakpoints for the next run."""
+        """Set breakpoints for the next run."""
         table, _, name = str(data["element"]).partition(".")
         drawn = (self.feed.state["task"] or {}).get(table, ())
         if name not in {element["name"] for element in drawn}:
@@ -350,7 +353,7 @@ class Station:
         return {"ok": True}
 
     async def _override(self, who: str, data: Mapping[str, Any]) -> Answer:
-        """Choices for the next run."""
+        """Set choices for the next run."""
         name, action = str(data["primitive_task"]), data.get("action")
         known = self.feed.state["selectors"].get(name)
         if known is None or (
@@ -370,14 +373,14 @@ class Station:
         return await self._order(STOP)
 
     async def _clear_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
-        """Devices take orders again; nothing moves by that alone."""
+        """Let devices accept orders again; this alone moves nothing."""
         answer = await self._order(CLEAR)
         if self.feed.state["mission"]["state"] == "stopped":
             self.feed.emit("mission", mission={"state": "idle", "reason": ""})
         return answer
 
     async def _order(self, verb: str) -> Answer:
-        """Straight to the nodes that own devices; an answer that is missing is told."""
+        """Send an order directly to the nodes that own devices; report missing answers."""
         told = await order_all(self.directory, credentials_of(self.directory), verb)
         missing = [
             f"{one.node}: {one.bus or one.why or 'no answer'}" for one in told if not one.answered
@@ -387,10 +390,10 @@ class Station:
             return refusal("unreachable", "; ".join([*missing, *said]))
         return {"ok": True, "text": ", ".join(said)}
 
-    # --- who is there -------------------------------------------------------------------------
+    # --- states of the nodes ------------------------------------------------------------------
 
     async def _look(self) -> None:
-        """Ask the nodes now and then while no run does; the first time at once."""
+        """Poll the nodes while no run is active, the first time at once."""
         while True:
             if self._run is None and (self.feed.watched or not self._nodes):
                 await self.look()
@@ -400,7 +403,7 @@ class Station:
         """Ask every node whether it is up and what it offers."""
         self._nodes = await ask_all(self.directory, PATIENCE)
         if self._run is not None:
-            return  # the run tells itself
+            return  # The active run reports them itself.
         for name, answer in self._nodes.items():
             state = (
                 {"state": "up", "text": ""}
@@ -417,7 +420,7 @@ class Station:
 
 
 def _prepared(text: TaskText) -> Task:
-    """A task with what is derived from it once and takes long for a large net. Raises
+    """Return a task with the data derived from it once, which takes long for a large net. Raises
     TaskFileError."""
     task = loads(text.text, f"{text.name}.toml")
     picture(task)
@@ -425,8 +428,8 @@ def _prepared(text: TaskText) -> Task:
 
 
 def offered(directory: Directory, up: Callable[[str, str], bool]) -> list[dict[str, Any]]:
-    """What the designer may choose from: every action of services.toml; `up(action, node)` says
-    whether it is there now."""
+    """Return what the designer may choose from: every action of services.toml; `up(action, node)`
+    tells whether it is available now."""
     return [
         {
             "action": name,

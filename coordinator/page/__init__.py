@@ -1,2 +1,2 @@
-"""The operator's page: draw a task, follow its tokens, step in; one server in the coordinator's own
-loop."""
+"""The operator's page: draw a task, follow its tokens, intervene; one server in the coordinator's
+event loop."""

@@ -1,9 +1,9 @@
-"""Who may come in: the checks that each request passes before anything else, and the headers of
-each answer.
+"""Access control: the checks of each request before anything else, and the headers of each answer.
 
-Against: a stranger on this host (token), a web page in the operator's browser that posts or opens a
-WebSocket to this server (Origin, Sec-Fetch-Site, JSON only), DNS rebinding (Host), script in names
-and reasons (Content-Security-Policy; the page also never builds markup from text).
+They protect against other users of this host (token), a web page in the operator's browser that
+posts or opens a WebSocket to this server (Origin, Sec-Fetch-Site, JSON only), DNS rebinding (Host),
+and script in names and reasons (Content-Security-Policy; the page also never builds markup from
+text).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _PORT = re.compile(r":\d{1,5}$")
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address names this machine only."""
+    """Return whether an address can be reached only from this machine."""
     if host == "localhost":
         return True
     try:
@@ -50,16 +50,17 @@ def is_loopback(host: str) -> bool:
 
 @dataclass(frozen=True)
 class Doors:
-    """The allow-lists and the secret of one server."""
+    """Allow-lists and secret of one server."""
 
     token: str
     port: int
     names: frozenset[str]
-    """Names and addresses under which the page may be asked for, without port."""
+    """Names and addresses of the server, without port."""
     secure: bool = False
     cookie: str = field(init=False)
     pass_value: str = field(init=False)
-    """What the cookie holds: derived from the token, so that a leaked cookie is not the token."""
+    """Value of the cookie: derived from the token, so that a leaked cookie does not reveal the
+    token."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cookie", f"petrobot_{self.port}")
@@ -68,18 +69,18 @@ class Doors:
 
     @property
     def hosts(self) -> frozenset[str]:
-        """All values of the Host header that are let in."""
+        """Accepted values of the Host header."""
         return frozenset(f"{name}:{self.port}" for name in self.names)
 
     @property
     def origins(self) -> frozenset[str]:
-        """All values of the Origin header that are let in."""
+        """Accepted values of the Origin header."""
         scheme = "https" if self.secure else "http"
         return frozenset(f"{scheme}://{host}" for host in self.hosts)
 
     def fault(self, request: web.Request) -> web.HTTPException | None:
-        """Why a request is refused, or None. The first page with `?token=` is let in here and
-        exchanged by the server."""
+        """Return why a request is refused, or None. The front page with `?token=` passes here; the
+        server replaces the token by a cookie."""
         if request.headers.get("Host", "").lower() not in self.hosts:
             return web.HTTPMisdirectedRequest(text="this server does not answer to that name")
         origin = request.headers.get("Origin")
@@ -97,7 +98,7 @@ class Doors:
         )
         if changes and origin is None and not self._bearer(request):
             return web.HTTPForbidden(
-                text="a browser says its Origin; a script gives the token as Bearer"
+                text="a browser must send its Origin, a script its token as Bearer"
             )
         if request.method not in READING and request.content_type != "application/json":
             return web.HTTPUnsupportedMediaType(text="send JSON as application/json")
@@ -119,7 +120,7 @@ class Doors:
         )
 
     def is_first_visit(self, request: web.Request) -> bool:
-        """Whether this is the first page, asked for with the right token in its address."""
+        """Return whether this requests the front page with the right token in the address."""
         given = request.query.get("token", "").encode("utf-8", "replace")
         return (
             request.method == "GET"
@@ -128,7 +129,7 @@ class Doors:
         )
 
     def hand_out(self, response: web.StreamResponse) -> None:
-        """Give the browser its cookie."""
+        """Set the browser's cookie."""
         response.set_cookie(
             self.cookie,
             self.pass_value,
@@ -141,7 +142,7 @@ class Doors:
 
 
 def names_for(host: str, extra: Sequence[str]) -> frozenset[str]:
-    """Names that a server bound to `host` answers to: the address, this machine's own names for
+    """Return the names of a server bound to `host`: the address, this machine's own names for
     loopback, and `extra`."""
     named = {"[" + host.strip("[]") + "]" if ":" in host else host, *extra}
     if is_loopback(host) or host in ("0.0.0.0", "::"):
@@ -152,8 +153,8 @@ def names_for(host: str, extra: Sequence[str]) -> frozenset[str]:
 
 
 def middleware(doors: Doors) -> Middleware:
-    """The aiohttp middleware that refuses, and puts the headers on every answer, refusals and
-    errors included."""
+    """Return the aiohttp middleware that refuses requests and adds the headers to every answer,
+    including refusals and errors."""
 
     @web.middleware
     async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:

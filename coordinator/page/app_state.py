@@ -1,5 +1,5 @@
-"""What all handlers of one server share: the mission, the task files, the doors, and who is
-connected."""
+"""State shared by all handlers of one server: the mission, the task files, access control, and the
+connected clients."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from petrobot.coordinator.page.sessions import Session, carry_out, encode
 from petrobot.coordinator.page.task_store import TaskStore
 
 ABSENT_S = 10.0
-"""Controls go free when their holder's last window has been gone for so long."""
+"""Controls become free after their holder has had no open window for this long (s)."""
 CLOCK_S = 0.05
-"""How much too early a timer of the loop may come."""
+"""How much too early a timer of the event loop may fire (s)."""
 ENCODED_KEPT = 8
 
 
 @dataclass
 class House:
-    """The state of one page server."""
+    """State of one page server."""
 
     port: MissionPort
     store: TaskStore
@@ -39,15 +39,15 @@ class House:
     sessions: set[Session] = field(default_factory=set)
     commands: set[asyncio.Task[None]] = field(default_factory=set)
     apart: BackgroundProcess = field(default_factory=BackgroundProcess)
-    """Where work on documents and journals is done."""
+    """Process for work on documents and journals."""
     analyses: BackgroundProcess = field(default_factory=BackgroundProcess)
-    """Where drawings are analysed, which takes so long that nothing else may wait for it."""
+    """Process that analyses drawings, which takes so long that nothing else may wait for it."""
     closing: bool = False
     _heard: dict[str, float] = field(default_factory=dict)
     _encoded: OrderedDict[tuple[int, int], str] = field(default_factory=OrderedDict)
 
     def encode_once(self, delta: dict[str, Any]) -> str:
-        """A merged delta as text; clients that are equally far share it."""
+        """Encode a merged delta; clients with the same position share the text."""
         key = (delta["first"], delta["last"])
         text = self._encoded.get(key)
         if text is None:
@@ -57,21 +57,22 @@ class House:
         return text
 
     def left(self, session: Session) -> None:
-        """A client left: if it holds the controls and does not come back in time, they go free."""
+        """Note that a client left: if it holds the controls and does not return in time, they
+        become free."""
         self.sessions.discard(session)
         if session.who and not self.closing:
             asyncio.get_running_loop().call_later(ABSENT_S, self._free_controls, session.who)
 
     def heard(self, who: str) -> None:
-        """A script gave a command: if it holds the controls and gives none for a while, they go
-        free."""
+        """Note a command of a script: if it holds the controls and gives no more commands for a
+        while, they become free."""
         loop = asyncio.get_running_loop()
         self._heard[who] = loop.time()
         loop.call_later(ABSENT_S, self._free_controls, who)
 
     def _free_controls(self, who: str) -> None:
         if asyncio.get_running_loop().time() < self._heard.get(who, -ABSENT_S) + ABSENT_S - CLOCK_S:
-            return  # it has been heard again since
+            return  # It has sent a command since.
         self._heard.pop(who, None)
         if self.closing or any(session.who == who for session in self.sessions):
             return

@@ -1,4 +1,4 @@
-"""Keeps the number of open connections bounded, and closes those that never ask for anything."""
+"""Limit the number of open connections, and close those that never send a request."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from aiohttp import web
 
 CONNECTIONS = 128
 SILENT_S = 10.0
-"""A connection that has not sent one whole request head in this time is closed (slow-loris)."""
+"""A connection without a complete request header in this time (s) is closed (slow-loris)."""
 
 
 class _Turned(asyncio.Protocol):
-    """Answers a connection too many by closing it."""
+    """Closes a connection above the limit at once."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         transport.close()
@@ -32,13 +32,13 @@ class Gate:
         self.turned_away = 0
 
     def __call__(self) -> asyncio.Protocol:
-        """The protocol of a new connection."""
+        """Return the protocol of a new connection."""
         if self.open_connections >= self._limit:
             self.turned_away += 1
             return _Turned()
         handler = self._server()
         self._waiting.add(handler)
-        self._coming += 1  # aiohttp counts it one turn of the loop later
+        self._coming += 1  # aiohttp counts it one iteration of the event loop later.
         loop = asyncio.get_running_loop()
         loop.call_soon(self._came)
         loop.call_later(self.silent, self._end_if_silent, handler)
@@ -46,14 +46,14 @@ class Gate:
 
     @property
     def open_connections(self) -> int:
-        """Connections that are open now."""
+        """Number of open connections."""
         return len(self._server.connections) + self._coming
 
     def _came(self) -> None:
         self._coming -= 1
 
     def asked(self, request: web.Request) -> None:
-        """Note that a connection has sent a whole request head."""
+        """Note that a connection has sent a complete request header."""
         self._waiting.discard(request.protocol)
 
     def _end_if_silent(self, handler: web.RequestHandler) -> None:

@@ -1,8 +1,8 @@
-"""The written side over HTTP: task files, what nodes offer, findings of the check, foreign formats,
+"""Documents over HTTP: task files, offers of the nodes, findings of the check, other formats,
 journals.
 
-Nothing here looks into a document: whatever takes its time is done in a process of its own and
-passed on as it comes.
+Nothing here reads a document: all long work is done in a separate process, and its result is passed
+on unchanged.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ DESK_AT_MOST = 64
 
 
 def add_routes(app: web.Application) -> None:
-    """The routes for documents."""
+    """Add the routes for documents."""
     app.router.add_get("/api/tasks", _list)
     app.router.add_get("/api/tasks/{name}", _open)
     app.router.add_put("/api/tasks/{name}", _save)
@@ -48,8 +48,8 @@ async def _open(request: web.Request) -> web.StreamResponse:
 
 
 async def _revision(request: web.Request) -> web.Response:
-    """{revision}: whether a file is still the one that was opened; cheap enough to be asked every
-    few seconds."""
+    """{revision}: shows whether a file is still the one that was opened; cheap enough for a request
+    every few seconds."""
     try:
         return json_answer(
             {"revision": request.app[HOUSE].store.read(request.match_info["name"]).revision}
@@ -59,7 +59,8 @@ async def _revision(request: web.Request) -> web.Response:
 
 
 async def _save(request: web.Request) -> web.StreamResponse:
-    """{base, document, renames} or, to settle a conflict, {base, text}; 409 gives both versions."""
+    """{base, document, renames} or, to resolve a conflict, {base, text}; 409 returns both
+    versions."""
     house = request.app[HOUSE]
     body = await read_object(request)
     content = (
@@ -74,10 +75,10 @@ async def _save(request: web.Request) -> web.StreamResponse:
 
 
 async def _check(request: web.Request) -> web.StreamResponse:
-    """{name, document, desk}: what the check says of a document that is being drawn, and the text
-    that it would be saved as.
+    """{name, document, desk}: the findings for an unsaved document, and the text that it would be
+    saved as.
 
-    What was asked from the same desk before is given up, analyses too: it was about an older
+    Earlier requests from the same desk, including analyses, are cancelled: they were about an older
     drawing.
     """
     house = request.app[HOUSE]
@@ -88,8 +89,8 @@ async def _check(request: web.Request) -> web.StreamResponse:
 
 
 async def _analyse(request: web.Request) -> web.StreamResponse:
-    """{name, document, desk}: verdicts on a document that is being drawn, and where its time goes;
-    one analysis at a time."""
+    """{name, document, desk}: verdicts on an unsaved document, and how its time is spent; one
+    analysis at a time."""
     house = request.app[HOUSE]
     body = await read_object(request)
     desk = str(body.get("desk") or "")[:DESK_AT_MOST]
@@ -123,7 +124,7 @@ async def _export(request: web.Request) -> web.Response:
 
 
 async def _import(request: web.Request) -> web.StreamResponse:
-    """{form, text}: a net in another format as a document to go on drawing."""
+    """{form, text}: a net in another format as a document that can be edited."""
     body = await read_object(request)
     return await _done(
         request, "import", {"form": str(body.get("form")), "text": str(body.get("text"))}
@@ -154,7 +155,7 @@ async def _run(request: web.Request) -> web.StreamResponse:
 async def _done(
     request: web.Request, work: str, given: Mapping[str, Any], desk: str = ""
 ) -> web.StreamResponse:
-    """Have the work done apart, and pass on what came of it."""
+    """Have the work done in the other process, and pass on its result."""
     try:
         said = await request.app[HOUSE].apart.do(work, given, desk)
     except RefusedError as refusal:
@@ -163,7 +164,7 @@ async def _done(
 
 
 def _refusal(refusal: RefusedError) -> web.Response:
-    """The answer to work that was not done. Raises it if it says nothing but its text."""
+    """Return the answer to work that was not done. Raises it if it holds only a text."""
     if refusal.more:
         return json_answer(refusal.more, refusal.status)
     raise refused(refusal) from refusal
@@ -183,12 +184,12 @@ def _drawing(house: House, body: Mapping[str, Any]) -> dict[str, Any]:
 def _document(body: Mapping[str, Any]) -> dict[str, Any]:
     document = body.get("document")
     if not isinstance(document, dict):
-        raise web.HTTPBadRequest(text="document is an object")
+        raise web.HTTPBadRequest(text="document must be an object")
     return document
 
 
 def _renames(body: Mapping[str, Any]) -> dict[str, Any]:
     given = body.get("renames", [])
     if not isinstance(given, list):
-        raise web.HTTPBadRequest(text="renames is a list of {path, old, new}")
+        raise web.HTTPBadRequest(text="renames must be a list of {path, old, new}")
     return {"renames": given[:RENAMES_AT_MOST]}

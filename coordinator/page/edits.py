@@ -1,8 +1,9 @@
-"""Edits of a task file's text: what was not edited keeps every byte, its comments and its order.
+"""Edit a task file's text: parts that were not edited keep every byte, their comments and their
+order.
 
-The page sends the whole document as plain JSON data. It is compared with what the text says now;
+The page sends the whole document as plain JSON data. It is compared with the content of the text;
 only values that differ are replaced in the text (tomlkit keeps the rest), and renamed tables keep
-their place.
+their position.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ _FAULTS = (
 
 
 class EditError(ValueError):
-    """The text is no TOML, or the edit cannot be made."""
+    """The text is not TOML, or the edit cannot be made."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rename:
-    """A table that got another name: in the table at `path`, from `old` to `new`."""
+    """A renamed table: in the table at `path`, from `old` to `new`."""
 
     path: tuple[str, ...]
     old: str
@@ -46,7 +47,7 @@ class Rename:
 
 
 def parse(text: str) -> TOMLDocument:
-    """The document of a text. Raises EditError."""
+    """Return the document of a text. Raises EditError."""
     try:
         return tomlkit.parse(text)
     except (TOMLKitError, ValueError, RecursionError) as fault:
@@ -54,14 +55,14 @@ def parse(text: str) -> TOMLDocument:
 
 
 def plain(document: TOMLDocument) -> dict[str, Any]:
-    """The document as JSON data: what JSON cannot hold (dates, infinities, huge integers) becomes
-    text."""
+    """Return the document as JSON data; values that JSON cannot hold (dates, infinities, huge
+    integers) become text."""
     value: dict[str, Any] = _json_value(document.unwrap())
     return value
 
 
 def edited(text: str, wanted: Mapping[str, Any], renames: Sequence[Rename] = ()) -> str:
-    """The text after its document was made equal to `wanted`; the same bytes when it was already.
+    """Return the text with its document changed to `wanted`, or the same bytes if they were equal.
     Raises EditError."""
     for rename in renames:
         text = _renamed(text, rename)
@@ -81,7 +82,7 @@ def edited(text: str, wanted: Mapping[str, Any], renames: Sequence[Rename] = ())
 
 
 def _lines_as_in(text: str, result: str) -> str:
-    """The result with the line ends of a text that has one kind throughout."""
+    """Return the result with the line ends of the text, if the text has only one kind."""
     return (
         _BARE_END.sub("\r\n", result) if "\r\n" in text and not _BARE_END.search(text) else result
     )
@@ -110,8 +111,8 @@ def _without_none(value: Any) -> Any:
 
 
 def _without_empty(document: Mapping[str, Any]) -> dict[str, Any]:
-    """The document without tables of elements that hold none: their header goes with the last of
-    them."""
+    """Return the document without empty tables of elements: the header is removed with the last
+    element."""
     kept = {key: value for key, value in document.items() if value != {}}
     if isinstance(kept.get("subnets"), Mapping):
         kept["subnets"] = {
@@ -122,7 +123,8 @@ def _without_empty(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _same(left: Any, right: Any) -> bool:
-    """Equal as JSON: 1 and 1.0 are one number there, true is none."""
+    """Return whether values are equal as JSON: 1 and 1.0 are the same number, true is not a
+    number."""
     if isinstance(left, Mapping) and isinstance(right, Mapping):
         return left.keys() == right.keys() and all(_same(left[key], right[key]) for key in left)
     if isinstance(left, list) and isinstance(right, list):
@@ -161,13 +163,13 @@ def _put(table: MutableMapping[str, Any], key: str, value: Any, path: tuple[str,
 
 
 def _has_header(path: tuple[str, ...]) -> bool:
-    """Whether a new table gets a [header] of its own: `places.p`, `subnets.s.places.p`; arguments
-    stand inline."""
+    """Return whether a new table gets its own [header]: `places.p`, `subnets.s.places.p`; arguments
+    are written inline."""
     return len(path) <= 2 or (path[0] == "subnets" and len(path) <= 4)
 
 
 def _is_element(path: tuple[str, ...]) -> bool:
-    """Whether a path leads to one place, transition, event or the like."""
+    """Return whether a path leads to one place, transition, event or the like."""
     return len(path) == 2 or (path[0] == "subnets" and len(path) == 4)
 
 
@@ -179,7 +181,9 @@ def _change(table: MutableMapping[str, Any], key: str, value: Any, path: tuple[s
         except _FAULTS:
             if not _is_element(path):
                 raise
-            del table[key]  # its lines stand apart (dotted keys): this one element is written anew
+            del table[
+                key
+            ]  # Its lines are not together (dotted keys): this element is written again.
             _put(table, key, value, path)
     elif isinstance(value, list) and isinstance(old, Array):
         _change_array(old, value)
@@ -190,7 +194,7 @@ def _change(table: MutableMapping[str, Any], key: str, value: Any, path: tuple[s
 
 
 def _change_array(array: Array, wanted: list[Any]) -> None:
-    """Alter only the entries between the common head and the common tail."""
+    """Change only the entries between the common head and the common tail."""
     have = [_value_of(entry) for entry in array]
     head = 0
     while head < min(len(have), len(wanted)) and _same(have[head], wanted[head]):
@@ -226,8 +230,8 @@ def _item(value: Any) -> Item:
 
 
 def _renamed(text: str, rename: Rename) -> str:
-    """The text with the table's headers renamed; unaltered if that cannot be done in place (it is
-    then written anew)."""
+    """Return the text with the table's headers renamed; unchanged if that is not possible in place
+    (the table is then written again)."""
     goal = plain(parse(text))
     table: Any = goal
     for key in rename.path:

@@ -1,4 +1,4 @@
-"""Reading JSON bodies and answering in JSON, the same for all handlers."""
+"""Read JSON bodies and answer in JSON, for all handlers."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from petrobot.services.host.json_text import json_text
 BODY_S = 10.0
 LARGEST_BODY = 2 * 1024 * 1024
 PIECE = 256 * 1024
-"""Bytes of an answer that are handed over at once."""
+"""Size of a piece of a long answer (bytes)."""
 
 
 async def read_object(request: web.Request) -> dict[str, Any]:
-    """The JSON object in the body. Raises the HTTP answer that says what is wrong with it."""
+    """Return the JSON object in the body. Raises the HTTP answer that explains its fault."""
     try:
         async with asyncio.timeout(BODY_S):
             text = await request.text()
@@ -39,7 +39,7 @@ async def read_object(request: web.Request) -> dict[str, Any]:
 
 
 async def send_json(request: web.Request, text: bytes, status: int = 200) -> web.StreamResponse:
-    """Answer with JSON text that may be long, piece by piece: no other client waits for it."""
+    """Answer with JSON text in pieces, so that a long answer does not delay other clients."""
     headers = {
         **HEADERS,
         "Cache-Control": "no-store",
@@ -47,7 +47,7 @@ async def send_json(request: web.Request, text: bytes, status: int = 200) -> web
     }
     response = web.StreamResponse(status=status, headers=headers)
     response.content_length = len(text)
-    with contextlib.suppress(ConnectionError):  # whoever asked has left meanwhile
+    with contextlib.suppress(ConnectionError):  # The client has left meanwhile.
         await response.prepare(request)
         for begin in range(0, len(text), PIECE):
             await response.write(text[begin : begin + PIECE])
@@ -56,10 +56,10 @@ async def send_json(request: web.Request, text: bytes, status: int = 200) -> web
 
 
 def json_answer(value: Mapping[str, Any] | Sequence[Any], status: int = 200) -> web.Response:
-    """An answer that no cache keeps."""
+    """Return an answer that no cache stores."""
     body = json_text(value, ensure_ascii=False).encode(
         "utf-8", "replace"
-    )  # a lone surrogate is no text
+    )  # A lone surrogate is not valid text.
     return web.Response(
         body=body,
         status=status,
@@ -70,7 +70,7 @@ def json_answer(value: Mapping[str, Any] | Sequence[Any], status: int = 200) -> 
 
 
 def refused(refusal: RefusedError) -> web.HTTPException:
-    """The HTTP answer to work that could not be done."""
+    """Return the HTTP answer to work that could not be done."""
     by_status: dict[int, type[web.HTTPException]] = {
         404: web.HTTPNotFound,
         409: web.HTTPConflict,

@@ -1,5 +1,5 @@
-"""Serves the operator's page in the coordinator's own loop: files, task documents, history, and one
-WebSocket a client."""
+"""Serve the operator's page in the coordinator's event loop: files, task documents, history, and
+one WebSocket per client."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from petrobot.coordinator.page.task_store import TaskStore
 
 PAGE_FILES = Path(__file__).parent / "static"
 LAST_COMMANDS_S = 1.0
-"""Time that commands have at the end; the one that ended the run (`abort`) is among them."""
+"""Time for commands to complete at the end (s), among them the one that ended the run (`abort`)."""
 
 
 class Page:
-    """A running page: `url` holds the token; `await close()` ends it."""
+    """A served page: `url` holds the token; `await close()` ends it."""
 
     def __init__(
         self, runner: web.AppRunner, listening: asyncio.Server, house: House, url: str
@@ -51,12 +51,12 @@ class Page:
 
     @property
     def sessions(self) -> frozenset[Session]:
-        """The clients that are connected."""
+        """The connected clients."""
         return frozenset(self._house.sessions)
 
     @property
     def gate(self) -> Gate:
-        """Where connections come in."""
+        """The factory of connections."""
         assert self._house.gate is not None
         return self._house.gate
 
@@ -66,8 +66,8 @@ class Page:
             await asyncio.wait(set(self._house.commands))
 
     async def close(self) -> None:
-        """Close all connections and the port. Whoever gave the last commands is answered; one that
-        takes long is given up."""
+        """Close all connections and the port. The last commands are still answered, unless they
+        take too long."""
         self._listening.close()
         self._house.closing = True
         with contextlib.suppress(TimeoutError):
@@ -96,14 +96,13 @@ async def start_page(
     tls: ssl.SSLContext | None = None,
     page: bool = True,
 ) -> Page:
-    """Serve the page of a mission; without `page` only the operator's protocol: the WebSocket,
-    snapshot and commands.
+    """Serve the page of a mission; without `page`, only the operator protocol: WebSocket, snapshot
+    and commands.
 
-    Tasks are saved in `tasks_folder`; those of `shipped` are offered, too, and a save of one makes
-    a copy there. `port` 0 takes a free one. `names` are further names under which browsers ask for
-    this server (needed when `host` is not loopback). `token` is drawn anew unless given. Raises
-    OSError when the address cannot be bound.
-    """
+    Tasks are saved in `tasks_folder`; those of `shipped` are offered, too, and saving one makes a
+    copy there. `port` 0 selects a free one. `names` are further names of this server in browsers
+    (needed if `host` is not loopback). `token` is random unless given. Raises OSError if the
+    address cannot be bound."""
     listener = _listen(host, port)
     number = listener.getsockname()[1]
     doors = Doors(
@@ -173,19 +172,19 @@ async def _index(request: web.Request) -> web.StreamResponse:
     if "token" in request.query:
         away = web.HTTPSeeOther(
             "/"
-        )  # the token leaves the address bar and the history of the browser
+        )  # The token disappears from the address bar and the history of the browser.
         doors.hand_out(away)
         raise away
     return web.FileResponse(PAGE_FILES / "index.html", headers={"Cache-Control": "no-store"})
 
 
-# The live side over HTTP: the WebSocket, and the same commands and snapshot for scripts.
+# The live protocol over HTTP: the WebSocket, and the same commands and snapshot for scripts.
 
 CLIENTS = 64
 
 
 def add_routes(app: web.Application) -> None:
-    """The live routes."""
+    """Add the routes of the live protocol."""
     app.router.add_get("/api/live", _live)
     app.router.add_get("/api/snapshot", _snapshot)
     app.router.add_post("/api/command", _command)
@@ -217,7 +216,7 @@ async def _snapshot(request: web.Request) -> web.Response:
 
 
 async def _start(request: web.Request) -> web.Response:
-    """What may be asked for when this task is started, with types and defaults."""
+    """The options for starting this task, with types and defaults."""
     starts = request.app[HOUSE].starts
     if starts is None:
         raise web.HTTPNotFound(text="no run can be started here")
@@ -234,7 +233,7 @@ async def _command(request: web.Request) -> web.Response:
     body = await read_object(request)
     data = body.get("data", {})
     if not isinstance(data, dict):
-        raise web.HTTPBadRequest(text="data is an object")
+        raise web.HTTPBadRequest(text="data must be an object")
     who = who_is(str(body.get("name", "script")), house.doors.pass_value)
     answer = await carry_out(house.port, who, str(body.get("verb")), data)
     house.heard(who)

@@ -1,4 +1,4 @@
-"""One WebSocket of one client: a snapshot, then merged deltas as fast as the client takes them, and
+"""The WebSocket of one client: a snapshot, then merged deltas as fast as the client reads them, and
 its commands."""
 
 from __future__ import annotations
@@ -20,36 +20,35 @@ from petrobot.services.host.json_text import json_text
 
 LONGEST_FAULT = 400
 SEND_S = 8.0
-"""A client that takes nothing for so long is closed; it comes back by itself."""
+"""A client that reads nothing for this long (s) is disconnected; it connects again by itself."""
 HELLO_S = 5.0
 ALIVE_S = 1.0
 PACE_S = 0.012
-"""Pause between two deltas to one client: no screen shows more."""
+"""Pause between two deltas to one client (s): no screen needs more."""
 COMMANDS_AT_ONCE = 8
 NUMBERS_KEPT = 256
-"""So many numbers of commands are remembered: none is carried out twice."""
+"""How many numbers of commands are remembered, so that none is carried out twice."""
 MESSAGES_PER_S = 60
 LARGEST_MESSAGE = 256 * 1024
 LARGEST_SNAPSHOT = 64 * 1024 * 1024
-"""For clients: the largest message that the server may send (newest images and all)."""
+"""For clients: the size of the largest message from the server (with all newest images)."""
 
 _NAME = re.compile(r"[^\w .'-]+")
 Encode = Callable[[dict[str, Any]], str]
 
 
 class BadMessageError(Exception):
-    """A client said what nobody may say; its text is sent as the reason of the close."""
+    """A client sent an invalid message; the text is sent as the reason of the close."""
 
 
 def encode(message: Mapping[str, Any]) -> str:
-    """A message as JSON text: whatever a value is, it neither ends the feed nor makes the message
-    unreadable."""
+    """Encode a message as JSON text. No value ends the feed or makes the message unreadable."""
     return json_text(message, separators=(",", ":"))
 
 
 def who_is(name: str, tab: str) -> str:
-    """How a client is called for all: its name and four digits of its tab's secret, so that two of
-    one name differ."""
+    """Return a client's name for all others: its name and four digits of its tab's secret, so that
+    two clients with one name differ."""
     clean = _NAME.sub("", name).strip()[:24] or "operator"
     return f"{clean} {hashlib.sha256(tab.encode()).hexdigest()[:4]}"
 
@@ -68,7 +67,7 @@ class Session:
         self._port = port
         self._encoded = encoded
         self._all_commands = (
-            commands  # held by the server: a command goes on when its client leaves
+            commands  # Held by the server: a command continues when its client leaves.
         )
         self._pending = Pending()
         self._news = asyncio.Event()
@@ -86,7 +85,7 @@ class Session:
         try:
             await self._meet()
             stop = self._port.subscribe(self._receive)
-            self._pending.stale = True  # the first thing to send is a snapshot
+            self._pending.stale = True  # The first message is a snapshot.
             self._news.set()
             sender = asyncio.create_task(self._send_all())
             try:
@@ -102,11 +101,11 @@ class Session:
             await self._close_hard()
 
     async def leave(self) -> None:
-        """Close the connection in good order, as when the server ends."""
+        """Close the connection properly, as when the server ends."""
         with contextlib.suppress(Exception):
             async with asyncio.timeout(1.0):
                 if self._pending and not self._pending.stale:
-                    await self._send(self._encoded(self._pending.take()))  # how it ended
+                    await self._send(self._encoded(self._pending.take()))  # the reason of the end
                 answers, self._answers = self._answers, []
                 for answer in answers:
                     await self._send(encode(answer))
@@ -153,7 +152,7 @@ class Session:
     def _begin(self, message: Mapping[str, Any]) -> None:
         number, verb, data = message.get("id"), message.get("verb"), message.get("data", {})
         if not isinstance(number, int) or not isinstance(data, dict):
-            raise BadMessageError("a command has a whole number as id and an object as data")
+            raise BadMessageError("a command needs an integer id and an object as data")
         if number in self._numbers:
             self._answer(
                 number,
@@ -202,7 +201,9 @@ class Session:
         elif delta:
             self.deltas_sent += 1
             await self._send(self._encoded(self._pending.take()))
-        for answer in answers:  # after what the command changed, so that its client has seen that
+        for (
+            answer
+        ) in answers:  # After the changes by the command, so that its client has seen them.
             await self._send(encode(answer))
         if delta:
             await asyncio.sleep(PACE_S)
@@ -230,8 +231,8 @@ class Session:
 async def carry_out(
     port: MissionPort, who: str, verb: str, data: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """One command to the mission; whatever goes wrong there becomes an answer, so that no command
-    goes unanswered."""
+    """Pass a command to the mission; an exception there becomes an answer, so that every command is
+    answered."""
     if verb not in VERBS:
         return {"ok": False, "code": "unknown_command", "text": f"no command {verb[:40]!r}"}
     try:

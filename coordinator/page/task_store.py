@@ -1,5 +1,5 @@
-"""The folders of task files: names, texts, revisions. Shipped ones are read only; a save that would
-undo another's is refused with both versions."""
+"""The folders of task files: names, texts, revisions. Shipped files are read-only; a save that
+would undo that of another user is refused with both versions."""
 
 from __future__ import annotations
 
@@ -24,33 +24,35 @@ class StoreError(Exception):
         self.status = status
 
 
-class Conflict(Exception):  # noqa: N818 - no fault: two people edited the same file
-    """The file is no longer what the edit began from."""
+class Conflict(Exception):  # noqa: N818 - not an error: two people edited the same file
+    """The file is not the version that was edited."""
 
     def __init__(self, theirs: TaskText, yours: str) -> None:
-        super().__init__(f"{theirs.name} was changed by somebody else since you opened it")
+        super().__init__(
+            f"{theirs.name} was changed by another user or program since you opened it"
+        )
         self.theirs = theirs
         self.yours = yours
 
 
 @dataclass(frozen=True, slots=True)
 class TaskText:
-    """One task file as it stands on disk."""
+    """One task file as it is on disk."""
 
     name: str
     text: str
     own: bool = True
-    """Whether it stands in the user's own folder; a shipped one is saved as a copy there."""
+    """Whether it is in the user's own folder; a shipped one is saved as a copy there."""
 
     @property
     def revision(self) -> str:
-        """Changes exactly when the text does."""
+        """Identifier that changes exactly when the text does."""
         return hashlib.sha256(self.text.encode()).hexdigest()[:16]
 
 
 class TaskStore:
-    """Task files by bare name: those of the user's own folder, made when it is first needed, and
-    behind them shipped ones."""
+    """Task files by bare name: those of the user's own folder, made when it is first needed, then
+    the shipped ones."""
 
     def __init__(self, folder: Path, shipped: Path | None = None) -> None:
         self._folder = folder
@@ -58,21 +60,21 @@ class TaskStore:
 
     @property
     def folder(self) -> Path:
-        """Where tasks are saved."""
+        """Folder where tasks are saved."""
         return self._folder
 
     @property
     def folders(self) -> dict[str, str]:
-        """Where its files are, for work in a process of its own."""
+        """Folders of its files, for work in another process."""
         return {"tasks": str(self._folder), "shipped": str(self._shipped or "")}
 
     def names(self) -> list[str]:
-        """All task files."""
+        """Names of all task files."""
         return sorted(self._own() | self._behind())
 
     def listed(self) -> list[dict[str, object]]:
-        """All task files: {name, own, shipped}; one that is both is the user's copy of a shipped
-        one."""
+        """Return all task files: {name, own, shipped}; one with both is the user's copy of a
+        shipped one."""
         own, behind = self._own(), self._behind()
         return [
             {"name": name, "own": name in own, "shipped": name in behind}
@@ -80,7 +82,7 @@ class TaskStore:
         ]
 
     def read(self, name: str) -> TaskText:
-        """One task file, the user's own if there is one. Raises StoreError."""
+        """Return one task file, preferably the user's own. Raises StoreError."""
         path = self._path(name)
         try:
             return TaskText(name, _content(path))
@@ -100,10 +102,9 @@ class TaskStore:
     def save(
         self, name: str, base: str | None, document: dict[str, object], renames: list[Rename]
     ) -> TaskText:
-        """Write an edited document; `base` is the revision that the edit began from, None for a new
-        file.
+        """Write an edited document; `base` is the revision that was edited, None for a new file.
 
-        Only what differs from the file's own values is altered in its text. Raises Conflict,
+        Only values that differ from those of the file are changed in its text. Raises Conflict,
         StoreError.
         """
         try:
@@ -119,7 +120,7 @@ class TaskStore:
         return TaskText(name, yours)
 
     def save_text(self, name: str, base: str | None, text: str) -> TaskText:
-        """Write a whole text, as after a conflict was settled by hand. Raises Conflict,
+        """Write a whole text, for example after resolving a conflict by hand. Raises Conflict,
         StoreError."""
         try:
             parse(text)
@@ -134,7 +135,7 @@ class TaskStore:
     def edited_text(
         self, current: TaskText | None, document: dict[str, object], renames: list[Rename]
     ) -> str:
-        """What the file would become. Raises StoreError."""
+        """Return the text that the file would have. Raises StoreError."""
         try:
             return edited(current.text if current else "", document, renames)
         except EditError as fault:
@@ -142,7 +143,9 @@ class TaskStore:
 
     def _path(self, name: str) -> Path:
         if not _NAME.fullmatch(name):
-            raise StoreError(400, "a task's name has letters, digits, _ and - only, 64 at most")
+            raise StoreError(
+                400, "a task's name may have only letters, digits, _ and -, 64 at most"
+            )
         return self._folder / f"{name}.toml"
 
     def _write(self, name: str, text: str) -> None:
@@ -161,7 +164,7 @@ def _stems(folder: Path) -> set[str]:
 
 
 def _content(path: Path) -> str:
-    """A task file's text. Raises FileNotFoundError, StoreError."""
+    """Return a task file's text. Raises FileNotFoundError, StoreError."""
     try:
         if path.stat().st_size > LARGEST_FILE:
             raise StoreError(413, f"{path.name} is larger than {LARGEST_FILE} bytes")

@@ -1,8 +1,8 @@
-"""Work on task files that may take long for a large net, as plain functions of plain data: open,
-save, check, convert.
+"""Work on task files that may take long for a large net, as functions of plain data: open, save,
+check, convert.
 
-The page's server has all of it done in a process of its own
-(`coordinator.background.BackgroundProcess`), in the names of `WORKS`.
+The page's server runs all of it in a separate process (`coordinator.background.BackgroundProcess`)
+under the names in `WORKS`.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from petrobot.coordinator.page.task_store import Conflict, StoreError, TaskStore
 from petrobot.coordinator.task import Kind, Task
 from petrobot.coordinator.task.file import TaskFileError, dumps, loads
 
-# Nets of other tools as the text of a task file, to go on drawing: names, marking, weights,
-# inhibitors and positions; pure.
+# Nets of other tools as the text of a task file that can be edited: names, marking, weights,
+# inhibitors and positions (pure functions).
 
 _NOT_NAME = re.compile(r"\W+")
 
 
 def as_task_file(model: NetFile) -> str:
-    """Its places are control places, to be given their meaning by drawing on; `final` is never true
-    until it is written."""
+    """Return a net as a task file. Its places are control places, which the user then changes;
+    `final` is never true until it is edited."""
     names = usable_names(model)
     document = tomlkit.document()
     document.add("schema", tomlkit.item(1))
@@ -62,8 +62,8 @@ def as_task_file(model: NetFile) -> str:
 
 
 def usable_names(model: NetFile) -> dict[str, str]:
-    """For each id of the file a name that a task file may hold: its label made usable, kept apart
-    from all others."""
+    """Return for each id of the file a valid and distinct name for a task file, made from its
+    label."""
     taken: set[str] = set()
     return {
         i: _free(model.labels.get(i) or i, taken)
@@ -95,7 +95,7 @@ Where = Mapping[str, str] | None
 
 
 class FormatError(ValueError):
-    """A format is not known, or the text is not in it."""
+    """A format is unknown, or the text is not in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,10 +107,9 @@ class Made:
 
 
 def findings(text: str, filename: str, where: Mapping[str, str] | None) -> list[dict[str, Any]]:
-    """What keeps the task from running or should be looked at: {severity, key, text, remedy};
-    errors first.
+    """Return errors and warnings of the task: {severity, key, text, remedy}; errors first.
 
-    `where` gives the node of each action that is offered; None leaves offers out.
+    `where` gives the node of each offered action; None leaves offers out.
     """
     try:
         task = loads(text, filename)
@@ -125,7 +124,7 @@ def _finding(severity: str, key: str, text: str, remedy: str) -> dict[str, Any]:
 
 
 def load(text: str, filename: str) -> Task:
-    """The task in a text. Raises FormatError with all faults."""
+    """Return the task in a text. Raises FormatError with all faults."""
     try:
         return loads(text, filename)
     except TaskFileError as error:
@@ -133,7 +132,7 @@ def load(text: str, filename: str) -> Task:
 
 
 def export(text: str, filename: str, form: str) -> Made:
-    """The task in another format. Raises FormatError."""
+    """Return the task in another format. Raises FormatError."""
     task = load(text, filename)
     if form == "toml":
         return Made(dumps(task), "application/toml")
@@ -143,7 +142,7 @@ def export(text: str, filename: str, form: str) -> Made:
 
 
 def imported(form: str, text: str) -> str:
-    """A net in another format as the text of a task file, to go on drawing. Raises FormatError."""
+    """Return a net in another format as the text of a task file. Raises FormatError."""
     if form == "toml":
         return text
     if form != "pnml":
@@ -154,7 +153,7 @@ def imported(form: str, text: str) -> str:
         raise FormatError(f"not a place/transition net in PNML: {error}") from error
 
 
-# --- as orders --------------------------------------------------------------------------------
+# --- as requests ------------------------------------------------------------------------------
 
 
 def _store(tasks: str, shipped: str) -> TaskStore:
@@ -166,7 +165,8 @@ def _refused(fault: StoreError) -> RefusedError:
 
 
 def _described(task: TaskText, where: Where) -> dict[str, Any]:
-    """A task file for the designer: its document, its text, and what the check says of it."""
+    """Return a task file for the designer: its document, its text, and the findings of the
+    check."""
     try:
         document = plain(parse(task.text))
     except EditError as fault:
@@ -192,7 +192,7 @@ def _save(
     content: dict[str, Any],
     renames: list[Any],
 ) -> dict[str, Any]:
-    """`content` is {document}, or {text} to settle a conflict. A conflict is refused with both
+    """`content` is {document}, or {text} to resolve a conflict. A conflict is refused with both
     versions."""
     store = _store(tasks, shipped)
     try:
@@ -213,7 +213,7 @@ def _save(
 def _drawn(
     tasks: str, shipped: str, name: str, document: dict[str, Any], renames: list[Any]
 ) -> dict[str, Any]:
-    """The text that a drawing would be saved as: {text}."""
+    """Return the text that a drawing would be saved as: {text}."""
     store = _store(tasks, shipped)
     try:
         current = store.read(name) if name in store.names() else None
@@ -223,7 +223,7 @@ def _drawn(
 
 
 def _check(where: Where, name: str, **drawing: Any) -> dict[str, Any]:
-    """The text that a drawing would be saved as, and what the check says of it."""
+    """Return the text that a drawing would be saved as, and the findings of the check."""
     made = _drawn(name=name, **drawing)
     return {"findings": findings(made["text"], f"{name}.toml", where), **made}
 
@@ -250,7 +250,7 @@ def _renames(given: list[Any]) -> list[Rename]:
     try:
         return [Rename(tuple(map(str, r["path"])), str(r["old"]), str(r["new"])) for r in given]
     except (TypeError, KeyError):
-        raise RefusedError(400, "a rename is {path, old, new}") from None
+        raise RefusedError(400, "a rename must be {path, old, new}") from None
 
 
 WORKS: Mapping[str, Callable[..., Any]] = {

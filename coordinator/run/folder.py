@@ -16,11 +16,12 @@ RESULT = "result.json"
 DEFAULT = Path("runs")
 NODE_LOGS = DEFAULT / "logs"
 """Where the programs that are started for a run keep their logs, a file each."""
-SEMANTICS = 3
+SEMANTICS = 4
 """The rules by which this engine executes a net, in the header of each journal (key `semantics`).
 
 1 (and no such key): after 1,000 firings without time the net pauses. 2: endless firing ends in
-ERROR. 3: every dead end is reported. A journal is replayed and resumed under its own rules
+ERROR. 3: every dead end is reported. 4: conflicts over a token are settled first come, first
+served, before the order in the file. A journal is replayed and resumed under its own rules
 (`recording.as_recorded`).
 """
 

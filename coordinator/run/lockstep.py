@@ -14,9 +14,9 @@ NAME = "coordinator"
 
 
 class CoordinatorParty:
-    """Implements `services.comm.party.Party`. `watch(now)` is called once a tick, for progress
-    shown to people; `begin(now)` once every node is there (the mission's start, unless a recorded
-    run is to go on)."""
+    """Implements `services.comm.lockstep.party.Party`. `watch(now)` is called once a tick, for
+    progress shown to people; `begin(now)` once every node is there (the mission's start, unless a
+    recorded run is to go on)."""
 
     def __init__(
         self,

@@ -64,9 +64,8 @@ class Punctuality:
 LINGER = 1.0
 """Seconds that nothing at the end of a run waits for."""
 LEAVE: Final = 2.5
-"""Seconds after the loss of a node in which it may come back to be told good-bye: a little
-longer than it keeps the leases of one who has gone without a word
-(`services.comm.calls.runs.Retention.lease`)."""
+"""How long to wait for a lost node, so that it can be sent BYE (s): a little longer than it keeps
+the leases of a coordinator that left without BYE (`services.comm.calls.callee.Retention.lease`)."""
 
 KEY_CODES: Final = ("key_needed", "no_key_here", "no_key_there", "wrong_key")
 """Refusals (docs/protocol.md) of one whose key is not that of the node."""

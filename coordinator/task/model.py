@@ -7,7 +7,7 @@ priorities, weights and times dropped.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -98,34 +98,33 @@ class Task:
     def error_elements(self) -> frozenset[str]:
         """Names of the places and transitions that only error branches reach, with macro places as
         they are."""
-        transitions = {
-            t.name
+        others: dict[str, int] = {}
+        """By place: how many transitions feed it that are not known to be of an error branch."""
+        takers: dict[str, list[Transition]] = {}
+        for transition in self.transitions.values():
+            for place in {o.place for o in transition.outputs}:
+                others[place] = others.get(place, 0) + 1
+            for place in {i.place for i in transition.inputs}:
+                takers.setdefault(place, []).append(transition)
+        places: set[str] = set()
+        transitions: set[str] = set()
+        new = [
+            t
             for t in self.transitions.values()
             if t.error_branch or any(i.end is End.ERROR for i in t.inputs)
-        }
-        places: set[str] = set()
-        while True:
-            new_places = set(self._only_fed_by(transitions)) - places
-            new_transitions = {
-                t.name
-                for t in self.transitions.values()
-                if any(i.place in places | new_places for i in t.inputs)
-            } - transitions
-            if not new_places and not new_transitions:
-                return frozenset(places | transitions)
-            places |= new_places
-            transitions |= new_transitions
-
-    def _only_fed_by(self, transitions: set[str]) -> Iterator[str]:
-        """Yield the places without initial tokens that only these transitions feed."""
-        for place in self.places.values():
-            feeders = [
-                t.name
-                for t in self.transitions.values()
-                if any(o.place == place.name for o in t.outputs)
-            ]
-            if feeders and not place.tokens and transitions.issuperset(feeders):
-                yield place.name
+        ]
+        # Each transition is looked at once: large nets are shown while a mission is active.
+        while new:
+            transition = new.pop()
+            if transition.name in transitions:
+                continue
+            transitions.add(transition.name)
+            for place in {o.place for o in transition.outputs}:
+                others[place] -= 1
+                if not others[place] and place in self.places and not self.places[place].tokens:
+                    places.add(place)
+                    new += takers.get(place, ())
+        return frozenset(places | transitions)
 
     def primitive_task_of(self, place: str) -> PrimitiveTask:
         """Return the primitive task of an action place of the flat task. Raises KeyError."""

@@ -43,6 +43,8 @@ _IDENTIFIER = re.compile(r"[^\W\d]\w*\Z")
 _RESERVED = frozenset({"and", "or", "not", "true", "false", "none"})
 MOST_COPIES = 1_000
 """Largest number of copies that `tries` may make of one transition (`expansion`)."""
+LONGEST = 1e9
+"""Longest time in a task file (s), about 31 years."""
 _COST = re.compile(r"(wall|cpu|count|value:[^\W\d]\w*)\Z")
 
 
@@ -124,12 +126,7 @@ def _primitive_task(p: PrimitiveTask) -> Iterator[Fault]:
         if n > 1:
             yield Fault(f"{key}.alternatives", f"{action!r} is listed {n} times", "name it once")
     for name, seconds in (("deadline", p.deadline), ("stop_within", p.stop_within)):
-        if not seconds > 0:
-            yield Fault(
-                f"{key}.{name}",
-                f"expected a time above 0, got {seconds} s",
-                "give a positive number of seconds",
-            )
+        yield from _time(f"{key}.{name}", seconds)
     if not 0 < p.target_reliability <= 1:
         yield Fault(
             f"{key}.target_reliability",
@@ -203,10 +200,15 @@ def _event(task: Task, e: Event) -> Iterator[Fault]:
         )
     if e.early is EarlyEvent.KEEP and (e.scope is Scope.INTERNAL or e.memory is EventMemory.PULSE):
         yield Fault(f"{key}.early", "only a latched external event can be kept", "drop `early`")
-    if e.mean_wait is not None and not e.mean_wait > 0:
+    if e.mean_wait is not None:
+        yield from _time(f"{key}.mean_wait", e.mean_wait)
+
+
+def _time(key: str, seconds: float) -> Iterator[Fault]:
+    if not 0 < seconds <= LONGEST:
         yield Fault(
-            f"{key}.mean_wait",
-            f"expected a mean time above 0, got {e.mean_wait} s",
+            key,
+            f"expected a time above 0 and at most {LONGEST:g} s, got {seconds:g} s",
             "give a positive number of seconds",
         )
 
@@ -307,9 +309,8 @@ def _short_forms(
         yield Fault(f"{key}.retry_unknown", "there is only one try", "give `tries`")
     if p.timeout is not None and runs:
         primitive = task.primitive_tasks.get(p.task)
-        if not p.timeout > 0:
-            yield Fault(f"{key}.timeout", f"{p.timeout} s", "give a positive number of seconds")
-        elif primitive is not None and p.timeout > primitive.deadline:
+        yield from _time(f"{key}.timeout", p.timeout)
+        if primitive is not None and p.timeout > primitive.deadline:
             text = f"{p.timeout} s is longer than the deadline of {p.task}, {primitive.deadline} s"
             yield Fault(f"{key}.timeout", text, "give less, or raise the deadline")
     if p.listen and p.kind not in (Kind.ACTION, Kind.PLAIN):
@@ -509,12 +510,8 @@ def _trigger(task: Task, key: str, t: Transition) -> Iterator[Fault]:
         yield Fault(f"{key}.event", f"it waits for the pulses {listed(pulses)} at once", remedy)
     if len(set(t.events)) < len(t.events):
         yield Fault(f"{key}.event", "an event is listed twice", "name it once")
-    if t.after is not None and not t.after > 0:
-        yield Fault(
-            f"{key}.after",
-            f"expected a time above 0, got {t.after} s",
-            "give a positive number of seconds",
-        )
+    if t.after is not None:
+        yield from _time(f"{key}.after", t.after)
     if t.after is not None and t.events:
         remedy = "put the timer on a transition of its own beside this one"
         yield Fault(f"{key}.after", "it waits for an event and for a time", remedy)

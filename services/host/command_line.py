@@ -41,8 +41,15 @@ def log_to_stderr(level: int = logging.INFO) -> None:
     logging.getLogger("numba").setLevel(max(level, logging.INFO))
 
 
-def whole(least: int = 1) -> Callable[[str], int]:
-    """Return the type of an option that takes a whole number of at least `least`."""
+MOST_RUNS = 1_000_000
+"""Largest number of runs that one command may ask for."""
+LARGEST_SEED = 2**63 - 1
+"""As a signed 64-bit number carries it."""
+
+
+def whole(least: int = 1, most: int | None = None) -> Callable[[str], int]:
+    """Return the type of an option that takes a whole number of at least `least`, at most
+    `most`."""
 
     def read(text: str) -> int:
         try:
@@ -51,6 +58,8 @@ def whole(least: int = 1) -> Callable[[str], int]:
             value = least - 1
         if value < least:
             raise ArgumentTypeError(f"{text} is not a whole number of at least {least}")
+        if most is not None and value > most:
+            raise ArgumentTypeError(f"{text} is more than the largest number, {most}")
         return value
 
     return read

@@ -91,7 +91,11 @@ class FloorCamera(Driver):
 
     def state(self) -> Mapping[str, Any]:
         """Return plain data for operator and report."""
-        return {"rate": self._rate, "images": self._count}
+        return {
+            "rate": self._rate,
+            "source": self._images.condition or "ok",
+            "images": self._count,
+        }
 
     def stop(self, now: float) -> None:
         """Take no more images."""

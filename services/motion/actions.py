@@ -280,6 +280,6 @@ async def _go(ctx: Context, pose: str, speed: float, until: float) -> Result | N
 
     await ctx.sleep(CYCLE)
     if not await ctx.wait(over, max(0.0, until - ctx.now)):
-        what = ctx.device.state["guard"] or "still under way"
+        what = ctx.device.state["guard"] or "still in progress"
         return error("arm_timeout", f"pose {pose} not reached in time: {what}")
     return _trouble(ctx.device.state)

@@ -5,7 +5,7 @@ A commanded step is allowed only if the pose in which the arm would come to rest
 that step, touches nothing, and, where the braking distance is long, if the path to it touches
 nothing either. So the arm can stop at any moment without touching anything: where a step is
 refused, the arm brakes along the path that was found clear one cycle before (compare
-inevitable collision states, Fraichard and Asama, IROS 2003).
+T. Fraichard, H. Asama, Inevitable collision states: a step towards safer robots?, IROS 2003).
 
 The kernels compute on plain floats and use square roots and squares only, so that the compiled
 kernels (numba) decide exactly as the uncompiled ones; sine and cosine come from the same C library

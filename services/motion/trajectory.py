@@ -3,8 +3,8 @@ cycle and any state of motion.
 
 In each cycle each joint takes the greatest velocity from which it can still come to rest exactly on
 its target by an even ramp of whole cycles. That is the discrete time-optimal rule (compare Kroeger,
-"On-line trajectory generation in robotic systems", 2010, type II). It needs no planning, so a new
-target costs nothing. Positions are the trapezoidal sums of the velocities: a drive that
+"On-Line Trajectory Generation in Robotic Systems", Springer 2010, type I). It needs no planning, so
+a new target costs nothing. Positions are the trapezoidal sums of the velocities: a drive that
 interpolates linearly in velocity follows them exactly.
 
 The kernels compute on plain floats, not arrays: six joints are too few for numpy to be faster.

@@ -47,7 +47,7 @@ def make_driver(directory: Directory, device: DeviceEntry, ports: Ports) -> Driv
         )
         raise DirectoryError((f"{here}.driver: {text}",))
     period = driver.period
-    if period is not None and not (isinstance(period, int | float) and 0.0 <= period < math.inf):
-        text = f"{device.driver}.period: expected seconds or None, found {period!r:.40}"
+    if period is not None and not (isinstance(period, int | float) and 0.0 < period < math.inf):
+        text = f"{device.driver}.period: expected seconds above 0 or None, found {period!r:.40}"
         raise DirectoryError((f"{here}.driver: {text}",))
     return driver

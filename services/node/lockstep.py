@@ -199,8 +199,8 @@ _ANSWERS = (Welcome, Refuse, Accept, Feedback, Outcome, Event, Answer, Pong)
 
 
 class LockstepNode:
-    """Implements `services.comm.party.Party` for one node of services.toml. Raises DirectoryError
-    when a driver refuses.
+    """Implements `services.comm.lockstep.party.Party` for one node of services.toml. Raises
+    DirectoryError when a driver refuses.
 
     Endpoints send under their own names (action, device, service, timer), whatever node they live
     on, and a call to one's own node takes the same way as any other: so moving an action to another

@@ -147,6 +147,7 @@ class Camera(Driver):
         """Return plain data for operator and report."""
         return {
             "rate": self._rate,
+            "source": self._images.condition or "ok",
             "images": self._count,
             "background_images": self.background.images,
         }

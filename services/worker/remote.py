@@ -74,7 +74,7 @@ class Refusing(Protocol):
 
 class RemoteDriver:
     """The actions' end: implements `services.device.Remote` for them and
-    `services.runner.DeviceControl` for the runner.
+    `services.worker.runner.DeviceControl` for the runner.
 
     `post` sends a command; `take` is given each newer state. Where the driver lives in the same
     process, `expect` is told instead where to get it: nothing is put together that nobody looks at.

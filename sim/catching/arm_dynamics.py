@@ -1,13 +1,17 @@
 """Mass matrix and bias torques of the arm in this project's own code, for the portable back end.
 
-The recursive Newton-Euler algorithm (J. Y. S. Luh et al. 1980) and the composite rigid body
-algorithm (M. W. Walker, D. E. Orin 1982) in link coordinates. Frame i stands at joint i and turns
-with link i; its z axis is the joint's axis.
+The recursive Newton-Euler algorithm (J. Y. S. Luh, M. W. Walker, R. P. C. Paul, On-line
+computational scheme for mechanical manipulators, J. Dyn. Syst. Meas. Control 102, 1980) and the
+composite rigid body algorithm (M. W. Walker, D. E. Orin, Efficient dynamic computer simulation of
+robotic mechanisms, J. Dyn. Syst. Meas. Control 104, 1982) in link coordinates. Frame i stands at
+joint i and turns with link i; its z axis is the joint's axis.
 
-Three steps make them fast. Second moments stand for the inertia tensors (C. A. Balafoutis et al.
-1988). The numbers of the links are regrouped, so that masses and some moments are zero. And for
-arms with the geometry of a PUMA, right angles and offsets that are zero, both algorithms are
-written out without the terms that vanish. Other arms have `general_torques`, which is slower.
+Three steps make them fast. Second moments replace the inertia tensors (C. A. Balafoutis, R. V.
+Patel, P. Misra, Efficient modeling and computation of manipulator dynamics using orthogonal
+Cartesian tensors, IEEE J. Robotics and Automation 4, 1988). The numbers of the links are regrouped,
+so that masses and some moments are zero. And for arms with the geometry of a PUMA, right angles and
+offsets that are zero, both algorithms are written out without the terms that vanish. Other arms
+have `general_torques`, which is slower.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 regime's disturbances.
 
 Only the laboratory reads this. A regime name is a regime and any number of disturbances of
-`sim/catching/laboratory.toml`, joined by `+` (or a comma): `A`, `B+latency200`, `A+dim+arm50`.
+`sim/catching/laboratory.toml`, joined by `+` (or a comma): `A`, `B+latency200`, `A+dim+arm50`. With
+`@n` behind it, it takes place in another installation: `C@3`, `A+dim@1`.
 """
 
 from __future__ import annotations
@@ -137,7 +138,8 @@ def read_toml(path: Path) -> dict[str, Any]:
 def disturb(settings: Mapping[str, Any], regime: str) -> tuple[tuple[float, float], dict[str, Any]]:
     """Return the speed range and the disturbed values of a regime name. Raises LaboratoryError for
     an unknown or contradictory one."""
-    base, *names = (part.strip() for part in regime.replace(",", "+").split("+"))
+    name = regime.partition("@")[0]
+    base, *names = (part.strip() for part in name.replace(",", "+").split("+"))
     regimes, disturbances = settings["regimes"], settings["disturbances"]
     if base not in regimes:
         raise LaboratoryError(
@@ -166,21 +168,41 @@ def disturb(settings: Mapping[str, Any], regime: str) -> tuple[tuple[float, floa
     return (float(low), float(high)), values
 
 
+def installation_of(regime: str) -> int:
+    """Return the number of the installation behind the `@` of a regime name; 0, the shipped one,
+    without it. Raises LaboratoryError."""
+    _, at, text = regime.partition("@")
+    if not at:
+        return 0
+    if not (text.isascii() and text.isdecimal()):
+        raise LaboratoryError(
+            f"regime {regime!r}: expected the number of an installation after @, got {text!r}; "
+            "write for example 'C@2'"
+        )
+    return int(text)
+
+
 def read_truth(
     cell: Mapping[str, Any], regime: str = "A", laboratory: Path = LABORATORY_FILE
 ) -> Truth:
-    """Return the truth of a regime: nominal `cell` (services/cell.toml), this installation's
-    errors, the regime's disturbances."""
+    """Return the truth of a regime: nominal `cell` (services/cell.toml), the installation's errors,
+    the regime's disturbances."""
     settings = read_toml(laboratory)
     try:
         speed, values = disturb(settings, regime)
-        errors = settings["installation"]
+        errors, number = settings["installation"], installation_of(regime)
         rng = np.random.default_rng(errors["seed"])
+        camera, cup = _camera(cell["camera"], errors, values, rng), cell["cup"]
+        if number:
+            rng = np.random.default_rng((errors["seed"], number))
+            others = settings["installations"]
+            camera = _calibrated(camera, others, rng)
+            settings, cup = _elsewhere(settings, cup, others, rng)
         return Truth(
             regime=regime,
             speed=speed,
-            camera=_camera(cell["camera"], errors, values, rng),
-            cup=_cup(cell["cup"], errors, values, rng),
+            camera=camera,
+            cup=_cup(cup, errors, values, rng),
             table=_table(cell["table"], errors, rng),
             joint_zero=rng.normal(0.0, errors["joint_zero"], 6),
             light_gradient=(float(values["light_gradient"][0]), float(values["light_gradient"][1])),
@@ -236,6 +258,41 @@ def _camera(
         principal_px=(centre[0] + float(dx), centre[1] + float(dy)),
         distortion=(float(k1), float(k2), float(p1), float(p2)),
     )
+
+
+def _calibrated(
+    camera: CameraTruth, left: Mapping[str, Any], rng: np.random.Generator
+) -> CameraTruth:
+    """Return the camera of another installation, as its own calibration would find it: the shipped
+    one but for what calibrations leave."""
+    turn = rotation_from_vector(rng.normal(0.0, left["camera_rotation"], 3))
+    dx, dy = rng.normal(0.0, left["camera_principal_px"], 2)
+    k1, k2, p1, p2 = np.asarray(camera.distortion) * (
+        1.0 + rng.normal(0.0, left["camera_distortion"], 4)
+    )
+    return CameraTruth(
+        position=camera.position + rng.normal(0.0, left["camera_position"], 3),
+        rotation=turn @ camera.rotation,
+        focal_px=camera.focal_px * (1.0 + float(rng.normal(0.0, left["camera_focal"]))),
+        principal_px=(camera.principal_px[0] + float(dx), camera.principal_px[1] + float(dy)),
+        distortion=(float(k1), float(k2), float(p1), float(p2)),
+    )
+
+
+def _elsewhere(
+    settings: Mapping[str, Any],
+    cup: Mapping[str, Any],
+    ranges: Mapping[str, Any],
+    rng: np.random.Generator,
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return settings and cup of another installation: its table is as smooth, its thrower throws
+    with as little spin and its cup is as large and springy as drawn."""
+    friction, spin, radius, restitution = (
+        float(rng.uniform(*ranges[key]))
+        for key in ("friction", "least_spin", "cup_radius", "cup_restitution")
+    )
+    ball = {**settings["ball"], "friction": friction, "spin": [spin, settings["ball"]["spin"][1]]}
+    return {**settings, "ball": ball}, {**cup, "radius": radius, "restitution": restitution}
 
 
 def _cup(

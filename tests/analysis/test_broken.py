@@ -102,6 +102,7 @@ def faults_by_brute_force(task: Task) -> set[str]:
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+@pytest.mark.processes
 def test_single_mistakes_are_refused_if_they_matter(path: Path, tmp_path: Path) -> None:
     """A sample of all single mistakes: the analysis refuses what deadlocks or leaks, and its
     witness replays."""
@@ -129,6 +130,7 @@ def test_single_mistakes_are_refused_if_they_matter(path: Path, tmp_path: Path) 
     assert refused_ >= 5 and harmless >= 1
 
 
+@pytest.mark.processes
 def test_a_task_that_loops_and_never_ends_is_refused(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -152,6 +154,7 @@ def test_a_task_that_loops_and_never_ends_is_refused(
     assert "sound: from" in told and "no designed end can be reached" in told and "by: " in told
 
 
+@pytest.mark.processes
 def test_check_refuses_and_analyse_draws(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -53,7 +53,7 @@ class Case:
         return make_task(self.places, self.net, self.events, final=self.final, **(self.more or {}))
 
 
-STUCK = {
+STUCK: dict[str, Case] = {
     "an ended run waits for a token that does not come back": Case(
         "arm~=1 parts=2 tray=1 look!",
         {
@@ -148,9 +148,84 @@ STUCK = {
             "fail": {"in": "look:error", "out": "go"},
         },
         "go == 0 and look == 0",
-        ("store is barred by box, which holds 1",),
+        ("store is barred by box (capacity 1), which holds 1",),
     ),
 }
+
+
+CELL = "parts=3 arm~=1/1 camera~=1/1 look! grasp! place! done recover! broken"
+PICK: Mapping[str, Mapping[str, Any]] = {
+    "next": {"in": "parts arm camera", "out": "look"},
+    "seen": {"in": "look:normal", "out": "grasp camera"},
+    "unseen": {"in": "look:error", "out": "arm camera parts"},
+    "grasped": {"in": "grasp:normal", "out": "place"},
+    "missed": {"in": "grasp:error", "out": "recover"},
+    "placed": {"in": "place:normal", "out": "arm done"},
+    "dropped": {"in": "place:error", "out": "recover"},
+    "recovered": {"in": "recover:normal", "out": "arm done"},
+    "gone": {"in": "recover:error", "out": "broken"},
+}
+"""A right task: three parts, with an arm and a camera; `broken` is its honest end."""
+
+
+def seeded(*told: str, cell: str = CELL, **changes: Mapping[str, Any]) -> Case:
+    """The right task with a fault."""
+    net = {**PICK, **{name: {**PICK.get(name, {}), **new} for name, new in changes.items()}}
+    more = {"final_error": parse("broken == 1")}
+    return Case(cell, net, "parts == 0 and arm == 1 and camera == 1", told, "bell*", more)
+
+
+STUCK |= {
+    "a resource is not given back": seeded(
+        "next needs camera, which is empty: taken by `next`, never returned by `seen`, `grasped`, "
+        "`placed`",
+        seen={"out": "grasp"},
+    ),
+    "an error branch gives back only one of two": seeded(
+        "next needs camera, which is empty: taken by `next`, never returned by `unseen`",
+        unseen={"out": "arm parts"},
+    ),
+    "a resource is given back twice": seeded(
+        "placed is barred by arm (capacity 1, and it adds 2), which holds 0",
+        placed={"out": "arm*2 done"},
+    ),
+    "a resource is given back twice into a place without capacity": seeded(
+        "no transition takes what is left, and the end asks for arm == 1 (it holds 4), or for "
+        "broken == 1",
+        cell=CELL.replace("arm~=1/1", "arm~=1"),
+        placed={"out": "arm*2 done"},
+    ),
+    "a preempt arc loses the arm": seeded(
+        "next needs arm, which is empty: taken by `next`, never returned by `seen`, `stop`",
+        stop={"in": "grasp:preempt=none", "event": "bell"},
+    ),
+    "an inhibitor looks at the wrong place": seeded(
+        "next is barred by done, which holds 1", next={"in": "parts arm camera !done"}
+    ),
+    "a place has too little room": seeded(
+        "placed is barred by done (capacity 2), which holds 2",
+        cell=CELL.replace("done", "done/2"),
+    ),
+    "a flag is not set again": seeded(
+        "next needs ready, which is empty: taken by `next`, never returned by `seen`, `grasped`, "
+        "`placed`",
+        cell=f"{CELL} ready=1",
+        next={"in": "parts arm camera ready"},
+        unseen={"out": "arm camera parts ready"},
+        recovered={"out": "arm done ready"},
+    ),
+    "an arc takes two parts at once": seeded(
+        "next needs 2 of parts, which holds 1", next={"in": "parts*2 arm camera"}
+    ),
+    "an error branch is missing": seeded(
+        "no transition takes what ended in place that way", dropped={"in": "place:normal"}
+    ),
+}
+
+
+def test_the_right_task_has_no_fault() -> None:
+    answer = may_run(seeded().task, None, Budget())
+    assert answer.ok and not answer.objections()
 
 
 @pytest.mark.parametrize("what", STUCK)
@@ -518,7 +593,7 @@ def test_the_operators_hand_can_make_the_catching_task_stuck() -> None:
     notes = found.hand_notes(20_000)
     recovered = next(n for n in notes if "arm_recovered" in n)
     assert recovered.startswith("only if the operator moves tokens: stuck with")
-    assert "forgive is barred by attempts, which holds 3" in recovered
+    assert "forgive is barred by attempts (capacity 3), which holds 3" in recovered
     command = "the operator adds a token to failed_attempts -> nothing"
     assert recovered.count("the operator") == 2 and command in recovered
     assert all("the operator adds" in note or "the operator takes" in note for note in notes)

@@ -24,6 +24,7 @@ async def said_of(
     return code, capsys.readouterr().out
 
 
+@pytest.mark.processes
 async def test_nodes_that_give_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Up, with the same file: the task may run."""
     directory = directory_in(tmp_path)
@@ -36,6 +37,7 @@ async def test_nodes_that_give_all(tmp_path: Path, capsys: pytest.CaptureFixture
     assert (code, "may run" in said) == (0, True), said
 
 
+@pytest.mark.processes
 async def test_a_node_that_is_away(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Its address, what it would have offered and the remedy are named; the exit code is that of an
     unreachable node."""
@@ -45,6 +47,7 @@ async def test_a_node_that_is_away(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "robot at 127.0.0.1" in said and "reach_slowly" in said and "may not run" in said
 
 
+@pytest.mark.processes
 async def test_a_node_with_an_older_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -225,6 +225,7 @@ def test_a_port_in_use_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixtur
     )
 
 
+@pytest.mark.processes
 def test_check_gives_its_findings_as_json(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -236,6 +237,7 @@ def test_check_gives_its_findings_as_json(
     assert answer["task"] == "catch_ball"
 
 
+@pytest.mark.processes
 def test_a_task_without_error_branch_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -253,6 +255,7 @@ def test_a_task_without_error_branch_is_refused(
     assert "error" in said.out + said.err
 
 
+@pytest.mark.processes
 def test_a_task_that_can_deadlock_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -471,6 +474,7 @@ def test_a_task_of_ones_own_comes_before_a_shipped_one(
     assert task_path("catch_ball") == Path("tasks/catch_ball.toml")
 
 
+@pytest.mark.processes
 def test_a_task_may_name_its_own_location_file(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -139,6 +139,7 @@ def test_bad_input_names_file_key_and_remedy(command: str, said: str, petrobot: 
     assert "Error(" not in err and "Errno" not in err
 
 
+@pytest.mark.processes
 def test_a_cell_that_was_not_given_is_named(petrobot: Petrobot) -> None:
     """The location file beside the task, one folder above it, or here; no other cell's."""
     assert petrobot("check", "work.toml")[0] == 0
@@ -161,6 +162,7 @@ def test_a_cell_that_was_not_given_is_named(petrobot: Petrobot) -> None:
     assert code == 2 and "there is no services.toml beside the task" in err
 
 
+@pytest.mark.processes
 def test_an_action_that_translates_another_task_is_told(petrobot: Petrobot) -> None:
     """This is a warning; the task may still run."""
     Path("services.toml").write_text(
@@ -175,6 +177,7 @@ def test_an_action_that_translates_another_task_is_told(petrobot: Petrobot) -> N
     assert "write task = 'work' in its [actions.work]" in out
 
 
+@pytest.mark.processes
 def test_check_does_not_promise_what_analyse_does_not_do(petrobot: Petrobot) -> None:
     """`analyse` searches longer than `check`, but not when the net is unbounded."""
     endless = WORK.replace('out = ["robot_free"]', 'out = ["robot_free", "runs*2"]', 1)
@@ -184,6 +187,7 @@ def test_check_does_not_promise_what_analyse_does_not_do(petrobot: Petrobot) -> 
     assert "cut short (the net is unbounded)" in out and "goes on longer" not in out
 
 
+@pytest.mark.processes
 def test_a_search_that_was_cut_short_may_go_on(
     petrobot: Petrobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:

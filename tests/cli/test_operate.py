@@ -256,7 +256,7 @@ def test_without_a_run_every_command_says_so(
         "override": ["t", "a"],
     }
     assert main([name, *arguments.get(name, []), "--journal", str(tmp_path)]) == 2
-    assert "goes on; begin one with `petrobot run`" in capsys.readouterr().err
+    assert "is active; start one with `petrobot run`" in capsys.readouterr().err
 
 
 async def test_a_coordinator_that_is_gone_is_exit_code_3(petrobot: Terminal) -> None:
@@ -277,7 +277,7 @@ def test_the_door_is_its_owners_alone_and_gone_with_its_run(tmp_path: Path) -> N
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         assert find_door(folder=tmp_path) == find_door("r", tmp_path) == door
     assert not path.exists()
-    with pytest.raises(NoRunError, match="does not go on"):
+    with pytest.raises(NoRunError, match="is not active"):
         find_door("r", tmp_path)
 
 

@@ -16,10 +16,17 @@ from petrobot.coordinator.engine import (
     Finished,
     Fired,
     Mode,
+    Pause,
     Policy,
+    RemoveTokens,
+    Resume,
+    RunEnded,
     StopConfirmed,
     Subject,
+    state_from_plain,
+    to_plain,
 )
+from petrobot.coordinator.engine.step import RECORDED
 from petrobot.coordinator.task import Executed, Status
 
 Plays = Callable[..., Any]
@@ -195,6 +202,69 @@ def test_undecided_conflict_goes_by_file_order_and_is_reported(play: Plays) -> N
     p = play("x=1 y z", net, events="e")
     p(EventOccurred("e"))
     assert p.fired == ["t"] and p.reports == ["undecided"]
+
+
+ARM = {
+    "hold": {"in": "go arm", "out": "c"},
+    "free": {"in": "c:normal", "out": "arm"},
+    "first": {"in": "a:normal arm", "out": "arm done_a"},
+    "second": {"in": "b:normal arm", "out": "arm done_b"},
+}
+"""`first` and `second` need the arm, which c holds."""
+
+
+def ended(run: str) -> RunEnded:
+    return RunEnded(run, Status.SUCCESS)
+
+
+@pytest.mark.parametrize(
+    ("ends", "served"),
+    [(("a#1", "b#1"), ["first", "second"]), (("b#1", "a#1"), ["second", "first"])],
+)
+def test_a_conflict_over_a_resource_is_settled_first_come_first_served(
+    play: Plays, ends: tuple[str, ...], served: list[str]
+) -> None:
+    p = play("go=1 arm~=1 a!=1 b!=1 c! done_a done_b", ARM)
+    p(*map(ended, ends))
+    assert [wait.since for wait in p.state.waits.values()] and p.fired == ["hold"]
+    p(ended("c#1"))
+    assert p.fired == ["hold", "free", *served] and p.reports == [] and not p.state.waits
+
+
+def test_who_waits_from_the_same_stimulus_goes_by_the_order_in_the_file(play: Plays) -> None:
+    p = play("go=1 arm~=1 x a!=1 b!=1 c! done_a done_b", ARM, policy=Policy(end_when_dead=False))
+    p(Pause(), ended("b#1"), ended("a#1"), Resume())
+    waits = {name: wait.since for name, wait in p.state.waits.items()}
+    assert waits == {"second": 3, "first": 4}  # they waited while the net was paused
+    net = {"both": {"in": "s:normal", "out": "x y"}, "t": {"in": "x r"}, "u": {"in": "y r"},
+           "give": {"in": "h:normal", "out": "r"}}  # fmt: skip
+    p = play("s!=1 h!=1 x y r", net)
+    p(ended("s#1"))
+    assert {wait.since for wait in p.state.waits.values()} == {2}
+    p(ended("h#1"))
+    assert p.fired == ["both", "give", "t"] and p.reports == ["undecided"]
+
+
+def test_a_wait_ends_when_something_else_is_lacking(play: Plays) -> None:
+    """`second` came first, loses its own token for a while, and has to queue again."""
+    net = {**ARM, "second": {"in": "ticket arm", "out": "arm done_b"}}
+    p = play("go=1 arm~=1 ticket=1 a!=1 c! done_a done_b", net)
+    assert p.state.waits["second"].since == 1
+    p(ended("a#1"), RemoveTokens("ticket"), AddTokens("ticket"))
+    p(ended("c#1"))
+    assert p.fired == ["hold", "free", "first", "second"]
+
+
+def test_old_journals_keep_the_order_in_the_file(play: Plays) -> None:
+    p = play("go=1 arm~=1 a!=1 b!=1 c! done_a done_b", ARM, policy=RECORDED[3])
+    p(ended("b#1"), ended("a#1"), ended("c#1"))
+    assert p.fired == ["hold", "free", "first", "second"] and not p.state.waits
+
+
+def test_a_state_with_waits_is_written_and_read(play: Plays) -> None:
+    p = play("go=1 arm~=1 a!=1 b!=1 c! done_a done_b", ARM)
+    p(ended("b#1"))
+    assert state_from_plain(to_plain(p.state)) == p.state
 
 
 def test_exclusive_conditions_are_no_conflict(play: Plays) -> None:

@@ -454,3 +454,8 @@ def test_example_of_the_documentation_is_a_sound_task() -> None:
     text = (Path(__file__).parents[2] / "docs" / "task-file.md").read_text(encoding="utf-8")
     example = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)[0]
     assert check(loads(example)).findings == ()
+
+
+def test_a_file_may_begin_with_a_byte_order_mark() -> None:
+    """Some editors write one; it changes nothing."""
+    assert loads("\ufeff" + GOOD) == loads(GOOD)

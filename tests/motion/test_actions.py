@@ -234,7 +234,7 @@ def test_a_pose_that_is_not_reached_in_time_is_an_error(play: Any) -> None:
     play.rig.run(0.8)
     result = play.play(actions.empty_and_home(play, timeout=0.3, speed=0.3))
     assert (result.status, result.cause) == (Status.ERROR, "arm_timeout")
-    assert "home not reached in time: still under way" in result.text
+    assert "home not reached in time: still in progress" in result.text
 
 
 def test_actions_report_that_the_drives_are_off(make_rig: Any, make_play: Any) -> None:

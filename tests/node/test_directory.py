@@ -159,7 +159,7 @@ FAULTS = [
     (
         "[actions.look_twice]",
         "[actions.look]",
-        "actions.look: is placed twice; each name stands on one node only",
+        "actions.look: is placed twice; a name may belong to one node only",
     ),
     (
         "[actions.add]",
@@ -170,12 +170,12 @@ FAULTS = [
     (
         "deadline = 5",
         "deadline = 0",
-        ":25: actions.look.deadline: is 0; write a number of seconds above 0",
+        ":25: actions.look.deadline: is 0; write a number of seconds above 0 and below 1e9",
     ),
     (
         "deadline = 5",
         "deadline = nan",
-        "actions.look.deadline: is nan; write a number of seconds above 0",
+        "actions.look.deadline: is nan; write a number of seconds above 0 and below 1e9",
     ),
     ("deadline = 5", "deadlin = 5", "actions.look.deadlin: unknown key; did you mean 'deadline'?"),
     ("deadline = 5", 'on_resume = "retry"', 'write one of "rejoin", "error", "ask"'),
@@ -194,9 +194,13 @@ FAULTS = [
     (
         "period = 0.02",
         "period = -1",
-        "streams.where.period: is -1; write a number of seconds above 0",
+        "streams.where.period: is -1; write a number of seconds above 0 and below 1e9",
     ),
-    ("period = 0.04\n", "", "timers.beat.period: is missing; write a number of seconds above 0"),
+    (
+        "period = 0.04\n",
+        "",
+        "timers.beat.period: is missing; write a number of seconds above 0 and below 1e9",
+    ),
     (
         "call = 0.008",
         "call = 0.001",
@@ -214,7 +218,7 @@ FAULTS = [
     ),
     ("[devices.hand]", '[devices."a hand"]', "a name has letters, digits, _ and - only"),
     ("port = 7301", "port = ", ":6: not valid TOML"),
-    (GOOD, "schema = 1\n", "nodes: there is no node; write at least one [nodes.NAME]"),
+    (GOOD, "schema = 1\n", "nodes: no node here; write at least one [nodes.NAME]"),
     ("[links]\ncall = 0.008\n", "[links_]\n", "links_: unknown table; did you mean 'links'?"),
 ]
 

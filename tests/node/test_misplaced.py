@@ -134,7 +134,7 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "period = 0.02 ",
         "period = 0 ",
-        ":56: streams.catch_point.period: is 0; write a number of seconds above 0",
+        ":56: streams.catch_point.period: is 0; write a number of seconds above 0 and below 1e9",
     ),
     (
         "period = 0.04 ",

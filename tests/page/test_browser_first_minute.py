@@ -298,7 +298,7 @@ async def test_a_loaded_task_that_was_changed_outside_is_shown_before_it_runs(
     await expect(element(tab, "^Control place jobs, 2 tokens", "Task net")).to_be_visible()
     altered(cell)
     await toolbar.get_by_role("button", name="Start", exact=True).click()
-    await toasted(tab, "changed outside")
+    await toasted(tab, "changed by another program")
     await expect(element(tab, "^Control place jobs, 1 token", "Task net")).to_be_visible()
     assert not list(cell.runs.glob("*")), "nothing has run"
     answer = await cell.station.command(
@@ -318,9 +318,9 @@ async def test_run_this_task_never_runs_a_changed_file_unseen(
     await checked(tab)
     text = altered(cell)
     await tab.get_by_role("button", name="Run this task").click()
-    await toasted(tab, "changed outside")
+    await toasted(tab, "changed by another program")
     assert not list(cell.runs.glob("*")), "nothing has run"
-    await expect(tab.locator(".saved")).to_contain_text("changed outside")
+    await expect(tab.locator(".saved")).to_contain_text("changed by another program")
     await tab.get_by_role("button", name="Load it").click()
     await expect(element(tab, "^Control place jobs, 1 token")).to_be_visible()
     await expect(tab.locator(".saved")).to_have_text("saved")
@@ -335,6 +335,6 @@ async def test_a_change_by_another_program_is_noticed_at_once(
     await settled(tab)
     await checked(tab)
     altered(cell)
-    await expect(tab.locator(".saved")).to_contain_text("changed outside")
+    await expect(tab.locator(".saved")).to_contain_text("changed by another program")
     await tab.get_by_role("button", name="Load it").click()
     await expect(element(tab, "^Control place jobs, 1 token")).to_be_visible()

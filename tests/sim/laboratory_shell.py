@@ -22,11 +22,48 @@ from petrobot.services.comm.lockstep.mesh import Member
 from petrobot.services.comm.lockstep.party import Envelope
 from petrobot.services.comm.protocol.messages import Call, Hello, Outcome
 from petrobot.sim.realtime import LaboratoryShell
+from tests.ports import free_ports
 
 REPOSITORY = Path(__file__).parents[2]
 NUMBERS = itertools.count(1)
 PATIENCE = 60.0
 """Longest wait (s of wall time) on a busy machine."""
+
+
+def laboratory_file(folder: Path, sim: str, parameters: str) -> Path:
+    """Write a location file with free ports: a laboratory, and the node of a robot with a device on
+    the laboratory's bus and one on its camera."""
+    node, bus, camera, coordinator = free_ports(4)
+    file = folder / "services.toml"
+    file.write_text(f"""\
+schema = 1
+[nodes.laboratory]
+host = "127.0.0.1"
+port = {node}
+sim = "{sim}"
+[nodes.robot]
+host = "127.0.0.1"
+port = {coordinator}
+[devices.drives]
+node = "robot"
+driver = "nowhere:Drives"
+interface = "petrobot_stream"
+channel = "tcp://127.0.0.1:{bus}"
+[devices.eye]
+node = "robot"
+driver = "nowhere:Eye"
+source = "sim"
+address = "127.0.0.1:{camera}"
+[services.laboratory_prepare]
+node = "laboratory"
+[services.laboratory_score]
+node = "laboratory"
+[services.laboratory_fault]
+node = "laboratory"
+[parameters]
+{parameters}
+""")
+    return file
 
 
 async def until(holds: Callable[[], bool]) -> None:

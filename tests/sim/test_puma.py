@@ -160,7 +160,7 @@ def sixes(rng: np.random.Generator, most: float) -> Six:
 
 
 def any_puma(arm: PumaModel, rng: np.random.Generator) -> PumaModel:
-    """An arm with the geometry of a PUMA whose other numbers are all drawn: none is zero."""
+    """Draw an arm with the geometry of a PUMA and random other numbers, none of them zero."""
     drawn = any_arm(arm, rng)
     d, a = drawn.d, drawn.a
     return replace(
@@ -173,11 +173,11 @@ def any_puma(arm: PumaModel, rng: np.random.Generator) -> PumaModel:
 
 
 @pytest.mark.parametrize("case", range(6))
-def test_the_algorithms_without_their_zeros_agree_with_the_whole_ones(
+def test_the_algorithms_without_zero_terms_agree_with_the_general_ones(
     arm: PumaModel, case: int
 ) -> None:
-    """The shipped arm (case 0), arms with the geometry of a PUMA (1, 2) and any arms: bias and mass
-    matrix within 1e-12 of the general recursion, in plain Python and compiled to the same bits."""
+    """The shipped arm (case 0), arms with the geometry of a PUMA (1, 2), any arms: bias and mass
+    matrix equal the general recursion within 1e-12; plain and compiled code equal to the bit."""
     rng = np.random.default_rng(case)
     if case:
         arm = (any_puma if case < 3 else any_arm)(arm, rng)

@@ -28,6 +28,7 @@ from tests.sim.laboratory_shell import (
     PATIENCE,
     REPOSITORY,
     call,
+    laboratory_file,
     program,
     running,
     score_as_member,
@@ -36,38 +37,9 @@ from tests.sim.laboratory_shell import (
 
 
 def services_file(folder: Path, extra: str = "") -> Path:
-    node, bus, camera, coordinator = free_ports(4)
-    text = f"""\
-schema = 1
-[nodes.laboratory]
-host = "127.0.0.1"
-port = {node}
-sim = "petrobot.sim.catching.laboratory:make_laboratory"
-[nodes.robot]
-host = "127.0.0.1"
-port = {coordinator}
-[devices.arm]
-node = "robot"
-driver = "nowhere:Arm"
-interface = "petrobot_stream"
-channel = "tcp://127.0.0.1:{bus}"
-[devices.eye]
-node = "robot"
-driver = "nowhere:Eye"
-source = "sim"
-address = "127.0.0.1:{camera}"
-[services.laboratory_prepare]
-node = "laboratory"
-[services.laboratory_score]
-node = "laboratory"
-[services.laboratory_fault]
-node = "laboratory"
-[parameters]
-cell = "{REPOSITORY / "services" / "cell.toml"}"
-{extra}"""
-    file = folder / "services.toml"
-    file.write_text(text)
-    return file
+    cell = REPOSITORY / "services" / "cell.toml"
+    sim = "petrobot.sim.catching.laboratory:make_laboratory"
+    return laboratory_file(folder, sim, f'cell = "{cell}"\n{extra}')
 
 
 @pytest.fixture

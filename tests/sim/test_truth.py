@@ -37,6 +37,7 @@ def changed(one: Truth, other: Truth) -> set[str]:
     [
         ("A+drift", {"light_drift"}),
         ("A+dim", {"light_level"}),
+        ("A+dark15", {"light_level"}),
         ("A+miscalibrated", {"camera.position", "camera.rotation", "cup.mouth"}),
         ("A+latency200", {"image_latency"}),
         ("A,latency400", {"image_latency"}),
@@ -53,6 +54,30 @@ def test_a_disturbance_changes_only_what_it_names(site: Site, name: str, differs
     assert changed(site.truth("A"), site.truth(name)) == differs
 
 
+def test_another_installation_differs_in_what_installations_differ_in(site: Site) -> None:
+    """Camera, mounting, table, cup, friction and spin, the same for every regime and seed; what a
+    regime disturbs comes on top."""
+    shipped, one, two = (site.truth(name) for name in ("C", "C@1", "C@2"))
+    mounted = {f"camera.{f.name}" for f in fields(shipped.camera)} | {"joint_zero", "cup.mouth"}
+    mounted |= {"table.top", "table.near_edge", "table.far_edge"}
+    differs = mounted | {"cup.radius", "cup.restitution"}
+    assert changed(shipped, one) == changed(one, two) == differs
+    assert changed(one, site.truth("A@1")) == {"speed"}
+    assert changed(one, site.truth("C+bouncy+dim@1")) == {"light_level", "cup.restitution"}
+    assert changed(one, site.truth("C@1")) == changed(shipped, site.truth("C@0")) == set()
+    found = [site.truth(f"C@{n}") for n in range(1, 40)]
+    for key, of in (
+        ("friction", [t.settings["ball"]["friction"] for t in found]),
+        ("least_spin", [t.settings["ball"]["spin"][0] for t in found]),
+        ("cup_radius", [t.cup.radius for t in found]),
+        ("cup_restitution", [t.cup.restitution for t in found]),
+    ):
+        low, high = SETTINGS["installations"][key]
+        assert low <= min(of) < max(of) <= high and max(of) - min(of) > 0.7 * (high - low), key
+    off = np.array([t.camera.position - shipped.camera.position for t in found])
+    assert np.abs(off).max() < 4.5 * SETTINGS["installations"]["camera_position"]
+
+
 def test_every_disturbance_of_the_file_is_tried_here(site: Site) -> None:
     for name in SETTINGS["disturbances"]:
         assert changed(site.truth("B"), site.truth(f"B+{name}")), name
@@ -64,6 +89,9 @@ def test_every_disturbance_of_the_file_is_tried_here(site: Site) -> None:
         ("Q", "must begin with one of A, B, C, D, E, F"),
         ("dim", "must begin with"),
         ("A+fog", "unknown disturbance 'fog'"),
+        ("A@two", "number of an installation after @, got 'two'"),
+        ("A@", "number of an installation after @, got ''"),
+        ("A@1+dim", "number of an installation after @, got '1+dim'"),
         ("A+latency200+latency400", "latency200 and latency400 both set image_latency"),
     ],
 )

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from petrobot.coordinator.cli import main
+from petrobot.services.comm.streams.image import Image
 from petrobot.services.vision import calibrate as command
 from petrobot.services.vision.calibration import (
     Board,
@@ -223,8 +224,6 @@ def test_missing_images_are_taken_from_the_camera(
 ) -> None:
     """For a folder with only views.toml, each image is taken when the operator confirms, and again
     if the board is not fully visible."""
-    from petrobot.services.comm.streams.image import Image
-
     lines = (folder / "views.toml").read_text(encoding="utf-8").split("[[views]]")
     (tmp_path / "views.toml").write_text("[[views]]".join(lines[:3]), encoding="utf-8")
     shown = [np.zeros((480, 640), np.uint8), views[0].pixels, views[1].pixels]
@@ -233,6 +232,7 @@ def test_missing_images_are_taken_from_the_camera(
     class Hand:
         """A camera that shows the board that the operator holds."""
 
+        condition = ""
         sequence = 0
 
         def start(self, rate: float) -> None:
@@ -301,3 +301,78 @@ def test_shipped_calibration_is_what_the_command_makes(
         == 2
     )
     assert "nowhere/c.toml: folder" in capsys.readouterr().err
+
+
+class Screen:
+    """A camera of 100 images/s whose images come 0.08 s after mid-exposure, before a screen; and
+    the time in which that happens."""
+
+    condition = ""
+    late = 0.08
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.changes = [(0.0, 0.0)]
+        self.sequence = -1
+
+    def flash(self, bright: bool) -> None:
+        """The screen."""
+        self.changes.append((self.now, 200.0 * bright))
+
+    def monotonic(self) -> float:
+        """The time (s); asking takes some of it."""
+        self.now += 1e-5
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass."""
+        self.now += seconds
+
+    def start(self, rate: float) -> None:
+        """It is always on."""
+
+    def stop(self) -> None:
+        """It stays on."""
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def newest(self) -> Image | None:
+        """Each image is exposed at one moment, in its middle."""
+        if int((self.now - self.late) * 100) == self.sequence:
+            return None
+        self.sequence = int((self.now - self.late) * 100)
+        level = [to for at, to in self.changes if at <= self.sequence / 100][-1]
+        pixels = np.full((8, 8), 20, np.uint8)
+        pixels[2:6, 2:6] += np.uint8(level)
+        return Image(pixels, self.now, self.sequence)
+
+
+@pytest.fixture
+def screen(monkeypatch: pytest.MonkeyPatch) -> Screen:
+    """With its own time, which the command then goes by."""
+    made = Screen()
+    monkeypatch.setattr(command, "time", made)
+    return made
+
+
+def test_the_latency_of_a_camera_is_measured(screen: Screen) -> None:
+    latency, spread = command.measure_latency(screen, screen.flash)
+    assert latency == pytest.approx(screen.late, abs=0.002)
+    assert 0.001 < spread < 0.005, "flashes meet any phase of a period of 0.01 s"
+
+
+def test_a_camera_that_does_not_see_the_flash_is_reported(screen: Screen) -> None:
+    with pytest.raises(ConnectionError, match="does not see the flash: point it at the terminal"):
+        command.measure_latency(screen, lambda bright: None)
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [([], "give --views DIR, or --latency"), (["--latency"], "--latency needs --source")],
+)
+def test_what_to_do_must_be_said(
+    given: list[str], text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command.calibrate_main(given) == 2
+    assert text in capsys.readouterr().err

@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,7 +13,6 @@ from hypothesis import strategies as st
 
 from petrobot.services.comm.streams.camera import (
     IMAGE_HEADER,
-    CaptureImages,
     ImageDecoder,
     ImageFormatError,
     ImageServer,
@@ -23,9 +20,8 @@ from petrobot.services.comm.streams.camera import (
     StreamImages,
     WireImage,
     encode_image,
-    open_images,
 )
-from petrobot.services.comm.streams.image import Image, ImageSource
+from petrobot.services.comm.streams.image import Image
 
 
 def grey(level: int, shape: tuple[int, int] = (48, 64)) -> np.ndarray:
@@ -220,106 +216,3 @@ def test_memory_images() -> None:
     images.close()
     assert images.newest() is None
     assert rates == [50.0, 0.0]
-
-
-@pytest.fixture(scope="module")
-def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write a video of ten images, each brighter than the one before."""
-    path = tmp_path_factory.mktemp("film") / "film.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (64, 48))
-    assert writer.isOpened()
-    for k in range(10):
-        writer.write(np.full((48, 64, 3), 20 * k, np.uint8))
-    writer.release()
-    return path
-
-
-def test_a_file_is_paced_by_the_clock(film: Path) -> None:
-    clock = [100.0]
-    images: ImageSource = CaptureImages(str(film), lambda: clock[0])
-    assert images.newest() is None
-    for _ in range(2):  # A second start begins from the first image again.
-        images.start(25.0)
-        begin = clock[0]
-        first = images.newest()
-        assert first is not None and (first.sequence, first.time) == (0, begin)
-        assert images.newest() is None
-        clock[0] += 0.121
-        later = images.newest()
-        assert later is not None and later.sequence == 3
-        assert later.time == pytest.approx(begin + 0.12)
-        assert later.pixels.shape == (48, 64) and abs(float(later.pixels.mean()) - 60) < 6
-        clock[0] += 5.0
-        assert images.newest() is not None, "the last one"
-        assert images.newest() is None, "the video has ended"
-    images.stop()
-    assert images.newest() is None
-    images.close()
-
-
-def test_images_of_a_device_are_stamped_on_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A device sends images at its own times; only the newest is kept, with its time of arrival."""
-    given_out: list[int] = []
-
-    class Device:
-        def __init__(self, target: int) -> None:
-            assert target == 2
-
-        def isOpened(self) -> bool:  # noqa: N802 - OpenCV's name
-            return True
-
-        def set(self, key: int, value: float) -> None:
-            assert (key, value) == (cv2.CAP_PROP_FPS, 30.0)
-
-        def read(self) -> tuple[bool, np.ndarray]:
-            given_out.append(1)
-            return len(given_out) <= 5, np.dstack([grey(0), grey(100), grey(0)])
-
-        def release(self) -> None:
-            given_out.append(-1)
-
-    monkeypatch.setattr(cv2, "VideoCapture", Device)
-    images = CaptureImages(2, lambda: 7.0, latency=0.03)
-    images.start(30.0)
-    until(lambda: len(given_out) > 5)
-    images._thread.join() if images._thread else None
-    image = images.newest()
-    assert image is not None and image.sequence == 4
-    assert image.time == pytest.approx(6.97)
-    assert image.pixels[0, 0] == 59, "green by ITU-R BT.601"
-    assert images.newest() is None, "unplugged: no more images"
-    images.close()
-    assert given_out[-1] == -1
-
-
-def test_a_source_that_cannot_be_opened_is_reported(tmp_path: Path) -> None:
-    images = CaptureImages(str(tmp_path / "none.avi"), time.monotonic)
-    with pytest.raises(ConnectionError, match=r"none\.avi.*cannot be opened"):
-        images.start(25.0)
-
-
-@pytest.mark.parametrize(
-    ("config", "kind"),
-    [
-        ({"source": "sim", "address": "127.0.0.1:4810"}, StreamImages),
-        ({"source": "capture:0", "latency": 0.03}, CaptureImages),
-        ({"source": "file:balls.avi"}, CaptureImages),
-    ],
-)
-def test_sources_by_config(config: dict[str, object], kind: type) -> None:
-    assert isinstance(open_images(config, time.monotonic), kind)
-
-
-@pytest.mark.parametrize(
-    ("config", "text"),
-    [
-        ({}, "source = ''"),
-        ({"source": "sim"}, "needs address"),
-        ({"source": "sim", "address": "host"}, "needs address"),
-        ({"source": "capture:front"}, 'use "sim", "capture:NUMBER"'),
-        ({"source": "file:"}, 'use "sim"'),
-    ],
-)
-def test_bad_sources_are_refused_with_a_remedy(config: dict[str, object], text: str) -> None:
-    with pytest.raises(ValueError, match=text):
-        open_images(config, time.monotonic)

@@ -450,8 +450,8 @@ def page() -> str:
     machine = f"{os.cpu_count()} cores, Python {sys.version.split()[0]}, {versions}"
     told = "\n".join(TOLD)
     return (
-        "# Figures: the analysis beside other tools\n\n"
-        "How fast the analysis is, beside other tools for Petri nets. Made by\n"
+        "# Figures: the analysis compared with other tools\n\n"
+        "The speed of the analysis, compared with other tools for Petri nets. Made by\n"
         "`python -m tools.bench.analysis --write docs/figures-analysis.md`, all tools in one run, "
         "each\nmeasurement in a process of its own. Seconds are CPU seconds without imports and "
         "compilation; MB is\nthe peak memory of the process. Ratios hold on other machines, "

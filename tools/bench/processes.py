@@ -43,9 +43,11 @@ def unpin() -> None:
         os.sched_setaffinity(0, range(os.cpu_count() or 1))
 
 
-def start(script: str, *arguments: str, pinned: bool) -> subprocess.Popen[str]:
+def start(
+    script: str, *arguments: str, pinned: bool, python: str = sys.executable
+) -> subprocess.Popen[str]:
     """A script of the benchmark again, in another part; its input and its output are pipes."""
-    command = [sys.executable, script, *arguments, "--pin" if pinned else "--no-pin"]
+    command = [python, script, *arguments, "--pin" if pinned else "--no-pin"]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 

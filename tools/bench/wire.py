@@ -3,6 +3,8 @@ second, 100 kB, set-point streams.
 
     python tools/bench/wire.py                      everything that is installed
     python tools/bench/wire.py --quick --json out.json
+    python tools/bench/wire.py --against ../older   beside petrobot of another checkout, in turns
+    python tools/bench/wire.py --big                how long large messages keep other callers
 
 The contenders alternate every few calls, so that a busy machine affects all of them. Each end is a
 process of its own. Everything is measured three times: with both ends SCHED_FIFO on different cores
@@ -10,6 +12,8 @@ process of its own. Everything is measured three times: with both ends SCHED_FIF
 The first two show the cost of the code. In the third, the scheduler may keep both ends of one
 contender on one core and those of another on two, where each message has to wake the other end.
 Only ratios matter: microseconds depend on the machine.
+
+The other checkout of `--against` has its own `.venv`; its `wire.py` may lie in `tests/bench`.
 """
 
 from __future__ import annotations
@@ -26,9 +30,17 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from tools.bench.processes import load, pin, quantile, share, show, unpin
+from tools.bench.processes import load, pin, quantile, share, show, start, unpin
 from tools.bench.wire_asker import Asker, ask
-from tools.bench.wire_contenders import Bare, Contender, Petrobot, PetrobotSealed
+from tools.bench.wire_contenders import (
+    BIG_KINDS,
+    Bare,
+    Contender,
+    Petrobot,
+    PetrobotSealed,
+    PetrobotWorker,
+    load_with,
+)
 from tools.bench.wire_peers import CONTENDERS
 from tools.bench.wire_streams import measure_streams
 
@@ -40,6 +52,8 @@ BIG = 100_000
 GAP = 0.001
 """Seconds between spaced calls: the other end sleeps by then."""
 ROWS = ("call", "spaced", "round p50", "spaced p50", "big", "rate")
+OURS = (Petrobot, PetrobotSealed, PetrobotWorker)
+SCRIPTS = ("tools/bench/wire.py", "tests/bench/wire.py")
 TURN = 20
 """Calls of one contender before the next has its turn."""
 NOISE = 1.15
@@ -52,9 +66,16 @@ PINNED, SHARED, ORDINARY = "a core each end", "one core for both ends", "as the 
 class ResultTable:
     """What was measured, by contender."""
 
-    def __init__(self, contenders: Sequence[type[Contender]], pinned: bool) -> None:
+    def __init__(
+        self, contenders: Sequence[type[Contender]], pinned: bool, older: Path | None = None
+    ) -> None:
         self.rows: dict[str, dict[str, list[float]]] = {}
         self._askers = {one.name: Asker(__file__, one.name, pinned) for one in contenders}
+        for one in OURS if older is not None else ():
+            assert older is not None
+            script = next(older / f for f in SCRIPTS if (older / f).exists())
+            python = str(older / ".venv" / "bin" / "python")
+            self._askers[f"{one.name} (older)"] = Asker(str(script), one.name, pinned, python)
 
     def measure(self, rounds: int, calls: int) -> None:
         """Rounds of all; within a round they take turns every few calls, so that the machine is in
@@ -135,10 +156,24 @@ def call_goals(table: ResultTable) -> Goals:
     return goals
 
 
+def goals_against(table: ResultTable) -> Goals:
+    """The goals beside an older petrobot."""
+    goals: Goals = {}
+    for one in OURS:
+        older = f"{one.name} (older)"
+        most = 0.65 if one is PetrobotWorker else 1.0
+        for what, column in (("in a row", "round p50"), ("spaced", "spaced p50")):
+            found = _below(table.ratios(one.name, older, column), most)
+            goals[f"{one.name}: p50 of the older, {what}"] = found
+        rates = table.ratios(one.name, older, "rate")
+        goals[f"{one.name}: calls/s of the older"] = rates, 1.0, quantile(rates, 0.5) >= 1.0
+    return goals
+
+
 def stream_goals(streams: dict[str, dict[str, float]]) -> Goals:
     """The goals of set-point streams."""
     return {
-        f"p99 <= 2 x raw, {name}": _below([row["p99_to_raw"], row["round_p99_to_raw"]], 2.0)
+        f"p99 <= 1.4 x raw, {name}": _below([row["p99_to_raw"], row["round_p99_to_raw"]], 1.4)
         for name, row in streams.items()
         if name.startswith("petrobot")
     }
@@ -151,17 +186,29 @@ def _below(found: list[float], limit: float) -> tuple[list[float], float, bool]:
 def scheduled(how: str, arguments: argparse.Namespace) -> dict[str, Any]:
     """All measurements with one way of scheduling."""
     pinned = how == PINNED
-    table = ResultTable([one for one in CONTENDERS if _is_installed(one)], pinned)
+    older = arguments.against
+    all_of_them = [one for one in CONTENDERS if _is_installed(one)]
+    table = ResultTable(all_of_them if older is None else [Bare, *OURS], pinned, older)
     try:
         table.measure(arguments.rounds, arguments.calls)
     finally:
         table.close()
     calls = table.results()
+    if older is not None:
+        print(f"\n== {how} ==")
+        show("calls", calls)
+        _show_goals(goals := goals_against(table))
+        return {"calls": calls, "goals": goals}
     streams = measure_streams(max(arguments.rounds // 3, 1), arguments.seconds, pinned)
     goals = call_goals(table) | stream_goals(streams)
     print(f"\n== {how} ==")
     show("calls", calls)
     show("streams (age when taken)", streams)
+    _show_goals(goals)
+    return {"calls": calls, "streams": streams, "goals": goals}
+
+
+def _show_goals(goals: Goals) -> None:
     print(
         f"\n{'goal (median, least and largest of the rounds)':52}{'limit':>7}{'median':>8}"
         f"{'least':>8}{'largest':>8}"
@@ -169,7 +216,33 @@ def scheduled(how: str, arguments: argparse.Namespace) -> dict[str, Any]:
     for goal, (found, limit, met) in goals.items():
         row = "".join(f"{one:8.2f}" for one in (quantile(found, 0.5), min(found), max(found)))
         print(f"{goal:52}{limit:7.2f}{row}  {'met' if met else 'NOT MET'}")
-    return {"calls": calls, "streams": streams, "goals": goals}
+
+
+def measure_big(rounds: int, calls: int) -> dict[str, dict[str, float]]:
+    """How long a small call of one process takes (us) while another process sends or receives large
+    messages through the same node, without a pause; without them first."""
+    asker = Asker(__file__, PetrobotSealed.name, False)
+    taken: dict[str, list[float]] = {kind: [] for kind in ("nothing", *BIG_KINDS)}
+    for _ in range(rounds):
+        for kind, found in taken.items():
+            loader = None
+            if kind != "nothing":
+                loader = start(__file__, "--load", kind, asker.port, pinned=False)
+                assert loader.stdout is not None
+                loader.stdout.readline()
+            found += asker.latencies(calls, 0, GAP)
+            if loader is not None:
+                loader.kill()
+                loader.communicate()
+    asker.close()
+    return {
+        kind: {
+            "p50_us": quantile(found, 0.5) * 1e6,
+            "p99_us": quantile(found, 0.99) * 1e6,
+            "most_us": max(found) * 1e6,
+        }
+        for kind, found in taken.items()
+    }
 
 
 def _is_installed(one: type[Contender]) -> bool:
@@ -230,11 +303,21 @@ def main() -> None:
         default=True,
         help="measure with SCHED_FIFO, too",
     )
+    parser.add_argument("--against", type=Path, metavar="FOLDER", help="another checkout")
+    parser.add_argument("--big", action="store_true", help="large messages beside small calls")
+    parser.add_argument("--load", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--serve", help=argparse.SUPPRESS)
     parser.add_argument("--ask", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.serve or arguments.ask:
         _be_one_end(arguments)
+        return
+    if arguments.load:
+        load_with(arguments.load[0], int(arguments.load[1]))
+        return
+    if arguments.big:
+        print(f"load of this machine: {load()}")
+        show("small calls beside", measure_big(arguments.rounds, arguments.calls))
         return
     if arguments.quick:
         arguments.rounds, arguments.calls, arguments.seconds = 3, 500, 1.0

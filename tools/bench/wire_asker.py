@@ -23,11 +23,12 @@ WARM_UP = 200
 class Asker:
     """A contender, served by one process and asked by another one."""
 
-    def __init__(self, script: str, name: str, pinned: bool) -> None:
-        self._server = start(script, "--serve", name, pinned=pinned)
+    def __init__(self, script: str, name: str, pinned: bool, python: str = sys.executable) -> None:
+        """`script` may be that of another checkout, run by its own `python`."""
+        self._server = start(script, "--serve", name, pinned=pinned, python=python)
         assert self._server.stdout is not None
-        port = self._server.stdout.readline().strip()
-        self._client = start(script, "--ask", name, port, pinned=pinned)
+        self.port = self._server.stdout.readline().strip()
+        self._client = start(script, "--ask", name, self.port, pinned=pinned, python=python)
         assert self._client.stdout is not None and self._client.stdin is not None
         self._orders, self._answers = self._client.stdin, self._client.stdout
         self._answer()

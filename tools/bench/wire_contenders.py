@@ -11,6 +11,7 @@ import os
 import socket
 import time
 from collections.abc import Awaitable, Coroutine
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -239,7 +240,18 @@ class Petrobot(AsyncContender):
         def echo(now: float, call: Call) -> Outcome:
             return Outcome(call.id, "success", call.arguments)
 
-        self.server = Server(Callee("node", "b", {"echo": Offer(inline=echo)}), key=self.key)
+        big = {kind: Outcome("", "success", {"v": value}) for kind, value in BIG.items()}
+
+        def give(now: float, call: Call) -> Outcome:
+            return replace(big[call.arguments["kind"]], id=call.id)
+
+        def tell(now: float, call: Call) -> Outcome:
+            callee.raise_event(now, "big", {"v": BIG["bytes"][: len(BIG["bytes"]) // 2]})
+            return Outcome(call.id, "success")
+
+        offers = {"echo": echo, "give": give, "tell": tell}
+        callee = Callee("node", "b", {name: Offer(inline=one) for name, one in offers.items()})
+        self.server = Server(callee, key=self.key)
         await self.server.start(HOST, 0)
         return self.server.address[1]
 
@@ -264,6 +276,41 @@ class PetrobotSealed(Petrobot):
 
     name = "petrobot, sealed"
     key = KEY
+
+
+BIG: dict[str, Any] = {"bytes": bytes(4_000_000), "texts": ["x" * 28] * 130_000}
+"""What is sent: bytes, and as many texts as one message may hold."""
+BIG_KINDS = (
+    "CALL of 4 MB, bytes",
+    "CALL of 4 MB, texts",
+    "RESULT of 4 MB, bytes",
+    "RESULT of 4 MB, texts",
+    "EVENT of 2 MB, bytes",
+)
+
+
+def load_with(kind: str, port: int) -> None:
+    """Be the process that sends or receives large messages, one after the other, until it is
+    killed."""
+    name, value = kind.partition(" ")[0], kind.rpartition(" ")[2]
+
+    async def run() -> None:
+        caller = Caller("node", Hello(2, 2, "client", "loader", os.urandom(4).hex()))
+        client = Client(HOST, port, caller, key=KEY)
+        client.start()
+        if not await client.connected(30.0):
+            raise ConnectionError("the node does not answer")
+        caller.subscribe(client.now(), ["big"])
+        client.flush()
+        service = {"CALL": "echo", "RESULT": "give", "EVENT": "tell"}[name]
+        arguments = {"v": BIG[value]} if name == "CALL" else {"kind": value}
+        while True:
+            end = await client.call(service, arguments, deadline=30.0)
+            if end.status != "success":
+                raise RuntimeError(f"{end.cause}: {end.text}")
+            print(end.status, flush=True)
+
+    asyncio.run(run())
 
 
 class PetrobotWorker(Petrobot):

@@ -33,8 +33,8 @@ FLOORS = {
 balls are missed, by errors of vision, time, and cup."""
 MARGIN, SPRINGY = 0.15, 0.3
 """Most by which the shares of the same balls may differ, with the interval of the difference; the
-second in `C+springy`. At the rim Bullet's step of 1 ms and its limit on the spin decide, by the
-restitution; refined, it tends to the portable contact (tests/sim/test_contact.py)."""
+second in `C+springy`. At the rim Bullet's decisions depend on its step and its limit on the spin,
+those of the portable contact do not (docs/physics.md, "The same balls")."""
 
 
 def arm() -> Result:

@@ -3,7 +3,7 @@ last, and by which path it should have come back."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from petrobot.coordinator.engine import Phase, State
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import Obstacle, obstacles
 from petrobot.coordinator.task.compiled_task import CompiledTransition
+from petrobot.coordinator.task.conditions import And, Compare, Expression, Literal, Name
+from petrobot.coordinator.task.conditions.language import Node
 from petrobot.coordinator.task.net import Net
 
 MOST = 4
@@ -52,8 +54,11 @@ def explain(x: ExecutionGraph, state: int) -> str:
     firings = x.firings(state)
     waiting = [t for t in x.engine.compiled.transitions if _near(t, ended, draft.marking)]
     told = list[tuple[tuple[int, bool], str]]()
+    missed, spent = _asked(x, draft)
     for t in waiting:
         found = obstacles(draft, t)
+        if not ended and any(one.kind == "short" and one.place in spent for one in found):
+            continue  # the end wants that place empty, and so it is
         if ended and all(_other_end(draft, one) for one in found):
             continue
         parts = [_cause(x, draft, firings, one) for one in found if not _other_end(draft, one)]
@@ -65,8 +70,36 @@ def explain(x: ExecutionGraph, state: int) -> str:
         return "; ".join(text for _, text in told[:MOST]) + more
     if ended:
         return f"no transition takes what ended in {', '.join(sorted(ended))} that way"
-    final = x.engine.compiled.task.final
-    return f"no transition takes what is left, and the end asks for {final}"
+    return f"no transition takes what is left, and the end asks for {missed}"
+
+
+def _asked(x: ExecutionGraph, draft: Draft) -> tuple[str, set[int]]:
+    """Return what of the designed ends does not hold, in words, and the places that `final` wants
+    to be empty and that are."""
+    task, index = x.engine.compiled.task, x.engine.compiled.net.place_index
+    held = {name: draft.marking[p] for name, p in index.items()}
+    missed, spent = list[str](), set[int]()
+    for node in _conjuncts(task.final.tree):
+        if not (isinstance(node, Compare) and isinstance(node.left, Name)):
+            missed += [str(task.final)] * (not Expression("", node).holds(held))
+            continue
+        name = node.left.name
+        if not Expression("", node).holds(held):
+            wanted = node.right.value if isinstance(node.right, Literal) else node.right
+            missed.append(f"{name} {node.sign} {wanted} (it holds {held[name]})")
+        elif not held[name]:
+            spent.add(index[name])
+    ends = [" and ".join(dict.fromkeys(missed))]
+    ends += [str(task.final_error)] if task.final_error is not None else []
+    return ", or for ".join(ends), spent
+
+
+def _conjuncts(node: Node) -> Iterator[Node]:
+    if isinstance(node, And):
+        for operand in node.operands:
+            yield from _conjuncts(operand)
+    else:
+        yield node
 
 
 def _near(t: CompiledTransition, ended: set[str], marking: Sequence[int]) -> bool:
@@ -100,28 +133,29 @@ def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
     taker = f"taken by `{net.transitions[order[last]]}`"
     if not givers:
         return f"{taker}, and no transition returns it"
-    last_mover, carried = _carried(net, order[last:])
+    movers, carried = _carried(net, order[last:])
     held = [net.places[p] for p in sorted(carried) if draft.marking[p]]
-    mover = net.transitions[last_mover]
-    if last_mover != order[last] and not _leads(net, carried, set(givers)):
-        return f"{taker}, never returned by `{mover}`"
-    if last_mover == order[last] and not _leads(net, carried, set(givers)):
+    names = ", ".join(f"`{net.transitions[t]}`" for t in dict.fromkeys(movers))
+    if not _leads(net, carried, set(givers)):
+        if movers:
+            return f"{taker}, never returned by {names}"
         return f"{taker}, and nothing that follows it returns it"
     where = f"still held with {' and '.join(held)}" if held else f"to be returned by {back}"
-    if last_mover != order[last]:
-        return f"{taker}, not returned by `{mover}`; {where}"
-    return f"{taker}, {where}"
+    return f"{taker}, not returned by {names}; {where}" if movers else f"{taker}, {where}"
 
 
-def _carried(net: Net, order: list[int]) -> tuple[int, set[int]]:
-    """Follow the tokens that the first firing gave through the others. Return the last firing that
-    moved some of them on, and the places to which they came."""
-    mover, carried = order[0], {p for p, _ in net.produce[order[0]]}
+def _carried(net: Net, order: list[int]) -> tuple[list[int], set[int]]:
+    """Follow the tokens that the first firing gave through the others. Return the firings that
+    moved some of them on, and the places to which they came. Places with tokens at the beginning,
+    such as other resources, are not followed: what comes there is given back."""
+    given = [{p for p, _ in arcs if not net.initial[p]} for arcs in net.produce]
+    movers, carried = list[int](), given[order[0]]
     for t in order[1:]:
         taken = {p for p, _ in net.consume[t]} & carried
-        if taken and taken != {p for p, _ in net.produce[t]} & taken:
-            mover, carried = t, (carried - taken) | {p for p, _ in net.produce[t]}
-    return mover, carried
+        if taken and taken != given[t] & taken:
+            movers.append(t)
+            carried = (carried - taken) | given[t]
+    return movers, carried
 
 
 def _leads(net: Net, places: set[int], givers: set[int]) -> bool:

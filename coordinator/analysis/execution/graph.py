@@ -32,6 +32,8 @@ from petrobot.coordinator.engine import (
 from petrobot.coordinator.engine.step import at_end
 from petrobot.coordinator.task import Status, Task
 
+SHOWN = 20
+"""The most firings of one stimulus that are written."""
 STEPS = 300_000
 """The most stimuli and firings for one graph; they take about twenty seconds."""
 
@@ -44,7 +46,9 @@ class Step:
     firings: tuple[str, ...]
 
     def __str__(self) -> str:
-        return f"{self.text} -> {' '.join(self.firings) or 'nothing'}"
+        firings = self.firings[:SHOWN]
+        more = f" ... ({len(self.firings)} firings)" if len(self.firings) > SHOWN else ""
+        return f"{self.text} -> {' '.join(firings) or 'nothing'}{more}"
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,7 @@ class ExecutionGraph:
     crowded: dict[str, int]
     """By action place that should hold one run: a state in which it holds more."""
     contests: dict[tuple[str, ...], int]
-    """Conflicts that only the order in the file settles: a state in which it comes to that."""
+    """Conflicts that neither priority nor weight settles: a state in which it comes to that."""
     index: Mapping[Hashable, int] = field(repr=False)
     """By what the future of a state depends on: its number."""
     by_hand: Mask
@@ -180,15 +184,22 @@ class ExecutionGraph:
 
 
 def execute(
-    task: Task, *, limit: int = STEPS, free_choice: bool = False, engine: Engine | None = None
+    task: Task,
+    *,
+    limit: int = STEPS,
+    free_choice: bool = False,
+    engine: Engine | None = None,
+    rivals: frozenset[str] | None = None,
 ) -> ExecutionGraph:
     """Explore the execution graph of a task, up to a limit in stimuli and firings.
 
-    With `free_choice` a conflict that nothing but the order in the file settles may go either way.
+    With `free_choice` a conflict that neither priority nor weight settles may go either way.
+    `rivals` are the transitions in such conflicts, if they are known; states then differ in the
+    order of waiting of these only.
     Raises TooManyValues.
     """
     engine = engine or Engine(task, policy=Policy(ask_undecided=free_choice))
-    return _Search(engine, Names(engine)).run(limit)
+    return _Search(engine, Names(engine, rivals)).run(limit)
 
 
 def with_operator(x: ExecutionGraph, *, limit: int = STEPS) -> ExecutionGraph:

@@ -65,9 +65,13 @@ class Cause:
 class Names:
     """What the conditions of a task read, and so which parts of a state count."""
 
-    def __init__(self, engine: Engine) -> None:
-        """Collect them. Raises TooManyValues."""
+    def __init__(self, engine: Engine, rivals: frozenset[str] | None = None) -> None:
+        """Collect them. `rivals`: the transitions that may come into a conflict which first come,
+        first served settles; None: not known. Raises TooManyValues."""
         self.engine = engine
+        self._rivals = frozenset[str]() if engine.policy.ask_undecided else rivals
+        """Transitions whose order of waiting counts; None: all. It does not count where each
+        conflict may go either way."""
         compiled = engine.compiled
         self.task = task = compiled.task
         conditions = [x.when for x in compiled.transitions if x.when is not None]
@@ -140,6 +144,7 @@ class Names:
         draw = state.suspended
         return (
             state.mode,
+            self._waiting(state),
             state.closing,
             state.marking,
             tuple(runs),
@@ -152,6 +157,21 @@ class Names:
             tuple(
                 self.region(name, state.variables.get(name, MISSING)) for name in sorted(self.known)
             ),
+        )
+
+    def _waiting(self, state: State) -> Hashable:
+        """Return by place the transitions that wait for its tokens, in the order in which they
+        came; those that came together are a set."""
+        if not state.waits:
+            return ()
+        by_place: dict[str, dict[int, set[str]]] = {}
+        for name, wait in state.waits.items():
+            if self._rivals is not None and name not in self._rivals:
+                continue
+            by_place.setdefault(wait.place, {}).setdefault(wait.since, set()).add(name)
+        return frozenset(
+            (place, tuple(frozenset(names) for _, names in sorted(since.items())))
+            for place, since in by_place.items()
         )
 
     def _run(self, run: Run, ends: list[int]) -> Hashable:
@@ -293,7 +313,7 @@ class Names:
         return list({self.region(name, value): value for value in self._values[name]}.values())
 
     def undecided(self, instruction: object) -> tuple[str, ...]:
-        """Return the transitions of a conflict that only the order in the file settles, if the
+        """Return the transitions of a conflict that neither priority nor weight settles, if the
         instruction asks for one."""
         if isinstance(instruction, Choose) and instruction.subject is Subject.CONFLICT:
             return instruction.alternatives if not any(instruction.weights) else ()

@@ -107,10 +107,10 @@ class Odds:
 
 @dataclass(frozen=True, slots=True)
 class Contest:
-    """A conflict that only the order in the file settles."""
+    """A conflict that neither priority nor weight settles: first come, first served."""
 
     transitions: tuple[str, ...]
-    """The first one fires."""
+    """In the order of the file, which settles a tie."""
     over: tuple[str, ...]
     """The places of which they want the same token."""
     matters: Mapping[str, str]
@@ -136,12 +136,12 @@ class Progress:
     measured: Measured | None = None
     """Numbers for `odds`; None: those that the task declares."""
     free: Progress | None = None
-    """The same with conflicts that may go either way, where only the order in the file settles
+    """The same with conflicts that may go either way, where neither priority nor weight settles
     some; else None."""
 
     @cached_property
     def contests(self) -> tuple[Contest, ...]:
-        """The conflicts that only the order in the file settles."""
+        """The conflicts that neither priority nor weight settles."""
         if self.free is None:
             return ()
         named = {t.name: t for t in self.x.engine.compiled.transitions}
@@ -166,9 +166,10 @@ class Progress:
 
     def hand_notes(self, limit: int) -> list[str]:
         """Return the dead ends and conflicts that need tokens which the operator moves, in words,
-        from a second graph within a limit in stimuli and firings."""
+        from a second graph within a limit in stimuli and firings. Nothing is said of a task that
+        gets stuck without him."""
         own = self.x if self.free is None else self.free.x
-        if not own.complete:
+        if not own.complete or own.dead.any() or own.livelocks:
             return []
         x = with_operator(own, limit=limit)
         said = [
@@ -278,7 +279,9 @@ class Progress:
         always = set.intersection(*lacking)
         if always:
             return f"whenever the engine rests, it {' and '.join(sorted(always))}"
-        return "what it needs is never there together"
+        net = compiled.net
+        needs = ", ".join(net.places[p] for p, _ in compiled.transitions[t].needs)
+        return f"what it needs ({needs}) is never there together"
 
     # --- from mission to mission --------------------------------------------------------------
 
@@ -629,8 +632,9 @@ def progress_of(view: OrdinaryView, limit: int, measured: Measured | None = None
     free = execute(view.task, limit=limit, free_choice=True)
     if not free.contests:
         return Progress(free, view, measured)
-    settled_by_order = execute(view.task, limit=limit)
-    return Progress(settled_by_order, view, measured, Progress(free, view))
+    rivals = frozenset(name for names in free.contests for name in names) if free.complete else None
+    served = execute(view.task, limit=limit, rivals=rivals)
+    return Progress(served, view, measured, Progress(free, view))
 
 
 class _Again:

@@ -7,8 +7,9 @@ The components are solved in that order, successors first: small ones by dense e
 ones by Gauss-Seidel.
 
 Stationary vectors of up to DENSE vertices come from Grassmann-Taksar-Heyman (GTH) elimination. It
-contains no subtraction, so no digits cancel (W. K. Grassmann, M. I. Taksar, D. P. Heyman, Oper.
-Res. 33, 1985). Larger ones come from Gauss-Seidel.
+contains no subtraction, so no digits cancel (W. K. Grassmann, M. I. Taksar, D. P. Heyman,
+Regenerative analysis and steady state distributions for Markov chains, Oper. Res. 33, 1985). Larger
+ones come from Gauss-Seidel.
 """
 
 from __future__ import annotations
@@ -190,8 +191,8 @@ def stationary(n: int, rows: Index, columns: Index, value: Values) -> Values:
 
     P is given by its entries. Small ones by GTH elimination, others by Gauss-Seidel with
     aggregation over blocks of neighbours where it is slow (J. R. Koury, D. F. McAllister, W. J.
-    Stewart, Iterative methods for computing stationary distributions, SIAM J. Alg. Disc. Meth. 5,
-    1984). Raises NotConverged.
+    Stewart, Iterative methods for computing stationary distributions of nearly completely
+    decomposable Markov chains, SIAM J. Alg. Disc. Meth. 5, 1984). Raises NotConverged.
     """
     if n == 1:
         return np.ones(1)

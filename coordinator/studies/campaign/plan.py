@@ -139,6 +139,25 @@ class Block:
         return asdict(self)
 
 
+def regimes_of(text: str) -> tuple[str, ...]:
+    """Return the regimes of a comma-separated list. `C@1-5` stands for C@1, C@2, ..., C@5: one
+    regime in five installations of a laboratory. Raises CampaignError."""
+    found: list[str] = []
+    for name in filter(None, (part.strip() for part in text.split(","))):
+        regime, at, number = name.partition("@")
+        first, dash, last = number.partition("-")
+        if not (at and dash):
+            found.append(name)
+            continue
+        if not (first.isdecimal() and last.isdecimal() and int(first) <= int(last)):
+            raise CampaignError(
+                f"regime {name}: expected installations from and to, such as {regime}@1-5, got "
+                f"{number!r}"
+            )
+        found += [f"{regime}@{n}" for n in range(int(first), int(last) + 1)]
+    return tuple(found)
+
+
 def digest(path: Path | str) -> str:
     """Return the SHA-256 of a file. Raises CampaignError if it cannot be read."""
     try:

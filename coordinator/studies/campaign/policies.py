@@ -17,7 +17,7 @@ import numpy as np
 from petrobot.coordinator.learning.learning import Learning
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.records import Choice, RunEnd
-from petrobot.coordinator.learning.selectors import RULES
+from petrobot.coordinator.learning.selectors import ACTION, RULES, TASK, verdicts_of_task
 from petrobot.coordinator.studies.campaign.block import Weights
 from petrobot.coordinator.studies.campaign.observed import context_of, observation, regime_of
 from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, CampaignPlan
@@ -161,9 +161,10 @@ class LearnedActions:
         alternatives: Mapping[str, Sequence[str]],
         chosen: Mapping[str, str],
         question: Question,
+        credit: str = ACTION,
     ) -> None:
         self._task, self._alternatives, self._chosen = task, alternatives, chosen
-        self._learning = Learning(task, selector, question)
+        self._learning = Learning(task, selector, question, credit=credit)
         self._before: dict[str, Any] | None = None
         """States of the selectors before the batch that is being handed out."""
         self._fixed: Weights = {
@@ -195,13 +196,21 @@ class LearnedActions:
         self._learning.restore(self._before or {})
         self._before = None
         for row in rows:
-            context = context_of(row.regime)
+            context, ends = context_of(row.regime), []
             for run in row.trial.runs if row.trial is not None else ():
                 name = self._task.primitive_task_of(run.place).name
                 self._learning.apply(Choice(name, run.action, context))
-                self._learning.apply(
-                    RunEnd(name, run.action, context, observation(self._task, run))
-                )
+                ends.append((name, run.action, context, observation(self._task, run)))
+                self._learning.apply(RunEnd(*ends[-1]))
+            if row.trial is not None and self._learning.credit == TASK:
+                trial = row.trial
+                met = trial.goals > 0 if self._task.goal_transitions else trial.completed
+                took = float("nan") if trial.time is None else trial.time
+                for verdict in verdicts_of_task(ends, met, took, self._measure):
+                    self._learning.apply(verdict)
+
+    def _measure(self, primitive_task: str) -> str:
+        return self._learning.question(primitive_task).measure
 
     def state(self) -> dict[str, Any]:
         """Return, by regime and primitive task: learned probabilities, J from the learner's sums,
@@ -272,7 +281,8 @@ def policy_of(plan: CampaignPlan, task: Task, directory: Directory) -> ChoicePol
         known = ", ".join(dict.fromkeys([*PLAIN, *RULES]))
         raise CampaignError(f"--selector {plan.selector}: unknown; choose one of {known}")
     question = Question(target=plan.options.get("target"), rho=plan.options.get("rho"))
-    return LearnedActions(task, plan.selector, alternatives, plan.chosen, question)
+    credit = plan.options.get("credit", ACTION)
+    return LearnedActions(task, plan.selector, alternatives, plan.chosen, question, credit)
 
 
 def learned_choices(folder: Path) -> dict[str, dict[str, str]]:

@@ -214,6 +214,7 @@ def loads(text: str, source: str = "task", *, flat: bool = False) -> Task:
     `flat`: the text is a flat task that petrobot wrote (`dumps(task.flat)`): its names may have
     dots, its elements say what they were made from, and it was judged before.
     """
+    text = text.removeprefix("\ufeff")  # some editors begin a file with a byte-order mark
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -164,6 +164,7 @@ class Retention:
 
 _SCALAR = 9
 """Bytes of a number on the wire: one marker and eight bytes."""
+_TEXTS = frozenset((str, bytes))
 _NUMBERS = frozenset((float, int, bool, NoneType))
 
 
@@ -178,8 +179,11 @@ def weight_of(value: Any) -> int:
             weight += len(key) + (_SCALAR if type(item) in _NUMBERS else weight_of(item))
         return weight
     if kind is list or kind is tuple:
-        if _NUMBERS.issuperset(map(type, value)):
+        kinds = set(map(type, value))
+        if kinds <= _NUMBERS:
             return _SCALAR * (1 + len(value))
+        if kinds <= _TEXTS:
+            return _SCALAR * (1 + len(value)) + sum(map(len, value))
         return _SCALAR + sum(map(weight_of, value))
     return _SCALAR
 

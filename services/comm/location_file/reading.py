@@ -91,8 +91,8 @@ def _name_key(what: str, *, required: bool = False) -> KeySpec:
     return KeySpec(f"the name of {what}", _text, required)
 
 
-_POSITIVE = KeySpec("a number of seconds above 0", lambda v: _number(v) and v > 0)
-_NOT_NEGATIVE = KeySpec("a number of seconds, 0 or more", lambda v: _number(v) and v >= 0)
+_POSITIVE = KeySpec("a number of seconds above 0 and below 1e9", lambda v: _number(v) and v > 0)
+_NOT_NEGATIVE = KeySpec("a number of seconds from 0 to 1e9", lambda v: _number(v) and v >= 0)
 _PERIOD = _POSITIVE._replace(required=True)
 
 SHAPES: Mapping[str, Mapping[str, KeySpec]] = {
@@ -250,9 +250,9 @@ def _syntax_fault(source: str, text: str) -> str:
     if twice:
         return (
             f"{source}{line}: {twice[1]}.{twice[2]}: is placed twice; "
-            "each name stands on one node only: remove one of the two tables or rename it"
+            "a name may belong to one node only: remove one of the two tables or rename it"
         )
-    return f"{source}{line}: not valid TOML: {text}; mend this line"
+    return f"{source}{line}: not valid TOML: {text}; correct this line"
 
 
 def _check_top(data: Mapping[str, Any], faults: Faults) -> None:
@@ -266,7 +266,7 @@ def _check_top(data: Mapping[str, Any], faults: Faults) -> None:
             "schema", f"{known}; write schema = {SCHEMA}, the layout that this version reads"
         )
     if not data.get("nodes"):
-        faults.add("nodes", "there is no node; write at least one [nodes.NAME] with host and port")
+        faults.add("nodes", "no node here; write at least one [nodes.NAME] with host and port")
 
 
 def _coordinator(data: Mapping[str, Any], faults: Faults) -> dict[str, Any]:

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import importlib
+import re
 import socket
 import struct
-import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -21,110 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.services.comm.protocol.security import is_loopback
+from petrobot.services.comm.streams.capture import CaptureImages, RecordedImages, settings_of
 from petrobot.services.comm.streams.image import Image, ImageSource
-
-# Images from any cv2.VideoCapture device or video file. OpenCV is imported at the first start, so
-# nodes without one need none.
 
 Clock = Callable[[], float]
 Pixels = NDArray[np.uint8]
-
-
-class CaptureImages:
-    """A cv2.VideoCapture device (a number) or a video file (a path), opened at the first start.
-
-    A thread reads a device's images as they come, so the newest one is never older than one
-    exposure. A file is paced by the clock: image k belongs to the time start + k / rate, and after
-    the last one there is none.
-    """
-
-    def __init__(self, target: int | str, clock: Clock, latency: float = 0.0) -> None:
-        """`latency`: time from mid-exposure until a device's image is available (s), from its
-        datasheet or measured."""
-        self._target = target
-        self._clock = clock
-        self._latency = latency
-        self._capture: Any = None
-        self._lock = threading.Lock()
-        self._newest: Image | None = None
-        self._sequence = 0
-        self._begin = 0.0
-        self._rate = 0.0
-        self._thread: threading.Thread | None = None
-        self._on = threading.Event()
-
-    def start(self, rate: float) -> None:
-        """Deliver images at about this rate (1/s). Raises ConnectionError with the source when it
-        cannot be opened."""
-        import cv2  # imported here: a node without a capture needs no OpenCV
-
-        self.stop()
-        if self._capture is None:
-            self._capture = cv2.VideoCapture(self._target)
-        if not self._capture.isOpened():
-            self._capture = None
-            raise ConnectionError(
-                f"camera source {self._target!r} cannot be opened: is it plugged in, does "
-                "the file exist?"
-            )
-        self._begin, self._rate, self._sequence, self._newest = self._clock(), rate, 0, None
-        if isinstance(self._target, str):
-            self._capture.set(cv2.CAP_PROP_POS_FRAMES, 0)
-            return
-        self._capture.set(cv2.CAP_PROP_FPS, rate)
-        self._on.set()
-        self._thread = threading.Thread(target=self._grab, name="capture", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Deliver no more images."""
-        self._on.clear()
-        if self._thread is not None:
-            self._thread.join()
-        self._thread, self._rate, self._newest = None, 0.0, None
-
-    def close(self) -> None:
-        """Release the device or file."""
-        self.stop()
-        if self._capture is not None:
-            self._capture.release()
-            self._capture = None
-
-    def newest(self) -> Image | None:
-        """Return the newest image that was not returned yet, None if there is none."""
-        if isinstance(self._target, str) and self._rate > 0.0:
-            self._advance_file()
-        with self._lock:
-            newest, self._newest = self._newest, None
-        return newest
-
-    def _advance_file(self) -> None:
-        due = int((self._clock() - self._begin) * self._rate)
-        while self._sequence <= due:
-            taken, pixels = self._capture.read()
-            if not taken:
-                return
-            self._newest = Image(
-                _grey(pixels), self._begin + self._sequence / self._rate, self._sequence
-            )
-            self._sequence += 1
-
-    def _grab(self) -> None:
-        while self._on.is_set():
-            taken, pixels = self._capture.read()
-            if not taken:
-                return  # unplugged: no more images, and the reader finds that the camera is dead
-            image = Image(_grey(pixels), self._clock() - self._latency, self._sequence)
-            self._sequence += 1
-            with self._lock:
-                self._newest = image
-
-
-def _grey(pixels: NDArray[Any]) -> Pixels:
-    """Return the grey levels (height, width) of a BGR or grey picture (weights of ITU-R BT.601)."""
-    if pixels.ndim == 2:
-        return np.asarray(pixels, np.uint8)
-    return np.asarray(np.rint(pixels[..., :3] @ np.array([0.114, 0.587, 0.299])), np.uint8)
 
 
 IMAGE_HEADER = struct.Struct("!4sIQdHHI")
@@ -229,6 +131,13 @@ class StreamImages:
     def close(self) -> None:
         """Disconnect from the camera."""
         self._drop(self._clock())
+
+    @property
+    def condition(self) -> str:
+        """Why no images come; empty while the camera is connected or was not asked for any."""
+        host, port = self._address
+        away = self._rate > 0.0 and not self._connected
+        return f"the camera at {host}:{port} cannot be reached" if away else ""
 
     def newest(self) -> Image | None:
         """Return the newest image that was not returned yet; all older ones in the socket are
@@ -406,6 +315,8 @@ class ImageServer:
 class MemoryImages:
     """Images of a camera in the same process (lock step): the owner of the camera puts them in."""
 
+    condition = ""
+
     def __init__(self, control: Callable[[float], None] = lambda rate: None) -> None:
         """`control` is called with the wanted rate (images/s), 0 to stop."""
         self._control = control
@@ -438,8 +349,14 @@ class MemoryImages:
 
 
 def open_images(config: Mapping[str, Any], clock: Clock) -> ImageSource:
-    """Return the source that a device's config names: `source = "sim"` (with `address =
-    "host:port"`), "capture:0" or "file:PATH".
+    """Return the source that a device's config names:
+
+    - `source = "sim"`, with `address = "host:port"`: the simulated camera;
+    - `"capture:WHAT"`: a camera (see `CaptureImages`), such as "capture:0",
+      "capture:/dev/v4l/by-id/..." or "capture:rtsp://...";
+    - `"file:PATH"`: a recording;
+    - `"MODULE:CLASS"`: a class of the user's, called with the config and a clock (s), which
+      implements `ImageSource`.
 
     Raises ValueError naming key and remedy.
     """
@@ -450,8 +367,29 @@ def open_images(config: Mapping[str, Any], clock: Clock) -> ImageSource:
         if not host or not port.isdigit():
             raise ValueError('source = "sim" needs address = "host:port" of the simulated camera')
         return StreamImages(host, int(port), clock)
-    if kind == "capture" and target.isdigit():
-        return CaptureImages(int(target), clock, float(config.get("latency", 0.0)))
+    if kind == "capture" and (target.isdigit() or re.search("[/!]", target)):
+        return CaptureImages(
+            int(target) if target.isdigit() else target, clock, settings_of(config)
+        )
     if kind == "file" and target:
-        return CaptureImages(target, clock)
-    raise ValueError(f'source = {source!r}: use "sim", "capture:NUMBER" or "file:PATH"')
+        return RecordedImages(target, clock, colour=settings_of(config).colour)
+    if kind not in ("capture", "file") and target.isidentifier():
+        return _own_source(kind, target)(config, clock)
+    raise ValueError(
+        f'source = {source!r}: use "sim", "capture:0", "capture:/dev/v4l/by-id/...", a URL as in '
+        '"capture:rtsp://...", "file:PATH", or "MODULE:CLASS" for a class of your own'
+    )
+
+
+def _own_source(module: str, name: str) -> Callable[[Mapping[str, Any], Clock], ImageSource]:
+    """Return the user's class. Raises ValueError."""
+    try:
+        found: Callable[[Mapping[str, Any], Clock], ImageSource] = getattr(
+            importlib.import_module(module), name
+        )
+    except (ImportError, AttributeError) as fault:
+        raise ValueError(
+            f'source = "{module}:{name}": {fault}; write the module beside services.toml, or '
+            "install it"
+        ) from fault
+    return found

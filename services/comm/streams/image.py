@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """One exposure: `pixels` (height, width) uint8 grey levels, `time` of mid-exposure on the
-    receiver's clock (s).
+    """One exposure: `pixels` (height, width) uint8 grey levels, or (height, width, 3) blue green
+    red with the key `colour = true`; `time` of mid-exposure on the receiver's clock (s).
 
     `sequence` counts from 0.
     """
@@ -24,7 +24,14 @@ class Image:
 
 
 class ImageSource(Protocol):
-    """A source of images: the simulated camera, a cv2.VideoCapture device, or a file."""
+    """A source of images: the simulated camera, a camera, a recording, or a class of the user's.
+
+    None of its methods waits for an image; `start` may wait until the source is open.
+    """
+
+    @property
+    def condition(self) -> str:
+        """Why no images come, for the operator; empty if nothing is wrong."""
 
     def start(self, rate: float) -> None:
         """Begin to deliver images at about this rate (1/s)."""

@@ -152,15 +152,17 @@ class StreamConnection:
 
     def write(self, data: bytes) -> None:
         """Send, or keep what finds no room now. Raises OSError when the connection is gone."""
-        data = self.unsent + data
-        self.unsent = b""
-        if not data:
+        if self.unsent:
+            data = self.unsent + data
+            self.unsent = b""
+        elif not data:
             return
         try:
             sent = self.sock.send(data)
         except BlockingIOError:
             sent = 0
-        self.unsent = data[sent:]
+        if sent < len(data):
+            self.unsent = data[sent:]
 
     def read(self, reads: int = _READS, chunk: int = _CHUNK) -> list[Message]:
         """Return the messages that have arrived, with at most `reads` reads.

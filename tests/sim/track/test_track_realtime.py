@@ -21,11 +21,11 @@ from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.realtime import LaboratoryShell, bus_channel, camera_address
 from petrobot.sim.track.course import Track
 from petrobot.sim.track.laboratory import TrackLaboratory
-from tests.ports import free_ports
 from tests.sim.laboratory_shell import (
     PATIENCE,
     REPOSITORY,
     call,
+    laboratory_file,
     program,
     running,
     score_as_member,
@@ -34,38 +34,8 @@ from tests.sim.laboratory_shell import (
 
 
 def services_file(folder: Path, sim: str = "petrobot.sim.track.laboratory:make_laboratory") -> Path:
-    """The shipped location file with free ports, its devices named by hand."""
-    node, bus, camera, coordinator = free_ports(4)
-    file = folder / "services.toml"
-    file.write_text(f"""\
-schema = 1
-[nodes.laboratory]
-host = "127.0.0.1"
-port = {node}
-sim = "{sim}"
-[nodes.drive]
-host = "127.0.0.1"
-port = {coordinator}
-[devices.rover]
-node = "drive"
-driver = "nowhere:Rover"
-interface = "petrobot_stream"
-channel = "tcp://127.0.0.1:{bus}"
-[devices.camera]
-node = "drive"
-driver = "nowhere:Camera"
-source = "sim"
-address = "127.0.0.1:{camera}"
-[services.laboratory_prepare]
-node = "laboratory"
-[services.laboratory_score]
-node = "laboratory"
-[services.laboratory_fault]
-node = "laboratory"
-[parameters]
-rover = "{REPOSITORY / "services" / "mobile" / "rover.toml"}"
-""")
-    return file
+    rover = REPOSITORY / "services" / "mobile" / "rover.toml"
+    return laboratory_file(folder, sim, f'rover = "{rover}"')
 
 
 @pytest.fixture
@@ -172,9 +142,9 @@ def test_as_a_process_it_serves_until_sigterm(tmp_path: Path) -> None:
 def test_it_is_a_member_of_a_lock_step_cell(tmp_path: Path) -> None:
     file = services_file(tmp_path)
     text = file.read_text()
-    port = text.split("[nodes.drive]")[1].split("port = ")[1].split()[0]
+    port = text.split("[nodes.robot]")[1].split("port = ")[1].split()[0]
     alone = (
-        text[: text.index("[nodes.drive]")] + text[text.index("[services.laboratory_prepare]") :]
+        text[: text.index("[nodes.robot]")] + text[text.index("[services.laboratory_prepare]") :]
     )
     file.write_text(f'{alone}[coordinator]\nhost = "127.0.0.1"\nport = {port}\n')
     directory = load(file)

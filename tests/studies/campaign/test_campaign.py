@@ -29,6 +29,7 @@ from petrobot.coordinator.studies.campaign.plan import (
     CampaignPlan,
     digest,
     read_manifest,
+    regimes_of,
     write_manifest,
 )
 from petrobot.coordinator.studies.campaign.pool import LocalPool
@@ -575,3 +576,35 @@ def test_the_summary_adds_up_what_the_score_counts_for_each_trial() -> None:
     assert whole.to_plain(False)["counts"] == {"eggs": {"laid": 9}}
     assert by_regime["A"].to_plain(False)["counts"] == {"eggs": {"laid": 4}}
     assert by_regime["B"].to_plain(False)["counts"] == {"eggs": {"laid": 5}}
+
+
+def test_regimes_may_be_named_in_several_installations() -> None:
+    assert regimes_of("A, C+dim@2,B@1-3") == ("A", "C+dim@2", "B@1", "B@2", "B@3")
+    assert regimes_of("") == ()
+    for text in ("C@3-1", "C@1-x", "C@-2"):
+        with pytest.raises(CampaignError, match="from and to, such as C@1-5"):
+            regimes_of(text)
+
+
+def test_with_credit_by_the_task_the_goal_judges_every_choice_of_a_trial(conduct: Conduct) -> None:
+    """The learners' sums are those of the table: each action of a trial once, by its goal and its
+    duration or the forces of its runs."""
+    campaign = conduct("task", runs=24, batch=6, selector="nikolic_fu", options={"credit": "task"})
+    policy, task = campaign.policy, campaign.bench.task
+    found: dict[tuple[str, str, str], list[float]] = {}
+    for row in campaign.table.rows():
+        trial = row.trial
+        assert trial is not None
+        forces = sum(run.values.get("force", 0.0) for run in trial.runs)
+        for name, action in {(task.primitive_task_of(r.place).name, r.action) for r in trial.runs}:
+            sums = found.setdefault((name, action, row.regime), [0.0, 0.0, 0.0])
+            cost = {"look": trial.time or 0.0, "grip": forces}.get(name, 0.0)
+            for i, more in enumerate((1.0, float(trial.goals > 0), cost)):
+                sums[i] += more
+    for name, state in policy.selectors().items():
+        assert state["selector"] == "nikolic_fu by task"
+        for context, learned in state["learners"].items():
+            for i, action in enumerate(state["actions"]):
+                expected = found.get((name, action, context.removeprefix("regime=")), [0.0] * 3)
+                sums = [learned[part][i] for part in ("runs", "successes", "cost")]
+                assert sums == pytest.approx(expected, abs=1e-5), (name, action, context)

@@ -3,6 +3,8 @@ probabilities."""
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -12,7 +14,23 @@ from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import loads
 
-TASK = """
+
+def with_transitions(text: str) -> str:
+    """Return the text of a task file in which each line `name: a, b -> c; key = value` is a
+    transition with its input and output arcs and other keys."""
+    return re.sub(r"(?m)^(\w+): (.*?) ?->(.*?)(?:; (.*))?$", _transition, text)
+
+
+def _transition(line: re.Match[str]) -> str:
+    name, *arcs, keys = line.groups()
+    inputs, outputs = (
+        json.dumps([arc.strip() for arc in a.split(",") if arc.strip()]) for a in arcs
+    )
+    more = "".join(f"\n{key}" for key in (keys or "").split("; ") if key)
+    return f"[transitions.{name}]\nin = {inputs}\nout = {outputs}{more}"
+
+
+TASK = with_transitions("""
 schema = 1
 [task]
 name = "pair"
@@ -47,27 +65,13 @@ task = "first"
 [places.second]
 kind = "action"
 task = "second"
-[transitions.begin]
-in = ["jobs", "free"]
-out = ["first"]
-event = "tick"
-[transitions.on]
-in = ["first:normal"]
-out = ["second"]
-[transitions.off]
-in = ["first:error"]
-out = ["free"]
-[transitions.done]
-in = ["second:preempt=success"]
-out = ["free"]
-event = "signal"
-[transitions.missed]
-in = ["second:normal"]
-out = ["free"]
-[transitions.lost]
-in = ["second:error"]
-out = ["free"]
-"""
+begin: jobs, free -> first; event = "tick"
+on: first:normal -> second
+off: first:error -> free
+done: second:preempt=success -> free; event = "signal"
+missed: second:normal -> free
+lost: second:error -> free
+""")
 
 Make = Callable[..., list[Trial]]
 

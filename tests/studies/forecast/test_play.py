@@ -24,9 +24,11 @@ from petrobot.coordinator.studies.forecast.history import Training
 from petrobot.coordinator.studies.forecast.net_arrays import Structure
 from petrobot.coordinator.studies.forecast.play import Play, Played
 from petrobot.coordinator.studies.forecast.residual import doubts
-from petrobot.coordinator.task import Status
+from petrobot.coordinator.task import Status, Task
 from petrobot.coordinator.task.file import loads
+from tests.studies.forecast.conftest import with_transitions
 
+GOAL = 'final = "end == 1"\nruns_place = "jobs"'
 HEAD = """
 schema = 1
 [task]
@@ -54,16 +56,16 @@ kind = "control"
 """
 
 
-def play(
-    text: str,
-    throws: list[Trial],
-    n: int = 2000,
-    task: str = 'final = "end == 1"\nruns_place = "jobs"',
-) -> Played:
+def task_of(text: str, keys: str = GOAL) -> Task:
+    """Return the task with these transitions (and other tables)."""
+    return loads(with_transitions(HEAD.replace("{task}", keys) + text), "net.toml")
+
+
+def play(text: str, trials: list[Trial], n: int = 2000, task: str = GOAL) -> Played:
     """Simulate trials of a task from measured runs."""
-    training = Training.of(loads(HEAD.replace("{task}", task) + text, "net.toml"), throws)
+    training = Training.of(task_of(text, task), trials)
     random = np.random.default_rng(1)
-    drawer = Drawer(RunDistributions(training), training.waits, np.ones((1, len(throws))), random)
+    drawer = Drawer(RunDistributions(training), training.waits, np.ones((1, len(trials))), random)
     return Play(
         Structure.of(training.task), drawer, choices_of(training), np.zeros(n, np.int64)
     ).run()
@@ -77,28 +79,20 @@ def entry(
 
 
 FORK = """
-[transitions.begin]
-in = ["jobs"]
-out = ["a", "b"]
-[transitions.join]
-in = ["a:normal", "b:normal"]
-out = ["end"]
-[transitions.a_lost]
-in = ["a:error"]
-out = ["end"]
-[transitions.b_lost]
-in = ["b:error"]
-out = ["end"]
+begin: jobs -> a, b
+join: a:normal, b:normal -> end
+a_lost: a:error -> end
+b_lost: b:error -> end
 """
 
 
 def test_parallel_branches_take_as_long_as_the_longer_one() -> None:
     """A run of 1 or 3 s (half each) parallel to one of 2 s: the time is 2 or 3 s, half each."""
-    throws = [
+    trials = [
         Trial(1, 0.0, runs=[entry("a", took, taken="join"), entry("b", 2.0, taken="join")])
         for took in (1.0, 3.0)
     ]
-    played = play(FORK, throws)
+    played = play(FORK, trials)
     assert set(played.time.tolist()) == {2.0, 3.0}
     assert np.mean(played.time == 3.0) == pytest.approx(0.5, abs=0.05)
     assert played.completed.all() and played.all_success.all()
@@ -110,26 +104,12 @@ def test_recorded_choices_decide_between_outgoing_transitions_of_one_status() ->
     text = """
 [variables.found]
 type = "bool"
-[transitions.begin]
-in = ["jobs"]
-out = ["a"]
-[transitions.yes]
-in = ["a:normal"]
-out = ["b"]
-when = "found"
-[transitions.no]
-in = ["a:normal"]
-out = ["end"]
-when = "not found"
-[transitions.lost]
-in = ["a:error"]
-out = ["end"]
-[transitions.done]
-in = ["b:normal"]
-out = ["end"]
-[transitions.b_lost]
-in = ["b:error"]
-out = ["end"]
+begin: jobs -> a
+yes: a:normal -> b; when = "found"
+no: a:normal -> end; when = "not found"
+lost: a:error -> end
+done: b:normal -> end
+b_lost: b:error -> end
 """
     yes = [
         Trial(
@@ -149,31 +129,21 @@ out = ["end"]
 
 
 LOOP = """
-[transitions.begin]
-in = ["jobs"]
-out = ["a"]
-[transitions.done]
-in = ["a:normal"]
-out = ["end"]
-[transitions.again]
-in = ["a:error"]
-out = ["a"]
-[transitions.b_done]
-in = ["b:normal"]
-out = ["end"]
-[transitions.b_lost]
-in = ["b:error"]
-out = ["end"]
+begin: jobs -> a
+done: a:normal -> end
+again: a:error -> a
+b_done: b:normal -> end
+b_lost: b:error -> end
 """
 
 
 def test_a_loop_is_geometric() -> None:
     """With a probability of 1/2 to try again, the mean number of runs is 2."""
-    throws = [
+    trials = [
         Trial(1, 0.0, runs=[entry("a", 1.0, taken="done")]),
         Trial(1, 0.0, runs=[entry("a", 1.0, "error", "again")]),
     ]
-    played = play(LOOP, throws, 5000)
+    played = play(LOOP, trials, 5000)
     assert played.time.mean() == pytest.approx(2.0, abs=0.08)
     assert np.mean(played.time == 1.0) == pytest.approx(0.5, abs=0.03)
 
@@ -219,21 +189,13 @@ def test_branches_with_equal_rounds_are_described_by_their_own_rounds() -> None:
     """In every recorded trial the rounds of one branch determine those of the other; in simulated
     trials they drift apart."""
     text = """
-[transitions.begin]
-in = ["jobs"]
-out = ["a", "b"]
-[transitions.a_again]
-in = ["a:error"]
-out = ["a"]
-[transitions.b_again]
-in = ["b:error"]
-out = ["b"]
-[transitions.done]
-in = ["a:normal", "b:normal"]
-out = ["end"]
+begin: jobs -> a, b
+a_again: a:error -> a
+b_again: b:error -> b
+done: a:normal, b:normal -> end
 """
     random = np.random.default_rng(1)
-    throws = []
+    trials = []
     for _ in range(60):
         runs = []
         for k, drift in enumerate(random.uniform(-0.3, 0.3, 3)):
@@ -242,15 +204,13 @@ out = ["end"]
                 runs.append(
                     RunEntry(place, f"run_{place}", begun, 1.5 + drift, end[0], taken=end[1])
                 )
-        throws.append(Trial(1, 0.0, runs=runs))
-    training = Training.of(
-        loads(HEAD.replace("{task}", 'final = "end == 1"\nruns_place = "jobs"') + text, "n"), throws
-    )
+        trials.append(Trial(1, 0.0, runs=runs))
+    training = Training.of(task_of(text), trials)
     found = {
         s["place"]: s["by"] for s in RunDistributions(training).splits() if s["of"] == "outcome"
     }
     assert found == {"a": "visits of a", "b": "visits of b"}
-    assert play(text, throws).completed.all()
+    assert play(text, trials).completed.all()
 
 
 def test_timers_and_events_race() -> None:
@@ -260,32 +220,18 @@ def test_timers_and_events_race() -> None:
 [events.bell]
 scope = "external"
 memory = "pulse"
-[transitions.rung]
-in = ["jobs"]
-out = ["a"]
-event = "bell"
-[transitions.tired]
-in = ["jobs"]
-out = ["end"]
-after = 2.0
-[transitions.done]
-in = ["a:normal"]
-out = ["end"]
-[transitions.lost]
-in = ["a:error"]
-out = ["end"]
-[transitions.b_done]
-in = ["b:normal"]
-out = ["end"]
-[transitions.b_lost]
-in = ["b:error"]
-out = ["end"]
+rung: jobs -> a; event = "bell"
+tired: jobs -> end; after = 2.0
+done: a:normal -> end
+lost: a:error -> end
+b_done: b:normal -> end
+b_lost: b:error -> end
 """
-    throws = [
+    trials = [
         Trial(1, 0.0, runs=[entry("a", 4.0, taken="done")], waits=[("rung", wait)])
         for wait in (1.0, 3.0)
     ]
-    played = play(text, throws, task='final = "end == 1"')
+    played = play(text, trials, task='final = "end == 1"')
     assert set(played.time.tolist()) == {5.0, 2.0}
     assert np.mean(played.time == 2.0) == pytest.approx(0.5, abs=0.05)
 
@@ -295,31 +241,21 @@ def test_giving_up_and_dead_ends_do_not_complete() -> None:
     text = """
 [places.broken]
 kind = "resource"
-[transitions.begin]
-in = ["jobs"]
-out = ["a"]
-[transitions.done]
-in = ["a:normal", "!broken"]
-out = ["end"]
-[transitions.lost]
-in = ["a:error"]
-out = ["broken"]
-[transitions.b_done]
-in = ["b:normal"]
-out = ["end"]
-[transitions.b_lost]
-in = ["b:error"]
-out = ["end"]
+begin: jobs -> a
+done: a:normal, !broken -> end
+lost: a:error -> broken
+b_done: b:normal -> end
+b_lost: b:error -> end
 """
-    throws = [
+    trials = [
         Trial(1, 0.0, runs=[entry("a", 1.0, "error", "lost")]),
         *[Trial(1, 0.0, runs=[entry("a", 1.0, taken="done")])] * 3,
     ]
     for ending in (
         'final = "end == 1"\nfinal_error = "broken == 1"\nruns_place = "jobs"',
-        'final = "end == 1"\nruns_place = "jobs"',
+        GOAL,
     ):
-        played = play(text, throws, task=ending)
+        played = play(text, trials, task=ending)
         assert np.mean(played.completed) == pytest.approx(0.75, abs=0.04)
         assert np.isnan(played.time[~played.completed]).all()
 
@@ -333,22 +269,11 @@ def test_a_preemption_of_higher_priority_also_takes_a_finished_run(
     text = f"""
 [places.alarm]
 kind = "control"
-[transitions.begin]
-in = ["jobs"]
-out = ["a", "b"]
-[transitions.join]
-in = ["a:normal", "b:normal"]
-out = ["end"]
-[transitions.b_lost]
-in = ["b:error"]
-out = ["alarm"]
-[transitions.drop]
-in = ["alarm", "a:preempt=none"]
-out = ["end"]
-priority = {priority}
-[transitions.a_lost]
-in = ["a:error", "alarm"]
-out = ["end"]
+begin: jobs -> a, b
+join: a:normal, b:normal -> end
+b_lost: b:error -> alarm
+drop: alarm, a:preempt=none -> end; priority = {priority}
+a_lost: a:error, alarm -> end
 """
     runs = [entry("a", 1.0, taken="drop"), entry("b", 2.0, "error", "b_lost")]
     played = play(text, [Trial(1, 0.0, runs=runs)])
@@ -362,12 +287,8 @@ SERVERS = """
 kind = "action"
 task = "a"
 servers = 2
-[transitions.c_done]
-in = ["c:normal"]
-out = ["end"]
-[transitions.c_lost]
-in = ["c:error"]
-out = ["end"]
+c_done: c:normal -> end
+c_lost: c:error -> end
 """
 
 
@@ -430,28 +351,15 @@ def test_an_inhibitor_blocks_until_its_place_holds_fewer_tokens(
 kind = "control"
 [places.half]
 kind = "control"
-[transitions.begin]
-in = ["jobs"]
-out = ["a", "b", "busy*2"]
-[transitions.done]
-in = ["a:normal", "!{threshold}"]
-out = ["end"]
-[transitions.first]
-in = ["b:normal", "busy"]
-out = ["half"]
-[transitions.second]
-in = ["half", "busy"]
-out = []
-after = 1.0
-[transitions.a_lost]
-in = ["a:error"]
-out = ["end"]
-[transitions.b_lost]
-in = ["b:error"]
-out = ["end"]
+begin: jobs -> a, b, busy*2
+done: a:normal, !{threshold} -> end
+first: b:normal, busy -> half
+second: half, busy ->; after = 1.0
+a_lost: a:error -> end
+b_lost: b:error -> end
 """
-    throws = [Trial(1, 0.0, runs=[entry("a", 1.0, taken="done"), entry("b", 2.0, taken="first")])]
-    played = play(text.replace("{threshold}", threshold), throws, n=20)
+    trials = [Trial(1, 0.0, runs=[entry("a", 1.0, taken="done"), entry("b", 2.0, taken="first")])]
+    played = play(text.replace("{threshold}", threshold), trials, n=20)
     assert played.time.tolist() == [seconds] * 20
 
 
@@ -468,36 +376,19 @@ def test_priority_decides_between_two_fireable_transitions_and_then_weight(
 kind = "control"
 [places.detour]
 kind = "control"
-[transitions.begin]
-in = ["jobs"]
-out = ["a"]
-[transitions.done]
-in = ["a:normal"]
-out = ["fork"]
-[transitions.left]
-in = ["fork"]
-out = ["end"]
+begin: jobs -> a
+done: a:normal -> fork
+left: fork -> end
 {left}
-[transitions.right]
-in = ["fork"]
-out = ["detour"]
+right: fork -> detour
 {right}
-[transitions.back]
-in = ["detour"]
-out = ["end"]
-after = 1.0
-[transitions.a_lost]
-in = ["a:error"]
-out = ["end"]
-[transitions.b_done]
-in = ["b:normal"]
-out = ["end"]
-[transitions.b_lost]
-in = ["b:error"]
-out = ["end"]
+back: detour -> end; after = 1.0
+a_lost: a:error -> end
+b_done: b:normal -> end
+b_lost: b:error -> end
 """
-    throws = [Trial(1, 0.0, runs=[entry("a", 1.0, taken="done")])]
-    played = play(text.replace("{left}", left).replace("{right}", right), throws)
+    trials = [Trial(1, 0.0, runs=[entry("a", 1.0, taken="done")])]
+    played = play(text.replace("{left}", left).replace("{right}", right), trials)
     assert set(played.time.tolist()) <= {1.0, 2.0}
     assert np.mean(played.time == 2.0) == pytest.approx(late, abs=0.04)
 
@@ -507,29 +398,17 @@ def test_an_arc_of_weight_two_waits_for_both_tokens() -> None:
     text = """
 [places.parts]
 kind = "control"
-[transitions.begin]
-in = ["jobs"]
-out = ["a", "b"]
-[transitions.a_done]
-in = ["a:normal"]
-out = ["parts"]
-[transitions.b_done]
-in = ["b:normal"]
-out = ["parts"]
-[transitions.both]
-in = ["parts*2"]
-out = ["end"]
-[transitions.a_lost]
-in = ["a:error"]
-out = ["end"]
-[transitions.b_lost]
-in = ["b:error"]
-out = ["end"]
+begin: jobs -> a, b
+a_done: a:normal -> parts
+b_done: b:normal -> parts
+both: parts*2 -> end
+a_lost: a:error -> end
+b_lost: b:error -> end
 """
-    throws = [
+    trials = [
         Trial(1, 0.0, runs=[entry("a", 1.0, taken="a_done"), entry("b", 2.0, taken="b_done")])
     ]
-    assert play(text, throws, n=20).time.tolist() == [2.0] * 20
+    assert play(text, trials, n=20).time.tolist() == [2.0] * 20
 
 
 FULL = """
@@ -537,25 +416,12 @@ FULL = """
 kind = "control"
 tokens = 1
 capacity = 1
-[transitions.begin]
-in = ["jobs"]
-out = ["a"]
-[transitions.store]
-in = ["a:normal"]
-out = ["shelf", "end"]
-[transitions.full]
-in = ["a:normal"]
-out = ["end"]
-after = 5.0
-[transitions.a_lost]
-in = ["a:error"]
-out = ["end"]
-[transitions.b_done]
-in = ["b:normal"]
-out = ["end"]
-[transitions.b_lost]
-in = ["b:error"]
-out = ["end"]
+begin: jobs -> a
+store: a:normal -> shelf, end
+full: a:normal -> end; after = 5.0
+a_lost: a:error -> end
+b_done: b:normal -> end
+b_lost: b:error -> end
 """
 
 
@@ -565,9 +431,7 @@ def test_a_full_place_blocks_firing_into_it_as_in_the_engine() -> None:
     played = play(FULL, [Trial(1, 0.0, runs=[entry("a", 1.0)])], n=200)
     assert played.ways == {"a": {"full": 200}}
     assert played.time.tolist() == [6.0] * 200
-    task = loads(
-        HEAD.replace("{task}", 'final = "end == 1"\nruns_place = "jobs"') + FULL, "net.toml"
-    )
+    task = task_of(FULL)
     engine = Engine(task)
     state, said = engine.handle(engine.initial(), Begin())
     (run,) = [i.run for i in said if isinstance(i, StartRun)]

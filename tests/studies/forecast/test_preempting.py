@@ -26,8 +26,9 @@ from petrobot.coordinator.studies.forecast.predict import Request, figures, pred
 from petrobot.coordinator.studies.forecast.residual import measured
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import loads
+from tests.studies.forecast.conftest import with_transitions
 
-HEAD = """
+HEAD = with_transitions("""
 schema = 1
 [task]
 name = "scan"
@@ -60,53 +61,27 @@ task = "locate"
 [places.watch]
 kind = "action"
 task = "watch"
-[transitions.next]
-in = ["parts", "idle"]
-out = ["watch", "locate"]
-"""
+next: parts, idle -> watch, locate
+""")
+ALONE = HEAD.replace('out = ["watch", "locate"]', 'out = ["watch"]')
+"""Without a run of `locate`."""
 
-ONE_WAY = (
-    HEAD
-    + """
-[transitions.found]
-in = ["locate:normal", "watch:preempt=none"]
-out = ["idle"]
-[transitions.lost]
-in = ["locate:error", "watch:preempt=none"]
-out = ["idle"]
-[transitions.found_late]
-in = ["locate:normal", "watch:normal"]
-out = ["idle"]
-[transitions.lost_late]
-in = ["locate:error", "watch:normal"]
-out = ["idle"]
-[transitions.found_blind]
-in = ["locate:normal", "watch:error"]
-out = ["idle"]
-[transitions.lost_blind]
-in = ["locate:error", "watch:error"]
-out = ["idle"]
-"""
-)
+ONE_WAY = HEAD + with_transitions("""
+found: locate:normal, watch:preempt=none -> idle
+lost: locate:error, watch:preempt=none -> idle
+found_late: locate:normal, watch:normal -> idle
+lost_late: locate:error, watch:normal -> idle
+found_blind: locate:normal, watch:error -> idle
+lost_blind: locate:error, watch:error -> idle
+""")
 """A task in which the end of locating preempts watching; locating is never preempted."""
 
-BOTH_WAYS = (
-    HEAD
-    + """
-[transitions.found]
-in = ["locate:normal", "watch:preempt=none"]
-out = ["idle"]
-[transitions.lost]
-in = ["locate:error", "watch:preempt=none"]
-out = ["idle"]
-[transitions.late]
-in = ["locate:preempt=failure", "watch:normal"]
-out = ["idle"]
-[transitions.late_blind]
-in = ["locate:preempt=failure", "watch:error"]
-out = ["idle"]
-"""
-)
+BOTH_WAYS = HEAD + with_transitions("""
+found: locate:normal, watch:preempt=none -> idle
+lost: locate:error, watch:preempt=none -> idle
+late: locate:preempt=failure, watch:normal -> idle
+late_blind: locate:preempt=failure, watch:error -> idle
+""")
 """A task in which the run that ends first preempts the other."""
 
 
@@ -251,21 +226,11 @@ def test_a_run_that_never_ends_by_itself_is_simulated_and_solved() -> None:
 def test_a_situation_without_recorded_runs_is_reported() -> None:
     """No other transition takes the run now, so it stays active for longer than any recorded one,
     and the forecast says that it is doubtful."""
-    alone = HEAD.replace('out = ["watch", "locate"]', 'out = ["watch"]')
-    text = (
-        alone
-        + """
-[transitions.stop]
-in = ["idle", "locate:normal", "watch:preempt=none"]
-out = ["idle"]
-[transitions.found]
-in = ["watch:normal"]
-out = ["idle"]
-[transitions.lost]
-in = ["watch:error"]
-out = ["idle"]
-"""
-    )
+    text = ALONE + with_transitions("""
+stop: idle, locate:normal, watch:preempt=none -> idle
+found: watch:normal -> idle
+lost: watch:error -> idle
+""")
     random = np.random.default_rng(1)
     runs = [(min(0.5, t), t < 0.5) for t in random.exponential(1.0, 300)]
     trials = [
@@ -345,23 +310,13 @@ def test_tasks_that_cannot_be_forecast_correctly_are_refused_by_name(
 def test_an_event_that_preempts_and_counts_no_try_is_a_cause() -> None:
     """Such preemptions are a way to end, not mere censoring: half of the runs ring at 1 s, half end
     at 2 s."""
-    text = HEAD.replace('out = ["watch", "locate"]', 'out = ["watch"]') + EVENTS.format(
-        more="", how='event = "bell"'
-    )
-    text += """
-[transitions.found]
-in = ["watch:normal"]
-out = ["idle"]
-[transitions.lost]
-in = ["watch:error"]
-out = ["idle"]
-[transitions.located]
-in = ["locate:normal"]
-out = ["idle"]
-[transitions.not_located]
-in = ["locate:error"]
-out = ["idle"]
-"""
+    text = ALONE + EVENTS.format(more="", how='event = "bell"')
+    text += with_transitions("""
+found: watch:normal -> idle
+lost: watch:error -> idle
+located: locate:normal -> idle
+not_located: locate:error -> idle
+""")
     ends = (("", 1.0, "rung"), ("success", 2.0, "found"))
     trials = [
         Trial(
@@ -387,15 +342,9 @@ out = ["idle"]
 def test_a_timer_over_two_runs_fires_once_for_both() -> None:
     """It fires at 1.02 s, as measured, not at the declared 1 s, and only if both runs are still
     active."""
-    text = (
-        BOTH_WAYS
-        + """
-[transitions.dog]
-in = ["locate:preempt=failure", "watch:preempt=none"]
-out = ["idle"]
-after = 1.0
-"""
-    )
+    text = BOTH_WAYS + with_transitions("""
+dog: locate:preempt=failure, watch:preempt=none -> idle; after = 1.0
+""")
     random = np.random.default_rng(7)
     trials = []
     for trial in trials_of(both_ways, 1500, 8):

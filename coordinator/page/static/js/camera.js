@@ -15,7 +15,7 @@ function shape(d) {
   return s("path", { ...common, d: `M${d.x - 9} ${d.y}h18M${d.x} ${d.y - 9}v18` });
 }
 
-/** Labels beside what they name, inside the image, and clear of each other: further ones go to another corner, then up or down. */
+/** Labels next to what they name, inside the image and without overlap: later ones move to another corner, then up or down. */
 export function labels(seen, width, height) {
   const size = Math.max(10, height / 18);
   const taken = [];
@@ -60,7 +60,7 @@ class Frame {
 export class Cameras {
   constructor() {
     this.frames = new Map();
-    this.empty = h("p", { class: "empty" }, "No images come in. They appear here while a camera's action runs.");
+    this.empty = h("p", { class: "empty" }, "No images are arriving. They appear here while a camera's action runs.");
     this.root = h("div", { class: "cameras" }, this.empty);
   }
 

@@ -1,4 +1,4 @@
-// A net view with what stands around it on every tab: zoom, search, error branches, minimap, the path of opened macros.
+// A net view with its controls, the same on every tab: zoom, search, error branches, minimap, the path of opened macros.
 
 import { attribute, fill, h, keep, text, words } from "./dom.js";
 import { icon } from "./icons.js";
@@ -50,7 +50,7 @@ export class Canvas {
     this.folded?.(folded);
   }
 
-  /** Show where we are: `names` from the task to the innermost opened macro; `go(index)` leads back. */
+  /** Show the path: `names` from the task to the innermost opened macro; `go(index)` returns to one of them. */
   trail(names, go) {
     this.path.hidden = names.length < 2;
     fill(this.path, names.map((name, i) => h("button", { type: "button", disabled: i === names.length - 1, onclick: () => go(i) }, words(name))));
@@ -91,7 +91,7 @@ export class Canvas {
   }
 }
 
-/** A titled part of a side panel; `count` is shown beside the title. */
+/** A titled part of a side panel; `count` is shown next to the title. */
 export function panel(title, content, properties = {}) {
   const count = h("span", { class: "count" });
   const head = h("h2", {}, title, count);

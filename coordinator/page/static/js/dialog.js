@@ -25,7 +25,7 @@ export function openDialog(dialog) {
   dialog.setAttribute("aria-modal", "true");
   document.body.append(veil, dialog);
   dialog.show();
-  // Enter without looking must do no harm: of buttons, one that neither destroys nor sends has the focus
+  // Pressing Enter at once must do no harm: the focus is on a button that neither destroys nor sends anything
   const harmless = within().find((node) => !node.matches(".danger, [type=submit]"));
   (dialog.querySelector("input") ?? harmless ?? within()[0])?.focus();
 }

@@ -1,4 +1,4 @@
-// Task files on the server: open, save with revision, settle a conflict with both versions in view, import and export.
+// Task files on the server: open, save with revision, resolve a conflict with both versions in view, import and export.
 
 import { openDialog } from "./dialog.js";
 import { fill, h } from "./dom.js";
@@ -11,7 +11,7 @@ async function ask(method, path, body) {
   return { status: response.status, ok: response.ok, value };
 }
 
-/** The answer's value; a fault is shown and gives null. */
+/** The answer's value; after a fault, which is shown, null. */
 async function need(method, path, body) {
   try {
     const answer = await ask(method, path, body);
@@ -33,7 +33,7 @@ export async function stopPastTheLink() {
   }
 }
 
-/** The revision of a task file as it stands now; null when it is not known. */
+/** The present revision of a task file; null if it is unknown. */
 export async function revisionOf(name) {
   try {
     const answer = await ask("GET", `/api/revisions/${encodeURIComponent(name)}`);
@@ -51,10 +51,10 @@ export const openRun = (run) => need("GET", `/api/runs/${encodeURIComponent(run)
 export const startForm = (name) => need("GET", `/api/start/${encodeURIComponent(name)}`);
 export const importNet = (form, text) => need("POST", "/api/import", { form, text });
 
-/** This window's desk: a newer drawing of it takes the place of the one that is checked or analysed just now. */
+/** Name of this window's desk: a newer drawing from it replaces the one that is being checked or analysed. */
 const DESK = Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("");
 
-/** What the check says of a document; null when the server cannot tell, or was asked about a newer one. */
+/** Findings for a document; null if the server gave none, or was sent a newer document. */
 export async function checkDocument(name, document, renames) {
   try {
     const answer = await ask("POST", "/api/check", { name, document, renames, desk: DESK });
@@ -65,7 +65,7 @@ export async function checkDocument(name, document, renames) {
   }
 }
 
-/** Verdicts on a document; a text says why there are none, null that a newer drawing was checked meanwhile. */
+/** Verdicts on a document; a text says why there are none; null if a newer drawing was checked meanwhile. */
 export async function analyseDocument(name, document, renames) {
   try {
     const answer = await ask("POST", "/api/analyse", { name, document, renames, desk: DESK });
@@ -76,7 +76,7 @@ export async function analyseDocument(name, document, renames) {
   }
 }
 
-/** Save; on a conflict the person chooses. Gives what the server then has, or null. */
+/** Save; on a conflict the user chooses. Returns what the server then has, or null. */
 export async function saveTask(model, name) {
   const path = `/api/tasks/${encodeURIComponent(name)}`;
   const base = name === model.name ? model.base : null;
@@ -145,7 +145,7 @@ function download(name, content, type) {
 
 const DRAWN = ["fill", "fill-opacity", "stroke", "stroke-width", "stroke-dasharray", "stroke-linecap", "stroke-linejoin", "font-size", "font-weight", "font-style", "font-family", "text-anchor", "paint-order", "opacity"];
 
-/** The drawing of a view as an SVG text of its own: styles written out, in light colours, nothing but the net. */
+/** The drawing of a view as a self-contained SVG text: styles written out, in light colours, only the net. */
 export function svgOf(view) {
   const box = view.extent ?? [0, 0, 100, 100];
   const theme = document.documentElement.dataset.theme;

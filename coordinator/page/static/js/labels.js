@@ -1,4 +1,4 @@
-// Where the words of an element stand: on the side where they cover no arc, no other element and no other words.
+// Positions of labels: on the side where they cover no arc, no other element and no other label.
 
 import { at, BAR_H, BAR_W, labelAt, PLACE_R } from "./geometry.js";
 

@@ -1,5 +1,5 @@
 // Layers along the flow of tokens: circles cut, every node in a column, few crossings, and level lines.
-// The same rules as coordinator/drawing/layers.py and layout.py, where they are explained; a test compares the two.
+// The same rules as coordinator/drawing/layout.py, where they are explained; a test compares the two.
 
 const HUB = 14;
 const SWEEPS = 10;

@@ -1,4 +1,4 @@
-// Automatic layout: by the button, and for what has no position of its own.
+// Automatic layout: by the button, and for elements without a position.
 
 import { snap } from "./geometry.js";
 import { layered } from "./layers.js";
@@ -16,7 +16,7 @@ export function automatic(net) {
   return Object.fromEntries(Object.entries(last.positions).map(([name, [x, y]]) => [name, [snap(x), snap(y)]]));
 }
 
-/** The net with a position for every element: its own where it has one, else beside the others by automatic layout. */
+/** The net with a position for every element: its own if it has one, otherwise next to the others by automatic layout. */
 export function placed(net) {
   const around = net.transitions.filter((t) => t.outside);
   if (around.length) return beside(placed({ ...net, transitions: net.transitions.filter((t) => !t.outside) }), around);

@@ -26,7 +26,7 @@ export class Link {
     this.everConnected = false;
     this.goodbye = false; // the server said that it ends, so nothing was lost
     this.refused = false; // a coordinator answers, but it does not know this browser: it was started again with another key
-    this.fault = ""; // why what came could not be read or shown
+    this.fault = ""; // why a message could not be read or shown
     this.gaps = 0;
     this.deltas = 0;
     this.lastPaint = 0;
@@ -76,7 +76,7 @@ export class Link {
     setTimeout(() => this.open(), RETRY_MS[Math.min(this.tries++, RETRY_MS.length - 1)]);
   }
 
-  /** A browser is not told why its WebSocket was turned away; a plain request says whether the key is the reason. */
+  /** A browser does not learn why its WebSocket was refused; a plain request shows whether the key is the reason. */
   async askWhy() {
     try {
       const { status } = await fetch("/page/icon.svg", { method: "HEAD", cache: "no-store" });
@@ -97,7 +97,7 @@ export class Link {
     }
   }
 
-  /** What came cannot be read or shown: say so, and begin again with a fresh snapshot. */
+  /** A message cannot be read or shown: report it, and start again with a new snapshot. */
   broken(fault) {
     console.error(fault);
     this.fault = String(fault?.message ?? fault);

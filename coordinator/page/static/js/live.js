@@ -133,7 +133,7 @@ export class Live {
     return words(this.labels.get(name) || name);
   }
 
-  /** What stands for an element on the sheet that is open; null when it is outside. */
+  /** What represents an element on the open sheet; null if it is outside. */
   drawnAs(name) {
     const { task } = this.link.state;
     if (this.view.elements.has(name) || !task) return this.view.elements.has(name) ? name : null;

@@ -29,7 +29,7 @@ export class NetView {
     const { arcs, nodes, over, live, flights } = this.layers;
     this.worlds = [[arcs, nodes, over], [live], [flights]].map((layers) => s("g", { class: "world" }, layers));
     this.svg = s("svg", { class: "net", role: "application", "aria-label": label, tabindex: "0" }, this.defs(), this.worlds[0]);
-    // what changes many times a second lies in drawings of its own: the browser then need not lay out 300 elements each time
+    // what changes many times a second is in separate drawings, so that the browser need not lay out 300 elements each time
     [this.moving, this.flying] = this.worlds.slice(1).map((world) => s("svg", { class: "net moving", "aria-hidden": "true" }, world));
     this.flights = new Flights(flights, (arc) => this.landed(arc));
     host.append(this.svg, this.moving, this.flying);
@@ -394,7 +394,7 @@ export class NetView {
     return bounds([...this.elements.values()].filter((e) => !this.isFolded(e)));
   }
 
-  /** `box` with all that is written and led beyond it. Reads what has been laid out: not for every change. */
+  /** `box` enlarged by the labels and arcs outside it. It reads the browser's layout, so do not call it for every change. */
   get extent() {
     const { box } = this;
     const { x, y, width, height } = this.worlds[0].getBBox();

@@ -3,7 +3,7 @@
 import { placed } from "./layout.js";
 import { seconds, words } from "./dom.js";
 
-/** What stands above a transition: its events, condition and timer. */
+/** The text above a transition: its events, condition and timer. */
 export function caption(transition) {
   const parts = (transition.events ?? []).map((e) => `${e.scope === "internal" ? "int" : "ext"}: ${words(e.name)}`);
   if (transition.after !== null && transition.after !== undefined) parts.push(`after ${seconds(transition.after)}`);

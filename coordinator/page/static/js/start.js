@@ -1,4 +1,4 @@
-// Dialogs in front of a start: what `petrobot run` takes, as a form; a point of a recorded run; and the end of an emergency stop.
+// Dialogs before a start: the options of `petrobot run` as a form; a point of a recorded run; clearing an emergency stop.
 
 import { openDialog } from "./dialog.js";
 import { fill, h, words } from "./dom.js";
@@ -12,7 +12,7 @@ const select = (label, options, chosen, onchange) =>
 const field = (label, control, remark = "") => h("label", { class: "field" }, h("span", {}, label), control, remark ? h("small", {}, remark) : null);
 const whole = (label, value, least) => h("input", { type: "number", step: 1, min: least, value: value ?? "", "aria-label": label });
 
-/** A number field's value; undefined when it is empty. Throws what is wrong. */
+/** A number field's value; undefined when it is empty. Throws an error that says what is wrong. */
 function numberIn(input, label) {
   if (input.validity.badInput) throw new Error(`${label}: expected a number`);
   return input.value.trim() === "" ? undefined : Number(input.value);
@@ -67,7 +67,7 @@ class Parameter {
   }
 }
 
-/** What a run is to be started with; `send(data)` gives the command. */
+/** The options for starting a run; `send(data)` gives the command. */
 export function startDialog(about, task, send) {
   const runs = about.runs && whole("Number of runs", about.runs.default, 1);
   const seed = whole("Seed", about.seed, 0);
@@ -134,11 +134,11 @@ export function departDialog(run, record, going, labelOf, send) {
   return formDialog("Simulate from here", "Simulate", [
     h("p", { class: "muted" }, `A new run in lock step continues the task of ${run.id} ${told}. Tokens, finished actions, variables and latched events are as they were then. The simulated world is not: it starts from its usual beginning.`),
     chosen.length ? h("fieldset", {}, h("legend", {}, "Actions that were running"), chosen.map(([place, box]) => field(labelOf(place), box))) : h("p", {}, "No action was running at that moment."),
-    h("div", { class: "two" }, field("Seed of all chance", seed), field("Pace", pace)),
+    h("div", { class: "two" }, field("Random seed", seed), field("Pace", pace)),
   ], values, send);
 }
 
-/** Ask once more before devices take orders again. */
+/** Ask for confirmation before devices accept orders again. */
 export function clearDialog(reason, send) {
   return formDialog("Clear the emergency stop?", "Clear the stop", [
     reason ? h("p", {}, reason) : null,

@@ -1,4 +1,4 @@
-// Gantt chart to now: one lane for each action place, a bar for each run; bars of runs that go on reach the present.
+// Gantt chart to now: one lane for each action place, a bar for each run; bars of active runs reach the present.
 
 import { h, seconds, text, words } from "./dom.js";
 

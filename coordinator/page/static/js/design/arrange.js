@@ -1,4 +1,4 @@
-// Where things stand: align, space evenly, automatic layout; and lines that show what a dragged element is in line with.
+// Arranging: align, space evenly, automatic layout; and lines that show with which elements a dragged one is aligned.
 
 import { fill, s } from "../dom.js";
 import { snap } from "../geometry.js";
@@ -29,7 +29,7 @@ export function distribute(designer) {
   designer.model.move(place(chosen, axis, (i) => snap(first + ((last - first) * i) / (chosen.length - 1))));
 }
 
-/** Automatic layout of the sheet, or of the chosen elements where they stand. */
+/** Automatic layout of the sheet, or of the chosen elements around their present position. */
 export function layOut(designer) {
   const own = (e) => !e.outside;
   const { picture } = designer;
@@ -50,7 +50,7 @@ function about(positions, elements) {
   return Object.fromEntries(Object.entries(positions).map(([name, [x, y]]) => [name, [x + shift[0], y + shift[1]]]));
 }
 
-/** Move the chosen elements by so much. */
+/** Move the chosen elements by (dx, dy). */
 export function nudge(designer, dx, dy) {
   const chosen = movable(designer);
   if (!chosen.length) return false;

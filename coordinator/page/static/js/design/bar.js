@@ -1,4 +1,4 @@
-// The bar over the drawing: which task is on the desk, whether it is saved, and buttons for what keys do, too.
+// The bar above the drawing: the open task, whether it is saved, and buttons that also have keys.
 
 import { tool } from "../canvas.js";
 import { attribute, fill, h, text, words } from "../dom.js";
@@ -33,7 +33,7 @@ export class Bar {
     return this.designer.desk.exchange(form);
   }
 
-  /** Show the tasks that there are; a new one that is not among them yet stands first. */
+  /** List the tasks; a new one that is not saved yet comes first. */
   list(tasks) {
     const { model } = this.designer;
     const names = tasks.map((t) => t.name);
@@ -43,12 +43,12 @@ export class Bar {
     this.picker.value = model.name;
   }
 
-  /** Show what is on the desk, and what undo would take back. */
+  /** Show the open task, and what undo would take back. */
   paint() {
     const { model, desk } = this.designer;
     this.picker.value = model.name;
     this.again.hidden = !desk.isOld;
-    text(this.state, desk.isOld ? `changed outside${model.dirty ? ", and not saved" : ""}` : model.dirty ? "not saved" : !model.name ? "" : desk.isShipped ? "shipped, saving makes your copy" : "saved");
+    text(this.state, desk.isOld ? `changed by another program${model.dirty ? ", and not saved" : ""}` : model.dirty ? "not saved" : !model.name ? "" : desk.isShipped ? "shipped, saving makes your copy" : "saved");
     attribute(this.state, "data-dirty", model.dirty || desk.isOld ? "" : null);
     for (const [button, states, word] of [[this.undo, model.past, "Undo"], [this.redo, model.future, "Redo"]]) {
       button.disabled = !states.length;

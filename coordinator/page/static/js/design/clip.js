@@ -39,7 +39,7 @@ function needed(data, net, found = Object.fromEntries(SHARED.map((group) => [gro
   return found;
 }
 
-/** Put copied elements into the drawn net, moved by (dx, dy); gives the names of those that stand on this sheet. */
+/** Put copied elements into the drawn net, moved by (dx, dy); returns the names of those on this sheet. */
 export function paste(model, made, dx, dy) {
   return model.edit("paste", (data, net) => {
     for (const group of SHARED) for (const [name, value] of Object.entries(made.shared?.[group] ?? {})) (data[group] ??= {})[name] ??= structuredClone(value);

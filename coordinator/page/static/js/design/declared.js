@@ -1,4 +1,4 @@
-// What a task declares beside its net: events and variables, as forms of the task's own properties.
+// What a task declares apart from its net: events and variables, as forms in the task's properties.
 
 import { h, keep, words } from "../dom.js";
 import { icon } from "../icons.js";

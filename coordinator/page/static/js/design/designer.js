@@ -63,7 +63,7 @@ export class Designer {
     this.inspector.show(this.selection);
   }
 
-  /** Until `work` is done the page says that it is busy: what is drawn may alter, and move, without anybody's hand. */
+  /** Mark the page as busy until `work` is done: the drawing may change and move by itself. */
   async during(work) {
     this.works += 1;
     attribute(this.root, "aria-busy", "true");
@@ -75,14 +75,14 @@ export class Designer {
     }
   }
 
-  /** What the nodes offer: of several answers on their way the last one asked for counts, whichever comes last. */
+  /** Offers of the nodes: of several outstanding requests, the newest one counts, in whichever order the answers arrive. */
   async askOffers() {
     const asked = ++this.offersAsked;
     const offers = await loadOffers();
     if (asked === this.offersAsked) this.offers = offers;
   }
 
-  /** A node came or went: what can be chosen and what no node offers are other actions now. */
+  /** A node joined or left: the available actions have changed. */
   async nodesChanged() {
     const states = JSON.stringify(Object.entries(this.link.state.nodes).map(([name, node]) => [name, node.state]));
     if (states === this.nodeStates || this.root.hidden) return;

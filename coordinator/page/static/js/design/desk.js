@@ -20,7 +20,7 @@ export class Desk {
     return this.designer.model;
   }
 
-  /** Put a document on the desk in the place of what lay there; gives its number. */
+  /** Open a document in place of the one before; returns its number. */
   put(task, isShipped = false) {
     this.documents += 1;
     this.isShipped = isShipped;
@@ -28,7 +28,7 @@ export class Desk {
     return this.documents;
   }
 
-  /** The first time that the designer is shown: the task that runs, or the first one, unless something else was begun. */
+  /** When the designer is first shown, open the running task, or the first one, unless another document was begun. */
   async first() {
     const tasks = await this.refresh();
     if (this.everShown || this.documents) return;
@@ -78,7 +78,7 @@ export class Desk {
     this.designer.view.look(0, 0, 1);
   }
 
-  /** Whether what is on the desk may be put away; asks when it is not saved. */
+  /** Whether the open document may be closed; asks if it is not saved. */
   mayLeave() {
     if (!this.model.dirty) return Promise.resolve(true);
     const question = "Leave without saving?";
@@ -103,22 +103,22 @@ export class Desk {
     this.looking = false;
     if (now === null || name !== this.model.name || base !== this.model.base) return; // not known, or saved meanwhile
     const outside = now === base ? null : now;
-    if (outside && outside !== this.outside) toast("warning", `${name} was changed outside this page since you opened it`);
+    if (outside && outside !== this.outside) toast("warning", `${name} was changed by another program since you opened it`);
     this.outside = outside;
     this.designer.bar.paint();
   }
 
-  /** Whether the file is another one now than the one that lies here. */
+  /** Whether the file has changed since it was opened here. */
   get isOld() {
     return Boolean(this.outside) && this.outside !== this.model.base;
   }
 
-  /** Put what the file holds now on the desk. */
+  /** Open the file's present content. */
   async loadAgain() {
     if (await this.mayLeave()) await this.open(this.model.name);
   }
 
-  /** One after the other: what is asked for while a save or an import is on its way means what will lie on the desk then. */
+  /** Run requests one after the other: one made during a save or an import is about the document that is open after it. */
   inTurn(step) {
     this.last = this.last.then(step, step);
     return this.last;

@@ -45,7 +45,7 @@ function placeOf(data, net, name, p, errors) {
 function transitionOf(data, name, t, error, outside) {
   const events = data.events ?? {};
   const when = { events: listed(t.event).map((e) => ({ name: e, scope: events[e]?.scope ?? "external" })), when: t.when ?? "", after: t.after };
-  // one that stands outside is put beside the opened macro place by the automatic layout
+  // the automatic layout puts an element outside next to the opened macro place
   const where = outside ? { x: undefined, y: undefined, outside } : { x: t.x, y: t.y };
   return { name, label: t.label ?? "", error, hint: name, ...where, ...when };
 }

@@ -1,4 +1,4 @@
-// What the check says of the task that is drawn: a mark on the element, and a list that leads there.
+// Findings of the check for the drawn task: a mark on the element, and a list with links to it.
 
 import { attribute, fill, h, Press, words } from "../dom.js";
 import { checkDocument } from "../files.js";
@@ -20,14 +20,14 @@ export class Findings {
     return this.list.filter((f) => f.severity === "error").length;
   }
 
-  /** What the server said of a text: its findings, and the text itself. */
+  /** The server's answer for a text: its findings, and the text itself. */
   take({ findings, text }) {
     Object.assign(this, { list: findings, text });
     attribute(this.root, "aria-busy", null);
     this.paint();
   }
 
-  /** Ask once the drawing has rested a moment; until the answer the list says what was found before. */
+  /** Ask when the drawing has not changed for a moment; until the answer the list shows the earlier findings. */
   soon() {
     clearTimeout(this.checking);
     attribute(this.root, "aria-busy", "true");

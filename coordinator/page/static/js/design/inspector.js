@@ -138,7 +138,7 @@ export class Inspector {
       this.field("Primitive task", this.choice(place.task, options, (p) => p && this.model.choosePrimitiveTask(name, p, offers))),
       primitive ? this.primitive(place.task, primitive, offers) : null,
       this.pairs("Arguments", place.args ?? {}, this.argumentNames(place, offers), (args) => this.model.set(name, { args: Object.keys(args).length ? args : null })),
-      h("div", { class: "buttons" }, add("normal", "Add normal exit"), add("error", "Add error branch")),
+      h("div", { class: "buttons" }, add("normal", "Add normal transition"), add("error", "Add error branch")),
     ];
   }
 
@@ -192,7 +192,7 @@ export class Inspector {
   groupFields(name, inside) {
     const { designer } = this;
     return [
-      h("p", { class: "muted" }, inside ? `Shows ${inside} ${inside === 1 ? "element" : "elements"} as one place; its tokens are theirs.` : "Nothing is inside it yet: open it and draw."),
+      h("p", { class: "muted" }, inside ? `Shows ${inside} ${inside === 1 ? "element" : "elements"} as one place, with the sum of their tokens.` : "Nothing is inside it yet: open it and draw."),
       h("div", { class: "buttons" },
         h("button", { type: "button", class: "small", onclick: () => designer.openSheet(this.model.sheet, name) }, icon("open"), "Open"),
         inside ? h("button", { type: "button", class: "small", onclick: () => designer.ungroup() }, icon("close"), "Ungroup") : null,
@@ -252,7 +252,7 @@ export class Inspector {
     ];
   }
 
-  /** An arc of a macro place stands for arcs of the places inside it. */
+  /** An arc of a macro place represents arcs of the places inside it. */
   innerArcs(arc) {
     return [
       h("h2", {}, h("span", { class: "kind" }, arc.inner.length > 1 ? `${arc.inner.length} arcs` : "Arc"), `${words(arc.transition)} with ${arc.inner.map(words).join(", ")}`),

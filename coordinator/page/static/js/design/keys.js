@@ -8,7 +8,7 @@ const STEP = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDo
 const TOOL = { v: "select", 1: "action", 2: "resource", 3: "control", 4: "macro", 5: "plain", t: "transition", a: "arc", i: "inhibit" };
 
 const LIST = [
-  ["1 2 3 4 5", "tool for an action, resource, control, macro or plain place; Enter adds one beside the selection"],
+  ["1 2 3 4 5", "tool for an action, resource, control, macro or plain place; Enter adds one next to the selection"],
   ["T", "tool for a transition"], ["A, I", "arc or inhibitor arc from the selected element: go to the target with Ctrl and arrows, press Enter"],
   ["V, Esc", "back to the selection tool; Esc never deletes anything"],
   ["Ctrl + arrows", "select the nearest element in that direction"], ["[ and ]", "previous and next element"],
@@ -40,7 +40,7 @@ export class Keys {
     const { designer } = this;
     const key = event.key.toLowerCase();
     if (key === "s") {
-      if (typing) event.target.blur(); // what stands in the field belongs to what is saved
+      if (typing) event.target.blur(); // the text in the field belongs to what is saved
       return designer.desk.save() ?? true;
     }
     if (key === "f") return designer.canvas.query.focus() ?? true;

@@ -1,4 +1,4 @@
-// Macro places that group: which part of a net stands within which, and putting elements in and taking them out.
+// Macro places that group elements: which part of a net is inside which, adding elements and removing them.
 
 import { arcsOf } from "./arcs.js";
 
@@ -19,7 +19,7 @@ export function around(net, name) {
   return found;
 }
 
-/** Names of all that stands within a macro place, at any depth. */
+/** Names of all elements inside a macro place, at any depth. */
 export const within = (net, macro) => [...Object.keys(net.places ?? {}), ...Object.keys(net.transitions ?? {})].filter((name) => around(net, name).includes(macro));
 
 /** What each place is drawn as where `inside` is opened ("" for the whole): itself or the macro place around it. */
@@ -48,14 +48,14 @@ const middle = (net, names, axis) => {
   return all.length ? Math.round(all.reduce((sum, v) => sum + v, 0) / all.length / SNAP) * SNAP : undefined;
 };
 
-/** Put elements into a new macro place, which stands in their middle. */
+/** Put elements into a new macro place at their centre. */
 export function group(net, names, macro, inside) {
   const at = Object.fromEntries(["x", "y"].map((axis) => [axis, middle(net, names, axis)]).filter(([, value]) => value !== undefined));
   for (const name of names) elementOf(net, name).macro = macro;
   net.places[macro] = { kind: "macro", ...(inside ? { macro: inside } : {}), ...at };
 }
 
-/** Dissolve a macro place: what it held comes out around where it stood. */
+/** Dissolve a macro place: its elements are placed around its position. */
 export function ungroup(net, macro) {
   const place = net.places[macro];
   const names = [...Object.keys(net.places), ...Object.keys(net.transitions)].filter((n) => elementOf(net, n).macro === macro);

@@ -52,7 +52,7 @@ export class Model {
 
   // ---- edits --------------------------------------------------------------------------------------------------------
 
-  /** Alter the document by `change(data, net)`; edits of one `group` in a row are one step of undo. */
+  /** Change the document with `change(data, net)`; consecutive edits of one `group` are one step of undo. */
   edit(label, change, group = null) {
     const before = { ...this.state, label };
     const data = copy(this.data);
@@ -144,7 +144,7 @@ export class Model {
     return `${root}_${i}`;
   }
 
-  /** What says of a new element that it stands in the opened macro place. */
+  /** The field that puts a new element into the opened macro place. */
   get here() {
     return this.inside ? { macro: this.inside } : {};
   }
@@ -166,7 +166,7 @@ export class Model {
     });
   }
 
-  /** Draw an arc; a text says why it cannot be drawn, null that it was. */
+  /** Draw an arc; returns null, or why it cannot be drawn. */
   connect(from, to, inhibit = false) {
     const [a, b] = [this.place(from), this.place(to)];
     if (from === to) return "An arc connects two different elements.";
@@ -206,7 +206,7 @@ export class Model {
     });
   }
 
-  /** Alter an arc ({direction, place, transition}); `null` takes it away. */
+  /** Change an arc ({direction, place, transition}); `null` deletes it. */
   setArc(arc, change) {
     this.edit(change ? "change arc" : "delete arc", (_, net) => {
       const t = net.transitions[arc.transition];
@@ -219,7 +219,7 @@ export class Model {
     });
   }
 
-  /** Delete elements with their arcs, macro places with all that stands within, and arcs. */
+  /** Delete elements with their arcs, macro places with everything inside, and arcs. */
   remove(names, arcs = []) {
     this.edit("delete", (_, net) => {
       for (const arc of arcs) for (const place of arc.inner?.length ? arc.inner : [arc.place]) this.dropArc(net, { ...arc, place });
@@ -258,7 +258,7 @@ export class Model {
     }, group && `${group} ${name}`);
   }
 
-  /** Give an element another name, wherever it is named; a text says why not. */
+  /** Rename an element wherever it is named; returns null, or why it cannot be renamed. */
   rename(from, to) {
     if (to === from) return null;
     if (!NAME.test(to) || to === "__proto__") return "A name must start with a letter and contain only letters, digits and _.";
@@ -295,7 +295,7 @@ export class Model {
     if (data.task.runs_place === from) data.task.runs_place = to;
   }
 
-  /** Use a primitive task in an action place; one that only the nodes know is written into the document. */
+  /** Use a primitive task in an action place; one that only the nodes know is added to the document. */
   choosePrimitiveTask(place, primitive, offers) {
     this.edit("choose primitive task", (data, net) => {
       data.primitive_tasks ??= {};
@@ -319,7 +319,7 @@ export class Model {
     return { name, left: chosen.left };
   }
 
-  /** Dissolve macro places that group; gives the names of what came out. */
+  /** Dissolve macro places that group; returns the names of their elements. */
   ungroup(names) {
     const macros = [...names].filter((n) => groups(this.place(n)));
     return macros.length ? this.edit("ungroup", (_, net) => macros.flatMap((macro) => ungroup(net, macro))) : [];

@@ -94,7 +94,7 @@ export class Pointer {
     return true;
   }
 
-  /** End an arc at an element, or at a new one of the other kind where nothing stands. */
+  /** End an arc at an element, or on free ground at a new element of the other kind. */
   async arcTo(from, name, event) {
     const { designer, view } = this;
     const kept = designer.tools.tool;

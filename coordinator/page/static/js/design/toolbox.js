@@ -1,4 +1,4 @@
-// The drawing tools: which one is in hand, what it says, and where a new element goes.
+// The drawing tools: which one is chosen, its hint, and where a new element is put.
 
 import { attribute, h, text } from "../dom.js";
 import { snap } from "../geometry.js";
@@ -68,7 +68,7 @@ export class Toolbox {
     return this.insert(kind, near("x", x), near("y", y));
   }
 
-  /** Beside the selection, or in the middle of what is seen, where nothing stands yet. */
+  /** A free position next to the selection, or in the middle of the view. */
   insertFree(kind) {
     const [first] = this.designer.selection.names;
     const near = this.view.elements.get(first);

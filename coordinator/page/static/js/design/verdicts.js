@@ -1,4 +1,4 @@
-// What the analysis says of the task that is drawn: verdicts, the firings that speak against it, and where its time goes.
+// Results of the analysis of the drawn task: verdicts, firings that lead to a counterexample, and how its time is spent.
 
 import { attribute, fill, h, s } from "../dom.js";
 import { analyseDocument } from "../files.js";
@@ -20,7 +20,7 @@ export class Verdicts {
     this.heat = {};
   }
 
-  /** The document changed: what was said no longer counts. */
+  /** The document changed: earlier verdicts no longer hold. */
   forget() {
     clearTimeout(this.later);
     this.asked = null;
@@ -73,7 +73,7 @@ export class Verdicts {
     return h("li", { class: verdict.holds === false ? "error" : "" }, button);
   }
 
-  /** The marking that speaks against it, with the turns in which transitions fired; a second press takes it away. */
+  /** The marking of the counterexample, with the order in which transitions fired; a second click removes it. */
   show(verdict, button) {
     const again = this.shown === verdict;
     this.shown = again ? null : verdict;
@@ -88,7 +88,7 @@ export class Verdicts {
     this.paint();
   }
 
-  /** Put what is chosen here onto the drawing. */
+  /** Show the chosen verdict on the drawing. */
   paint() {
     const { view, picture } = this.designer;
     const witness = this.shown?.witness;

@@ -1,0 +1,140 @@
+"""Whether a task fits the code of its actions: arguments, results, causes of errors, events, and
+what an action does that would fail only when it runs.
+
+What the code says comes from elsewhere (`services.comm.location_file.code`), as plain data by
+action; actions of other hosts are not known here and are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from petrobot.coordinator.task import Place, PrimitiveTask, Reference, Scope, Task
+from petrobot.coordinator.task.check.findings import Finding
+from petrobot.coordinator.task.wording import Severity, listed, nearest
+
+Code = Mapping[str, Mapping[str, Any]]
+"""By action: parameters (name: type or empty), required, open, causes, values, complete, words,
+events, faults; `device`: the words of its driver."""
+RUNTIME = (
+    *("bad_arguments", "bad_result", "busy", "cancelled", "command_not_taken", "command_refused"),
+    *("deadline", "device_died", "emergency_stop", "exception", "fenced", "hung", "import_failed"),
+    *("node_lost", "node_silent", "not_ready", "out_of_memory", "stopped", "unknown_service"),
+    "worker_died",
+)
+"""Causes that the runtime gives to runs of any action."""
+_FITS: Mapping[str, tuple[type, ...]] = {
+    "bool": (bool,),
+    "int": (int,),
+    "float": (int, float),
+    "str": (str,),
+    "list": (list, tuple),
+    "dict": (dict,),
+}
+
+
+def code_findings(
+    task: Task, code: Code, args: Mapping[str, Mapping[str, Any]], services: Mapping[str, Any]
+) -> Iterator[Finding]:
+    """What does not fit. `args` are the arguments of each action in the location file, `services`
+    what else it offers by name."""
+    for key, service in (("prepare", task.prepare), ("score", task.score)):
+        if service and service not in services and service not in args:
+            text = f"there is no service {service!r}{nearest(service, services)}"
+            remedy = f"declare [services.{service}] in the location file, or drop the key"
+            yield Finding(Severity.ERROR, "no-service", f"task.{key}", text, remedy)
+    used: dict[str, None] = {}
+    for place in task.flat.places.values():
+        if place.task:
+            primitive = task.primitive_tasks[place.task]
+            known = [a for a in primitive.alternatives if a in code]
+            used |= dict.fromkeys(known)
+            for action in known:
+                yield from _arguments(place, action, code[action], args.get(action, {}))
+            if known and len(known) == len(primitive.alternatives):
+                yield from _values(place, [code[a] for a in known])
+    for primitive in task.primitive_tasks.values():
+        yield from _causes(primitive, code)
+    for action in used:
+        yield from _events(task, action, code[action])
+    faults = {tuple(fault) for action in used for fault in code[action].get("faults", ())}
+    for file, line, text in sorted(faults):
+        yield Finding(Severity.ERROR, "code", f"{file}:{line}", text)
+
+
+def _arguments(
+    place: Place, action: str, facts: Mapping[str, Any], given: Mapping[str, Any]
+) -> Iterator[Finding]:
+    if "parameters" not in facts:
+        return
+    key, known = f"places.{place.name}.args", facts["parameters"]
+    for name, value in place.args.items():
+        if name not in known:
+            if not facts["open"]:
+                text = f"the action {action!r} has no argument {name!r}{nearest(name, known)}"
+                yield Finding(Severity.ERROR, "code", f"{key}.{name}", text, "correct the name")
+        elif not isinstance(value, Reference) and not _fits(value, known[name]):
+            text = f"the action {action!r} expects {name}: {known[name]}, found {value!r}"
+            remedy = "correct the value, or the annotation"
+            yield Finding(Severity.WARNING, "code", f"{key}.{name}", text, remedy)
+    for name in facts["required"]:
+        if name not in place.args and name not in given:
+            text = f"the action {action!r} needs the argument {name!r}"
+            remedy = f"give args = {{ {name} = ... }} here or in [actions.{action}]"
+            yield Finding(Severity.ERROR, "code", key, text, remedy)
+
+
+def _fits(value: Any, kind: str) -> bool:
+    if kind not in _FITS or value is None:
+        return True
+    return isinstance(value, _FITS[kind]) and (kind == "bool" or not isinstance(value, bool))
+
+
+def _values(place: Place, facts: list[Mapping[str, Any]]) -> Iterator[Finding]:
+    """Values that `out` waits for, and no action returns."""
+    if not all(f.get("complete") for f in facts):
+        return
+    known = sorted({value for f in facts for value in f["values"]})
+    for name, variable in place.out.items():
+        if name not in known:
+            text = f"no action of {place.task} returns a value {name!r}{nearest(name, known)}"
+            remedy = f"return it (success({name}=...)), or {variable} is never written"
+            yield Finding(Severity.ERROR, "code", f"places.{place.name}.out.{name}", text, remedy)
+
+
+def _causes(primitive: PrimitiveTask, code: Code) -> Iterator[Finding]:
+    """Declared causes that no action can give, and causes that are not declared."""
+    facts = [code[a] for a in primitive.alternatives if "causes" in code.get(a, {})]
+    if not primitive.error_causes or len(facts) < len(primitive.alternatives):
+        return
+    key = f"primitive_tasks.{primitive.name}.error_causes"
+    possible = {cause for f in facts for cause in f["causes"]}
+    # A cause that stands in a variable is often one that the driver has found.
+    open_ones = [f for f in facts if not f["complete"]]
+    said = possible | {w for f in open_ones for w in (*f["words"], *f["device"].get("words", ()))}
+    for cause in primitive.error_causes:
+        if cause not in said and cause not in RUNTIME:
+            text = f"no action of {primitive.name} returns the error {cause!r}"
+            remedy = f"drop it{nearest(cause, sorted(possible))}"
+            yield Finding(Severity.WARNING, "code", f"{key}.{cause}", text, remedy)
+    if undeclared := sorted(possible - {*primitive.error_causes}):
+        text = f"its actions also return {listed(undeclared)}"
+        remedy = "declare each with a sentence for people"
+        yield Finding(Severity.WARNING, "code", key, text, remedy)
+
+
+def _events(task: Task, action: str, facts: Mapping[str, Any]) -> Iterator[Finding]:
+    """Internal events that the action raises and the task does not know as such."""
+    raisers = {p.name for p in task.primitive_tasks.values() if action in p.alternatives}
+    for name, (file, line) in facts.get("events", {}).items():
+        event = task.events.get(name)
+        if event is None:
+            text = f"{action!r} raises the event {name!r}, which the task does not declare"
+            text, remedy = text + nearest(name, task.events), f"declare [events.{name}]"
+        elif event.scope is not Scope.INTERNAL or event.by not in raisers:
+            text = f"{action!r} raises the event {name!r}, but it is declared as another's"
+            remedy = f'write scope = "internal" and by = {listed(sorted(raisers))}'
+        else:
+            continue
+        yield Finding(Severity.WARNING, "code", f"{file}:{line}", text, remedy)

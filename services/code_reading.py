@@ -1,0 +1,317 @@
+"""What the code that a location file names says of itself: a program for a process of its own.
+
+`python -m petrobot.services.code_reading` reads one JSON object from standard input, imports each
+module that it names, and answers with one line of JSON for each import path. Importing runs code of
+the user, which may print, wait, or end the process: so nothing of petrobot runs here, and whoever
+started it (`comm.location_file.code`) limits its time.
+
+What a function does is read from its source (`ast`), with all functions and classes of the same
+top-level package that it names. Where the source cannot say it, `complete` is false.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from petrobot.services import action as actions
+from petrobot.services.comm.location_file import resolve
+from petrobot.services.device import Driver, faults_of_keys
+
+AWAITED = frozenset(
+    ("wait", "sleep", "call", "command", "get", "get_versioned", "put", "compare_and_set")
+)
+"""Calls of the context that do nothing unless they are awaited."""
+MADE = (actions.success, actions.failure, actions.error)
+API = (actions.__name__, Driver.__module__)
+"""Modules of petrobot that actions and drivers are written with."""
+METHODS = ("period", "state", "stop", "stopped", "hold", "release", "close")
+CYCLIC = ("command", "step")
+"""What a driver with a period needs beside `METHODS`."""
+_KINDS = {bool: "bool", int: "int", float: "float", str: "str", list: "list", dict: "dict"}
+
+
+@dataclass
+class _Seen:
+    """What was found in the code of one import path."""
+
+    faults: list[tuple[str, int, str]] = field(default_factory=list)
+    """File, line, and what is wrong there."""
+    causes: set[str] = field(default_factory=set)
+    """First arguments of `error`."""
+    values: set[str] = field(default_factory=set)
+    """Names of values of results."""
+    complete: bool = True
+    """Whether all causes and values stand in the code."""
+    words: set[str] = field(default_factory=set)
+    """All texts in the code: what an unknown cause may be."""
+    streams: dict[str, tuple[str, int]] = field(default_factory=dict)
+    events: dict[str, tuple[str, int]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Code:
+    """The source of one function or class."""
+
+    tree: ast.AST
+    file: str
+    names: Mapping[str, Any]
+    """What its global names are."""
+
+    def value(self, node: ast.AST) -> Any:
+        """The object that a dotted name or a constant stands for, None if it is not known."""
+        if isinstance(node, ast.Constant):
+            return node.value
+        if isinstance(node, ast.Name):
+            return self.names.get(node.id)
+        if isinstance(node, ast.Attribute):
+            return getattr(self.value(node.value), node.attr, None)
+        return None
+
+
+@cache
+def _parsed(file: str) -> ast.Module:
+    return ast.parse(Path(file).read_bytes())
+
+
+def _code(thing: Any) -> _Code | None:
+    """The source of a function or class; None if there is none."""
+    try:
+        thing = inspect.unwrap(thing)
+        file, lines = inspect.getsourcefile(thing), inspect.getsourcelines(thing)
+        module = sys.modules[thing.__module__]
+        for node in ast.walk(_parsed(str(file))):
+            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                continue
+            if node.name == thing.__name__:
+                first = min([node.lineno, *(d.lineno for d in node.decorator_list)])
+                if first == lines[1]:
+                    return _Code(node, str(file), {**vars(module), **dict(_imported(node))})
+    except (OSError, TypeError, SyntaxError, KeyError, AttributeError):
+        pass
+    return None
+
+
+def _imported(tree: ast.AST) -> Iterator[tuple[str, Any]]:
+    """Yield the names that a function imports for itself, as far as they are imported already."""
+    for node in ast.walk(tree):
+        for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
+            if isinstance(node, ast.Import) and (alias.asname or "." not in alias.name):
+                yield alias.asname or alias.name, sys.modules.get(alias.name)
+            elif isinstance(node, ast.ImportFrom):
+                module = sys.modules.get(node.module or "")
+                yield alias.asname or alias.name, getattr(module, alias.name, None)
+
+
+def _reachable(thing: Any) -> Iterator[_Code]:
+    """Yield the source of a function or class, and of all of its package that it names: base
+    classes, helpers, what they name in turn."""
+    package = str(thing.__module__).partition(".")[0]
+    waiting, seen = [thing], set[int]()
+    while waiting:
+        found = waiting.pop()
+        if id(found) in seen or (code := _code(found)) is None:
+            continue
+        seen.add(id(found))
+        yield code
+        for node in ast.walk(code.tree):
+            if isinstance(node, ast.Name | ast.Attribute):
+                named = code.value(node)
+                home = str(getattr(named, "__module__", ""))
+                ours = home.partition(".")[0] == package and home not in API
+                if ours and (inspect.isfunction(named) or inspect.isclass(named)):
+                    waiting.append(named)
+
+
+def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
+    """Note what stands in one function or class."""
+    awaited = _awaited(code.tree)
+    for node in ast.walk(code.tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            seen.words.add(node.value)
+        if not isinstance(node, ast.Call):
+            continue
+        made = code.value(node.func)
+        if made in MADE:
+            _result(code, node, made, seen)
+        elif made is actions.Result:
+            seen.complete = False
+        elif made is time.sleep and in_action:
+            text = "time.sleep stops everything that runs beside it; write `await ctx.sleep(...)`"
+            seen.faults.append((code.file, node.lineno, text))
+        if isinstance(node.func, ast.Attribute):
+            _method(code, node, node.func, seen, node in awaited)
+
+
+def _method(
+    code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen, awaited: bool
+) -> None:
+    """Note a call of a method of the context, or of a driver's ports."""
+    owner, name = ast.unparse(function.value), function.attr
+    first = code.value(node.args[0]) if node.args else None
+    ports = owner in ("ports", "self.ports", "self._ports")
+    if owner in ("ctx", "context") or ports:
+        if name == "call":
+            seen.complete = False
+        if name in AWAITED and not ports and not awaited:
+            text = (
+                f"`{owner}.{name}` does nothing without `await`; write `await {owner}.{name}(...)`"
+            )
+            seen.faults.append((code.file, node.lineno, text))
+        if isinstance(first, str):
+            if name in ("publish", "withdraw", "stream"):
+                seen.streams.setdefault(first, (code.file, node.lineno))
+            elif name == "raise_event":
+                seen.events.setdefault(first, (code.file, node.lineno))
+
+
+def _awaited(tree: ast.AST) -> set[ast.AST]:
+    """The calls that are awaited, or handed on to somebody who may await them."""
+    waits = {n.id for a in ast.walk(tree) if isinstance(a, ast.Await) for n in ast.walk(a.value)
+             if isinstance(n, ast.Name)}  # fmt: skip
+    found: set[ast.AST] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Await | ast.Return):
+            found |= set(ast.walk(node))
+        elif isinstance(node, ast.Lambda):
+            found |= set(ast.walk(node.body))
+        elif isinstance(node, ast.Call):
+            found |= {*node.args, *(k.value for k in node.keywords)}
+        elif isinstance(node, ast.Assign) and any(
+            isinstance(t, ast.Name) and t.id in waits for t in node.targets
+        ):
+            found.add(node.value)
+    return found
+
+
+def _result(code: _Code, node: ast.Call, made: Callable[..., Any], seen: _Seen) -> None:
+    """Note cause and values of `success(...)`, `failure(...)` or `error(...)`."""
+    for keyword in node.keywords:
+        if keyword.arg is None:
+            seen.complete = False
+        elif keyword.arg not in ("cause", "text") or made is actions.success:
+            seen.values.add(keyword.arg)
+    if made is not actions.error:
+        return
+    given = [*node.args[:1], *(k.value for k in node.keywords if k.arg == "cause")]
+    parts = [part for cause in given for part in _branches(cause)]
+    for cause in (code.value(part) for part in parts):
+        if isinstance(cause, str):
+            seen.causes.add(str(cause))
+        else:
+            seen.complete = False
+
+
+def _branches(node: ast.expr) -> Iterator[ast.expr]:
+    """The values that an expression may have, as far as it is a choice."""
+    if isinstance(node, ast.IfExp):
+        yield from _branches(node.body)
+        yield from _branches(node.orelse)
+    else:
+        yield node
+
+
+# --------------------------------------------------------------------------- functions and drivers
+
+
+def _function(thing: Callable[..., Any]) -> dict[str, Any]:
+    """What is known of an action or service."""
+    try:
+        parameters = list(inspect.signature(thing).parameters.values())
+    except (TypeError, ValueError):
+        return {}
+    try:
+        hints = get_type_hints(thing)
+    except Exception:
+        hints = {}
+    named = [p for p in parameters[1:] if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    seen = _Seen()
+    is_async = inspect.iscoroutinefunction(thing)
+    if inspect.isfunction(inspect.unwrap(thing)):
+        for code in _reachable(inspect.unwrap(thing)):
+            _look(code, seen, is_async)
+    else:
+        seen.complete = False
+    if not parameters:
+        source = thing.__code__
+        text = f"{thing.__name__} takes no context; its first parameter is `ctx`"
+        seen.faults.append((source.co_filename, source.co_firstlineno, text))
+    return {
+        "parameters": {p.name: _KINDS.get(hints.get(p.name, object), "") for p in named},
+        "required": [p.name for p in named if p.default is p.empty],
+        "open": any(p.kind is p.VAR_KEYWORD for p in parameters),
+        **_plain(seen),
+    }
+
+
+def _driver(thing: Any, config: Mapping[str, Any]) -> dict[str, Any]:
+    """What is known of a driver's class, and what is wrong with the keys of its table."""
+    seen = _Seen()
+    if not inspect.isclass(thing):
+        return {"keys": [["driver", "is not a class; a driver is a class derived from `Driver`"]]}
+    for code in _reachable(thing):
+        _look(code, seen, in_action=False)
+    keys: list[tuple[str, str]] = []
+    period: Any = getattr(thing, "period", None)
+    declared = not hasattr(period, "__get__")  # a property is known only when the driver is made
+    moves = declared and period is not None
+    wanted = [*METHODS, *(CYCLIC if moves else ())]
+    if missing := [name for name in wanted if not hasattr(thing, name)]:
+        text = f"{thing.__name__} has no {', '.join(missing)}; derive it from petrobot.Driver"
+        keys.append(("driver", text))
+    is_number = isinstance(period, int | float) and not isinstance(period, bool)
+    if moves and not (is_number and 0.0 < period < float("inf")):
+        text = f"{thing.__name__}.period: expected seconds above 0 or None, found {period!r:.40}"
+        keys.append(("driver", text))
+    if issubclass(thing, Driver):
+        keys += faults_of_keys(thing, config)
+    return {"keys": keys, **_plain(seen)}
+
+
+def _plain(seen: _Seen) -> dict[str, Any]:
+    return {
+        "faults": sorted(set(seen.faults)),
+        "causes": sorted(seen.causes),
+        "values": sorted(seen.values),
+        "complete": seen.complete,
+        "words": sorted(w for w in seen.words if len(w) <= 100 and w.isidentifier()),
+        "streams": seen.streams,
+        "events": seen.events,
+    }
+
+
+def _read(path: str, config: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Import one path and say what is known of it."""
+    try:
+        thing = resolve(path)
+    except ImportError as fault:
+        return {"import": str(fault)}
+    return _function(thing) if config is None else _driver(thing, config)
+
+
+def main() -> None:
+    """Answer on what was standard output; what imported code prints goes nowhere."""
+    asked = json.load(sys.stdin)
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    silent = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silent, 1)
+    os.dup2(silent, 2)
+    sys.path[:] = asked["sys_path"]
+    for path, config in asked["paths"]:
+        answers.write(json.dumps({"path": path, **_read(path, config)}) + "\n")
+        answers.flush()
+    answers.close()
+    os._exit(0)  # threads of imported modules, and what they do at exit, have no say
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+"""What the code that a location file names says of itself, read in a process of its own, and what
+does not fit the file.
+
+`petrobot check` asks here. Importing runs the user's code, so it happens elsewhere and within
+limits: a module that waits for a device, or ends the process, costs a line of text.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.location_file.reading import Faults, nearest
+from petrobot.services.comm.protocol.security import is_loopback
+
+PROGRAM = "petrobot.services.code_reading"
+SECONDS = 20.0
+"""How long all imports together may take."""
+MEMORY = 4 << 30
+"""Bytes of address space that they may have."""
+
+Facts = Mapping[str, Any]
+"""What `PROGRAM` says of one import path."""
+
+
+def read_code(directory: Directory, seconds: float = SECONDS) -> dict[str, Facts]:
+    """Return what is known of each action, service and driver of this host's nodes, by import path.
+
+    What cannot be imported, or not within `seconds` altogether, has the key `import`: why.
+    """
+    here = {node.name for node in directory.nodes.values() if is_loopback(node.host)}
+    actions, services = directory.actions.values(), directory.services.values()
+    functions = [(a.node, a.run) for a in actions] + [(s.node, s.run) for s in services]
+    asked: dict[str, Any] = {run: None for node, run in functions if node in here and run}
+    asked |= {d.driver: d.config for d in directory.devices.values() if d.node in here and d.driver}
+    known: dict[str, Facts] = {}
+    while left := [[path, config] for path, config in asked.items() if path not in known]:
+        told, why = _ask(left, seconds)
+        known |= {facts["path"]: facts for facts in told}
+        for path, _ in left[len(told) : len(told) + 1]:
+            known[path] = {"import": why}  # its import broke the process; the others are asked anew
+    return known
+
+
+def _ask(paths: list[Any], seconds: float) -> tuple[list[Facts], str]:
+    """Return what a new process says of the paths until it ends, and why it ended before the
+    last. Code that comes with petrobot does not change while this process lives: it is asked
+    once."""
+    question = json.dumps({"sys_path": sys.path, "paths": paths})
+    if all(path.startswith("petrobot.") for path, _ in paths):
+        return _ask_once(question, seconds)
+    return _ask_process(question, seconds)
+
+
+def _ask_process(question: str, seconds: float) -> tuple[list[Facts], str]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", f"import sys; sys.path[:0] = {sys.path!r}; import runpy; "
+         f"runpy.run_module({PROGRAM!r}, run_name='__main__')"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+    )  # fmt: skip
+    resource.prlimit(process.pid, resource.RLIMIT_AS, (MEMORY, MEMORY))
+    try:
+        text, _ = process.communicate(question, timeout=seconds)
+        why = f"importing it ended the process (exit code {process.returncode})"
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        text, _ = process.communicate()
+        why = f"importing it took longer than {seconds:g} s"
+    lines = [line for line in text.splitlines() if line.endswith("}")]
+    return [json.loads(line) for line in lines], f"{why}; a module only defines, it does nothing"
+
+
+_ask_once = functools.lru_cache(maxsize=8)(_ask_process)
+
+
+def code_faults(directory: Directory, code: Mapping[str, Facts], text: str) -> tuple[str, ...]:
+    """Return one line for each fault, as "FILE:LINE: KEY: what is wrong; remedy". `text` is that
+    of the location file."""
+    faults = Faults(text, str(directory.source))
+    for table in (directory.actions, directory.services):
+        for entry in table.values():
+            key = f"{'actions' if entry.name in directory.actions else 'services'}.{entry.name}"
+            if why := code.get(entry.run, {}).get("import"):
+                faults.add(f"{key}.run", why)
+    for device in directory.devices.values():
+        facts = code.get(device.driver, {})
+        if why := facts.get("import"):
+            faults.add(f"devices.{device.name}.driver", why)
+        for key, said in facts.get("keys", ()):
+            faults.add(f"devices.{device.name}.{key}", said)
+    return (*faults.lines, *_streams(directory, code))
+
+
+def _streams(directory: Directory, code: Mapping[str, Facts]) -> Iterator[str]:
+    """Streams that the code names and the location file does not, or leads elsewhere."""
+    for device in directory.devices.values():
+        for name, (file, line) in code.get(device.driver, {}).get("streams", {}).items():
+            entry = directory.streams.get(name)
+            if entry is None or entry.to != device.name:
+                what = "is not declared" if entry is None else f"leads to {entry.to!r}"
+                remedy = f'write [streams.{name}] to = "{device.name}" in {directory.source}'
+                yield f"{file}:{line}: the stream {name!r} {what}; {remedy}"
+    for path in dict.fromkeys(action.run for action in directory.actions.values()):
+        for name, (file, line) in code.get(path, {}).get("streams", {}).items():
+            if name not in directory.streams:
+                hint = nearest(name, directory.streams)
+                remedy = f"declare [streams.{name}] in {directory.source}{hint}"
+                yield f"{file}:{line}: the stream {name!r} is not declared; {remedy}"

@@ -1,0 +1,311 @@
+"""Images through OpenCV: cameras of this host, network streams, and recordings.
+
+OpenCV is imported when a source is first opened, so nodes without one do not need it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from petrobot.services.comm.streams.image import Image
+
+_log = logging.getLogger(__name__)
+
+Clock = Callable[[], float]
+
+SILENCE_MS = 3000
+"""Milliseconds after which opening or reading a network stream fails."""
+FIRST_WAIT, LONGEST_WAIT = 0.5, 8.0
+"""Seconds until a source that was lost is opened again: twice as long after each failure."""
+OPEN_LIMIT = 10.0
+"""Seconds for which `start` waits until a source is open."""
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureSettings:
+    """What a camera is asked for. Zero, empty or None: what it does by itself."""
+
+    fps: float = 0.0
+    """Images/s that it takes; 0: the rate of the first `start`."""
+    width: int = 0
+    height: int = 0
+    fourcc: str = ""
+    """Pixel format, four characters such as "MJPG"."""
+    exposure: float | None = None
+    """Exposure in the unit of its driver (V4L2: 100 us); given, it is no longer automatic."""
+    colour: bool = False
+    """Images of shape (height, width, 3), blue green red, instead of grey levels."""
+    latency: float = 0.0
+    """Time from mid-exposure until an image is available (s), from the datasheet or measured."""
+
+
+class CaptureImages:
+    """A camera, as `cv2.VideoCapture` opens it: a number, a device file, a URL or a GStreamer
+    pipeline (with "!").
+
+    One thread owns it. It takes every image as it comes, wanted or not, so the newest one is never
+    an old one from a buffer. When the camera is lost it is opened again, with growing pauses;
+    `condition` says so. Device files are resolved at each opening, since a camera that is plugged
+    in again may get another number: /dev/v4l/by-id/... stays the same.
+    """
+
+    def __init__(
+        self, target: int | str, clock: Clock, settings: CaptureSettings | None = None
+    ) -> None:
+        self._target = target
+        self._clock = clock
+        self._settings = settings or CaptureSettings()
+        self._lock = threading.Lock()
+        self._newest: Image | None = None
+        self._sequence = 0
+        self._rate = 0.0
+        self._fault = ""
+        self._tried = threading.Event()
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def condition(self) -> str:
+        """Why no images come; empty while the camera is open or was not asked for any."""
+        return self._fault
+
+    def start(self, rate: float) -> None:
+        """Deliver the images from now on, those that come. Raises ConnectionError with the source
+        while it cannot be opened."""
+        with self._lock:
+            self._newest, self._sequence, self._rate = None, 0, rate
+        if self._thread is None:
+            self._tried.clear()
+            self._ended.clear()
+            self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
+            self._thread.start()
+        if not self._tried.wait(OPEN_LIMIT):
+            raise ConnectionError(f"camera {self._target!r} was not opened within {OPEN_LIMIT:g} s")
+        if self._fault:
+            raise ConnectionError(self._fault)
+
+    def stop(self) -> None:
+        """Deliver no more images. The camera stays open for the next start."""
+        with self._lock:
+            self._newest, self._rate = None, 0.0
+
+    def close(self) -> None:
+        """Release the camera; a thread that is still waiting for an image does so afterwards."""
+        self.stop()
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join(SILENCE_MS / 1000)
+        self._thread, self._fault = None, ""
+
+    def newest(self) -> Image | None:
+        """Return the newest image that was not returned yet, None if there is none."""
+        with self._lock:
+            newest, self._newest = self._newest, None
+        return newest
+
+    def _run(self) -> None:
+        wait, ended = FIRST_WAIT, self._ended
+        while not ended.is_set():
+            with _opened(self._target, self._settings, self._rate) as capture:
+                if capture is not None:
+                    self._fault = ""
+                    self._tried.set()
+                    if self._take(capture, ended):
+                        wait = FIRST_WAIT
+            if ended.is_set():
+                return
+            self._fault = (
+                f"camera {self._target!r} was lost" if capture is not None else self._closed()
+            )
+            _log.warning("%s; it is opened again in %g s", self._fault, wait)
+            self._tried.set()
+            ended.wait(wait)
+            wait = min(2.0 * wait, LONGEST_WAIT)
+
+    def _closed(self) -> str:
+        text = f"camera {self._target!r} cannot be opened: is it plugged in, is the address right?"
+        if _is_pipeline(self._target) and not _has_gstreamer():
+            text += " This OpenCV was built without GStreamer."
+        return text
+
+    def _take(self, capture: Any, ended: threading.Event) -> int:
+        """Take images until the camera is lost or closed; return how many came."""
+        count = 0
+        while not ended.is_set() and capture.grab():
+            count += 1
+            time = self._clock() - self._settings.latency
+            if not self._rate:
+                continue
+            taken, pixels = capture.retrieve()
+            if not taken:
+                break
+            if not self._settings.colour:
+                pixels = grey(pixels)
+            with self._lock:
+                if self._rate:
+                    self._newest = Image(pixels, time, self._sequence)
+                    self._sequence += 1
+        return count
+
+
+class RecordedImages:
+    """A video file, paced by the clock: image k belongs to the time start + k / rate, and after the
+    last one there is none."""
+
+    condition = ""
+
+    def __init__(self, path: str, clock: Clock, *, colour: bool = False) -> None:
+        self._path = path
+        self._clock = clock
+        self._colour = colour
+        self._capture: Any = None
+        self._sequence = 0
+        self._begin = 0.0
+        self._rate = 0.0
+
+    def start(self, rate: float) -> None:
+        """Deliver the images from the first one on, at this rate (1/s). Raises ConnectionError when
+        the file cannot be opened."""
+        import cv2  # see the module's docstring
+
+        if self._capture is None:
+            capture = cv2.VideoCapture(self._path)
+            if not capture.isOpened():
+                raise ConnectionError(f"recording {self._path!r} cannot be opened as a video")
+            self._capture = capture
+        self._capture.set(cv2.CAP_PROP_POS_FRAMES, 0)
+        self._begin, self._rate, self._sequence = self._clock(), rate, 0
+
+    def stop(self) -> None:
+        """Deliver no more images."""
+        self._rate = 0.0
+
+    def close(self) -> None:
+        """Release the file."""
+        self.stop()
+        if self._capture is not None:
+            self._capture.release()
+            self._capture = None
+
+    def newest(self) -> Image | None:
+        """Return the newest image that is due and was not returned yet, None if there is none."""
+        newest = None
+        while self._rate and self._sequence <= int((self._clock() - self._begin) * self._rate):
+            taken, pixels = self._capture.read()
+            if not taken:
+                break
+            pixels = pixels if self._colour else grey(pixels)
+            newest = Image(pixels, self._begin + self._sequence / self._rate, self._sequence)
+            self._sequence += 1
+        return newest
+
+
+def grey(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the grey levels (height, width) of a blue-green-red or grey picture (weights of ITU-R
+    BT.601)."""
+    if pixels.ndim == 2:
+        return pixels
+    import cv2  # see the module's docstring
+
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+@contextlib.contextmanager
+def _opened(target: int | str, settings: CaptureSettings, rate: float) -> Iterator[Any]:
+    """Open a camera and set it up; None if it cannot be opened."""
+    import cv2  # see the module's docstring
+
+    if isinstance(target, int):
+        capture = cv2.VideoCapture(target)
+    elif "://" in target:
+        limits = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
+        given = [value for limit in limits for value in (limit, SILENCE_MS)]
+        capture = cv2.VideoCapture(target, cv2.CAP_FFMPEG, given)
+    elif _is_pipeline(target):
+        capture = cv2.VideoCapture(target, cv2.CAP_GSTREAMER)
+    else:
+        capture = cv2.VideoCapture(os.path.realpath(target), cv2.CAP_V4L2)
+    try:
+        if not capture.isOpened():
+            yield None
+            return
+        for name, value in _properties(settings, rate):
+            # Network streams accept none of them, which is normal: their sender decides.
+            if not capture.set(getattr(cv2, name), value) and "://" not in str(target):
+                _log.warning("camera %r does not accept %s = %g", target, name, value)
+        yield capture
+    finally:
+        capture.release()
+
+
+def _properties(settings: CaptureSettings, rate: float) -> Iterator[tuple[str, float]]:
+    """Yield OpenCV's properties to set, in the order that V4L2 needs: format, size, rate."""
+    if settings.fourcc:
+        a, b, c, d = map(ord, settings.fourcc)
+        yield "CAP_PROP_FOURCC", a | b << 8 | c << 16 | d << 24
+    if settings.width:
+        yield "CAP_PROP_FRAME_WIDTH", settings.width
+    if settings.height:
+        yield "CAP_PROP_FRAME_HEIGHT", settings.height
+    if fps := settings.fps or rate:
+        yield "CAP_PROP_FPS", fps
+    if settings.exposure is not None:
+        yield "CAP_PROP_AUTO_EXPOSURE", 1.0  # V4L2's number for manual
+        yield "CAP_PROP_EXPOSURE", settings.exposure
+
+
+def _is_pipeline(target: int | str) -> bool:
+    return isinstance(target, str) and "!" in target and "://" not in target.split("!")[0]
+
+
+def _has_gstreamer() -> bool:
+    import cv2  # see the module's docstring
+
+    return bool(cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER))
+
+
+def settings_of(config: Mapping[str, Any]) -> CaptureSettings:
+    """Return what a device's table says of its camera. Raises ValueError naming key and remedy."""
+    return CaptureSettings(
+        fps=_number(config, "fps", 0.0, 1000.0),
+        width=int(_number(config, "width", 0, 1 << 14)),
+        height=int(_number(config, "height", 0, 1 << 14)),
+        fourcc=_fourcc(config.get("fourcc", "")),
+        exposure=_number(config, "exposure", -100.0, 1e6) if "exposure" in config else None,
+        colour=_flag(config.get("colour", False)),
+        latency=_number(config, "latency", 0.0, 10.0),
+    )
+
+
+def _number(config: Mapping[str, Any], key: str, least: float, most: float) -> float:
+    value = config.get(key, 0)
+    whole = isinstance(least, int)
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int if whole else int | float)
+        or not least <= value <= most
+    ):
+        kind = "a whole number" if whole else "a number"
+        raise ValueError(f"{key}: expected {kind} from {least:g} to {most:g}, got {value!r}")
+    return float(value)
+
+
+def _fourcc(value: Any) -> str:
+    if not isinstance(value, str) or (value and (len(value) != 4 or not value.isascii())):
+        raise ValueError(f'fourcc: expected four characters such as "MJPG", got {value!r}')
+    return value
+
+
+def _flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError(f"colour: expected true or false, got {value!r}")
+    return value

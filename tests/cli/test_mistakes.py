@@ -1,0 +1,400 @@
+"""Mistakes that a newcomer makes in his own robot, and the message that he gets for each: file and
+line, key, what was expected, what was found, what to do."""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+
+import pytest
+
+from petrobot.coordinator.cli import main
+
+CHECK = ["check", "arm_bot.toml"]
+TASK, CELL, CODE = "arm_bot.toml", "services.toml", "arm_bot.py"
+RUN = ["run", "arm_bot.toml", "--mode", "lockstep", "--quiet", "--no-page"]
+
+Mistake = tuple[str, str, str, str]
+"""File, what stands there, what is written instead, and the message as a regular expression; LINE
+stands for the line of the mistake, or for any line where it is told of another file."""
+
+IN_THE_TASK: list[Mistake] = [
+    (
+        TASK,
+        "schema = 1",
+        "schema = 2",
+        r"arm_bot.toml:LINE: schema: 2 is not known.*write schema = 1",
+    ),
+    (TASK, "[task]", "[tsk]", r":LINE: tsk: unknown key.*did you mean 'task'\?"),
+    (TASK, 'final = "parts == 0"', "", r":4: task.final: missing; give a text"),
+    (TASK, '"parts == 0"', '"part == 0"', r":LINE: task.final: in 'part == 0'.*'part'.*parts"),
+    (TASK, '"parts == 0"', '"parts = 0"', r":LINE: task.final: .* at column 7: parts >>>= 0"),
+    (TASK, '"parts == 0"', "0", r":LINE: task.final: 0 is not a text; give a text"),
+    (
+        TASK,
+        '["delivered"]',
+        '["deliverd"]',
+        r"goal_transitions: unknown transition 'deliverd'.*deliv",
+    ),
+    (TASK, '["delivered"]', '"delivered"', r":LINE: task.goal_transitions: .* is not a list"),
+    (TASK, 'runs_place = "parts"', 'runs_place = "axis"', r":LINE: .*a control place, got 'axis'"),
+    (TASK, 'to = "broken"', 'to = "brokn"', r":LINE: errors.to: 'brokn' is not a place.*'broken'"),
+    (
+        TASK,
+        "deadline = 8.0",
+        "deadline = 0",
+        r":LINE: .*above 0 and at most 1e\+09 s, got 0 s; give",
+    ),
+    (TASK, "deadline = 8.0", "deadline = 1e300", r":LINE: .*at most 1e\+09 s, got 1e\+300 s; give"),
+    (
+        TASK,
+        "deadline = 8.0",
+        'deadline = "8 s"',
+        r":LINE: .*deadline: '8 s' is not a number; give a",
+    ),
+    (TASK, "deadline = 8.0", "deadline = nan", r":LINE: .*expected a finite number, got nan"),
+    (
+        TASK,
+        "deadline = 8.0",
+        "dedline = 8.0",
+        r":LINE: .*dedline: unknown key; did you mean 'deadli",
+    ),
+    (
+        TASK,
+        '["move"] ',
+        '["mov"] ',
+        r":LINE: .*no node offers the action 'mov'.*'move'[^|]*add \[act",
+    ),
+    (
+        TASK,
+        '["move"] ',
+        "[] ",
+        r":LINE: primitive_tasks.move.alternatives: it has no action; name at",
+    ),
+    (TASK, "tokens = 3", "tokens = -3", r":LINE: places.parts.tokens: expected 0 or more.*got -3"),
+    (TASK, "tokens = 3", "tokens = 3.5", r":LINE: places.parts.tokens: 3.5 is not a whole number"),
+    (
+        TASK,
+        "tokens = 3",
+        "tokens = 3, capacity = 2",
+        r":LINE: .*capacity of at least 3, got 2; raise",
+    ),
+    (
+        TASK,
+        'kind = "control"',
+        'kind = "counter"',
+        r":LINE: .*'counter' is none of action, .*control",
+    ),
+    (
+        TASK,
+        'kind = "action", task = "grip"',
+        'task = "grip"',
+        r":LINE: .*kind: missing.*write kind =",
+    ),
+    (TASK, 'task = "grip"', 'task = "gripp"', r":LINE: .*unknown primitive task 'gripp'.*'grip'"),
+    (TASK, "tries = 3", "tries = 0", r":LINE: places.grip.tries: 0 tries; give 1 or more"),
+    (
+        TASK,
+        "tries = 3",
+        "timeout = 9.0",
+        r":LINE: .*timeout: 9.0 s is longer than the deadline.*2.0 s",
+    ),
+    (
+        TASK,
+        'tries = 3, holds = "axis"',
+        'holds = "axs"',
+        r":LINE: .*'axs' is not a resource.*'axis'",
+    ),
+    (TASK, '["grip:normal"]', '["grip"]', r":LINE: .*its arc must say when.*write grip:normal"),
+    (TASK, '["grip:normal"]', '["grip:success"]', r":LINE: .*'success' is none of normal, error"),
+    (TASK, '["grip:normal"]', '["grab:normal"]', r":LINE: .*unknown place 'grab'"),
+    (
+        TASK,
+        'out = ["carry"]',
+        'out = "carry"',
+        r":LINE: transitions.gripped.out: 'carry' is not a list",
+    ),
+    (TASK, 'out = ["carry"]', 'out = ["carry"], when = "bin == 1"', r":LINE: .*'bin'"),
+    (
+        TASK,
+        'out = ["carry"]',
+        'out = ["carry"], event = "button"',
+        r":LINE: .*unknown event 'button'",
+    ),
+    (
+        TASK,
+        'out = ["carry"]',
+        'out = ["carry"], set = { n = 1 }',
+        r":LINE: .*'n' is not a variable",
+    ),
+    (TASK, "lost = { in", "lost = in", r"arm_bot.toml:LINE: TOML: "),
+    (
+        TASK,
+        '{ in = ["carry:normal"] }',
+        '{ in = ["carry:error"] }',
+        r":33: places.carry: no outgoing arc `normal`",
+    ),
+]
+
+IN_THE_CELL: list[Mistake] = [
+    (CELL, 'node = "pc"', 'node = "pcc"', r"services.toml:LINE: devices.axis.node: .*'pcc'.*'pc'"),
+    (
+        CELL,
+        "arm_bot:Axis",
+        "arm_bot:Axes",
+        r":LINE: devices.axis.driver: .*no 'Axes'; did you mean 'Axis'",
+    ),
+    (CELL, "arm_bot:Axis", "armbot:Axis", r":LINE: .*no module 'armbot' on this host; install"),
+    (CELL, "arm_bot:Axis", "arm_bot.Axis", r":LINE: .*write an import path \"module:Class\""),
+    (CELL, "arm_bot:Axis", "arm_bot:move", r":LINE: .*is not a class; a driver is a class derived"),
+    (
+        CELL,
+        "speed = 0.5",
+        'speed = "fast"',
+        r":LINE: devices.axis.speed: .*a number \(m/s\), found 'fast'",
+    ),
+    (
+        CELL,
+        "speed = 0.5",
+        "sped = 0.5",
+        r":LINE: devices.axis.sped: unknown key 'sped'; did you mean 'sp",
+    ),
+    (
+        CELL,
+        "arm_bot:grip",
+        "arm_bot:gripp",
+        r":LINE: actions.grip.run: .*no 'gripp'; did you mean 'gri",
+    ),
+    (CELL, "[actions.grip]", "[action.grip]", r":LINE: action: .*did you mean 'actions'"),
+    (
+        CELL,
+        "port = 7501",
+        "port = 75010",
+        r":LINE: nodes.pc.port: is 75010; write a port from 1 to",
+    ),
+    (
+        CELL,
+        'run = "arm_bot:grip"',
+        'run = "arm_bot:grip"\nargs = { slip = 1 }',
+        r":18: .*no argument 'slip'; did you mean",
+    ),
+]
+
+IN_THE_CODE: list[Mistake] = [
+    (
+        CODE,
+        "period = 0.01",
+        "period = 0",
+        r":LINE: devices.axis.driver: Axis.period: .*above 0.*found 0",
+    ),
+    (
+        CODE,
+        "class Axis(Driver):",
+        "class Axis:",
+        r":LINE: .*Axis has no hold|close.*derive it from petrobot.Dr",
+    ),
+    (CODE, "import Context, Driver,", "import Contxt, Driver,", r":LINE: .*'Contxt'|cannot import"),
+    (
+        CODE,
+        "await ctx.command({",
+        "ctx.command({",
+        r"arm_bot.py:\d+: `ctx.command` does nothing without `await`",
+    ),
+    (
+        CODE,
+        "await ctx.sleep(0.3)",
+        "ctx.sleep(0.3)",
+        r"arm_bot.py:\d+: `ctx.sleep` does nothing without",
+    ),
+    (
+        CODE,
+        "if not await ctx.wait(",
+        "if not ctx.wait(",
+        r"arm_bot.py:\d+: `ctx.wait` does nothing",
+    ),
+    (
+        CODE,
+        "await ctx.sleep(0.3)",
+        "import time; time.sleep(0.3)",
+        r"arm_bot.py:\d+: time.sleep stops everyth",
+    ),
+    (
+        CODE,
+        "*, to: float)",
+        "*, goal: float)",
+        r":LINE: places.fetch.args.to: .*'move' has no argument 'to'",
+    ),
+    (
+        CODE,
+        "*, to: float)",
+        "*, to: float, fast: bool)",
+        r":LINE: .*'move' needs the argument 'fast'.*give args",
+    ),
+    (CODE, "*, to: float)", "*, to: str)", r":LINE: .*'move' expects to: str, found 0.2"),
+    (
+        CODE,
+        '"blocked"',
+        '"jammed"',
+        r"error_causes.blocked: no action of move returns the error 'blocked'",
+    ),
+    (CODE, '"blocked"', '"jammed"', r"error_causes: its actions also return jammed.*declare each"),
+    (
+        CODE,
+        "await ctx.sleep(0.3)",
+        'ctx.publish("speed", [1.0])',
+        r"arm_bot.py:\d+: the stream 'speed' is not",
+    ),
+    (
+        CODE,
+        "await ctx.sleep(0.3)",
+        'ctx.raise_event("shut")',
+        r"arm_bot.py:\d+: 'grip' raises the event 'shut'",
+    ),
+    (
+        CODE,
+        "class Axis",
+        "raise SystemExit(3)\n\n\nclass Axis",
+        r":LINE: .*importing it ended the process|SystemExit",
+    ),
+    (
+        CODE,
+        "class Axis",
+        "import os; os._exit(3)\n\n\nclass Axis",
+        r":LINE: .*ended the process \(exit code 3\)",
+    ),
+]
+
+BOTH: list[tuple[list[Mistake], str]] = [
+    (
+        [
+            (TASK, 'task = "grip", tries', 'task = "grip", out = { width = "w" }, tries', ""),
+            (TASK, "[places]", '[variables.w]\ntype = "float"\n\n[places]', ""),
+        ],
+        r"places.grip.out.width: no action of grip returns a value 'width'.*return it",
+    ),
+    (
+        [
+            (TASK, "[errors]", "[errors]", ""),
+            (TASK, "final_error", 'prepare = "ready"\nfinal_error', ""),
+        ],
+        r":LINE: task.prepare: there is no service 'ready'.*declare \[services.ready\]",
+    ),
+]
+
+ON_THE_LINE: list[tuple[list[str], str]] = [
+    (["run", "arm_bt.toml"], r"arm_bt.toml: file: cannot be read: No such file"),
+    (["run", "armbot"], r"no task 'armbot': give a .toml file, or a task that comes with petrobot"),
+    (
+        [*RUN, "--runs", "1000000000"],
+        r"--runs: 1000000000 is more than the largest number, 1000000",
+    ),
+    (
+        [*RUN, "--seed", "9" * 30],
+        r"--seed: 9+ is more than the largest number, 9223372036854775807",
+    ),
+    ([*RUN, "--set", "speed=1"], r"speed"),
+    ([*RUN, "--use", "grip=grab"], r"grab.*grip"),
+    ([*RUN, "--services", "cell.toml"], r"cell.toml: No such file"),
+    (["rum", "arm_bot.toml"], r"unknown command 'rum'"),
+    (
+        ["new", "robot", "arm_bot", "--folder", ".."],
+        r"named 'arm_bot' is there already|exists already",
+    ),
+]
+
+
+@pytest.fixture(autouse=True)
+def _one_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Modules are looked up beside the location file: not beside those of other tests, too."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The files of a robot without a mistake, as `petrobot new robot` writes them."""
+    folder = tmp_path_factory.mktemp("sound")
+    with redirect_stdout(io.StringIO()):
+        assert main(["new", "robot", "arm_bot", "--folder", str(folder)]) == 0
+    return {p.name: p.read_text(encoding="utf-8") for p in (folder / "arm_bot").iterdir()}
+
+
+def said(*arguments: str) -> tuple[int, str]:
+    """Exit code and all words of a command."""
+    out = io.StringIO()
+    with redirect_stdout(out), redirect_stderr(out):
+        code = main(list(arguments))
+    return code, out.getvalue()
+
+
+def damaged(sound: dict[str, str], mistakes: list[Mistake], folder: Path) -> None:
+    """Write the robot with the mistakes into a folder."""
+    files = dict(sound)
+    for name, old, new, _ in mistakes:
+        assert old in files[name], f"{old!r} does not stand in {name}"
+        files[name] = files[name].replace(old, new, 1)
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="utf-8")
+
+
+def expect(pattern: str, arguments: list[str], code: int | None = 2) -> None:
+    """The command says so, in one message without a traceback."""
+    found, words = said(*arguments)
+    assert code is None or found == code, words
+    assert re.search(pattern, words.replace("\n        ", "; ")), words
+    assert "Traceback" not in words, words
+
+
+WARNINGS = (
+    "expects to: str",
+    "no action of move returns",
+    "also return jammed",
+    "raises the event",
+)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    "mistake", [*IN_THE_TASK, *IN_THE_CELL, *IN_THE_CODE], ids=lambda m: m[2][:40]
+)
+def test_each_mistake_is_told(
+    sound: dict[str, str], mistake: Mistake, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, old, _, pattern = mistake
+    damaged(sound, [mistake], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    line = sound[name].partition(old)[0].count("\n") + 1 if name != CODE else r"\\d+"
+    is_warning = any(words in pattern for words in WARNINGS)
+    expect(re.sub("LINE", str(line), pattern), CHECK, 0 if is_warning else 2)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(("mistakes", "pattern"), BOTH, ids=["out", "prepare"])
+def test_mistakes_between_files_are_told(
+    sound: dict[str, str],
+    mistakes: list[Mistake],
+    pattern: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    damaged(sound, mistakes, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    expect(pattern.replace("LINE", r"\d+"), CHECK)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(("arguments", "pattern"), ON_THE_LINE, ids=lambda a: " ".join(a[-2:])[:40])
+def test_mistakes_on_the_command_line_are_told(
+    sound: dict[str, str],
+    arguments: list[str],
+    pattern: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    folder = tmp_path / "arm_bot"
+    folder.mkdir()
+    damaged(sound, [], folder)
+    monkeypatch.chdir(folder)
+    expect(pattern, arguments)

@@ -1,0 +1,349 @@
+"""Cameras and recordings through OpenCV: pace, loss and return, settings, sources by name."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from petrobot.services.comm.streams import capture
+from petrobot.services.comm.streams.camera import StreamImages, open_images
+from petrobot.services.comm.streams.capture import (
+    CaptureImages,
+    CaptureSettings,
+    RecordedImages,
+    grey,
+    settings_of,
+)
+from petrobot.services.comm.streams.image import Image, ImageSource
+from tests.ports import free_ports
+from tests.waiting import Limit
+
+SIZE = (48, 64)
+
+
+def until(awaited: str, holds: Callable[[], Any]) -> Any:
+    """Wait until this is true or an object, and return it."""
+    limit, pause = Limit(awaited), threading.Event()
+    while not (found := holds()) and limit.left():
+        pause.wait(0.01)
+    return found
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write a video of ten images, each brighter than the one before."""
+    path = tmp_path_factory.mktemp("film") / "film.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, SIZE[::-1])
+    assert writer.isOpened()
+    for k in range(10):
+        writer.write(np.full((*SIZE, 3), 20 * k, np.uint8))
+    writer.release()
+    return path
+
+
+def test_a_file_is_paced_by_the_clock(film: Path) -> None:
+    clock = [100.0]
+    images: ImageSource = RecordedImages(str(film), lambda: clock[0])
+    assert images.newest() is None
+    for _ in range(2):  # A second start begins from the first image again.
+        images.start(25.0)
+        begin = clock[0]
+        first = images.newest()
+        assert first is not None and (first.sequence, first.time) == (0, begin)
+        assert images.newest() is None
+        clock[0] += 0.121
+        later = images.newest()
+        assert later is not None and later.sequence == 3
+        assert later.time == pytest.approx(begin + 0.12)
+        assert later.pixels.shape == SIZE and abs(float(later.pixels.mean()) - 60) < 6
+        clock[0] += 5.0
+        assert images.newest() is not None, "the last one"
+        assert images.newest() is None, "the video has ended"
+    images.stop()
+    assert images.newest() is None
+    images.close()
+
+
+def test_a_file_in_colour(film: Path) -> None:
+    images = open_images({"source": f"file:{film}", "colour": True}, time.monotonic)
+    images.start(25.0)
+    image = images.newest()
+    assert image is not None and image.pixels.shape == (*SIZE, 3)
+    images.close()
+
+
+def test_a_recording_that_cannot_be_opened_is_reported(tmp_path: Path) -> None:
+    images = RecordedImages(str(tmp_path / "none.avi"), time.monotonic)
+    with pytest.raises(ConnectionError, match=r"none\.avi.*cannot be opened"):
+        images.start(25.0)
+
+
+class Device:
+    """Stands for cv2.VideoCapture: gives an image each 2 ms while it is not `absent`."""
+
+    opened: list[Any]
+    accepted: dict[int, float]
+    absent = False
+
+    def __init__(self, *how: Any) -> None:
+        self.opened.append(how)
+
+    def isOpened(self) -> bool:  # noqa: N802 - OpenCV's name
+        return not self.absent
+
+    def set(self, key: int, value: float) -> bool:
+        self.accepted[key] = value
+        return True
+
+    def grab(self) -> bool:
+        threading.Event().wait(0.002)
+        return not self.absent
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return True, np.full((*SIZE, 3), (0, 100, 0), np.uint8)
+
+    def release(self) -> None:
+        self.opened.append("released")
+
+
+@pytest.fixture
+def device(monkeypatch: pytest.MonkeyPatch) -> type[Device]:
+    """A device of this test's own in place of OpenCV's; a lost one is opened again at once."""
+
+    class Own(Device):
+        opened: list[Any] = []  # noqa: RUF012 - shared by all that are opened
+        accepted: dict[int, float] = {}  # noqa: RUF012
+
+    monkeypatch.setattr(cv2, "VideoCapture", Own)
+    monkeypatch.setattr(capture, "FIRST_WAIT", 0.01)
+    return Own
+
+
+def test_images_of_a_camera_are_stamped_on_arrival(device: type[Device]) -> None:
+    """Only the newest is kept, with the time of its arrival less the latency."""
+    images = CaptureImages(2, lambda: 7.0, CaptureSettings(latency=0.03))
+    images.start(30.0)
+    image = until("an image", images.newest)
+    assert image.time == pytest.approx(6.97)
+    assert image.pixels.shape == SIZE
+    assert image.pixels[0, 0] == 59, "green by ITU-R BT.601"
+    images.close()
+    assert device.opened[0] == (2,) and device.opened[-1] == "released"
+    assert device.accepted == {cv2.CAP_PROP_FPS: 30.0}
+
+
+def test_a_lost_camera_is_opened_again(
+    device: type[Device], caplog: pytest.LogCaptureFixture
+) -> None:
+    """While it is away `condition` and `start` say so."""
+    images = CaptureImages(0, time.monotonic, CaptureSettings(colour=True))
+    images.start(30.0)
+    first: Image = until("an image", images.newest)
+    assert first.pixels.shape == (*SIZE, 3)
+    device.absent = True
+    until("the loss", lambda: "cannot be opened" in images.condition)
+    with pytest.raises(ConnectionError, match="camera 0 cannot be opened: is it plugged in"):
+        images.start(30.0)
+    device.absent = False
+    until("the return", lambda: not images.condition)
+    later: Image = until("an image after the return", images.newest)
+    assert later.time > first.time
+    images.close()
+    assert "camera 0 was lost; it is opened again in" in caplog.text
+    assert device.opened.count("released") == len(device.opened) / 2
+
+
+def test_images_that_nobody_wants_are_taken_and_dropped(device: type[Device]) -> None:
+    """So the first image after a start is not an old one from the camera's buffer."""
+    images = CaptureImages(0, time.monotonic)
+    images.start(30.0)
+    until("an image", images.newest)
+    images.stop()
+    assert images.newest() is None
+    began = time.monotonic()
+    images.start(30.0)
+    assert until("an image", images.newest).time >= began
+    images.close()
+
+
+def test_what_a_camera_is_asked_for(device: type[Device]) -> None:
+    table = {"fps": 60, "width": 1280, "height": 720, "fourcc": "MJPG", "exposure": 50}
+    images = open_images({"source": "capture:/dev/null", **table}, time.monotonic)
+    images.start(30.0)
+    images.close()
+    assert device.opened[0] == ("/dev/null", cv2.CAP_V4L2)
+    assert device.accepted == {
+        cv2.CAP_PROP_FOURCC: cv2.VideoWriter.fourcc(*"MJPG"),
+        cv2.CAP_PROP_FRAME_WIDTH: 1280.0,
+        cv2.CAP_PROP_FRAME_HEIGHT: 720.0,
+        cv2.CAP_PROP_FPS: 60.0,
+        cv2.CAP_PROP_AUTO_EXPOSURE: 1.0,
+        cv2.CAP_PROP_EXPOSURE: 50.0,
+    }
+
+
+@pytest.mark.parametrize(
+    ("table", "text"),
+    [
+        ({"width": 64.5}, "width: expected a whole number from 0 to 16384, got 64.5"),
+        ({"fps": "fast"}, "fps: expected a number from 0 to 1000, got 'fast'"),
+        ({"fps": True}, "fps: expected a number"),
+        ({"latency": -1}, "latency: expected a number from 0 to 10, got -1"),
+        ({"fourcc": "MJPEG"}, "fourcc: expected four characters"),
+        ({"colour": "yes"}, "colour: expected true or false"),
+    ],
+)
+def test_bad_settings_are_refused_with_a_remedy(table: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        settings_of(table)
+
+
+# --- a network camera -------------------------------------------------------------------------
+
+
+class Stream(BaseHTTPRequestHandler):
+    """A camera that sends JPEGs over HTTP, one after the other, until it is cut."""
+
+    cut: threading.Event
+
+    def do_GET(self) -> None:
+        _, jpeg = cv2.imencode(".jpg", np.full((*SIZE, 3), 90, np.uint8))
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=image")
+        self.end_headers()
+        head = f"--image\r\nContent-Type: image/jpeg\r\nContent-Length: {jpeg.size}\r\n\r\n"
+        try:
+            while not self.cut.wait(0.02):
+                self.wfile.write(head.encode() + jpeg.tobytes() + b"\r\n")
+        except OSError:
+            pass
+
+    def log_message(self, *said: Any) -> None:
+        """Say nothing."""
+
+
+class Network:
+    """A camera in the network that can be cut off and come back at the same address."""
+
+    def __init__(self) -> None:
+        [self.port] = free_ports(1)
+        self.plug()
+
+    def plug(self) -> None:
+        """Let it come (back)."""
+        self._cut = threading.Event()
+        handler = type("Own", (Stream,), {"cut": self._cut})
+        self._server = ThreadingHTTPServer(("127.0.0.1", self.port), handler)
+        self._serving = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._serving.start()
+
+    def unplug(self) -> None:
+        """Cut it off: its connections end, and nobody listens."""
+        self._cut.set()
+        self._server.shutdown()
+        self._server.server_close()
+        self._serving.join()
+
+
+@pytest.fixture
+def network() -> Iterator[Network]:
+    camera = Network()
+    yield camera
+    camera.unplug()
+
+
+def test_a_network_camera_is_cut_off_and_comes_back(network: Network) -> None:
+    """With OpenCV's own reader of network streams."""
+    url = f"http://127.0.0.1:{network.port}/video"
+    images = open_images({"source": f"capture:{url}"}, time.monotonic)
+    images.start(25.0)
+    image = until("an image", images.newest)
+    assert image.pixels.shape == SIZE and abs(float(image.pixels.mean()) - 90) < 3
+    network.unplug()
+    until("the loss", lambda: images.condition)
+    assert url in images.condition
+    network.plug()
+    until("the return", lambda: not images.condition)
+    images.start(25.0)
+    assert until("an image again", images.newest).pixels.shape == SIZE
+    images.close()
+
+
+def test_a_network_camera_that_is_not_there_is_reported(network: Network) -> None:
+    network.unplug()
+    images = open_images({"source": f"capture:http://127.0.0.1:{network.port}/"}, time.monotonic)
+    with pytest.raises(ConnectionError, match="cannot be opened: is it plugged in"):
+        images.start(25.0)
+    images.close()
+    network.plug()
+
+
+# --- sources by name --------------------------------------------------------------------------
+
+
+class Own:
+    """A vendor's camera in a module of the user's."""
+
+    condition = ""
+
+    def __init__(self, config: dict[str, Any], clock: Callable[[], float]) -> None:
+        self._clock, self._level = clock, int(config.get("level", 7))
+
+    def start(self, rate: float) -> None:
+        """It is always on."""
+
+    def stop(self) -> None:
+        """It stays on."""
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def newest(self) -> Image:
+        """One level everywhere."""
+        return Image(np.full(SIZE, self._level, np.uint8), self._clock(), 0)
+
+
+def test_grey_levels_of_a_grey_image_are_its_own() -> None:
+    level = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    assert grey(level) is level
+
+
+@pytest.mark.parametrize(
+    ("config", "kind"),
+    [
+        ({"source": "sim", "address": "127.0.0.1:4810"}, StreamImages),
+        ({"source": "capture:0", "latency": 0.03}, CaptureImages),
+        ({"source": "capture:/dev/v4l/by-id/usb-A"}, CaptureImages),
+        ({"source": "capture:rtsp://10.0.0.5/stream"}, CaptureImages),
+        ({"source": "capture:videotestsrc ! appsink"}, CaptureImages),
+        ({"source": "file:balls.avi"}, RecordedImages),
+        ({"source": "tests.comm.test_capture:Own"}, Own),
+    ],
+)
+def test_sources_by_config(config: dict[str, object], kind: type) -> None:
+    assert isinstance(open_images(config, time.monotonic), kind)
+
+
+@pytest.mark.parametrize(
+    ("config", "text"),
+    [
+        ({}, "source = ''"),
+        ({"source": "sim"}, "needs address"),
+        ({"source": "sim", "address": "host"}, "needs address"),
+        ({"source": "capture:front"}, 'use "sim", "capture:0"'),
+        ({"source": "nowhere.cams:Basler"}, "No module named 'nowhere'"),
+        ({"source": "tests.comm.test_capture:Basler"}, "no attribute 'Basler'"),
+        ({"source": "file:"}, 'use "sim"'),
+    ],
+)
+def test_bad_sources_are_refused_with_a_remedy(config: dict[str, object], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        open_images(config, time.monotonic)
