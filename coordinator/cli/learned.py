@@ -4,7 +4,6 @@ reset a primitive task."""
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,11 +50,7 @@ def figures(kept: FileContents, name: str, options: argparse.Namespace) -> dict[
     context = options.context
     known = {name: kept.estimates.of(name, context) for name in task.primitive_tasks}
     refuse_unknown_cost({name: of for name, of in known.items() if of}, options)
-    # R of the task is that of one scenario, and so is its cost: the targets by which actions were
-    # judged count only if they are asked for.
-    asked = {
-        name: replace(asked_question(kept, name, options), target=options.target) for name in known
-    }
+    asked = {name: asked_question(kept, name, options) for name in known}
     try:
         found = propagate(task, kept.estimates, context, questions=asked, rho=options.rho)
     except (NoEstimate, ValueError) as fault:

@@ -230,8 +230,9 @@ class Summary:
         The definition is that of `learned task`, which composes them from the actions' estimates:
         over several regimes the task is judged in the one in which its R_conj is lowest, C is the
         expected cost of a trial there, and rho is the given one, else 1 / C with the alternatives
-        that cost most. C and J are None if the primitive tasks measure different costs, or if not
-        all trials reported theirs.
+        that cost most. (Composed, C of an action is that of the hardest regime that meets its
+        target, if it has one; trials cannot be taken apart so.) C and J are None if the primitive
+        tasks measure different costs, or if not all trials reported theirs.
         """
         begun = {name: counts for name, counts in self.by_regime.items() if counts.runs}
         if not begun:
@@ -257,10 +258,7 @@ class Summary:
         cost = hardest.cost
         if not alike or cost.n < n or n < 2:
             return out
-        # a target decides between actions; the whole task has none
-        found = comparisons(
-            self.task, self.estimates.tallies, options={**self.options, "target": None}
-        )
+        found = self.comparisons()
         largest = sum(
             k / n * max((f.cost for f in found[name].figures if math.isfinite(f.cost)), default=0.0)
             for name, k in hardest.run_counts.items()

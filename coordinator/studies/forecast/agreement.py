@@ -100,8 +100,10 @@ def _row(regime: str, figure: str, said: Mapping[str, Any], training: Training) 
             if "weight" in found
             else share_weight(found["value"], found["sd"], said["runs"], said["training_trials"])
         )
-        row["interval"] = predictive_interval(found["value"], weight, n)
-        row["p"] = share_p_value(found["value"], weight, round(value * n), n)
+        # trials of one mission run that are alike count as fewer, in the new runs, too
+        size = max(1, round(n / found.get("likeness", 1.0)))
+        row["interval"] = predictive_interval(found["value"], weight, size)
+        row["p"] = share_p_value(found["value"], weight, round(value * size), size)
         low, high = wilson(round(value * n), n, EQUIVALENCE)
         row["margin"] = MARGIN_SHARE
     else:
@@ -204,7 +206,8 @@ def _law(regime: str, said: Mapping[str, Any], training: Training) -> dict[str, 
     below = np.searchsorted(times, grid, side="left") / len(times)
     distance = float(np.max(np.maximum(q - at, 0.0) + np.maximum(below - q, 0.0)))
     known = said["law"].get("trials", said["training_trials"])
-    size = math.sqrt(known * len(times) / (known + len(times)))
+    new = len(times) / said["law"].get("likeness", 1.0)
+    size = math.sqrt(known * new / (known + new))
     return row | {
         "distance": round(distance, 4),
         "limit": round(float(kstwobign.isf(LEVEL)) / size, 4),

@@ -5,6 +5,7 @@ and alike.
 A forecast of other choices weights each trial by how much more often those choices would have led
 to it (importance weights: Horvitz and Thompson, J. Am. Stat. Assoc. 47 (1952) 663-685).
 
+- Trials of one mission run may be alike: their number is divided by the design effect.
 - Shares: exact binomial intervals and predictive ones (shares.py); both hold at least their level.
 - Mean: bootstrap-t (P. Hall, The Bootstrap and Edgeworth Expansion, Springer 1992), because it
   corrects the skewness of long-tailed times.
@@ -18,10 +19,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta, norm
+from scipy.stats import beta, f, norm
 
 from petrobot.coordinator.studies.forecast.choices import choices_of
-from petrobot.coordinator.studies.forecast.history import Training, Values
+from petrobot.coordinator.studies.forecast.history import Codes, Training, Values
 
 LEVEL = 0.95
 PIVOTS = 2000
@@ -37,6 +38,10 @@ MANY = 4000
 SCORES: Values = np.array([-3.0, -2.6, -2.2, norm.ppf(0.025), -1.6, -1.2, -0.8, -0.4, 0.0])
 SCORES = np.concatenate([SCORES, -SCORES[-2::-1]])
 """Normal scores at which predictive distributions of times are stored."""
+FEWEST = 10
+"""Least number of mission runs whose likeness can be seen."""
+ALIKE = 0.05
+"""Significance level at which trials of one mission run are alike."""
 LEAST = 50
 """Least number of training trials, weighted, for a forecast of other choices."""
 
@@ -61,6 +66,34 @@ def trial_weights(training: Training, choices: Choices) -> Values:
     return weights
 
 
+def missions(training: Training) -> Codes:
+    """Return the number of the mission run of each trial: their own numbers begin again in each."""
+    k = np.array([trial.k for trial in training.trials])
+    return np.concatenate([[0], np.cumsum(np.diff(k) <= 0)])
+
+
+def design_effect(values: Values, weights: Values, mission: Codes) -> float:
+    """Return by how much the variance of a mean is larger because trials of one mission run are
+    alike; 1 unless a test says so (one-way analysis of variance, 5 %).
+
+    The variance with whole missions as units, over the one with trials as units (L. Kish, Survey
+    Sampling, Wiley 1965).
+    """
+    _, unit = np.unique(mission, return_inverse=True)
+    count = int(unit.max()) + 1
+    if count < FEWEST or count == len(values):
+        return 1.0
+    off = weights * (values - np.average(values, weights=weights))
+    sums, whole = np.bincount(unit, off), float(off @ off)
+    if whole <= 0.0:
+        return 1.0
+    means = sums / np.bincount(unit)
+    between = float(means**2 @ np.bincount(unit)) / (count - 1)
+    within = float(np.sum((off - means[unit]) ** 2)) / (len(values) - count)
+    alike = f.sf(between / within, count - 1, len(values) - count) if within > 0.0 else 0.0
+    return max(1.0, float(sums @ sums) / whole) if alike < ALIKE else 1.0
+
+
 def effective(weights: Values) -> float:
     """Return the number of equally weighted trials that would be worth as much (Kish)."""
     whole = float(weights.sum())
@@ -71,9 +104,9 @@ def effective(weights: Values) -> float:
 
 
 def mean_figure(
-    times: Values, weights: Values, runs: int, random: np.random.Generator
+    times: Values, weights: Values, runs: int, random: np.random.Generator, likeness: float = 1.0
 ) -> dict[str, Any]:
-    """Forecast the mean of the times of `runs` further trials.
+    """Forecast the mean of the times of `runs` further trials; `likeness`: their design effect.
 
     The bootstrap repeats both what was measured (trials drawn again) and what will be (new trials),
     and keeps the difference of their means in units of its own standard error.
@@ -100,8 +133,9 @@ def mean_figure(
             of_truth.append((centre - m) / e)
             of_new.append((new - m) / np.hypot(e, s / np.sqrt(runs)))
     truth, fresh = (np.concatenate(x) for x in (of_truth, of_new))
-    alone = float(error[0])
-    both = float(np.hypot(error[0], spread[0] / np.sqrt(runs)))
+    wider = np.sqrt(likeness)
+    alone = wider * float(error[0])
+    both = wider * float(np.hypot(error[0], spread[0] / np.sqrt(runs)))
     levels = norm.cdf(SCORES)
     return _figure(
         centre,
@@ -132,13 +166,17 @@ def _quantiles(pivots: Values, levels: Values) -> Values:
 # --- quantiles ---
 
 
-def quantile_figure(times: Values, weights: Values, runs: int, q: float) -> dict[str, Any]:
-    """Forecast a quantile of the times of `runs` further trials."""
+def quantile_figure(
+    times: Values, weights: Values, runs: float, q: float, likeness: float = 1.0
+) -> dict[str, Any]:
+    """Forecast a quantile of the times of `runs` further trials; `likeness`: design effect of being
+    below it."""
+    runs = max(1.0, runs / likeness)
     order = np.argsort(times)
-    law = _Law(times[order], weights[order])
+    n = effective(weights) / likeness
+    law = _Law(times[order], weights[order], n)
     rank = q * (runs - 1) + 1  # of the order statistic that numpy.quantile returns
     new = beta(rank, runs - rank + 1)
-    n = effective(weights)
 
     middle = q * (n + 1)
     # Ranks that reach seven standard errors to both sides, so that every score lies between them.
@@ -166,8 +204,7 @@ class _Law:
     """Weighted order statistics, interpolated; beyond the longest time an exponential tail with the
     mean excess of the upper half."""
 
-    def __init__(self, times: Values, weights: Values) -> None:
-        n = effective(weights)
+    def __init__(self, times: Values, weights: Values, n: float) -> None:
         # plotting positions i / (n + 1) for equal weights
         self._position = np.cumsum(weights) / weights.sum() * n / (n + 1)
         self._times = times

@@ -12,8 +12,10 @@ from petrobot.coordinator.studies.forecast.choices import choice_counts, choices
 from petrobot.coordinator.studies.forecast.direct import (
     LEAST,
     SCORES,
+    design_effect,
     effective,
     mean_figure,
+    missions,
     quantile_figure,
     trial_weights,
 )
@@ -171,35 +173,47 @@ def _never_entered(training: Training) -> list[str]:
 def _from_trials(
     training: Training, request: Request, weights: Values, random: np.random.Generator
 ) -> dict[str, Any]:
-    real = measured(training)
+    real, mission = measured(training), missions(training)
     point, worth = figures(real, weights), effective(weights)
     kept = real.completed & ~np.isnan(real.time) & (weights > 0)
     times, own = real.time[kept], weights[kept]
     runs = max(1, round(request.runs * point["P_complete"]))
-    enough = len(times) > 1
+    found: dict[str, Any] = {}
+    for name, happened in (
+        ("R_goal", real.goals > 0),
+        ("P_complete", real.completed),
+        ("R_conj", real.all_success),
+    ):
+        likeness = design_effect(happened.astype(np.float64), weights, mission)
+        found[name] = _share(point[name], worth, request.runs, likeness)
+    likeness = 1.0
+    if len(times) > 1:
+        likeness = design_effect(times, own, mission[kept])
+        late = design_effect((times > point["q90"]).astype(np.float64), own, mission[kept])
+        found["mean"] = mean_figure(times, own, runs, random, likeness)
+        found["q90"] = quantile_figure(times, own, runs, 0.9, late)
+        likeness = max(likeness, late)
     return {
         "from": TRIALS,
-        "figures": {
-            **{name: _share(point[name], worth, request.runs) for name in SHARES},
-            "mean": mean_figure(times, own, runs, random) if enough else NO_FIGURE,
-            "q90": quantile_figure(times, own, runs, 0.9) if enough else NO_FIGURE,
-        },
-        "law": _law(times, own),
+        "figures": {name: found.get(name, NO_FIGURE) for name in (*SHARES, *TIMES)},
+        "law": _law(times, own, likeness),
         "doubts": order_doubts(training),
         **_beside(training, request),
     }
 
 
-def _share(value: float, weight: float, runs: int) -> dict[str, Any]:
+def _share(value: float, weight: float, runs: int, likeness: float = 1.0) -> dict[str, Any]:
+    worth = weight / likeness
     return {
         "value": round(value, 6),
-        "interval": predictive_interval(value, weight, runs),
-        "confidence": confidence_interval(value, weight),
-        "weight": round(weight, 3),
+        "interval": predictive_interval(value, worth, max(1, round(runs / likeness))),
+        "confidence": confidence_interval(value, worth),
+        "weight": round(worth, 3),
+        "likeness": round(likeness, 3),
     }
 
 
-def _law(times: Values, weights: Values) -> dict[str, Any]:
+def _law(times: Values, weights: Values, likeness: float = 1.0) -> dict[str, Any]:
     """Return the distribution of the time as quantiles, and how many trials it is worth."""
     if not len(times):
         return {"q": list(GRID), "s": [], "trials": 0.0}
@@ -211,7 +225,12 @@ def _law(times: Values, weights: Values) -> dict[str, Any]:
         if (weights == weights[0]).all()
         else times[order][np.minimum(at, len(times) - 1)]
     )
-    return {"q": list(GRID), "s": _rounded(s), "trials": round(effective(weights), 3)}
+    return {
+        "q": list(GRID),
+        "s": _rounded(s),
+        "trials": round(effective(weights) / likeness, 3),
+        "likeness": round(likeness, 3),
+    }
 
 
 def _beside(training: Training, request: Request) -> dict[str, Any]:

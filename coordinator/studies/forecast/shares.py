@@ -38,10 +38,16 @@ def share_weight(value: float, sd: float, runs: int, training: int) -> float:
     return float(training) if noise <= 0.0 or own <= noise / training else max(2.0, noise / own)
 
 
+def _counts(value: float, weight: float) -> tuple[float, float]:
+    """Return for how many trials it happened, and for how many not. Rounded: a shape parameter of
+    1e-300 instead of 0 makes the beta-binomial distribution fail."""
+    return round(value * weight, 6), round((1.0 - value) * weight, 6)
+
+
 def confidence_interval(value: float, weight: float, level: float = 0.95) -> list[float]:
     """Return the interval of the true share (C. J. Clopper and E. S. Pearson, Biometrika 26 (1934)
     404-413); it holds at least its level."""
-    yes, no, tail = value * weight, (1.0 - value) * weight, (1 - level) / 2
+    (yes, no), tail = _counts(value, weight), (1 - level) / 2
     low = float(beta.ppf(tail, yes, no + 1)) if yes > 0 else 0.0
     high = float(beta.isf(tail, yes + 1, no)) if no > 0 else 1.0
     return [round(low, 6), round(high, 6)]
@@ -49,7 +55,7 @@ def confidence_interval(value: float, weight: float, level: float = 0.95) -> lis
 
 def predictive_interval(value: float, weight: float, n: int, level: float = 0.95) -> list[float]:
     """Return the interval in which a share of n new trials is expected."""
-    yes, no, tail = value * weight, (1.0 - value) * weight, (1 - level) / 2
+    (yes, no), tail = _counts(value, weight), (1 - level) / 2
     low = float(betabinom.ppf(tail, n, yes, no + 1)) if yes > 0 else 0.0
     high = float(betabinom.ppf(1 - tail, n, yes + 1, no)) if no > 0 else float(n)
     return [round(low / n, 6), round(high / n, 6)]
@@ -58,7 +64,7 @@ def predictive_interval(value: float, weight: float, n: int, level: float = 0.95
 def share_p_value(value: float, weight: float, count: int, n: int) -> float:
     """Return the two-sided p-value of `count` successes among n new trials; it is at most 5 % where
     the count lies outside the 95 % predictive interval."""
-    yes, no = value * weight, (1.0 - value) * weight
+    yes, no = _counts(value, weight)
     below = float(betabinom.cdf(count, n, yes, no + 1)) if yes > 0 else 1.0
     above = float(betabinom.sf(count - 1, n, yes + 1, no)) if no > 0 else 1.0
     return min(1.0, 2.0 * min(below, above))

@@ -87,7 +87,7 @@ def rows(n: int, seed: int = 1) -> list[TrialRow]:
 def test_measured_and_composed_figures_have_one_definition() -> None:
     """Independent statuses: the trials' R_conj, C, rho and J are those of the estimates through the
     net, in the same regime."""
-    made = Summary.of(TASK, rows(4000))
+    made = Summary.of(TASK, rows(4000), options={"target": None})
     found = made.to_plain()["task_figures"]
     composed = propagate(TASK, made.estimates)
     assert found["regime"] == "B" and "B" in (composed.scenario or "")

@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import binom
 from tools.proof import coverage
 
+from petrobot.coordinator.studies.campaign.trials import Trial
 from petrobot.coordinator.studies.forecast import predict as module
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.direct import (
@@ -19,6 +20,8 @@ from petrobot.coordinator.studies.forecast.direct import (
     trial_weights,
 )
 from petrobot.coordinator.studies.forecast.history import Training
+from petrobot.coordinator.studies.forecast.predict import figures
+from petrobot.coordinator.studies.forecast.residual import measured
 
 FEW = 25
 
@@ -121,3 +124,41 @@ def test_weights_of_a_what_if_are_how_much_more_often_its_trials_come() -> None:
     assert weights[second] == pytest.approx(1.0 / second.mean())
     assert effective(weights) == pytest.approx(second.sum())
     assert trial_weights(training, choices_of(training)).tolist() == [1.0] * 1000
+
+
+def by_missions(random: np.random.Generator, n: int, effect: float) -> list[Trial]:
+    """Trials of a sequence, five in each mission run; a mission is slow, and fails, as a whole."""
+    world = coverage.worlds()[0]
+    mission = np.repeat(random.normal(size=n // 5), 5)
+    drawn = world.draw(random, n)
+    drawn.time = drawn.time + effect * mission
+    drawn.goal = drawn.goal & (mission < 2.0 - effect)
+    trials = drawn.trials()
+    for i, trial in enumerate(trials):
+        trial.k = i % 5 + 1
+    return trials
+
+
+def test_trials_of_one_mission_that_are_alike_count_as_fewer() -> None:
+    """With a common effect of each mission run the intervals still cover; plain ones would not, and
+    without such an effect nothing changes."""
+    task, hits = coverage.worlds()[0].task, dict.fromkeys((*module.SHARES, *module.TIMES), 0)
+    apart, plain, effects = 0, 0, []
+    for seed in range(60):
+        random = np.random.default_rng(seed)
+        known = Training.of(task, by_missions(random, 200, 1.5))
+        new = figures(measured(Training.of(task, by_missions(random, 200, 1.5))))
+        made = module.predict(known, module.Request(200, choices_of(known), net=False))
+        assert not made["doubts"]
+        for name, found in made["figures"].items():
+            hits[name] += found["interval"][0] <= new[name] <= found["interval"][1]
+        effects.append(made["law"]["likeness"])
+        low, high = mean_figure(measured(known).time, np.ones(200), 200, random)["interval"]
+        plain += low <= new["mean"] <= high
+        alone = Training.of(task, by_missions(random, 200, 0.0))
+        even = module.predict(alone, module.Request(200, choices_of(alone), net=False))
+        apart += even["law"]["likeness"] == 1.0
+    assert min(hits.values()) >= binom.ppf(1e-4, 60, 0.95), hits
+    assert plain < binom.ppf(1e-3, 60, 0.95)
+    assert 2.0 < float(np.median(effects)) < 4.0
+    assert apart >= 45
