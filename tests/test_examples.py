@@ -90,3 +90,36 @@ def test_it_runs_in_real_time(sorter: Path) -> None:
     (sorter / "sort.toml").write_text(one_part, encoding="utf-8")
     ran = petrobot(sorter, "run", "sort.toml", "--up", "--quiet", "--no-page")
     assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+@pytest.mark.processes
+def test_the_mean_of_more_pictures_is_more_reliable(tmp_path: Path) -> None:
+    """The plot of docs/paper.md, with fewer runs: R(n) grows as in theory, and five pictures are
+    the cheapest number for a reliability of 0.9."""
+    ran = subprocess.run(
+        [sys.executable, str(ROOT / "examples" / "pictures" / "plot.py"), "1200"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT / "src")},
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert ran.returncode == 0, ran.stderr
+    rows = re.findall(r"n +(\d+) .* R ([\d.]+) of 200 runs, in theory ([\d.]+)", ran.stdout)
+    assert [int(n) for n, _, _ in rows] == [1, 2, 3, 5, 8, 13]
+    for _, measured, theory in rows:  # five standard errors
+        spread = (float(theory) * (1 - float(theory)) / 200) ** 0.5
+        assert abs(float(measured) - float(theory)) < 5 * max(spread, 0.005)
+    assert "cheapest n with R of at least 0.9: 5" in ran.stdout
+    assert (tmp_path / "pictures.svg").read_text(encoding="utf-8").count("<circle") == 6
+
+
+@pytest.mark.processes
+def test_the_net_of_figure_1_catches_a_ball() -> None:
+    """One: the next is thrown only when the cup is empty and the arm at home (docs/paper.md)."""
+    figure = str(ROOT / "examples" / "paper" / "figure1.toml")
+    given = ("run", figure, "--mode", "lockstep", "--runs", "1", "--quiet", "--json", "-")
+    ran = petrobot(ROOT, *given)
+    assert ran.returncode == 0, ran.stderr
+    result = json.loads(ran.stdout[ran.stdout.index("{") :])
+    assert result["caught"] == 1
