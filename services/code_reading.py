@@ -56,6 +56,8 @@ class _Seen:
     """All texts in the code: what an unknown cause may be."""
     streams: dict[str, tuple[str, int]] = field(default_factory=dict)
     events: dict[str, tuple[str, int]] = field(default_factory=dict)
+    any_event: bool = False
+    """Whether it raises events whose names do not stand in the code."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +169,8 @@ def _method(
                 f"`{owner}.{name}` does nothing without `await`; write `await {owner}.{name}(...)`"
             )
             seen.faults.append((code.file, node.lineno, text))
+        if name == "raise_event" and not isinstance(first, str):
+            seen.any_event = True
         if isinstance(first, str):
             if name in ("publish", "withdraw", "stream"):
                 seen.streams.setdefault(first, (code.file, node.lineno))
@@ -286,6 +290,7 @@ def _plain(seen: _Seen) -> dict[str, Any]:
         "words": sorted(w for w in seen.words if len(w) <= 100 and w.isidentifier()),
         "streams": seen.streams,
         "events": seen.events,
+        "any_event": seen.any_event,
     }
 
 

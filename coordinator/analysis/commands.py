@@ -389,7 +389,7 @@ def _simulated(name: str, seen: Simulation, notes: tuple[str, ...]) -> CommandRe
             + ", ".join(f"{q}: {t:.4g} s" for q, t in quantiles.items())
         )
     if seen.completed is None:
-        lines += [f"  {t:24}{_interval(one)} /s" for t, one in seen.throughput.items()]
+        lines += [f"  {t:24} {_interval(one)} /s" for t, one in seen.throughput.items()]
     return CommandResult(
         OK if seen.complete else FAULT, "\n".join([*lines, *(f"note: {n}" for n in notes)]), data
     )

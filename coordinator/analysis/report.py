@@ -369,7 +369,7 @@ class Analysis:
         if self.run is not None:
             busiest = sorted(self.run.utilisation.items(), key=lambda one: -one[1])[:SHOWN]
             rows = [
-                f"  {name:24}{self.run.throughput[name]:12.6g} /s {load:10.4g} busy"
+                f"  {name:24} {self.run.throughput[name]:12.6g} /s {load:10.4g} busy"
                 for name, load in busiest
             ]
             return ["", f"long run (residual {self.run.residual:.1e} /s):", *rows]

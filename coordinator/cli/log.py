@@ -16,6 +16,7 @@ from petrobot.coordinator.run.folder import NODE_LOGS
 from petrobot.services.host.whole_file import write_whole
 
 if TYPE_CHECKING:
+    from petrobot.coordinator.engine import RunRecorded
     from petrobot.coordinator.operator.start_from import Recorded
 
 EXAMPLE = "petrobot log last --format xes --out run.xes"
@@ -129,6 +130,19 @@ def _write(path: str, lines: Iterator[str]) -> None:
     write_whole(Path(path), "".join(line + "\n" for line in lines))
 
 
+def _ended(run: RunRecorded) -> str:
+    """How a run ended, and as what it counts. One whose token was taken away has a result of its
+    own only if that came before it was stopped."""
+    status = run.status.value.upper() if run.status else ""
+    if run.cancelled:
+        reason, _, late = run.text.partition("; it had ended with ")
+        counts = f"counts as {status}" if status else "is not counted"
+        own = "" if late in ("", "error, cancelled") else f"; its own result came too late: {late}"
+        return f"{status or '-'}  {reason}, which {counts}{own}"
+    why = f"  {run.cause}: {run.text}" if run.cause else ""
+    return "provisional " * run.deferred + status + why
+
+
 def _text(found: Recorded) -> Iterator[str]:
     from petrobot.coordinator.engine import (
         Corrected,
@@ -151,11 +165,7 @@ def _text(found: Recorded) -> Iterator[str]:
             elif isinstance(one, StartRun):
                 yield f"{when}started  {one.run:20} {one.action}"
             elif isinstance(one, RunRecorded):
-                why = f"  {one.cause}: {one.text}" if one.cause else ""
-                said = "provisional " * one.deferred + (
-                    one.status.value.upper() if one.status else "preempted"
-                )
-                yield f"{when}ended    {one.run:20} {said}{why}"
+                yield f"{when}ended    {one.run:20} {_ended(one)}"
             elif isinstance(one, Corrected):
                 why = f"  {one.cause}: {one.text}".rstrip(": ") if one.cause else ""
                 yield (

@@ -8,13 +8,17 @@ hierarchical system structures, IEEE Trans. SMC 11 (1981), in four steps:
 3. Give an arc over several columns a way point in each column between, and order each column so
    that few arcs cross.
 4. Choose heights that make arcs as level as the minimum distances allow.
+
+A net of `FOLDED_FROM` columns or more is folded into bands, one below the other, that run to the
+right and to the left in turn. Resources then take no part in the layers: they are put between the
+nodes that use them.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left, insort
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -232,6 +236,11 @@ Point = tuple[float, float]
 COLUMN = 120.0
 ROW = 105.0
 MARGIN = 80.0
+WIDEST = 14
+"""Columns of one band: about what a screen shows."""
+FOLDED_FROM = 28
+"""Columns from which a layout is folded: a fold costs crossings, so what a reader can still follow
+stays in one band."""
 _BESIDE_NODE = 58.0
 _BESIDE_ARC = 24.0
 _SETTLINGS = 20
@@ -249,9 +258,13 @@ class NodePositions:
 
 
 def lay_out(
-    wanted: Mapping[str, Point | None], edges: Sequence[Edge], sources: Sequence[str]
+    wanted: Mapping[str, Point | None],
+    edges: Sequence[Edge],
+    sources: Sequence[str],
+    aside: Collection[str] = (),
 ) -> NodePositions:
-    """Return a position for every node.
+    """Return a position for every node. `aside` are nodes that a wide layout leaves out of its
+    layers.
 
     If at least half of the positions are given, they are kept and the others are filled in next to
     their neighbours; else all nodes are placed in layers, starting from `sources` (the marked
@@ -262,7 +275,14 @@ def lay_out(
         return NodePositions(given)
     if 2 * len(given) >= len(wanted):
         return NodePositions(_fill_in(list(wanted), given, edges))
-    return _layered(list(wanted), edges, sources)
+    layers = Layers(list(wanted), edges, sources)
+    if len(layers.columns) < FOLDED_FROM:
+        return _layered(layers, list(wanted), edges)
+    names = [name for name in wanted if name not in aside]
+    inner = [(a, b) for a, b in edges if a not in aside and b not in aside]
+    layers = Layers(names, inner, [name for name in sources if name not in aside])
+    placed = _folded(_layered(layers, names, inner), len(layers.columns))
+    return NodePositions(_fill_in(list(wanted), placed.at, edges), placed.through)
 
 
 def _fill_in(
@@ -306,8 +326,34 @@ def _free_spot(centre: Point, taken: Sequence[Point]) -> Point:
         ring += 1
 
 
-def _layered(names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]) -> NodePositions:
-    layers = Layers(names, edges, sources)
+def _folded(flat: NodePositions, columns: int) -> NodePositions:
+    """Return a wide layout in bands of equally many columns; each second one runs to the left, so
+    that arcs from band to band are short."""
+    bands = -(-columns // WIDEST)
+    per = -(-columns // bands)
+
+    def band(point: Point) -> int:
+        return round((point[0] - MARGIN) / COLUMN) // per
+
+    points = [*flat.at.values(), *(p for way in flat.through.values() for p in way)]
+    heights = [[y for x, y in points if band((x, y)) == b] or [MARGIN] for b in range(bands)]
+    tops, top = list[float](), MARGIN
+    for ys in heights:
+        tops.append(top - min(ys))
+        top += max(ys) - min(ys) + 1.5 * ROW
+
+    def at(point: Point) -> Point:
+        b = band(point)
+        column = round((point[0] - MARGIN) / COLUMN) - b * per
+        return MARGIN + (per - 1 - column if b % 2 else column) * COLUMN, point[1] + tops[b]
+
+    return NodePositions(
+        {name: at(point) for name, point in flat.at.items()},
+        {edge: [at(point) for point in way] for edge, way in flat.through.items()},
+    )
+
+
+def _layered(layers: Layers, names: Sequence[str], edges: Sequence[Edge]) -> NodePositions:
     row = _settled(layers)
     top = min(row.values(), default=0.0)
 

@@ -263,6 +263,7 @@ def scene_of_task(
         wanted,
         [(a.source, a.target) for a in arcs],
         [n for n in sheet.places if sheet.tokens.get(n)],
+        {n for n, p in sheet.places.items() if p.kind is Kind.RESOURCE and sheet.tokens.get(n)},
     )
     at = layout.at
     nodes = {n: _place_node(sheet, p, at[n]) for n, p in sheet.places.items()}

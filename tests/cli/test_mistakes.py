@@ -398,3 +398,22 @@ def test_mistakes_on_the_command_line_are_told(
     damaged(sound, [], folder)
     monkeypatch.chdir(folder)
     expect(pattern, arguments)
+
+
+@pytest.mark.processes
+def test_an_event_does_not_become_internal_by_its_declaration(tmp_path: Path) -> None:
+    """The catching task with `ball_caught` as an internal event, which no action raises: it would
+    count each catch as a miss."""
+    shipped = Path(__file__).parents[2] / "coordinator" / "tasks" / "catch_ball.toml"
+    text = shipped.read_text(encoding="utf-8")
+    internal = 'scope = "internal"\nby = "catch_ball"'
+    text = text.replace('scope = "external"\nmemory = "latched"\nearly = "drop"', internal).replace(
+        '"caught_early"', '"missed"'
+    )
+    before, _, rest = text.partition("[transitions.caught_early]")
+    text = before + "[transitions.move_failed]" + rest.partition("[transitions.move_failed]")[2]
+    assert internal in text
+    (tmp_path / "internal.toml").write_text(text, encoding="utf-8")
+    services = shipped.parents[2] / "services.toml"
+    pattern = r"events.ball_caught.by: follow_and_wait of catch_ball never raises 'ball_caught'"
+    expect(pattern, ["check", str(tmp_path / "internal.toml"), "--services", str(services)])

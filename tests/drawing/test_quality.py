@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from petrobot.coordinator.drawing.layout import Point
+from petrobot.coordinator.drawing.layout import COLUMN, WIDEST, Point
 from petrobot.coordinator.drawing.routing import ArcPath, Box, Words, place_words, route
 from petrobot.coordinator.drawing.scene import DrawnNode, Scene, scene_of_net, scene_of_task
 from petrobot.coordinator.task import Task
-from petrobot.coordinator.task.file import load
+from petrobot.coordinator.task.file import load, loads
 from tests.drawing.conftest import random_task
 
 SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks"
@@ -148,3 +148,38 @@ def test_a_long_arc_back_runs_through_the_points_of_the_layout() -> None:
         assert way.points[0] == pytest.approx(way.start) and way.points[-1] == pytest.approx(
             way.end
         )
+
+
+def chain(length: int) -> Task:
+    """Return a task of so many action places in a row, of which some hold one of two resources."""
+    places = [f'p{i} = {{ kind = "action", task = "w" }}' for i in range(length)]
+    steps = []
+    for i in range(length - 1):
+        take, give = ', "arm"' * (i % 4 == 0), ', "arm"' * (i % 4 == 2)
+        steps.append(f't{i} = {{ in = ["p{i}:normal"{take}], out = ["p{i + 1}"{give}] }}')
+    text = "\n".join(
+        [
+            'schema = 1\n[task]\nname = "chain"\nfinal = "runs == 0"\n[errors]\nto = "stuck"',
+            '[primitive_tasks.w]\ngoal = "x"\nalternatives = ["w"]\ndeadline = 1.0\n[places]',
+            'runs = { kind = "control", tokens = 2 }\nstuck = {}',
+            'arm = { kind = "resource", tokens = 1 }\nbase = { kind = "resource", tokens = 1 }',
+            *places,
+            '[transitions]\nstart = { in = ["runs", "base"], out = ["p0"] }',
+            *steps,
+            f'end = {{ in = ["p{length - 1}:normal"], out = ["base"] }}',
+        ]
+    )
+    return loads(text)
+
+
+@pytest.mark.parametrize("errors", [False, True])
+@pytest.mark.parametrize("length", [16, 24, 40])
+def test_a_long_net_is_folded(length: int, errors: bool) -> None:
+    """It fits the width of a screen, and no node covers another."""
+    scene = scene_of_task(chain(length), errors, None, None)
+    boxes = [box_of(n) for n in scene.nodes.values()]
+    assert not any(covers(a, b) for a, b in combinations(boxes, 2))
+    across = [node.at[0] for node in scene.nodes.values()]
+    assert max(across) - min(across) <= WIDEST * COLUMN
+    down = [node.at[1] for node in scene.nodes.values()]
+    assert max(down) - min(down) <= 3 * WIDEST * COLUMN

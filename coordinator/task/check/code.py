@@ -56,6 +56,7 @@ def code_findings(
                 yield from _values(place, [code[a] for a in known])
     for primitive in task.primitive_tasks.values():
         yield from _causes(primitive, code)
+    yield from _unraised(task, code)
     for action in used:
         yield from _events(task, action, code[action])
     faults = {tuple(fault) for action in used for fault in code[action].get("faults", ())}
@@ -122,6 +123,25 @@ def _causes(primitive: PrimitiveTask, code: Code) -> Iterator[Finding]:
         text = f"its actions also return {listed(undeclared)}"
         remedy = "declare each with a sentence for people"
         yield Finding(Severity.WARNING, "code", key, text, remedy)
+
+
+def _unraised(task: Task, code: Code) -> Iterator[Finding]:
+    """Internal events that a transition waits for, and no action of their primitive task raises: an
+    external event does not become internal by its declaration."""
+    awaited = {name for t in task.flat.transitions.values() for name in t.events}
+    for name in sorted(awaited):
+        event = task.events[name]
+        if event.scope is not Scope.INTERNAL:
+            continue
+        alternatives = task.primitive_tasks[event.by].alternatives
+        facts = {a: code[a] for a in alternatives if "events" in code.get(a, {})}
+        silent = [a for a, f in facts.items() if name not in f["events"] and not f["any_event"]]
+        if silent:
+            none = len(silent) == len(alternatives)
+            text = f"{listed(silent)} of {event.by} never raises {name!r}, for which the task waits"
+            remedy = f'call ctx.raise_event("{name}") there, or write scope = "external"'
+            severity = Severity.ERROR if none else Severity.WARNING
+            yield Finding(severity, "code", f"events.{name}.by", text, remedy)
 
 
 def _events(task: Task, action: str, facts: Mapping[str, Any]) -> Iterator[Finding]:

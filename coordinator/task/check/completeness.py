@@ -96,8 +96,11 @@ def event_faults(task: Task) -> Iterator[Finding]:
 
 
 def external_waits(task: Task) -> Iterator[Finding]:
-    """Places whose tokens only an external event can free, with no `after` beside it."""
+    """Places whose tokens only an external event can free, with no `after` beside it. One that
+    listens may wait for ever."""
     for place in task.places.values():
+        if place.listen:
+            continue
         takers: dict[End | None, list[Transition]] = {}
         for t in task.transitions.values():
             for arc in t.inputs:
