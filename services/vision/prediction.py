@@ -25,11 +25,10 @@ Array = NDArray[np.float64]
 SLIDING, SLIDING_SIGMA = 2.5, 1.5
 """m/s^2, deceleration of a sliding ball before anything is known: friction coefficient 0.25 +- 0.15
 times g."""
-LARGEST_LOSS, LOSS_SIGMA = 0.13, 0.02
+LARGEST_LOSS, LOSS_SIGMA = 0.12, 0.02
 """Largest share of its speed that a ball loses by sliding, and how sharp that bound is. As measured
-in one installation: 0.12 was the most of 30 throws; a tenth more, since 30 throws need not show the
-largest. Where balls are thrown with less spin this prior is wrong (without any, a ball loses
-0.4)."""
+in one installation: 0.12 was the most of 30 throws. Where balls are thrown with less spin this
+prior is wrong (without any, a ball loses 0.4)."""
 
 
 class ExitWay(StrEnum):
