@@ -86,7 +86,7 @@ async def test_every_option_of_the_command_line(
     await dialog.get_by_label("Pace", exact=True).select_option("as fast as possible")
     await dialog.get_by_label("Number of runs").fill("0")
     await dialog.get_by_role("button", name="Start").click()
-    await expect(dialog.get_by_role("alert")).to_contain_text("runs: 0 is no whole number from 1")
+    await expect(dialog.get_by_role("alert")).to_contain_text("0 is not a whole number from 1")
     await dialog.get_by_label("Number of runs").fill("8")
     await dialog.get_by_label("Seed").fill("77")
     await dialog.get_by_label("speed").fill("0.25")
