@@ -95,7 +95,7 @@ async def test_every_option_of_the_command_line(
     await dialog.get_by_label("Learn which actions are best").check()
     await dialog.get_by_label("Estimates file").fill("../up")
     await dialog.get_by_role("button", name="Start").click()
-    await expect(dialog.get_by_role("alert")).to_contain_text("learn.file: '../up' is no name")
+    await expect(dialog.get_by_role("alert")).to_contain_text("'../up' is not a name")
     await tab.screenshot(path=shots / "start-refused.png")
     await dialog.get_by_label("Estimates file").fill("known")
     await dialog.get_by_label("Selector").select_option("thompson")
