@@ -246,7 +246,7 @@ class Operation:
         if action is not None and action not in primitive.alternatives:
             return refusal(
                 "refused",
-                f"{action} is no alternative of {task}: {', '.join(primitive.alternatives)}",
+                f"{action} is not an alternative of {task}: {', '.join(primitive.alternatives)}",
             )
         return self._order(Override(task, action or ""))
 

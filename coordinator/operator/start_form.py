@@ -52,11 +52,11 @@ def read_start(task: Task, data: Mapping[str, Any], estimates: Path) -> RunReque
     _refuse_unknown(data)
     mode = data.get("mode") or REALTIME
     if mode not in MODES:
-        raise ValueError(f"mode: {_shown(mode)} is none of {', '.join(MODES)}")
+        raise ValueError(f"mode: {_shown(mode)} is not one of {', '.join(MODES)}")
     runs = data.get("runs")
     if runs is not None:
         if not task.runs_place:
-            raise ValueError(f"runs: {task.name} counts no runs (it names no runs_place)")
+            raise ValueError(f"runs: {task.name} does not count runs (it has no runs_place)")
         runs = _whole("runs", runs, 1, MOST_RUNS)
     return RunRequest(
         mode,
@@ -74,22 +74,20 @@ def read_depart(task: Task, data: Mapping[str, Any]) -> RunRequest:
     _refuse_unknown(data)
     source = data["from"]
     if not isinstance(source, Mapping) or not isinstance(source.get("run"), str):
-        raise ValueError("from: {run, record, going} is needed")
+        raise ValueError("from: expected {run, record, going}")
     for name in ("runs", "learn"):
         if data.get(name) is not None:
-            raise ValueError(
-                f"{name}: a run from a point of another takes none; it stands where the other stood"
-            )
+            raise ValueError(f"{name}: a run from a recorded point has those of the recorded run")
     if data.get("mode", LOCKSTEP) != LOCKSTEP:
         raise ValueError(
-            "mode: a run from a point of another is simulated; a real cell does not stand "
-            "where a marking says"
+            "mode: a run from a recorded point must be simulated, as a real cell is not in the "
+            "state of a recorded marking"
         )
     going = source.get("going", AGAIN)
     if isinstance(going, Mapping):
         going = {str(place): str(word) for place, word in going.items()}
     elif not isinstance(going, str):
-        raise ValueError(f"from.going: {_shown(going)} is no word and no object of words by place")
+        raise ValueError(f"from.going: {_shown(going)} is neither a word nor words by place")
     seed = None if data.get("seed") is None else _whole("seed", data["seed"], 0, LARGEST_SEED)
     record = _whole("from.record", source.get("record", 0), 0, 2**53)
     return RunRequest(
@@ -116,7 +114,7 @@ def read_parameters(task: Task, given: Mapping[str, Any]) -> dict[str, Any]:
         if type(value) is not kind or (kind is float and value - value != 0):
             raise ValueError(f"parameter {name}: {_shown(value)} is not {_KINDS[kind]}")
         if kind is str and not _is_text(value):
-            raise ValueError(f"parameter {name}: {_shown(value)} is no text of Unicode")
+            raise ValueError(f"parameter {name}: {_shown(value)} is not Unicode text")
         made[name] = value
     return made
 
@@ -155,7 +153,7 @@ def _refuse_unknown(data: Mapping[str, Any]) -> None:
     unknown = sorted(set(data) - _KNOWN)
     if unknown:
         raise ValueError(
-            f"start knows no {', '.join(map(_shown, unknown[:8]))}; it knows "
+            f"start: unknown {', '.join(map(_shown, unknown[:8]))}; known are "
             f"{', '.join(sorted(_KNOWN))}"
         )
 
@@ -175,7 +173,7 @@ def _is_text(value: str) -> bool:
 
 def _whole(name: str, value: Any, least: int, most: int) -> int:
     if type(value) is not int or not least <= value <= most:
-        raise ValueError(f"{name}: {_shown(value)} is no whole number from {least} to {most}")
+        raise ValueError(f"{name}: {_shown(value)} is not a whole number from {least} to {most}")
     return value
 
 
@@ -184,7 +182,7 @@ def _pace(value: Any) -> float:
         return 1.0
     if type(value) not in (int, float) or not 0 <= value <= 1000:
         raise ValueError(
-            f"pace: {_shown(value)} is no number from 0 (as fast as it goes) to 1000 times "
+            f"pace: {_shown(value)} is not a number from 0 (as fast as possible) to 1000 times "
             "real time"
         )
     return float(value)
@@ -193,7 +191,7 @@ def _pace(value: Any) -> float:
 def _with_regime(data: Mapping[str, Any]) -> dict[str, Any]:
     given = data.get("parameters") or {}
     if not isinstance(given, Mapping):
-        raise ValueError(f"parameters: {_shown(given)} is no object of values by name")
+        raise ValueError(f"parameters: {_shown(given)} is not a table of values by name")
     return {str(k): v for k, v in given.items()} | (
         {} if data.get("regime") is None else {"regime": data["regime"]}
     )
@@ -201,26 +199,28 @@ def _with_regime(data: Mapping[str, Any]) -> dict[str, Any]:
 
 def _learn(given: Any, folder: Path) -> LearningSetting:
     if not isinstance(given, Mapping):
-        raise ValueError("learn: {file, selector, target, contexts, frozen} is needed")
+        raise ValueError("learn: expected {file, selector, target, contexts, frozen}")
     name, selector = given.get("file"), given.get("selector") or DEFAULT
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise ValueError(
-            f"learn.file: {_shown(name)} is no name of letters, digits, _ and -, 64 at most; "
-            f"it is kept in {folder}"
+            f"learn.file: {_shown(name)} is not a name of at most 64 letters, digits, _ and -; "
+            f"the file is kept in {folder}"
         )
     if selector not in RULES:
-        raise ValueError(f"learn.selector: {_shown(selector)} is none of {', '.join(RULES)}")
+        raise ValueError(f"learn.selector: {_shown(selector)} is not one of {', '.join(RULES)}")
     target, contexts, frozen = (
         given.get("target"),
         given.get("contexts"),
         given.get("frozen", False),
     )
     if target is not None and (type(target) not in (int, float) or not 0 < target <= 1):
-        raise ValueError(f"learn.target: {_shown(target)} is no reliability above 0 and at most 1")
+        raise ValueError(
+            f"learn.target: {_shown(target)} is not a reliability above 0 and at most 1"
+        )
     if contexts is not None and not (
         isinstance(contexts, list) and all(isinstance(c, str) for c in contexts)
     ):
-        raise ValueError("learn.contexts: a list of names or conditions is needed")
+        raise ValueError("learn.contexts: expected a list of names or conditions")
     if type(frozen) is not bool:
         raise ValueError(f"learn.frozen: {_shown(frozen)} is neither true nor false")
     parts = None if contexts is None else tuple(c for c in contexts if c.strip())

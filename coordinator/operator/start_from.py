@@ -117,9 +117,7 @@ def departure(
     numbers = [r.number for r in journal.records if r.kind == STIMULUS]
     last = numbers[-1] if numbers else 0
     if not 0 <= record <= last:
-        raise DepartureError(
-            f"{run} has records 0 (its beginning) to {last}; {record} is none of them"
-        )
+        raise DepartureError(f"{run} has records 0 (its beginning) to {last}, but not {record}")
     state, time = engine.initial(), 0.0
     for step in replay(journal, engine):
         if step.number > record:
@@ -212,8 +210,8 @@ def _words(live: set[str], going: Mapping[str, str] | str) -> dict[str, str]:
     given = dict.fromkeys(sorted(live), going) if isinstance(going, str) else dict(going)
     for place, word in given.items():
         if place not in live:
-            there = f"there: {', '.join(sorted(live))}" if live else "nothing ran then"
-            raise DepartureError(f"no run went on in {place!r} at that record; {there}")
+            there = f"active: {', '.join(sorted(live))}" if live else "no run was active"
+            raise DepartureError(f"no run was active in {place!r} at that record; {there}")
         _check(word)
     if isinstance(going, str):
         _check(going)
@@ -224,5 +222,6 @@ def _check(word: str) -> None:
     end, colon, _ = word.partition(":")
     if end not in ENDS or (end == AGAIN and colon):
         raise DepartureError(
-            f"{word!r}: a run that went on begins {AGAIN}, or ends in {', '.join(ENDS[1:])}[:CAUSE]"
+            f"expected `{AGAIN}` or a result ({', '.join(ENDS[1:])})[:CAUSE] for an active run, "
+            f"got {word!r}"
         )

@@ -359,7 +359,7 @@ class Station:
         if known is None or (
             action is not None and action not in {a["action"] for a in known["alternatives"]}
         ):
-            return refusal("refused", f"{action or name} is no alternative of {name}")
+            return refusal("refused", f"{action or name} is not an alternative of {name}")
         self._choices.pop(name, None)
         if action is not None:
             self._choices[name] = str(action)

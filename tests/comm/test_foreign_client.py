@@ -1,5 +1,5 @@
-"""docs/protocol.md is enough to talk to a node: a client written from the page alone, against real
-node processes.
+"""docs/protocol.md suffices to write a client: one written from the page alone, against real node
+processes.
 
 The location file is a real one, read by `python -m petrobot.services`: a node with the global
 memory, actions in worker processes, a device that takes a set-point stream, and a timer; once on
@@ -63,12 +63,12 @@ class Hub:
     count: int = 0
 
     def knock(self) -> Foreign:
-        """A connection that has said nothing."""
+        """Open a connection and send nothing."""
         self.opened.append(Foreign(self.address, self.key))
         return self.opened[-1]
 
     def coordinator(self, name: str = "") -> Foreign:
-        """A connection of a coordinator of its own, welcome."""
+        """Open a connection as a new coordinator, up to WELCOME."""
         self.count += 1
         client = self.knock()
         assert client.open("coordinator", name or f"foreign{self.count}", epoch=1)[0] == f.WELCOME
@@ -76,7 +76,7 @@ class Hub:
 
 
 def launched(folder: Path, key: bytes | None) -> tuple[subprocess.Popen[str], tuple[str, int]]:
-    """The node, ready."""
+    """Launch the node and wait until it is ready."""
     [port] = free_ports(1)
     text = PLACES.format(port=port)
     if key is not None:
@@ -109,7 +109,7 @@ def launched(folder: Path, key: bytes | None) -> tuple[subprocess.Popen[str], tu
 def process(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Hub]:
-    """A node that all tests of this page share."""
+    """A node that all tests of this file share."""
     node, address = launched(tmp_path_factory.mktemp("hub"), request.param)
     yield Hub(address, request.param, [])
     node.terminate()
@@ -118,7 +118,7 @@ def process(
 
 @pytest.fixture
 def hub(process: Hub) -> Iterator[Hub]:
-    """The same, its connections closed after each test."""
+    """The same node; its connections are closed after each test."""
     yield process
     for one in process.opened:
         one.close()
@@ -128,15 +128,15 @@ def hub(process: Hub) -> Iterator[Hub]:
 def result_of(
     client: Foreign, id_: str, service: str, arguments: dict[str, Any], *more: Any
 ) -> list[Any]:
-    """CALL to RESULT, acknowledged."""
+    """Send CALL, receive RESULT and acknowledge it; return the result."""
     client.say(f.CALL, id_, service, arguments, *more)
     result = client.expect(f.RESULT, id_)
     client.say(f.RESULT_ACK, id_)
     return result
 
 
-def test_the_bytes_of_the_page() -> None:
-    """Both examples, made by a client that has its own msgpack."""
+def test_the_example_bytes_of_the_page() -> None:
+    """A client with its own msgpack makes both examples."""
     client = Foreign.__new__(Foreign)
     client.seal_out, client.is_open = b"", True
     assert client.frame(pack((f.PING, 1))) == bytes.fromhex("00000007 92 0f 01 f1 49 99 d5")
@@ -158,7 +158,7 @@ def test_hello_and_welcome(hub: Hub) -> None:
     assert len(auth) == (4 if hub.key is None else 32)
 
 
-def test_a_service_answered_on_the_spot_sends_a_result_without_accept(hub: Hub) -> None:
+def test_a_service_answered_at_once_sends_a_result_without_accept(hub: Hub) -> None:
     client = hub.coordinator()
     name = f"at {hub.count}"
     client.say(
@@ -180,13 +180,12 @@ def test_a_service_answered_on_the_spot_sends_a_result_without_accept(hub: Hub) 
 
 
 def test_an_action_accept_result_and_at_most_once(hub: Hub) -> None:
-    """A known id is answered from what is known: its stored result, and `forgotten` once that was
-    acknowledged."""
+    """A CALL with a known id gets its stored result, or `forgotten` after that was acknowledged."""
     client = hub.coordinator()
     id_ = f"once {hub.count}"
     client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 5.0, 1)
     first = client.hear()
-    if first == [f.ACCEPT, id_]:  # left out when the result comes within 2 ms
+    if first == [f.ACCEPT, id_]:  # ACCEPT is left out if the result comes within 2 ms.
         first = client.hear()
     assert first[:4] == [f.RESULT, id_, "success", {"sum": 5}]
     client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 5.0, 1)
@@ -196,8 +195,8 @@ def test_an_action_accept_result_and_at_most_once(hub: Hub) -> None:
     assert client.hear()[2:7:2] == ["error", "forgotten", "unknown"]
 
 
-def test_what_was_lost_with_the_link_is_listed_and_given_again(hub: Hub) -> None:
-    """WELCOME names the runs that go on or are not acknowledged; the same CALL brings ACCEPT or the
+def test_results_lost_with_the_link_are_listed_and_sent_again(hub: Hub) -> None:
+    """WELCOME names the runs that are active or not acknowledged; the same CALL gets ACCEPT or the
     result."""
     client = hub.coordinator()
     name = f"foreign{hub.count}"
@@ -216,7 +215,7 @@ def test_what_was_lost_with_the_link_is_listed_and_given_again(hub: Hub) -> None
 
 
 def test_cancel_and_deadline(hub: Hub) -> None:
-    """CANCEL always leads to a RESULT; one that overtakes its CALL keeps it from beginning."""
+    """CANCEL always leads to a RESULT; if it arrives before its CALL, the CALL is not started."""
     client = hub.coordinator()
     name = f"foreign{hub.count}"
     client.say(f.CALL, f"{name}/1", "nap", {"seconds": 30.0}, 60.0, 1)
@@ -242,7 +241,7 @@ def test_cancel_and_deadline(hub: Hub) -> None:
         ("add", (1.0, 1, "another boot"), "rebooted", "unknown"),
     ],
 )
-def test_what_is_refused_is_a_result(
+def test_a_refusal_is_a_result(
     hub: Hub, service: str, more: tuple[Any, ...], cause: str, executed: str
 ) -> None:
     client = hub.coordinator()
@@ -251,7 +250,7 @@ def test_what_is_refused_is_a_result(
 
 
 def test_one_caller_at_a_time_holds_a_device(hub: Hub) -> None:
-    """The lease is given up with BYE; until then nobody else's orders are taken."""
+    """BYE releases the lease; until then the node accepts no orders of other callers."""
     first, second = hub.coordinator(), hub.coordinator()
     assert result_of(first, f"lease {hub.count}", "go", {"to": 0.0}, 5.0, 1)[2] == "success"
     assert result_of(second, f"lease {hub.count}b", "go", {"to": 0.0}, 5.0, 1)[4] == "device_leased"
@@ -262,7 +261,8 @@ def test_one_caller_at_a_time_holds_a_device(hub: Hub) -> None:
 
 
 def test_heartbeats(hub: Hub) -> None:
-    """PING is answered; the node asks when it hears nothing, and cuts off one that stays silent."""
+    """PING is answered; the node sends PING to a silent client, and disconnects it if it stays
+    silent."""
     client = hub.coordinator()
     client.say(f.PING, 2**63 - 1)
     assert f.unpack(client.body()) == [f.PONG, 2**63 - 1]
@@ -273,8 +273,8 @@ def test_heartbeats(hub: Hub) -> None:
 
 
 def test_events_and_commands(hub: Hub) -> None:
-    """Pulses of a timer; latched events of the memory, sent until they are acknowledged; a command
-    and its answer."""
+    """Pulses of a timer, latched events of the memory, which are sent until acknowledged, and a
+    command with its answer."""
     client = hub.coordinator()
     name = f"value {hub.count}"
     client.say(f.SUBSCRIBE, ["beat"])
@@ -292,8 +292,8 @@ def test_events_and_commands(hub: Hub) -> None:
 
 
 def test_set_points(hub: Hub) -> None:
-    """The service of the stream says where to and gives the ticket; the device follows what is
-    sent, and stops with WITHDRAW."""
+    """The service of the stream returns address and ticket; the device follows the set points and
+    stops at WITHDRAW."""
     client = hub.coordinator()
     there = result_of(client, f"stream {hub.count}", "stream:points", {}, None, 1)[3]
     stream = Foreign((there["host"], there["port"]), hub.key)
@@ -318,7 +318,7 @@ def test_set_points(hub: Hub) -> None:
     client.say(f.BYE)
 
 
-# --- what breaks the protocol -----------------------------------------------------------------
+# --- violations of the protocol ---------------------------------------------------------------
 
 
 OPENING: list[tuple[str, Callable[[Foreign], None]]] = [
@@ -360,7 +360,7 @@ OPEN: list[tuple[str, Callable[[Foreign], None]]] = [
 @pytest.mark.parametrize(
     ("code", "do"), OPENING, ids=lambda value: value if isinstance(value, str) else ""
 )
-def test_a_bad_frame_while_opening_is_refused_by_its_code(
+def test_a_bad_frame_during_the_handshake_is_refused_with_its_code(
     hub: Hub, code: str, do: Callable[[Foreign], None]
 ) -> None:
     client = hub.knock()
@@ -372,11 +372,11 @@ def test_a_bad_frame_while_opening_is_refused_by_its_code(
 @pytest.mark.parametrize(
     ("code", "do"), OPEN, ids=lambda value: value if isinstance(value, str) else ""
 )
-def test_a_bad_frame_while_open_is_refused_by_its_code(
+def test_a_bad_frame_on_an_open_connection_is_refused_with_its_code(
     hub: Hub, code: str, do: Callable[[Foreign], None]
 ) -> None:
-    """Sealed like every frame of an open connection. What came before it was done, and its result
-    is there for who comes back."""
+    """The refusal is sealed like every frame of an open connection. Earlier calls were carried out,
+    and a caller that connects again gets their results."""
     client, name = hub.coordinator(), f"foreign{hub.count}"
     call: tuple[Any, ...] = (f.CALL, f"{name}/before", "memory.list", {}, None, 1)
     client.raw(client.frame(pack(call)))
@@ -392,16 +392,17 @@ def test_a_bad_frame_while_open_is_refused_by_its_code(
 
 
 @pytest.mark.parametrize("versions", [(3, 9), (3, 2), (1, 1)])
-def test_versions_that_do_not_meet(hub: Hub, versions: tuple[int, int]) -> None:
+def test_no_common_version_is_refused(hub: Hub, versions: tuple[int, int]) -> None:
     assert hub.knock().open("client", "old", versions=versions)[:2] == [f.REFUSE, "version"]
 
 
-def test_the_range_of_a_newer_client_is_met(hub: Hub) -> None:
+def test_a_newer_client_with_an_older_version_in_its_range_is_welcomed(hub: Hub) -> None:
     assert hub.knock().open("client", f"newer {hub.count}", versions=(1, 9))[:2] == [f.WELCOME, 2]
 
 
 def test_names_epochs_and_directories(hub: Hub) -> None:
-    """One process a name; a replaced coordinator is told so; another location file is refused."""
+    """One process per name; a replaced coordinator is notified; another location file is
+    refused."""
     first = hub.knock()
     assert first.open("coordinator", "chief", "boot 1", epoch=5)[0] == f.WELCOME
     assert hub.knock().open("coordinator", "chief", "boot 2", epoch=5)[:2] == [
@@ -419,8 +420,8 @@ def test_names_epochs_and_directories(hub: Hub) -> None:
     ]
 
 
-def test_keys_that_do_not_fit(hub: Hub) -> None:
-    """Each refusal by its code, whichever side has which key."""
+def test_keys_that_differ(hub: Hub) -> None:
+    """Each combination of keys is refused with its code."""
     wrong = Foreign(hub.address, None if hub.key is not None else bytes(32))
     hub.opened.append(wrong)
     assert wrong.open("client", "w")[:2] == [
@@ -433,8 +434,8 @@ def test_keys_that_do_not_fit(hub: Hub) -> None:
         assert other.open("client", "w")[:2] == [f.REFUSE, "wrong_key"] and not other.proven
 
 
-def test_another_node_than_the_wanted_one_refuses(hub: Hub) -> None:
-    """A refusal after the proof of the key is sealed: nobody in between can have said it."""
+def test_a_node_refuses_a_client_that_wants_another_node(hub: Hub) -> None:
+    """A refusal after the proof of the key is sealed, so no third party can have sent it."""
     client = hub.knock()
     refusal = client.open("client", "lost", node="motion")
     assert (
@@ -447,7 +448,7 @@ def test_another_node_than_the_wanted_one_refuses(hub: Hub) -> None:
 @pytest.mark.parametrize("fault", ["changed", "repeated", "left out", "unsealed"])
 def test_a_broken_seal_ends_the_connection(hub: Hub, fault: str) -> None:
     if hub.key is None and fault in ("repeated", "left out"):
-        return  # TCP's own business: a check has no number
+        return  # TCP detects this: a check has no number.
     client = hub.coordinator()
     frame = client.frame(pack((f.PING, 1)))
     if fault == "changed":

@@ -1,5 +1,5 @@
-"""JSON for other readers: no value makes a text that a strict reader refuses, and nothing else
-writes such texts."""
+"""JSON for other programs: a strict parser accepts the text of every value, and no other code of
+the project writes JSON."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BETWEEN_OWN_PROCESSES = {
     "coordinator/studies/campaign/worker.py",
     "coordinator/learning/estimates_tables.py",
 }
-"""Only Python reads these, which knows infinity."""
+"""Files that only Python reads, whose parser accepts infinity."""
 FOR_A_HASH = {
     "coordinator/studies/campaign/plan.py",
     "coordinator/studies/forecast/registered.py",
@@ -33,7 +33,7 @@ WRITER = "services/host/json_text.py"
 
 
 def strict(text: str) -> Any:
-    """What a browser reads; fails where a browser does."""
+    """Parse like a browser; fail where a browser fails."""
 
     def refuse(token: str) -> None:
         raise AssertionError(f"no JSON: {token}")
@@ -48,7 +48,7 @@ VALUES = st.recursive(
 
 
 @given(VALUES)
-def test_every_value_is_read_by_a_strict_reader(value: Any) -> None:
+def test_a_strict_parser_reads_every_value(value: Any) -> None:
     strict(json_text(value))
     strict(json_text(value, indent=2, ensure_ascii=False))
 
@@ -56,7 +56,7 @@ def test_every_value_is_read_by_a_strict_reader(value: Any) -> None:
 @given(
     st.recursive(st.integers(-9, 9) | st.floats(allow_nan=False, allow_infinity=False), st.lists)
 )
-def test_finite_values_are_written_as_ever(value: Any) -> None:
+def test_finite_values_are_written_as_json_dumps_does(value: Any) -> None:
     assert json_text(value) == json.dumps(value)
     assert finite(value) == value
 
@@ -72,12 +72,12 @@ BAD = {
 
 
 @pytest.mark.parametrize("bad", BAD.values(), ids=BAD)
-def test_what_is_not_finite_is_no_value_at_any_depth(bad: Any) -> None:
+def test_numbers_that_are_not_finite_become_null_at_any_depth(bad: Any) -> None:
     told = strict(json_text({"a": [1.5, {"b": (bad, "x")}], "c": bad}))
     assert told == {"a": [1.5, {"b": [None, "x"]}], "c": None}
 
 
-def test_strange_values_become_text_or_numbers() -> None:
+def test_values_outside_json_become_text_or_numbers() -> None:
     ring: dict[str, Any] = {}
     ring["self"] = ring
 
@@ -94,8 +94,8 @@ def test_strange_values_become_text_or_numbers() -> None:
     strict(json_text(deep))
 
 
-def test_nothing_else_writes_json() -> None:
-    """A `json.dumps` of its own somewhere is the next text with `Infinity` in it."""
+def test_no_other_code_writes_json() -> None:
+    """A `json.dumps` elsewhere would be the next text with `Infinity` in it."""
     own = BETWEEN_OWN_PROCESSES | FOR_A_HASH | {WRITER}
     for top in ("coordinator", "services", "sim"):
         for path in sorted((ROOT / top).rglob("*.py")):

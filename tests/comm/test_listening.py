@@ -1,5 +1,5 @@
-"""An address that a node cannot have: file, key and remedy are told before any device is
-touched."""
+"""An address that a node cannot listen on: the error has file, key and remedy, and comes before any
+device is touched."""
 
 from __future__ import annotations
 
@@ -70,14 +70,14 @@ def directory_in(folder: Path, host: str, port: int) -> Directory:
         ),
     ],
 )
-def test_each_reason_names_its_key_and_a_remedy(fault: OSError, said: str) -> None:
+def test_each_error_names_its_key_and_a_remedy(fault: OSError, said: str) -> None:
     assert cannot_listen("nodes.left", "10.0.0.7", 7301, fault).startswith(said)
 
 
 def test_a_node_whose_port_is_taken_touches_no_device(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its first process may be moving them."""
+    """The process that has the port may be moving them."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         directory = directory_in(tmp_path, "127.0.0.1", port)
@@ -89,8 +89,8 @@ def test_a_node_whose_port_is_taken_touches_no_device(
     assert said.count("\n") == 1
 
 
-def test_a_foreign_address_is_the_hosts_fault(tmp_path: Path) -> None:
-    """192.0.2.0/24 belongs to nobody (RFC 5737)."""
+def test_an_address_of_another_host_is_an_error_of_host(tmp_path: Path) -> None:
+    """192.0.2.0/24 is reserved for documentation (RFC 5737)."""
     directory = directory_in(tmp_path, "192.0.2.1", 7301)
     with pytest.raises(
         DirectoryError,
@@ -104,8 +104,8 @@ def test_a_foreign_address_is_the_hosts_fault(tmp_path: Path) -> None:
         raise OSError(errno.EADDRINUSE, "in use")
 
 
-def test_an_address_that_is_free_may_be_had(tmp_path: Path) -> None:
-    """And it is free afterwards."""
+def test_a_free_address_is_accepted(tmp_path: Path) -> None:
+    """It is free again afterwards."""
     [port] = free_ports(1)
     refuse_unusable(directory_in(tmp_path, "127.0.0.1", port), "left")
     socket.create_server(("127.0.0.1", port)).close()
@@ -114,7 +114,7 @@ def test_an_address_that_is_free_may_be_had(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "key"), [("left", "nodes.left.port"), ("coordinator", "coordinator.port")]
 )
-def test_a_member_of_a_lock_step_cell_says_so_too(name: str, key: str) -> None:
+def test_a_member_of_a_lock_step_cell_gives_the_same_error(name: str, key: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(CellError, match=f"{key}: {port} is in use"):

@@ -1,5 +1,5 @@
-"""Lock step: one order whatever the placement, in one process, in threads and in processes; and how
-a cell ends."""
+"""Lock step: one order of messages in one process, in threads and in processes; and how a cell
+ends."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _listeners(names: Sequence[str]) -> tuple[dict[str, socket.socket], dict[str
 
 
 def _in_threads(members: Sequence[Callable[[], Any]]) -> list[Any]:
-    """What each gives back or raises."""
+    """Run each function in a thread; return what each returns or raises."""
     results: list[Any] = [None] * len(members)
 
     def run(index: int) -> None:
@@ -85,7 +85,9 @@ def _cell(scripts: Any, delays: Any) -> dict[str, list[str]]:
 
 @settings(max_examples=25)
 @given(SCRIPTS, DELAYS, st.sampled_from([None, b"k" * 32]))
-def test_one_process_and_a_mesh_hear_the_same(scripts: Any, delays: Any, key: bytes | None) -> None:
+def test_one_process_and_a_mesh_receive_the_same_messages(
+    scripts: Any, delays: Any, key: bytes | None
+) -> None:
     listeners, addresses = _listeners(NAMES)
     toys = {name: Toy(name, scripts[name]) for name in NAMES}
 
@@ -111,7 +113,7 @@ def test_one_process_and_a_mesh_hear_the_same(scripts: Any, delays: Any, key: by
 
 @settings(max_examples=25)
 @given(SCRIPTS, DELAYS)
-def test_several_parties_in_a_member_hear_the_same(scripts: Any, delays: Any) -> None:
+def test_several_parties_in_a_member_receive_the_same_messages(scripts: Any, delays: Any) -> None:
     hosts = {"coordinator": "a", "vision": "a", "motion": "b", "sim": "b"}
     listeners, addresses = _listeners(["a", "b"])
     toys = {name: Toy(name, scripts[name]) for name in NAMES}
@@ -132,7 +134,7 @@ def test_several_parties_in_a_member_hear_the_same(scripts: Any, delays: Any) ->
 
 @pytest.mark.processes
 @pytest.mark.parametrize("seed", range(2))
-def test_one_process_and_four_hear_the_same(seed: int) -> None:
+def test_one_process_and_four_processes_receive_the_same_messages(seed: int) -> None:
     ticks = 40
     scripts = {}
     for n, name in enumerate(NAMES):
@@ -170,7 +172,7 @@ def test_one_process_and_four_hear_the_same(seed: int) -> None:
 
 
 class Post:
-    """Sends what it is told at a tick, writes down what comes."""
+    """Sends given messages at their ticks and records what it receives."""
 
     def __init__(self, name: str, sends: Sequence[tuple[int, Envelope]] = ()) -> None:
         self.name = name
@@ -242,7 +244,9 @@ def test_moving_an_endpoint_to_another_party_changes_nothing(
     ("delays", "ticks"),
     [({}, 1), ({"control": 4}, 4), ({"src/there": 3, "control": 4}, 3), ({"other/there": 3}, 1)],
 )
-def test_delays_are_by_ends_then_by_channel(delays: dict[str, int], ticks: int) -> None:
+def test_delays_depend_on_both_ends_and_then_on_the_channel(
+    delays: dict[str, int], ticks: int
+) -> None:
     assert Delays(delays).ticks(_envelope("src", None)) == ticks
 
 
@@ -252,7 +256,7 @@ def test_a_delay_below_a_tick_is_refused(ticks: Any) -> None:
         Delays({"image": ticks})
 
 
-def test_bodies_arrive_as_from_another_process_and_are_nobody_elses() -> None:
+def test_bodies_arrive_as_from_another_process_and_are_not_shared() -> None:
     body = {"list": [1, (2, 3)], "text": "x"}
     b = Post("b")
     LockStepCell([Post("c", [(0, _envelope("z", body))]), b]).run(lambda: False, 2)
@@ -284,11 +288,11 @@ def test_mistakes_of_parties_are_named(posts: list[Party], says: str) -> None:
         LockStepCell(posts).run(lambda: False, 2)
 
 
-# How a cell ends.
+# Ends of a cell.
 
 
 class Failing(Post):
-    """Breaks down at tick 5."""
+    """Raises an exception at tick 5."""
 
     def advance(self, now: float) -> None:
         super().advance(now)
@@ -310,13 +314,13 @@ def _two(a: Party, b: Party, **options: Any) -> list[Any]:
     return _in_threads([member(a, lambda: len(getattr(a, "ticks", ())) == 30), member(b, None)])
 
 
-def test_all_have_run_the_same_ticks_when_one_ends_the_cell() -> None:
+def test_all_members_have_run_the_same_ticks_when_one_ends_the_cell() -> None:
     a, b = Post("a"), Post("b")
     assert _two(a, b) == ["until", "a: until"]
     assert len(a.ticks) == len(b.ticks) == 30
 
 
-def test_large_images_both_ways_at_once_do_not_block_the_cell() -> None:
+def test_large_images_in_both_directions_do_not_block_the_cell() -> None:
     image = np.arange(3_000_000, dtype=np.uint8).reshape(1500, 2000)
     posts = [
         Post(me, [(t, _envelope(f"{me}.cam", image, party=you)) for t in range(6)])
@@ -328,14 +332,14 @@ def test_large_images_both_ways_at_once_do_not_block_the_cell() -> None:
         assert all((body == image).all() for _, _, body in post.got)
 
 
-def test_a_failing_party_is_named_to_the_others() -> None:
+def test_the_other_members_are_told_which_party_failed() -> None:
     raised, told = _two(Failing("a"), Post("b"))
     assert isinstance(raised, RuntimeError)
     assert isinstance(told, PartyLostError) and told.member == "a"
     assert str(told) == "a: it failed: RuntimeError: out of luck"
 
 
-def test_a_member_that_never_comes_is_named() -> None:
+def test_a_member_that_never_connects_is_named() -> None:
     listeners, addresses = _listeners(["a", "b"])
     with pytest.raises(PartyLostError, match=r"b: it did not join the cell within 0\.1 s"):
         Member("a", [Post("a")], addresses, listener=listeners["a"], joining=0.1).open()
@@ -344,7 +348,7 @@ def test_a_member_that_never_comes_is_named() -> None:
 
 
 def _join(address: tuple[str, int], name: str = "b", directory: str = "") -> socket.socket:
-    """A member made by hand."""
+    """Connect to a cell as a member written by hand."""
     sock = socket.create_connection(address, timeout=60.0)
     sock.sendall(frame(m.Hello(2, 2, "party", name, "x", 0, directory), "a"))
     return sock
@@ -404,7 +408,7 @@ def test_a_member_that_does_not_keep_step_is_lost(rest: bytes | None, says: str)
     assert re.search(says, str(lost)), str(lost)
 
 
-def test_strangers_do_not_keep_a_cell_from_forming() -> None:
+def test_foreign_connections_do_not_prevent_a_cell_from_forming() -> None:
     listeners, addresses = _listeners(["a", "b"])
 
     def strangers() -> list[str]:

@@ -1,4 +1,4 @@
-"""docs/protocol.md says what the code does: kinds, fields, limits, codes and the example."""
+"""docs/protocol.md agrees with the code: kinds, fields, limits, codes and the example."""
 
 from __future__ import annotations
 

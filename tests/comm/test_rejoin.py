@@ -1,5 +1,5 @@
-"""Lock step with a member that dies and comes back: the others wait where they stand, no tick is
-run twice or left out."""
+"""Lock step with a member that dies and returns: the others wait at their tick, and no tick is run
+twice or left out."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ MORTAL = "coordinator"
 
 
 class _Killed(BaseException):
-    """The process is gone: no word to anybody."""
+    """The process is gone without a message."""
 
 
 class _Counting(Toy):
-    """Keeps the ticks that it ran."""
+    """Records the ticks that it ran."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name, {str(tick): [(MORTAL, "call")] for tick in range(0, 100, 3)})
@@ -37,7 +37,7 @@ class _Counting(Toy):
 
 
 class _Mortal:
-    """A coordinator that dies at a tick; `told` alone of its peers get its last Tick but one."""
+    """A coordinator that dies at a tick; only the peers in `told` get its last Tick but one."""
 
     def __init__(self, addresses: dict[str, Any], key: bytes | None) -> None:
         self._addresses = addresses
@@ -45,8 +45,7 @@ class _Mortal:
         self.toy = _Counting(MORTAL)
 
     def live(self, death: int | None, told: Collection[str], until: int, rejoins: bool) -> str:
-        """One life: join, run, and die at the tick `death` or end the cell when `until` ticks are
-        over."""
+        """Join, run, and die at the tick `death` or end the cell after `until` ticks."""
         member = Member(MORTAL, [self.toy], self._addresses, key=self._key, rejoins=rejoins)
         member.open()
 
@@ -67,7 +66,7 @@ class _Mortal:
 
 @pytest.mark.parametrize("key", [None, b"k" * 32])
 @pytest.mark.parametrize("told", [(), ("arm",), ("motion", "vision"), NODES])
-def test_a_member_that_dies_comes_back_to_where_the_others_are(
+def test_a_member_that_dies_returns_to_the_tick_of_the_others(
     told: Collection[str], key: bytes | None
 ) -> None:
     """Killed twice, each time with its last Tick sent to some of its peers only; then it ends the
@@ -109,7 +108,7 @@ def test_a_member_that_dies_comes_back_to_where_the_others_are(
     assert mortal.toy.heard and all(toy.heard for toy in toys.values())
 
 
-def test_one_that_does_not_come_back_is_lost_after_its_absence() -> None:
+def test_a_member_that_does_not_return_is_lost_after_its_patience() -> None:
     listener = socket.create_server(("127.0.0.1", 0))
     addresses = {MORTAL: ("127.0.0.1", free_ports(1)[0]), "motion": listener.getsockname()}
     failures: list[Any] = []

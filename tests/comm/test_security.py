@@ -1,4 +1,4 @@
-"""Seals, key files, and where one may listen without a key."""
+"""Seals, key files, and addresses that need a key."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_a_seal_is_hmac_sha256_of_number_and_body(key: bytes, bodies: list[bytes
         assert seal.next(body) == hmac.digest(own, number.to_bytes(8, "big") + body, "sha256")[:16]
 
 
-def test_a_key_file_comes_back_and_is_its_owners_alone(tmp_path: Path) -> None:
+def test_a_key_file_is_read_back_and_only_its_owner_can_read_it(tmp_path: Path) -> None:
     path, key = tmp_path / "cell.key", new_key()
     write_key(path, key)
     assert read_key(path) == key
@@ -41,7 +41,7 @@ def test_a_key_file_comes_back_and_is_its_owners_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "abc", "zz" * 32, "00" * 31, "00" * 33, "\xe9" * 64])
-def test_what_is_no_key_is_refused_without_showing_it(tmp_path: Path, text: str) -> None:
+def test_an_invalid_key_is_refused_without_showing_it(tmp_path: Path, text: str) -> None:
     path = tmp_path / "cell.key"
     path.write_bytes(text.encode("latin-1"))
     path.chmod(0o600)
@@ -76,7 +76,7 @@ def test_any_other_address_needs_one(host: str) -> None:
 
 
 def test_a_key_of_another_user_is_refused(tmp_path: Path) -> None:
-    """He could change it; root's is taken, as root can do so anyway."""
+    """That user could change it; a key of root is accepted, as root can change any file."""
     path = tmp_path / "cell.key"
     write_key(path, new_key())
     with pytest.MonkeyPatch.context() as patch:
@@ -90,9 +90,9 @@ def test_a_key_of_another_user_is_refused(tmp_path: Path) -> None:
         read_key(path)
 
 
-def test_a_key_file_is_looked_at_and_read_in_one_piece(tmp_path: Path) -> None:
-    """What is checked is what is read: whoever changes the name in between changes nothing. A pipe
-    does not hold anyone up."""
+def test_a_key_file_is_checked_and_read_through_one_descriptor(tmp_path: Path) -> None:
+    """The checked file is the one that is read: replacing the name in between has no effect. A pipe
+    does not block."""
     good, other = tmp_path / "cell.key", tmp_path / "other.key"
     key = new_key()
     write_key(good, key)

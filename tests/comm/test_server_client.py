@@ -1,5 +1,4 @@
-"""The machines on real sockets: calls, commands and events, liveness, and callers that are
-refused."""
+"""Server and client on real sockets: calls, commands and events, liveness, and refused callers."""
 
 from __future__ import annotations
 
@@ -36,7 +35,7 @@ async def test_a_service_and_an_action(node: Node, key: bytes | None) -> None:
     await until(lambda: node.server.connected == ())
 
 
-async def test_calls_of_several_clients_of_a_process_have_ids_of_their_own(open_node: Node) -> None:
+async def test_calls_of_several_clients_of_a_process_have_different_ids(open_node: Node) -> None:
     other = Node()
     await other.server.start("127.0.0.1", 0)
     first, second = open_node.client(), other.client()
@@ -79,7 +78,7 @@ async def test_cancelling_the_future_cancels_the_call(open_node: Node) -> None:
     await coordinator.client.close()
 
 
-async def test_a_result_or_a_call_too_large_for_a_frame_ends_that_call_alone(
+async def test_a_result_or_call_too_large_for_a_frame_ends_only_that_call(
     node: Node, key: bytes | None
 ) -> None:
     coordinator = node.client(key=key)
@@ -95,7 +94,9 @@ async def test_a_result_or_a_call_too_large_for_a_frame_ends_that_call_alone(
     await coordinator.client.close()
 
 
-async def test_the_heart_keeps_an_idle_link_up_and_a_broken_one_comes_back(open_node: Node) -> None:
+async def test_the_heartbeat_keeps_an_idle_link_and_a_broken_one_is_restored(
+    open_node: Node,
+) -> None:
     coordinator = open_node.client()
     assert await coordinator.client.connected(60.0)
     link = open_node.server._links["coord"]
@@ -119,7 +120,7 @@ async def test_a_run_whose_caller_is_gone_is_stopped(open_node: Node) -> None:
     assert (await open_node.order(m.Cancel)).reason == "orphan"
 
 
-async def test_nobody_listens(open_node: Node) -> None:
+async def test_a_call_to_a_closed_port(open_node: Node) -> None:
     address = open_node.server.address
     await open_node.server.close()
     coordinator = Coordinator(*address)
@@ -145,11 +146,11 @@ async def test_other_hosts_cannot_connect_without_a_key(host: str) -> None:
         (m.Hello(2, 2, "coordinator", "coord", "c1"), b"k" * 32, "unreachable", "no_key_here"),
     ],
 )
-async def test_a_refused_caller_is_told_why_and_its_calls_end(
+async def test_a_refused_caller_gets_the_reason_and_its_calls_end(
     open_node: Node, hello: m.Hello, key: bytes | None, cause: str, code: str
 ) -> None:
-    """At once where nothing could prove the refusal; with a key one that is not proven ends
-    nothing, and is tried again."""
+    """Without a key they end at once; with a key, an unproven refusal ends nothing, and the client
+    tries again."""
     coordinator = open_node.client(hello, key=key)
     outcome = await coordinator.client.call("echo")
     assert (outcome.cause, outcome.executed) == (cause, Executed.NO)
@@ -157,7 +158,7 @@ async def test_a_refused_caller_is_told_why_and_its_calls_end(
     await coordinator.client.close()
 
 
-async def test_a_wrong_key_is_told_to_both(key: bytes | None) -> None:
+async def test_both_sides_report_a_wrong_key(key: bytes | None) -> None:
     node = Node(key=b"k" * 32)
     await node.server.start("127.0.0.1", 0)
     coordinator = node.client(key=key)

@@ -1,7 +1,7 @@
-"""The shipped cell's vision node, launched from the shipped location file, under everything that a
-stranger can send to it.
+"""The shipped cell's vision node, launched from the shipped location file, under attack by clients
+without a key.
 
-Malformed frames by the thousand, handshakes that drip, lengths and nestings beyond all limits,
+Thousands of malformed frames, handshakes byte by byte, lengths and nestings beyond all limits,
 bodies that never end: a good caller on one connection is answered throughout, a new one is let in,
 and the node keeps neither memory nor sockets.
 """
@@ -30,11 +30,11 @@ from tests.waiting import Limit
 
 pytestmark = pytest.mark.processes
 GROWTH = 24 << 20
-"""Bytes by which the node may be larger after an attack than before."""
+"""By how much the node may grow in an attack (bytes)."""
 MIB = 1 << 20
 ASKED = itertools.count()
 BEAT = 0.1
-"""Seconds after which the good caller speaks again: silent for 1 s it would be cut, too."""
+"""Interval of the good caller's messages (s); after 1 s of silence it would be cut off, too."""
 
 
 @dataclass
@@ -45,12 +45,12 @@ class Vision:
     address: tuple[str, int]
 
     def size(self) -> int:
-        """Its resident set (bytes)."""
+        """Return the node's resident set (bytes)."""
         lines = Path(f"/proc/{self.process.pid}/status").read_text().splitlines()
         return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmRSS"))
 
     def sockets(self) -> int:
-        """How many sockets it holds."""
+        """Return the number of sockets that the node holds."""
         count = 0
         for one in Path(f"/proc/{self.process.pid}/fd").iterdir():
             with contextlib.suppress(OSError):
@@ -58,11 +58,11 @@ class Vision:
         return count
 
     def stranger(self) -> socket.socket:
-        """A connection of nobody."""
+        """Open a connection without a handshake."""
         return socket.create_connection(self.address, f.LIMIT)
 
     def good(self, name: str) -> Foreign:
-        """A caller that is welcome."""
+        """Connect a caller that is welcomed."""
         client = Foreign(self.address)
         assert client.open("client", name, node="vision")[0] == f.WELCOME
         return client
@@ -84,8 +84,8 @@ def vision(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Vision]:
 
 
 def ask(client: Foreign) -> None:
-    """The good caller's question: how are you."""
-    id_ = f"ask {next(ASKED)}"  # the id of a command belongs to one caller
+    """Send a status command as the good caller."""
+    id_ = f"ask {next(ASKED)}"  # The id of a command belongs to one caller.
     client.say(f.COMMAND, id_, "status")
     answer = client.expect(f.ANSWER, id_)
     assert answer[2] and "camera" in answer[3]["devices"], answer
@@ -96,7 +96,7 @@ def _hello(name: str) -> bytes:
 
 
 def malformed(random_: random.Random) -> bytes:
-    """A connection's worth of bytes that no server may choke on."""
+    """Return one connection's malformed bytes."""
     name = f"bad{random_.randrange(500)}"
     hello = _hello(name)
     call = framed(pack((f.CALL, "1", "locate_background", {"x": [1, {"y": 2.0}]}, 1.0)))
@@ -120,8 +120,8 @@ def malformed(random_: random.Random) -> bytes:
 
 
 def attack(vision: Vision, connections: int) -> None:
-    """So many connections that are no good; the good caller asks ten times a second and is answered
-    each time."""
+    """Open this many malformed connections; the good caller asks ten times a second and is always
+    answered."""
     random_ = random.Random(connections)
     good = vision.good("good")
     ask(good)
@@ -159,9 +159,9 @@ def test_a_hundred_thousand_malformed_frames(vision: Vision) -> None:
     attack(vision, 100_000)
 
 
-def test_dripping_handshakes_keep_nobody_out(vision: Vision) -> None:
-    """Two hundred connections that say a byte of HELLO now and then: each is cut after its 2 s, a
-    good caller gets in at once."""
+def test_slow_handshakes_block_no_other_client(vision: Vision) -> None:
+    """Two hundred connections send HELLO byte by byte: each is cut off after 2 s, and a good caller
+    gets in at once."""
     hello = _hello("drip")
     drips = [vision.stranger() for _ in range(200)]
     for at in range(4):
@@ -202,7 +202,7 @@ def test_dripping_handshakes_keep_nobody_out(vision: Vision) -> None:
         "2^32 bytes",
     ],
 )
-def test_what_is_beyond_all_limits_is_refused_and_costs_nothing(
+def test_data_beyond_the_limits_is_refused_at_no_cost(
     vision: Vision, body: bytes, code: str
 ) -> None:
     good = vision.good("steady")
@@ -219,8 +219,8 @@ def test_what_is_beyond_all_limits_is_refused_and_costs_nothing(
 
 
 def test_bodies_that_never_end_are_bounded(vision: Vision) -> None:
-    """Twelve callers, each with a call of 2 MiB of which the last byte never comes: the good one is
-    answered all the while."""
+    """Twelve callers each send a call of 2 MiB without its last byte: the good caller is answered
+    all the time."""
     good, open_ = vision.good("patient"), []
     for number in range(12):
         one = vision.good(f"endless {number}")
@@ -228,7 +228,7 @@ def test_bodies_that_never_end_are_bounded(vision: Vision) -> None:
         open_.append(one)
         ask(good)
     number, limit = 0, Limit("the silent ones to be cut")
-    while open_ and limit.left():  # they are silent: each is cut after 1 s
+    while open_ and limit.left():  # They are silent: each is cut off after 1 s.
         number += 1
         ask(good)
         open_ = [one for one in open_ if not hung_up(one)]
@@ -236,7 +236,7 @@ def test_bodies_that_never_end_are_bounded(vision: Vision) -> None:
 
 
 def hung_up(one: Foreign) -> bool:
-    """Whether the node has ended this connection; what it said on it is thrown away."""
+    """Return whether the node has closed this connection; its messages are ignored."""
     try:
         limit = Limit("the end of what the node sent")
         while one.socket.recv(4096, socket.MSG_DONTWAIT) and limit.left():

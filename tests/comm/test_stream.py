@@ -1,4 +1,4 @@
-"""Set-point streams: newest value wins, lateness, refusals, and ends."""
+"""Set-point streams: the newest value wins; lateness, refusals, and ends."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.comm.ends import frame, framed
 
 
 class RecordingSink:
-    """Writes down what it is given; None for a withdrawal."""
+    """Records the values that it receives; None for a withdrawal."""
 
     def __init__(self) -> None:
         self.got: list[tuple[tuple[float, ...], float] | None] = []
@@ -42,7 +42,7 @@ def _point(number: int, elapsed: float = 0.0, held: float = 0.0) -> m.SetPoint:
     return m.SetPoint(number, (float(number),), held, elapsed)
 
 
-def test_the_newest_wins_and_the_others_are_never_seen() -> None:
+def test_only_the_newest_value_is_delivered() -> None:
     sink = RecordingSink()
     inlet = Inlet(0.1, sink)
     inlet.receive(1.0, [_point(1), _point(2), _point(3, held=0.04)])
@@ -52,7 +52,7 @@ def test_the_newest_wins_and_the_others_are_never_seen() -> None:
     assert sink.got == [((3.0,), 0.04), None, ((5.0,), 0.0)]
 
 
-def test_what_was_held_up_on_its_way_is_as_old_as_it_is() -> None:
+def test_a_delay_in_transit_is_part_of_the_age() -> None:
     sink = RecordingSink()
     inlet = Inlet(0.04, sink)
     for n in range(5):
@@ -62,7 +62,7 @@ def test_what_was_held_up_on_its_way_is_as_old_as_it_is() -> None:
     assert sink.got[-1] is not None
     inlet.receive(100.281, [])
     inlet.receive(100.3, [])
-    assert sink.got[5:] == [None], "three periods and it counts no more, said once"
+    assert sink.got[5:] == [None], "after three periods it is withdrawn, once"
     inlet.receive(100.7, [_point(5, elapsed=0.20)])
     assert sink.got[5:] == [None], "half a second late: left out"
     inlet.receive(100.7, [_point(6, elapsed=0.60)])
@@ -79,7 +79,7 @@ def test_what_was_held_up_on_its_way_is_as_old_as_it_is() -> None:
     st.lists(st.tuples(st.floats(0.001, 0.1), st.floats(0.0, 0.5)), min_size=1, max_size=50),
     st.floats(-1e3, 1e3),
 )
-def test_lateness_is_the_delay_beyond_the_quickest(
+def test_lateness_is_the_delay_relative_to_the_fastest_message(
     steps: list[tuple[float, float]], offset: float
 ) -> None:
     lateness, elapsed, quickest, arrived = Lateness(), 0.0, float("inf"), float("-inf")
@@ -92,7 +92,7 @@ def test_lateness_is_the_delay_beyond_the_quickest(
         assert late >= arrived - elapsed - quickest - 1e-4 * 10.0
 
 
-def test_a_drifting_clock_does_not_make_an_hour_old_stream_late() -> None:
+def test_a_drifting_clock_does_not_make_a_stream_late_after_an_hour() -> None:
     lateness = Lateness()
     assert max(lateness.of(t * 0.04 * (1.0 + 5e-5), t * 0.04) for t in range(90_000)) < 1e-5
 
@@ -146,7 +146,7 @@ def test_a_stream_from_its_first_value_to_its_end(
     assert len(receiver.sockets()) == 1 and receiver.faults == 0
 
 
-def test_a_sender_that_is_gone_stands_by_nothing(
+def test_values_of_a_sender_that_is_gone_are_withdrawn(
     sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender
 ) -> None:
     _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
@@ -155,7 +155,7 @@ def test_a_sender_that_is_gone_stands_by_nothing(
     _until(lambda: sink.got[-1] is None, receiver.poll)
 
 
-def test_a_receiver_that_comes_back_is_found_again(
+def test_a_sender_connects_again_to_a_receiver_that_returns(
     sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender, key: bytes | None
 ) -> None:
     _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
@@ -194,7 +194,7 @@ def test_the_newest_sender_of_a_stream_takes_it_over(
         ("catch_point", 0.04, "", "ticket"),
     ],
 )
-def test_a_stream_that_does_not_fit_is_refused_with_the_reason(
+def test_a_stream_with_wrong_data_is_refused_with_the_reason(
     sink: RecordingSink,
     receiver: StreamReceiver,
     key: bytes | None,
@@ -247,7 +247,7 @@ MALFORMED = [
 
 @pytest.mark.parametrize("key", [None], indirect=True, ids=["plain"])
 @pytest.mark.parametrize("said", MALFORMED)
-def test_malformed_set_points_end_their_connection_alone(
+def test_malformed_set_points_end_only_their_own_connection(
     sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender, said: list[bytes]
 ) -> None:
     with socket.create_connection(receiver.address) as sock:
@@ -267,7 +267,7 @@ def _is_served(receiver: StreamReceiver) -> bool:
 
 
 @pytest.mark.parametrize("key", [None], indirect=True, ids=["plain"])
-def test_many_idle_connections_do_not_keep_a_sender_out(
+def test_many_idle_connections_do_not_block_a_sender(
     sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender
 ) -> None:
     idle = [socket.create_connection(receiver.address) for _ in range(40)]
@@ -278,7 +278,7 @@ def test_many_idle_connections_do_not_keep_a_sender_out(
 
 
 @pytest.mark.parametrize("key", [None], indirect=True, ids=["plain"])
-def test_a_receiver_that_stands_still_never_blocks_its_sender_and_sees_the_newest_after(
+def test_a_frozen_receiver_never_blocks_its_sender_and_then_gets_the_newest_value(
     sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender
 ) -> None:
     _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)

@@ -1,4 +1,4 @@
-"""One connection: cutting, handshake, states, and what an attacker may try."""
+"""One connection: division of the bytes, handshake, states, and attacks."""
 
 from __future__ import annotations
 
@@ -68,7 +68,9 @@ def _cut(data: bytes, cuts: list[int]) -> list[bytes]:
 
 
 @given(st.data(), st.booleans())
-def test_any_cutting_gives_the_same_messages(data: st.DataObject, sealed: bool) -> None:
+def test_any_division_of_the_bytes_gives_the_same_messages(
+    data: st.DataObject, sealed: bool
+) -> None:
     client, server = new_pair(KEY if sealed else None)
     greet(client, server)
     sent = data.draw(st.lists(SPOKEN, max_size=6))
@@ -79,7 +81,9 @@ def test_any_cutting_gives_the_same_messages(data: st.DataObject, sealed: bool) 
 
 
 @given(st.lists(SPOKEN, max_size=6), st.booleans())
-def test_several_at_once_are_the_bytes_of_each(sent: list[m.Message], sealed: bool) -> None:
+def test_several_messages_at_once_are_the_bytes_of_each(
+    sent: list[m.Message], sealed: bool
+) -> None:
     (one, server), (other, _) = [new_pair(KEY if sealed else None) for _ in range(2)]
     greet(one, server)
     greet(other, new_pair(KEY if sealed else None)[1])
@@ -88,7 +92,9 @@ def test_several_at_once_are_the_bytes_of_each(sent: list[m.Message], sealed: bo
     assert server.receive_data(together) == sent
 
 
-def test_several_of_which_one_may_not_go_change_nothing(open_pair: Pair, key: bytes | None) -> None:
+def test_several_messages_of_which_one_is_invalid_change_nothing(
+    open_pair: Pair, key: bytes | None
+) -> None:
     client, server = open_pair(key)
     for bad in (m.Bye(), m.Welcome(2, "x", "y"), m.Cancel("1", "x" * LIMITS[m.Cancel.KIND])):
         with pytest.raises(ProtocolError):
@@ -104,8 +110,8 @@ def _told(read: Callable[[], m.Message]) -> str:
 
 
 @given(st.data(), st.booleans())
-def test_an_open_connection_reads_a_body_as_decode_does(data: st.DataObject, sealed: bool) -> None:
-    """Whole frames of the kinds that make up nearly all traffic are read without `decode`."""
+def test_an_open_connection_reads_a_body_like_decode(data: st.DataObject, sealed: bool) -> None:
+    """Whole frames of the most frequent kinds are read without `decode`."""
     kind = data.draw(st.sampled_from((m.Call, m.Outcome)))
     body = bytearray(encode(data.draw(messages_of([kind]))))
     for place, byte in data.draw(
@@ -124,7 +130,7 @@ def test_a_long_name_is_measured_on_an_open_connection(
     assert body.count(b"\xa1x") == 1
     _assert_read_alike(
         kind, body.replace(b"\xa1x", msgpack.packb("x" * length)), key
-    )  # no sender of ours makes the long ones
+    )  # Our senders never make the long ones.
 
 
 @pytest.mark.parametrize("empty", [[], {}])
@@ -193,7 +199,7 @@ def test_random_bytes_raise_nothing_but_protocol_error(
 
 
 @given(st.data())
-def test_what_came_well_before_a_fault_is_not_lost(data: st.DataObject) -> None:
+def test_messages_before_a_fault_are_not_lost(data: st.DataObject) -> None:
     client, server = new_pair(None)
     greet(client, server)
     sent = data.draw(st.lists(SPOKEN, min_size=1, max_size=4))
@@ -237,7 +243,7 @@ SAMPLES: dict[type[Any], Any] = {
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
-def test_each_side_of_an_open_connection_says_its_own_kinds_only(
+def test_each_side_of_an_open_connection_sends_only_its_own_kinds(
     kind: type[Any], open_pair: Pair
 ) -> None:
     for speaker, kinds in ((0, FROM_CLIENT), (1, FROM_SERVER)):
@@ -261,7 +267,7 @@ def _raw(message: m.Message) -> bytes:
 @pytest.mark.parametrize(
     "kind", [kind for kind in KINDS if kind is not m.Hello], ids=lambda kind: kind.__name__
 )
-def test_a_server_takes_nothing_but_hello_first(
+def test_a_server_accepts_only_hello_as_the_first_message(
     kind: type[Any], key: bytes | None, pair: Pair
 ) -> None:
     _, server = pair(key)
@@ -272,7 +278,7 @@ def test_a_server_takes_nothing_but_hello_first(
 @pytest.mark.parametrize(
     "kind", [m.Call, m.Hello, m.Welcome, m.Ping], ids=lambda kind: kind.__name__
 )
-def test_a_server_with_a_key_takes_nothing_but_the_proof_second(
+def test_a_server_with_a_key_accepts_only_the_proof_as_the_second_message(
     kind: type[Any], pair: Pair
 ) -> None:
     client, server = pair(KEY)
@@ -281,7 +287,7 @@ def test_a_server_with_a_key_takes_nothing_but_the_proof_second(
         server.receive_data(_raw(SAMPLES[kind]))
 
 
-def test_nothing_follows_a_last_word(open_pair: Pair) -> None:
+def test_nothing_follows_the_last_message(open_pair: Pair) -> None:
     for last in (m.Bye("done"), m.Refuse("x", "y")):
         client, server = open_pair(None)
         data = client.send(last)
@@ -315,7 +321,7 @@ def test_a_large_hello_is_refused_from_its_first_bytes(key: bytes | None, pair: 
         )
 
 
-def test_a_refusal_reaches_a_client_that_is_opening(key: bytes | None, pair: Pair) -> None:
+def test_a_refusal_reaches_a_client_during_the_handshake(key: bytes | None, pair: Pair) -> None:
     client, server = pair(key)
     hello = server.receive_data(client.send(HELLO))
     if not hello:
@@ -341,7 +347,7 @@ def test_a_client_without_a_common_version_is_refused(pair: Pair) -> None:
     assert "update the older side" in fault.value.text
 
 
-def test_a_server_that_chooses_a_version_nobody_offered_is_refused(pair: Pair) -> None:
+def test_a_server_that_chooses_a_version_not_offered_is_refused(pair: Pair) -> None:
     client, server = pair(None)
     server.receive_data(client.send(HELLO))
     with pytest.raises(ProtocolError, match="version"):
@@ -356,7 +362,7 @@ KEYS = [
 
 
 @pytest.mark.parametrize(("client_key", "server_key", "code"), KEYS)
-def test_keys_that_do_not_fit_are_refused_by_the_server(
+def test_a_server_refuses_a_client_with_another_key(
     client_key: bytes | None, server_key: bytes | None, code: str
 ) -> None:
     client = Connection(
@@ -388,14 +394,14 @@ def test_a_server_that_does_not_know_the_key_is_refused_by_the_client(pair: Pair
             forged.receive_data(_raw(m.Welcome(2, "vision", "b1", auth=auth)))
 
 
-def test_a_client_without_a_key_says_so_when_it_is_asked_for_one(pair: Pair) -> None:
+def test_a_client_without_a_key_reports_that_one_is_needed(pair: Pair) -> None:
     client, _ = pair(None)
     client.send(HELLO)
     with pytest.raises(ProtocolError, match="key_needed"):
         client.receive_data(_raw(m.Challenge(b"s" * 32)))
 
 
-def test_a_changed_version_range_breaks_the_proof(pair: Pair) -> None:
+def test_a_changed_version_range_invalidates_the_proof(pair: Pair) -> None:
     client, server = pair(KEY)
     hello = client.send(m.Hello(1, 3, "coordinator", "coord", "b0"))
     assert server.receive_data(hello.replace(b"\x01\x01\x03", b"\x01\x01\x02", 1)) == []
@@ -404,7 +410,7 @@ def test_a_changed_version_range_breaks_the_proof(pair: Pair) -> None:
         server.receive_data(client.data_to_send())
 
 
-def test_a_changed_welcome_breaks_its_proof(pair: Pair) -> None:
+def test_a_changed_welcome_invalidates_its_proof(pair: Pair) -> None:
     client, server = pair(KEY)
     server.receive_data(client.send(HELLO))
     client.receive_data(server.data_to_send())
@@ -414,7 +420,7 @@ def test_a_changed_welcome_breaks_its_proof(pair: Pair) -> None:
         client.receive_data(welcome.replace(b"track", b"trick"))
 
 
-def test_a_recorded_session_cannot_be_played_again(
+def test_a_recorded_session_cannot_be_replayed(
     pair: Pair, shake_hands: Callable[..., bytes]
 ) -> None:
     client, server = pair(KEY)
@@ -459,7 +465,7 @@ def test_a_connection_with_a_key_needs_a_nonce() -> None:
         Connection(Side.CLIENT, SERVER, key=KEY)
 
 
-def test_a_message_that_is_too_large_leaves_the_connection_as_it_was(
+def test_a_message_that_is_too_large_does_not_change_the_connection(
     key: bytes | None, open_pair: Pair
 ) -> None:
     client, server = open_pair(key)
@@ -468,7 +474,7 @@ def test_a_message_that_is_too_large_leaves_the_connection_as_it_was(
     assert server.receive_data(client.send(m.Ping(1))) == [m.Ping(1)]
 
 
-# --- who is meant -----------------------------------------------------------------------------
+# --- the wanted node --------------------------------------------------------------------------
 
 
 def test_a_server_of_another_name_refuses_and_seals_its_refusal(key: bytes | None) -> None:
@@ -484,10 +490,10 @@ def test_a_server_of_another_name_refuses_and_seals_its_refusal(key: bytes | Non
     assert isinstance(refusal, m.Refuse) and refusal.code == "wrong_node" and client.proven
 
 
-def test_a_welcome_of_another_name_is_refused_though_its_proof_is_good(
+def test_a_welcome_of_another_name_is_refused_although_its_proof_is_valid(
     key: bytes | None, pair: Pair
 ) -> None:
-    """A server that has the key, or none, and does not look at whom HELLO asks for."""
+    """A server with the key, or without keys, that ignores which node HELLO wants."""
     client, server = pair(key)
     if server.receive_data(client.send(HELLO)) == []:
         client.receive_data(server.data_to_send())
@@ -499,7 +505,7 @@ def test_a_welcome_of_another_name_is_refused_though_its_proof_is_good(
     assert client.version == 0
 
 
-def test_a_name_changed_on_its_way_breaks_the_opening(key: bytes | None, pair: Pair) -> None:
+def test_a_name_changed_in_transit_fails_the_handshake(key: bytes | None, pair: Pair) -> None:
     client, _ = pair(key)
     server = Connection(Side.SERVER, "motion", key=key, nonce=NONCES[Side.SERVER] if key else b"")
     with pytest.raises(ProtocolError, match=r"wrong_key|bad_check"):
@@ -528,7 +534,7 @@ def test_a_refusal_without_the_seal_is_not_proven(when: str, sealed: bool, pair:
     assert not client.proven and client.state is ConnectionState.CLOSED
 
 
-def test_two_keys_are_accepted_while_one_takes_the_place_of_the_other() -> None:
+def test_two_keys_are_accepted_while_one_replaces_the_other() -> None:
     old, new = KEY, KEY[::-1]
     sides: list[Keys] = [old, (new, old), (old, new), new]
     for mine in sides:
@@ -544,11 +550,11 @@ def test_two_keys_are_accepted_while_one_takes_the_place_of_the_other() -> None:
             assert client.receive_data(server.send(m.Ping(2))) == [m.Ping(2)]
 
 
-# --- bits that are changed on their way -------------------------------------------------------
+# --- bits changed in transit ------------------------------------------------------------------
 
 
 def _conversation(key: bytes | None) -> list[tuple[Side, bytes]]:
-    """What each side says, in order, from HELLO on."""
+    """Return the messages of each side, in order, from HELLO on."""
     client, server = new_pair(key)
     said = [(Side.CLIENT, client.send(HELLO))]
     if not server.receive_data(said[0][1]):
@@ -577,8 +583,8 @@ def _conversation(key: bytes | None) -> list[tuple[Side, bytes]]:
 def _play(
     said: list[tuple[Side, bytes]], key: bytes | None
 ) -> tuple[dict[Side, list[m.Message]], bool]:
-    """What the owners of two fresh ends are given when these bytes arrive, and whether a fault was
-    noticed."""
+    """Return what two new ends deliver when they receive these bytes, and whether a fault was
+    detected."""
     ends = dict(zip((Side.CLIENT, Side.SERVER), new_pair(key), strict=True))
     ends[Side.CLIENT].send(HELLO)
     got: dict[Side, list[m.Message]] = {Side.CLIENT: [], Side.SERVER: []}
@@ -607,12 +613,12 @@ def _assert_noticed(
         assert its == right[side][: len(its)], "a wrong value was delivered"
     waits = any(len(got[side]) < len(right[side]) for side in Side)
     assert noticed or waits, (
-        "an incomplete frame is not heard, so the limit on silence ends the connection"
+        "an incomplete frame does not count, so the limit on silence ends the connection"
     )
 
 
-def test_any_one_changed_bit_of_a_conversation_is_noticed(key: bytes | None) -> None:
-    """Also in the lengths: a frame made longer delivers nothing."""
+def test_any_single_changed_bit_of_a_conversation_is_detected(key: bytes | None) -> None:
+    """This includes the lengths: a frame made longer delivers nothing."""
     said = _conversation(key)
     right, noticed = _play(said, key)
     assert not noticed and [len(right[side]) for side in Side] == [5, 4]

@@ -1,7 +1,7 @@
-"""A party whose every word depends on all it has heard so far, and a process that runs one as a
+"""A party whose messages depend on all messages received so far, and a process that runs one as a
 member of a cell.
 
-Run as a script: `toy_party.py NAME TICKS ADDRESSES SCRIPTS DELAYS` (JSON), prints what it heard.
+Run as a script: `toy_party.py NAME TICKS ADDRESSES SCRIPTS DELAYS` (JSON), prints what it received.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from petrobot.services.comm.lockstep.party import TICK, Envelope
 from petrobot.services.comm.protocol.messages import Call
 
 Script = Mapping[str, Sequence[tuple[str, str]]]
-"""What to say, by tick: (party, channel)."""
+"""Messages to send, by tick: (party, channel)."""
 
 
 class Toy:
-    """Says what its script names at each tick, about a digest of what it heard; answers every third
-    thing it hears."""
+    """Sends the messages of its script at each tick, with a digest of what it received; answers
+    every third message."""
 
     def __init__(self, name: str, script: Script, endpoint: str = "") -> None:
         self.name = name

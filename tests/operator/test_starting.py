@@ -131,9 +131,9 @@ def test_every_option_of_the_command_line_is_read(tmp_path: Path) -> None:
 
 
 BAD = [
-    ({"mode": "dream"}, "mode: 'dream' is none of realtime, lockstep"),
+    ({"mode": "dream"}, "mode: 'dream' is not one of realtime, lockstep"),
     ({"mode": ["lockstep"]}, "mode"),
-    ({"runs": 0}, "runs: 0 is no whole number from 1"),
+    ({"runs": 0}, "runs: 0 is not a whole number from 1"),
     ({"runs": 1.5}, "runs: 1.5"),
     ({"runs": True}, "runs: True"),
     ({"runs": "many"}, "runs: 'many'"),
@@ -144,7 +144,7 @@ BAD = [
     ({"pace": "fast"}, "pace: 'fast'"),
     ({"pace": float("nan")}, "pace: nan"),
     ({"parameters": []}, None),
-    ({"parameters": [1]}, "parameters: [1] is no object"),
+    ({"parameters": [1]}, "parameters: [1] is not a table"),
     ({"parameters": {"sped": 1}}, "no parameter 'sped'; it has: speed"),
     ({"parameters": {"speed": "fast"}}, "parameter speed: 'fast' is not a number"),
     ({"parameters": {"speed": float("inf")}}, "parameter speed: inf"),
@@ -152,17 +152,17 @@ BAD = [
     ({"parameters": {"count": 2.0}}, "parameter count: 2.0 is not a whole number"),
     ({"parameters": {"count": True}}, "parameter count: True"),
     ({"parameters": {"batch": 3}}, "parameter batch: 3 is not text"),
-    ({"learn": "x"}, "learn: {file"),
+    ({"learn": "x"}, "learn: expected {file"),
     ({"learn": {}}, "learn.file: None"),
     ({"learn": {"file": "../x"}}, "learn.file: '../x'"),
     ({"learn": {"file": "/etc/passwd"}}, "learn.file"),
     ({"learn": {"file": "a" * 65}}, "learn.file"),
     ({"learn": {"file": ["a"]}}, "learn.file"),
-    ({"learn": {"file": "a", "selector": "best"}}, "learn.selector: 'best' is none of"),
+    ({"learn": {"file": "a", "selector": "best"}}, "learn.selector: 'best' is not one of"),
     ({"learn": {"file": "a", "target": 2}}, "learn.target: 2"),
     ({"learn": {"file": "a", "contexts": "regime"}}, "learn.contexts"),
     ({"learn": {"file": "a", "frozen": "yes"}}, "learn.frozen: 'yes'"),
-    ({"marking": {"jobs": 3}}, "start knows no 'marking'"),
+    ({"marking": {"jobs": 3}}, "start: unknown 'marking'"),
 ]
 
 
@@ -385,7 +385,7 @@ async def test_a_run_from_a_point_is_shown_live_and_names_its_origin(
         ({"run": "RUN", "record": "1"}, "from.record: '1'"),
         ({"run": "RUN", "record": 10**6}, "records 0"),
         ({"run": "RUN", "record": 0, "going": 3}, "from.going: 3"),
-        ({"run": "RUN", "record": 0, "going": {"moon": "error"}}, "no run went on in 'moon'"),
+        ({"run": "RUN", "record": 0, "going": {"moon": "error"}}, "no run was active in 'moon'"),
         ({"run": "RUN", "record": 0, "going": "sometimes"}, "'sometimes'"),
     ],
 )
