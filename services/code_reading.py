@@ -26,6 +26,7 @@ from typing import Any, get_type_hints
 from petrobot.services import action as actions
 from petrobot.services.comm.location_file import resolve
 from petrobot.services.device import Driver, faults_of_keys
+from petrobot.services.host.json_text import json_text
 
 AWAITED = frozenset(
     ("wait", "sleep", "call", "command", "get", "get_versioned", "put", "compare_and_set")
@@ -312,7 +313,7 @@ def main() -> None:
     os.dup2(silent, 2)
     sys.path[:] = asked["sys_path"]
     for path, config in asked["paths"]:
-        answers.write(json.dumps({"path": path, **_read(path, config)}) + "\n")
+        answers.write(json_text({"path": path, **_read(path, config)}) + "\n")
         answers.flush()
     answers.close()
     os._exit(0)  # threads of imported modules, and what they do at exit, have no say

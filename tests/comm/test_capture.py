@@ -221,7 +221,8 @@ class Stream(BaseHTTPRequestHandler):
         self.end_headers()
         head = f"--image\r\nContent-Type: image/jpeg\r\nContent-Length: {jpeg.size}\r\n\r\n"
         try:
-            while not self.cut.wait(0.02):
+            limit = Limit("the end of the test")
+            while not self.cut.wait(0.02) and limit.left():
                 self.wfile.write(head.encode() + jpeg.tobytes() + b"\r\n")
         except OSError:
             pass
