@@ -9,6 +9,7 @@ Those that nobody has needed for a while retire.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -34,6 +35,9 @@ KEPT = 2
 BUSY_AFTER = 0.5
 """Seconds for which a call waits when there are as many workers as there may be, and all are busy:
 most runs end sooner."""
+STARTS = max(KEPT, os.cpu_count() or KEPT)
+"""Workers that are started at once. More would only take each other's time, and that of the runs
+that are active."""
 IDLE_LIMIT = 30.0
 """Seconds after which an idle worker beyond these retires."""
 
@@ -174,9 +178,12 @@ class WorkerPool:
                     self._touched.add(number)
                     worker.take(now, order)
 
-    def _starting(self) -> bool:
-        """Whether a worker is being started: the calls that wait may have it."""
-        return any(w.stage is HostStage.ACTIONS_START for w in self._workers.values())
+    def _starting(self) -> int:
+        """How many workers are being started: the calls that wait may have them."""
+        return sum(w.stage is HostStage.ACTIONS_START for w in self._workers.values())
+
+    def _may_add(self) -> bool:
+        return len(self._workers) < self._most and self._starting() < STARTS
 
     def _stop_waiting(self, id_: str, cause: str, text: str) -> None:
         del self._waiting[id_]
@@ -193,9 +200,7 @@ class WorkerPool:
         if self._held:
             self._workers[number].command(now, HOLD)
         self._workers[number].take(now, call)
-        if len(self._workers) < self._most and all(
-            worker.busy for worker in self._workers.values()
-        ):
+        if self._may_add() and all(worker.busy for worker in self._workers.values()):
             self._add()
 
     @property
@@ -223,7 +228,7 @@ class WorkerPool:
             return best
         idle = self._idle()
         # One that waits to be started again is the last choice: it may have to wait long.
-        if (not idle or self._rank(idle[0]) == 2) and len(self._workers) < self._most:
+        if (not idle or self._rank(idle[0]) == 2) and self._may_add():
             return self._add()
         return idle[0] if idle else None
 
