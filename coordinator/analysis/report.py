@@ -613,11 +613,14 @@ def _missing_lines(found: Analysis) -> list[str]:
         f"sound, but P_complete is {short:.3g} short of 1: an end can always be reached, and not "
         "every end is `final`. The rest of the probability goes to:"
     ]
-    net = found.forecast.view.task.net
-    return lines + [
+    net, rest = found.forecast.view.task.net, missing(found.forecast)
+    lines += [
         f"  {share:.3g}  {net.describe(marking)}  by: {' '.join(path) or '(initial marking)'}"
-        for share, marking, path in missing(found.forecast)[:SHOWN]
+        for share, marking, path in rest[:SHOWN]
     ]
+    if more := rest[SHOWN:]:
+        lines.append(f"  {sum(share for share, _, _ in more):.3g}  {len(more)} more states")
+    return lines
 
 
 def _sizes(net: Net) -> dict[str, int]:
