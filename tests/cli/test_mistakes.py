@@ -417,3 +417,17 @@ def test_an_event_does_not_become_internal_by_its_declaration(tmp_path: Path) ->
     services = shipped.parents[2] / "services.toml"
     pattern = r"events.ball_caught.by: follow_and_wait of catch_ball never raises 'ball_caught'"
     expect(pattern, ["check", str(tmp_path / "internal.toml"), "--services", str(services)])
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(("runs", "code"), [("20", 0), ("21", 2)])
+def test_runs_beyond_the_capacity_are_refused(
+    sound: dict[str, str], runs: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A place holds at the start what it holds later."""
+    damaged(sound, [(TASK, "tokens = 3", "tokens = 3, capacity = 20", "")], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    refusal = (
+        r"runs: expected at most 20, the capacity of 'parts', found 21; ask for fewer, or raise"
+    )
+    expect(refusal if code else "status +success", [*RUN, "--runs", runs], code)
