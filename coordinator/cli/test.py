@@ -59,8 +59,9 @@ def _command(text: str) -> Mapping[str, Any]:
 
 def run(options: argparse.Namespace) -> int:
     """Test, and print what was found."""
-    from petrobot.services.conformance import check_device
+    from petrobot.coordinator.launch import load_object
 
+    check_device = load_object("petrobot.services.conformance:check_device")
     directory = load_directory(options.services)
     try:
         found = check_device(

@@ -20,6 +20,7 @@ from typing import Any
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.location_file.reading import Faults, nearest
 from petrobot.services.comm.protocol.security import is_loopback
+from petrobot.services.host.json_text import json_text
 
 PROGRAM = "petrobot.services.code_reading"
 SECONDS = 20.0
@@ -54,7 +55,7 @@ def _ask(paths: list[Any], seconds: float) -> tuple[list[Facts], str]:
     """Return what a new process says of the paths until it ends, and why it ended before the
     last. Code that comes with petrobot does not change while this process lives: it is asked
     once."""
-    question = json.dumps({"sys_path": sys.path, "paths": paths})
+    question = json_text({"sys_path": sys.path, "paths": paths})
     if all(path.startswith("petrobot.") for path, _ in paths):
         return _ask_once(question, seconds)
     return _ask_process(question, seconds)
