@@ -37,7 +37,7 @@ class Budget:
     the same verdict on every machine."""
 
     markings: int = 100_000
-    """The most markings of the ordinary net; they take about a second."""
+    """The most markings of the ends net; they take about a second."""
     steps: int = 60_000
     """The most stimuli and firings of the engine for the execution graph; they take about four
     seconds. The shipped tasks need less than a third of it."""
