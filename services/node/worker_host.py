@@ -198,6 +198,7 @@ class WorkerHost:
         self._withdrawn: set[str] = set()
         """Runs that were taken back, until the worker says that it has seen that: before, it could
         take the permit of another call for one of them."""
+        self._withdrawn_at = -math.inf
         self._behind = False
         """Whether calls may wait in its process behind another one."""
         self._progress = -math.inf
@@ -483,6 +484,7 @@ class WorkerHost:
         if self._worker is None or not (count := self._worker.take_back()):
             return
         self._given -= count
+        self._withdrawn_at = self._clock()
         for id_, run in list(self._runs.items()):
             if run.posted is not None and run.number > self._given:
                 self._withdrawn.add(id_)
@@ -609,6 +611,9 @@ class WorkerHost:
             self._tell_lost("the device is not known to stand still")
         if now >= self._patience_ends():
             self.withdraw()
+        if now >= self._unseen_limit() and self._worker is not None:
+            self._withdrawn_at = now  # once more, should even the kill come to nothing
+            self._worker.kill("it did not read its calls, and was killed")
         for id_, run in list(self._runs.items()):
             if run.posted is None and now >= self._wait_limit(run):
                 why = self.failed or self._died or "it is being started"
@@ -619,6 +624,13 @@ class WorkerHost:
     def _patience_ends(self) -> float:
         """When calls that wait in its process are taken back (s)."""
         return self._progress + PATIENCE if self._behind else math.inf
+
+    def _unseen_limit(self) -> float:
+        """When a worker without a run must have seen that calls were taken back: it is frozen if it
+        has not (s)."""
+        if not self._withdrawn or any(run.posted is not None for run in self._runs.values()):
+            return math.inf
+        return max(self._withdrawn_at, self._progress) + GRACE + MARGIN
 
     def _wait_limit(self, run: _Given) -> float:
         """Until when a run waits for its process."""
@@ -656,7 +668,7 @@ class WorkerHost:
             soonest = min(soonest, self._halt_due)
         if self._stage in STARTING:
             soonest = min(soonest, self._started + START_LIMIT)
-        soonest = min(soonest, self._patience_ends())
+        soonest = min(soonest, self._patience_ends(), self._unseen_limit())
         for run in self._runs.values():
             due = self._due_of(run)
             if due < soonest:
