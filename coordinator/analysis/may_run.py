@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # the search needs numpy, which a command that only reads the
     from petrobot.coordinator.analysis.execution.progress import Contest
     from petrobot.coordinator.analysis.net.space import SearchLimits
     from petrobot.coordinator.analysis.report import Analysis
+    from petrobot.services.comm.location_file import Directory
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +28,21 @@ class Cell:
     """The node of each action."""
     source: str = "services.toml"
     """The location file."""
+    devices: Mapping[str, str] | None = None
+    """The device of each action that has one."""
     translates: Mapping[str, str] | None = None
     """The primitive task that each action translates, as its file says; None: not compared."""
+
+    @classmethod
+    def of(cls, directory: Directory) -> Cell:
+        """Return what this location file offers."""
+        actions = directory.actions.values()
+        return cls(
+            {action.name: action.node for action in actions},
+            str(directory.source),
+            {action.name: action.device for action in actions if action.device},
+            {action.name: action.task for action in actions if action.task},
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,14 +126,14 @@ def may_run(task: Task, cell: Cell | None = None, budget: Budget | None = None) 
     broken = any(finding.code == "inconsistent" for finding in report.errors)
     if broken or budget is None:
         return MayRun(task, report, None)
-    analysis = _search(task, budget)
+    analysis = _search(task, budget, cell.devices if cell is not None else None)
     return MayRun(task, _with_contests(report, analysis), analysis)
 
 
-def _search(task: Task, budget: Budget) -> Analysis:
+def _search(task: Task, budget: Budget, devices: Mapping[str, str] | None) -> Analysis:
     from petrobot.coordinator.analysis.report import analyse
 
-    return analyse(task, limits=budget.limits(), steps=budget.steps)
+    return analyse(task, limits=budget.limits(), steps=budget.steps, devices=devices)
 
 
 def _with_contests(report: CheckReport, analysis: Analysis) -> CheckReport:

@@ -409,6 +409,7 @@ def analyse(
     engine: EngineName = "auto",
     ordinary: Net | None = None,
     steps: int = STEPS,
+    devices: Mapping[str, str] | None = None,
 ) -> Analysis:
     """Return all verdicts on a net or task; with `view="gspn"` also the numbers over time.
 
@@ -416,10 +417,11 @@ def analyse(
     computed (incomplete space, timeless trap) leave a note instead. `limits` apply to each state
     space that is explored. `ordinary` is the net for the qualitative verdicts on a GSPN, if it is
     not the GSPN's own net because the rates and priorities came from another file. `steps` limits
-    the execution graph of a task, in stimuli and firings.
+    the execution graph of a task, in stimuli and firings; `devices` gives the device of each of its
+    actions that has one.
     """
     if isinstance(model, Task):
-        return _analyse_task(model, view, measured, stages, limits, engine, steps)
+        return _analyse_task(model, view, measured, stages, limits, engine, steps, devices)
     net = ordinary or (model.net if isinstance(model, Gspn) else model)
     notes: list[str] = []
     found = _examined(net, limits, engine, notes)
@@ -516,6 +518,7 @@ def _analyse_task(
     limits: SearchLimits | None,
     engine: EngineName,
     steps: int,
+    devices: Mapping[str, str] | None,
 ) -> Analysis:
     ordinary, n, notes = OrdinaryView(task), ends_net(task), list[str]()
     found = _examined(n.net, limits, engine, notes, partial(judged, n))
@@ -527,7 +530,7 @@ def _analyse_task(
             # An unbounded net seldom has a finite execution graph, but its dead ends may be near.
             most = steps if found.bounded.holds is not False else min(steps, LOOK)
             try:
-                progress = progress_of(ordinary, most, measured)
+                progress = progress_of(ordinary, most, measured, devices)
                 notes += progress.notes
             except TooManyValues as fault:
                 why = str(fault)

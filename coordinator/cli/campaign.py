@@ -263,8 +263,7 @@ def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
     from petrobot.coordinator.analysis.may_run import Cell, may_run
 
     directory = load_directory(options.services)
-    cell = Cell({action: entry.node for action, entry in directory.actions.items()})
-    refusal = may_run(task, cell).refusal(str(directory.source))
+    refusal = may_run(task, Cell.of(directory)).refusal(str(directory.source))
     if refusal:
         raise CommandError(2, refusal)
     refuse_script(options.mock, directory)

@@ -93,12 +93,7 @@ def _checked(task: Task, services: Path | None) -> tuple[MayRun, CheckReport]:
         return judged, _noted(judged.report, said)
     directory = load_directory(services)
     refuse_misplaced(directory)
-    cell = Cell(
-        {action: entry.node for action, entry in directory.actions.items()},
-        str(services),
-        {action: entry.task for action, entry in directory.actions.items() if entry.task},
-    )
-    judged = may_run(task, cell, BUDGET)
+    judged = may_run(task, Cell.of(directory), BUDGET)
     return judged, _with_code(task, directory, judged.report)
 
 

@@ -238,7 +238,7 @@ def run(options: argparse.Namespace) -> int:
     if (lockstep or options.up) and not options.join:
         refuse_misplaced(directory, everywhere=lockstep, scripted=options.mock is not None)
     request = _request(task, directory, options)
-    _warn(task, options)
+    _warn(task, directory, options)
     if not lockstep:
         _refuse_stopped(directory)
     text = task_path(options.task).read_text(encoding="utf-8")
@@ -365,19 +365,18 @@ async def _page(session: RunSession, options: argparse.Namespace) -> AsyncIterat
 def _refuse_unfit(task: Task, directory: Directory) -> None:
     from petrobot.coordinator.analysis.may_run import Cell, may_run
 
-    offers = {action: entry.node for action, entry in directory.actions.items()}
-    refusal = may_run(task, Cell(offers, str(directory.source))).refusal()
+    refusal = may_run(task, Cell.of(directory)).refusal()
     if refusal:
         raise CommandError(2, refusal)
 
 
-def _warn(task: Task, options: argparse.Namespace) -> None:
+def _warn(task: Task, directory: Directory, options: argparse.Namespace) -> None:
     """Print what a short search of the state space finds against the task. The run still starts."""
-    from petrobot.coordinator.analysis.may_run import BUDGET, may_run
+    from petrobot.coordinator.analysis.may_run import BUDGET, Cell, may_run
 
     if options.quiet:
         return
-    for objection in may_run(task, None, BUDGET).objections():
+    for objection in may_run(task, Cell.of(directory), BUDGET).objections():
         print(f"warning: {objection} (details: petrobot check {options.task})", file=sys.stderr)
 
 

@@ -687,3 +687,20 @@ def test_a_conflict_that_needs_the_operators_token_is_a_note() -> None:
     assert "pick and clean may both want the last token of arm" in note
     path = "the operator adds a token to dirty -> nothing; act ends in success -> picked"
     assert note.endswith(path)
+
+
+def test_two_actions_of_one_device_never_run_at_a_time() -> None:
+    """What needs both at once is found only where it is known that they share a device."""
+    net: dict[str, dict[str, Any]] = {
+        "start": {"in": "begin", "out": "drive look"},
+        "seen": {"in": "drive:preempt=success look:normal", "out": "end"},
+        "blind": {"in": "drive:preempt=success look:error", "out": "end"},
+        "broken": {"in": "drive:error !look", "out": "end"},
+        "driven": {"in": "drive:normal !look", "out": "end"},
+    }
+    task = make_task("begin=1 end drive! look!", net, final="end == 1")
+    actions = [a for p in task.primitive_tasks.values() for a in p.alternatives]
+    apart = progress_of(OrdinaryView(task), 40_000, None, {a: a for a in actions})
+    assert "seen" not in apart.quasi_live.reason
+    shared = progress_of(OrdinaryView(task), 40_000, None, dict.fromkeys(actions, "arm"))
+    assert not shared.quasi_live.holds and "seen can never fire" in shared.quasi_live.reason

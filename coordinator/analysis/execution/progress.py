@@ -39,6 +39,7 @@ from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
 from petrobot.coordinator.analysis.time.stochastic import Measured, NoEstimate
+from petrobot.coordinator.engine import Engine, Policy
 from petrobot.coordinator.task import Kind
 from petrobot.coordinator.task.compiled_task import CompiledTransition
 
@@ -655,17 +656,25 @@ class Progress:
         return PropertyVerdict(None, f"{text}; {more}" if more else text, complete=False)
 
 
-def progress_of(view: OrdinaryView, limit: int, measured: Measured | None = None) -> Progress:
+def progress_of(
+    view: OrdinaryView,
+    limit: int,
+    measured: Measured | None = None,
+    devices: Mapping[str, str] | None = None,
+) -> Progress:
     """Return the verdicts on the execution graph of a task, within a limit in stimuli
     and firings.
 
+    `devices` gives the device of each action that has one: two runs never use it at a time.
     Raises TooManyValues.
     """
-    free = execute(view.task, limit=limit, free_choice=True)
+    asking = Engine(view.task, devices, Policy(ask_undecided=True))
+    free = execute(view.task, limit=limit, engine=asking)
     if not free.contests:
         return Progress(free, view, measured)
     rivals = frozenset(name for names in free.contests for name in names) if free.complete else None
-    served = execute(view.task, limit=limit, rivals=rivals)
+    engine = Engine(view.task, devices)
+    served = execute(view.task, limit=limit, engine=engine, rivals=rivals)
     return Progress(served, view, measured, Progress(free, view))
 
 
