@@ -223,8 +223,8 @@ from petrobot import Context, Remote, Result, check_driver, rehearse, success
 
 
 def test_it_keeps_the_rules_of_drivers():
-    there_and_back = [{{"to": 0.9}}, {{"to": 0.1}}]
-    assert check_driver(lambda: {Class}({{}}, None), there_and_back, simulated=True).faults == []
+    there_and_back = [{"to": 0.9}, {"to": 0.1}]
+    assert check_driver(lambda: {Class}({}, None), there_and_back, simulated=True).faults == []
 
 
 async def drive(ctx: Context[Remote], *, to: float) -> Result:
@@ -350,8 +350,8 @@ def test_it_moves():
 
 
 def test_the_driver_keeps_the_rules_of_drivers():
-    there_and_back = [{{"to": 0.9}}, {{"to": 0.1}}]
-    assert check_driver(lambda: Axis({{}}, None), there_and_back, simulated=True).faults == []
+    there_and_back = [{"to": 0.9}, {"to": 0.1}]
+    assert check_driver(lambda: Axis({}, None), there_and_back, simulated=True).faults == []
 
 
 def test_what_is_out_of_reach_is_refused():

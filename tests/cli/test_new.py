@@ -51,7 +51,7 @@ def test_a_new_robot_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     }
     on_free_port(folder)
     tested = python(folder, "pytest", "-q", "-p", "no:cacheprovider")
-    assert tested.returncode == 0 and "5 passed" in tested.stdout, tested.stdout + tested.stderr
+    assert tested.returncode == 0 and "6 passed" in tested.stdout, tested.stdout + tested.stderr
     run = ("petrobot.coordinator", "run", "carrier.toml", "--quiet", "--no-page")
     lasted = []
     for seed in ("3", "4"):
