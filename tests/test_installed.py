@@ -15,11 +15,12 @@ import time
 import venv
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 
+from tests.cli.test_new import on_free_port
 from tests.integration.cell_files import services_file
 from tests.waiting import Limit
 
@@ -30,7 +31,7 @@ COMMANDS = [
     line.split("  #")[0].strip()
     for block in README.split("```")[1::2]
     for line in block.splitlines()
-    if line.startswith("petrobot ")
+    if line.startswith(("petrobot ", "cd "))
 ]
 STAY = ("petrobot up", "petrobot serve --up")
 """Commands that run until Ctrl-C."""
@@ -111,14 +112,19 @@ def test_every_command_of_the_readme(installed: Installed) -> None:
     assert len(COMMANDS) >= 16 and COMMANDS[0].startswith("petrobot run catch_ball --mode lockstep")
     _try(installed, COMMANDS[0])
     services_file(installed.folder)  # from now on on ports that no other test uses
+    user = replace(installed)
     with _staying(installed, "petrobot up"):
         limit = Limit("the nodes")
         while installed.run("petrobot nodes").returncode and limit.left():
             time.sleep(0.2)
         _try(installed, "petrobot run catch_ball --runs 1 --no-page --quiet")
         for command in COMMANDS[1:]:
-            if command not in STAY:
-                _try(installed, command)
+            if command.startswith("cd "):
+                user.folder = (user.folder / command.removeprefix("cd ")).resolve()
+                if user.folder != installed.folder:
+                    on_free_port(user.folder)
+            elif command not in STAY:
+                _try(user, command)
     with _staying(installed, "petrobot serve --up") as page:
         limit = Limit("the page")
         while "http://" not in page.read_text(encoding="utf-8") and limit.left():

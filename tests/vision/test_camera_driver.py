@@ -71,7 +71,12 @@ def test_the_drivers_interface_to_the_node(context: BenchContext) -> None:
     camera.stop(0.0)
     camera.stop(0.0)
     assert camera.stopped()
-    assert camera.state() == {"rate": 0.0, "images": 0, "background_images": 0}
+    assert camera.state() == {
+        "rate": 0.0,
+        "source": "ok",
+        "images": 0,
+        "background_images": 0,
+    }
     with pytest.raises(ValueError, match="no commands"):
         camera.command(0.0, {"verb": "zoom"})
     camera.close()
