@@ -170,9 +170,13 @@ def lockstep_mission(directory: Directory, setting: Setting, store: Store | None
 def lockstep_party(
     directory: Directory, node: NodeEntry, substitutes: Substitutes | None = None
 ) -> Party:
-    """The party of a node: a laboratory's own, or a node with its drivers and actions inline."""
+    """The party of a node: a laboratory's own, or a node with its drivers and actions inline.
+    Raises RequestError for a laboratory that cannot be made."""
     if node.sim:
-        party: Party = load_object(node.sim)(directory, node.name)
+        try:
+            party: Party = load_object(node.sim)(directory, node.name)
+        except (ValueError, OSError) as fault:
+            raise RequestError(f"{directory.source}: nodes.{node.name}: {fault}") from fault
         return party
     return load_object(NODE_PARTY)(directory, node.name, substitutes=substitutes)  # type: ignore[no-any-return]
 

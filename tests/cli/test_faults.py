@@ -12,6 +12,8 @@ import pytest
 from petrobot.coordinator.analysis.may_run import Budget
 from petrobot.coordinator.cli import COMMANDS, main
 from petrobot.coordinator.cli.new import TASK
+from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.lockstep.party import Party
 
 WORK = TASK.replace("{name}", "work")
 CELL = """\
@@ -213,3 +215,17 @@ def test_exit_codes_are_told(petrobot: Petrobot) -> None:
         word in told
         for word in ("analyse refutes", "forecast or replay", "operator's command", "3  a node")
     )
+
+
+def no_laboratory(directory: Directory, name: str) -> Party:
+    """A laboratory whose file is gone, as that of a run whose installation is."""
+    raise ValueError("gone.toml: cannot be read (No such file or directory)")
+
+
+def test_a_laboratory_that_cannot_be_made_is_named(petrobot: Petrobot) -> None:
+    lab = f'[nodes.lab]\nhost = "127.0.0.1"\nport = 7398\nsim = "{__name__}:no_laboratory"\n'
+    Path("cell.toml").write_text(CELL + lab, encoding="utf-8")
+    run = ("run", "work.toml", "--services", "cell.toml", "--mode", "lockstep", "--quiet")
+    code, _, said = petrobot(*run)
+    assert code == 2 and "Traceback" not in said
+    assert "cell.toml: nodes.lab: gone.toml: cannot be read" in said

@@ -15,6 +15,7 @@ import numpy as np
 from petrobot.coordinator.engine.instructions import RunRecorded
 from petrobot.coordinator.launch import (
     SCRIPTED,
+    RequestError,
     Setting,
     load_object,
     lockstep_mission,
@@ -176,6 +177,8 @@ def _cell(bench: LoadedPlan, block: Block, selector: BlockSelector) -> tuple[Mis
         parties = [
             lockstep_party(directory, node, substitutes) for node in directory.nodes.values()
         ]
+    except RequestError as fault:
+        raise CampaignError(str(fault)) from fault
     except (DirectoryError, ImportError, ValueError, OSError) as fault:
         raise CampaignError(f"{plan.services}: {fault}") from fault
     return lockstep_mission(directory, setting), parties
