@@ -76,13 +76,12 @@ def measurements(file: Path | None) -> Callable[[Task], Measured] | None:
 
 def task_path(name: str) -> Path:
     """Return the file of a task, given by its path or by its name. A name is looked up in the
-    folder `tasks` here, then among the shipped tasks. A shipped file of an installation that is
-    gone, as an old campaign names it, is the one of this installation."""
+    folder `tasks` here, then among the shipped tasks."""
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
-        shipped = SHIPPED / path.name
-        moved = path.parts[-3:-1] == SHIPPED.parts[-2:] and shipped.exists() and not path.exists()
-        return shipped if moved else path
+        from petrobot.coordinator.run.folder import still_there
+
+        return still_there(path)
     own = OWN / f"{name}.toml"
     if own.exists():
         return own

@@ -132,12 +132,13 @@ def task_of(journal: Journal) -> Task:
 
 
 def _devices(journal: Journal) -> dict[str, str]:
+    from petrobot.coordinator.run.folder import still_there
     from petrobot.services.comm.location_file import parse
 
     text = journal.header.get("services")
     if not text:
         return {}
-    directory = parse(text, Path(journal.header.get("services_path", "services.toml")))
+    directory = parse(text, still_there(Path(journal.header.get("services_path", "services.toml"))))
     return {a.name: a.device for a in directory.actions.values() if a.device}
 
 

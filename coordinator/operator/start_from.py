@@ -29,6 +29,7 @@ from petrobot.coordinator.engine import (
 from petrobot.coordinator.launch import Setting
 from petrobot.coordinator.learning.session import fixed_by_user, session_of
 from petrobot.coordinator.operator.history import task_of
+from petrobot.coordinator.run.folder import still_there
 from petrobot.coordinator.run.interfaces import FirstAlternative, Observer
 from petrobot.coordinator.run.journal import Journal, JournalError, read_journal
 from petrobot.coordinator.run.recording import STIMULUS, RecordedStep, replay
@@ -73,7 +74,7 @@ def read_recorded(path: Path) -> Recorded:
                 f"{path}: its header has no {key!r}; it is not the journal of a mission run"
             )
     task = task_of(journal)
-    directory = parse(then["services"], Path(then["services_path"]))
+    directory = parse(then["services"], still_there(Path(then["services_path"])))
     devices = {a.name: a.device for a in directory.actions.values() if a.device}
     return Recorded(journal, task, directory, Engine(task, devices))
 

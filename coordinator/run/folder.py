@@ -11,6 +11,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+_INSTALLED = Path(__file__).parents[2]
+
 JOURNAL = "run.journal"
 RESULT = "result.json"
 DEFAULT = Path("runs")
@@ -73,3 +75,12 @@ def retain(folder: Path, keep: int) -> list[str]:
     for path in removed:
         shutil.rmtree(path)
     return [path.name for path in removed]
+
+
+def still_there(path: Path) -> Path:
+    """The path; for a shipped file of an installation that is gone, as old records name it, the
+    file of this one."""
+    if path.exists():
+        return path
+    tails = (_INSTALLED.joinpath(*path.parts[n:]) for n in range(1, len(path.parts) - 1))
+    return next((tail for tail in tails if tail.exists()), path)

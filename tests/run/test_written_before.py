@@ -35,16 +35,23 @@ def test_a_journal_replays_without_a_difference(
     assert "all as recorded" in capfd.readouterr().out
 
 
-@needs_bullet
-def test_a_killed_run_resumes_to_the_end_that_it_had_without_the_kill(tmp_path: Path) -> None:
-    folder = tmp_path / "killed"
+@pytest.mark.parametrize(
+    ("name", "kept"), [pytest.param("killed", 1.0, marks=needs_bullet), ("rover", 0.85)]
+)
+def test_a_killed_run_resumes_to_the_end_that_it_had_without_the_kill(
+    name: str, kept: float, tmp_path: Path
+) -> None:
+    """Also where its shipped files were in an installation that is gone, and the journal is cut off
+    within a record (`kept`: the part of it that is left)."""
+    folder = tmp_path / name
     folder.mkdir()
-    shutil.copy(FILES / "runs" / "killed" / "run.journal", folder)
+    journal = (FILES / "runs" / name / "run.journal").read_bytes()
+    (folder / "run.journal").write_bytes(journal[: int(kept * len(journal))])
     assert (
         main(["resume", str(folder), "--quiet", "--no-page", "--json", str(tmp_path / "end.json")])
         == 0
     )
-    end, whole = given(tmp_path / "end.json"), given(FILES / "runs" / "killed" / "result.json")
+    end, whole = given(tmp_path / "end.json"), given(FILES / "runs" / name / "result.json")
     assert {key: end[key] for key in whole if key not in ("wall_s", "journal")} == {
         key: value for key, value in whole.items() if key not in ("wall_s", "journal")
     }
