@@ -17,7 +17,6 @@ if TYPE_CHECKING:  # the search needs numpy, which a command that only reads the
     from petrobot.coordinator.analysis.execution.progress import Contest
     from petrobot.coordinator.analysis.net.space import SearchLimits
     from petrobot.coordinator.analysis.report import Analysis
-    from petrobot.services.comm.location_file import Directory
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,17 +31,6 @@ class Cell:
     """The device of each action that has one."""
     translates: Mapping[str, str] | None = None
     """The primitive task that each action translates, as its file says; None: not compared."""
-
-    @classmethod
-    def of(cls, directory: Directory) -> Cell:
-        """Return what this location file offers."""
-        actions = directory.actions.values()
-        return cls(
-            {action.name: action.node for action in actions},
-            str(directory.source),
-            {action.name: action.device for action in actions if action.device},
-            {action.name: action.task for action in actions if action.task},
-        )
 
 
 @dataclass(frozen=True, slots=True)

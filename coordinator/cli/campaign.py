@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     add_services_argument,
+    cell_of,
     cell_path,
     load_directory,
     load_task,
@@ -260,10 +261,10 @@ def _print_check(check: dict[str, Any] | None) -> None:
 
 
 def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
-    from petrobot.coordinator.analysis.may_run import Cell, may_run
+    from petrobot.coordinator.analysis.may_run import may_run
 
     directory = load_directory(options.services)
-    refusal = may_run(task, Cell.of(directory)).refusal(str(directory.source))
+    refusal = may_run(task, cell_of(directory)).refusal(str(directory.source))
     if refusal:
         raise CommandError(2, refusal)
     refuse_script(options.mock, directory)

@@ -11,6 +11,7 @@ from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     MISSING_CELL,
     add_services_argument,
+    cell_of,
     cell_path,
     find_cell,
     load_directory,
@@ -85,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
 def _checked(task: Task, services: Path | None) -> tuple[MayRun, CheckReport]:
     """Return the judgement of the task in the cell of a location file, and its findings with a
     note about that file."""
-    from petrobot.coordinator.analysis.may_run import BUDGET, Cell, may_run
+    from petrobot.coordinator.analysis.may_run import BUDGET, may_run
 
     if services is None:
         judged = may_run(task, None, BUDGET)
@@ -93,7 +94,7 @@ def _checked(task: Task, services: Path | None) -> tuple[MayRun, CheckReport]:
         return judged, _noted(judged.report, said)
     directory = load_directory(services)
     refuse_misplaced(directory)
-    judged = may_run(task, Cell.of(directory), BUDGET)
+    judged = may_run(task, cell_of(directory), BUDGET)
     return judged, _with_code(task, directory, judged.report)
 
 

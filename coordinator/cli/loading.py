@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Mapping
 
+    from petrobot.coordinator.analysis.may_run import Cell
     from petrobot.coordinator.analysis.time.stochastic import Measured
     from petrobot.coordinator.task import Task
     from petrobot.services.comm.location_file import Directory
@@ -153,6 +154,19 @@ def find_cell(given: Path | None, name: str, task: Task) -> Path | None:
             2, f"{file_line(written, 'task.services')}: task.services: {what}; {remedy}"
         )
     return path
+
+
+def cell_of(directory: Directory) -> Cell:
+    """Return what a location file offers to a task."""
+    from petrobot.coordinator.analysis.may_run import Cell
+
+    actions = directory.actions.values()
+    return Cell(
+        {action.name: action.node for action in actions},
+        str(directory.source),
+        {action.name: action.device for action in actions if action.device},
+        {action.name: action.task for action in actions if action.task},
+    )
 
 
 def file_line(path: Path, key: str) -> str:

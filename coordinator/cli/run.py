@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     add_services_argument,
+    cell_of,
     cell_path,
     load_directory,
     load_task,
@@ -363,20 +364,20 @@ async def _page(session: RunSession, options: argparse.Namespace) -> AsyncIterat
 
 
 def _refuse_unfit(task: Task, directory: Directory) -> None:
-    from petrobot.coordinator.analysis.may_run import Cell, may_run
+    from petrobot.coordinator.analysis.may_run import may_run
 
-    refusal = may_run(task, Cell.of(directory)).refusal()
+    refusal = may_run(task, cell_of(directory)).refusal()
     if refusal:
         raise CommandError(2, refusal)
 
 
 def _warn(task: Task, directory: Directory, options: argparse.Namespace) -> None:
     """Print what a short search of the state space finds against the task. The run still starts."""
-    from petrobot.coordinator.analysis.may_run import BUDGET, Cell, may_run
+    from petrobot.coordinator.analysis.may_run import BUDGET, may_run
 
     if options.quiet:
         return
-    for objection in may_run(task, Cell.of(directory), BUDGET).objections():
+    for objection in may_run(task, cell_of(directory), BUDGET).objections():
         print(f"warning: {objection} (details: petrobot check {options.task})", file=sys.stderr)
 
 

@@ -16,7 +16,9 @@ def test_a_driver_that_keeps_the_rules(
 ) -> None:
     monkeypatch.chdir(SORTER)
     there_and_back = ["--command", '{"to": "belt"}', "--command", '{"to": "home"}']
-    assert main(["test", "driver", "arm", *there_and_back, "--within", "0.2"]) == 0
+    assert (
+        main(["test", "driver", "arm", *there_and_back, "--within", "0.2", "--seconds", "2"]) == 0
+    )
     assert "arm: its driver keeps the rules" in capsys.readouterr().out
 
 
