@@ -225,7 +225,12 @@ class TrackMap:
             return None
         kind = self._ends[-1][0]
         same = [(x, y) for k, x, y in self._ends if k is kind]
-        return kind, sum(x for x, _ in same) / len(same), sum(y for _, y in same) / len(same)
+        # Added one by one: since Python 3.12 `sum` corrects the rounding of floats, and lock step
+        # promises the same bits on every Python.
+        x, y = same[0]
+        for more_x, more_y in same[1:]:
+            x, y = x + more_x, y + more_y
+        return kind, x / len(same), y / len(same)
 
     @property
     def end_place(self) -> tuple[float, float] | None:
