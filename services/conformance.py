@@ -55,20 +55,12 @@ def check_driver(
     for a driver whose device is simulated by its steps; the check then takes milliseconds.
     """
     check = _Check(make, _Clock() if simulated else time, within)
-    check.life()
-    if check.driver.period is None:
-        check.note("steps, commands and movements: the driver has no `period`")
-    else:
-        check.refusal()
-        for there, back in pairwise([*commands, *commands[:1]] if len(commands) > 1 else ()):
-            check.movements(there, back, seconds)
-        if len(commands) < 2:
-            check.note("stop and hold during a movement: give two commands, there and back")
-    if cable is None:
-        check.note("a pulled cable: give `cable`")
-    else:
-        check.cable(cable, seconds)
-    check.end()
+    try:
+        check.rules(commands, seconds, cable)
+    except Exception as fault:
+        check.fault(f"the driver raised {type(fault).__name__}: {fault}")
+    finally:  # also after Ctrl-C: the device may be moving
+        check.end()
     return check.found
 
 
@@ -168,6 +160,24 @@ class _Check:
             changed |= {name for name in after if after[name] != before.get(name)}
             before = after
         return changed
+
+    def rules(
+        self, commands: Sequence[Command], seconds: float, cable: Callable[[bool], None] | None
+    ) -> None:
+        """Check all rules that the driver, the commands and the cable let check."""
+        self.life()
+        if self.driver.period is None:
+            self.note("steps, commands and movements: the driver has no `period`")
+        else:
+            self.refusal()
+            for there, back in pairwise([*commands, *commands[:1]] if len(commands) > 1 else ()):
+                self.movements(there, back, seconds)
+            if len(commands) < 2:
+                self.note("stop and hold during a movement: give two commands, there and back")
+        if cable is None:
+            self.note("a pulled cable: give `cable`")
+        else:
+            self.cable(cable, seconds)
 
     def life(self) -> None:
         """Made, closed, made again; stopped at rest, twice."""
@@ -271,12 +281,18 @@ class _Check:
         self.again("cable put back")
 
     def end(self) -> None:
+        """Stop and close the driver, whatever happened."""
+        try:
+            self.driver.stop(self.now())
+        except Exception as fault:
+            self.fault(f"stop at the end: {type(fault).__name__}: {fault}")
+        finally:
+            self.driver.close()
         if self.late > LATE_SHARE * self.steps:
             self.fault(
                 f"step: {self.late} of {self.steps} took longer than the period of "
                 f"{self.period:g} s, the longest {self.longest:.3f} s: it must not wait"
             )
-        self.driver.close()
 
 
 def _leaves(value: Any, path: str) -> Iterator[tuple[str, float]]:

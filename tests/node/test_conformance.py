@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import pytest
 
@@ -149,6 +149,24 @@ class CannotBeMadeAgain(Axis):
         super().__init__(config, ports)
 
 
+class BreaksOnTheWay(Axis):
+    """It raises in the middle of a movement; the device is then stopped and closed."""
+
+    after: ClassVar[list[str]] = []
+
+    def step(self, now: float) -> None:
+        if self.at > 0.05:
+            raise RuntimeError("motor is hot")
+        super().step(now)
+
+    def stop(self, now: float) -> None:
+        self.after.append("stop")
+        super().stop(now)
+
+    def close(self) -> None:
+        self.after.append("close")
+
+
 class Deaf(Axis):
     def command(self, now: float, body: Mapping[str, Any]) -> None:
         if not isinstance(body.get("to"), float):
@@ -169,12 +187,14 @@ class Deaf(Axis):
         (Waits, "took longer than the period of 0.01 s, the longest"),
         (StrangeState, "state: expected plain data"),
         (CannotBeMadeAgain, "close and a second driver of the same configuration: OSError: port"),
+        (BreaksOnTheWay, "the driver raised RuntimeError: motor is hot"),
         (Deaf, "{'to': 0.2}: no number of state changes"),
     ],
 )
 def test_each_broken_rule_is_named(kind: type[Axis], fault: str) -> None:
     found = checked(kind).faults
     assert any(fault in one for one in found), found
+    assert kind is not BreaksOnTheWay or BreaksOnTheWay.after[-2:] == ["stop", "close"]
 
 
 class Unplugged(Axis):
