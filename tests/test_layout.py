@@ -29,6 +29,8 @@ ALLOWED: tuple[tuple[str, tuple[str, ...]], ...] = (
         (room, ("services.action", "services.device", "services.comm", "services.host"))
         for room in ("services.vision", "services.motion", "services.mobile")
     ),
+    # What a user writes: an adapter reaches petrobot by its public API alone.
+    ("services.adapters", ()),
     ("services", ("services",)),
     ("sim", ("services.comm", "services.host")),
     ("coordinator.task.compiled", ()),
