@@ -1,5 +1,6 @@
-"""The interpreted net as a pure machine: stimulus in, instructions out. Its semantics stand in
-docs/semantics.md."""
+"""Executes a task's Petri net as a pure state machine: stimulus in, instructions out.
+
+docs/semantics.md defines what it does."""
 
 from petrobot.coordinator.engine.instructions import (
     ORDERS,

@@ -1,5 +1,5 @@
-"""A task compiled for execution: the transitions by index, and which of them must be looked at
-again when a token, a variable or an event changes."""
+"""A task compiled for execution: its transitions by index, and which of them to examine when
+tokens, a variable or an event change."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from petrobot.coordinator.task.net import Net
 from petrobot.coordinator.task.validation import condition_domains, faults
 
 FIRINGS_OF_A_FINITE_NET: Final = 1_000_000
-"""Firings without a stimulus of a net that must come to an end by itself: no laboratory has so many
-tokens; half a minute."""
+"""Most firings without a stimulus of a net that must stop by itself. No laboratory has so many
+tokens; they take half a minute."""
 
 
 @dataclass(frozen=True)
@@ -31,16 +31,16 @@ class Compiled:
     """In net order."""
     action_places: Mapping[str, int]
     primitives: Mapping[str, PrimitiveTask]
-    """By action place; with the deadline that its `timeout` leaves."""
+    """By action place; with the place's `timeout` as deadline where that is shorter."""
     executed: frozenset[str]
-    """Action places of which a condition reads whether the run was executed."""
+    """Action places whose `executed` is read by a condition."""
     copies: Mapping[str, tuple[int, ...]]
     """By written transition: those that were made from it (`expansion`)."""
     setting: Mapping[str, tuple[int, ...]]
     """By variable: transitions that write it. Arguments that read one are taken when the token
     enters."""
     touching: tuple[tuple[int, ...], ...]
-    """By place: transitions that its tokens, runs or room can enable or disable."""
+    """By place: transitions that its tokens, runs or free capacity can enable or disable."""
     timed: tuple[tuple[int, ...], ...]
     """By place: those of `touching` with an `after` timer."""
     reading: Mapping[str, tuple[int, ...]]
@@ -48,14 +48,14 @@ class Compiled:
     waiting: Mapping[str, tuple[int, ...]]
     """By event: transitions that wait for it."""
     kept: frozenset[str]
-    """Latched events that are kept when nothing waits for them."""
+    """Latched events that are kept while no transition waits for them."""
     contested: Mapping[int, frozenset[int]]
-    """By transition: resource, control and plain places of which others of the same rank take
-    tokens too, so that first come, first served may have to settle who gets one."""
+    """By transition: resource, control and plain places from which others of the same rank take
+    tokens, too, so that first come, first served may decide who gets one."""
     devices: Mapping[str, str]
     """By action: the device that it uses."""
     domains: Mapping[str, Domain]
-    """What the names in conditions can be."""
+    """The values that names in conditions can have."""
     free: frozenset[str]
     """Variables that no place or transition writes: only the global memory changes them."""
     firing_limit: int
@@ -63,7 +63,7 @@ class Compiled:
 
 
 def compile_task(task: Task, devices: Mapping[str, str]) -> Compiled:
-    """The compiled form. Raises ValueError with all faults when the description is inconsistent."""
+    """Compile a task. Raises ValueError with all faults of an inconsistent one."""
     found = faults(task)
     if found:
         raise ValueError(
@@ -123,9 +123,9 @@ def _names(t: CompiledTransition) -> frozenset[str]:
 
 
 def _firing_limit(flat: Task, net: Net) -> int:
-    """A net whose firings must come to an end may take its time; one that might go on for ever gets
-    what each of its transitions could do once with every token that it has at the beginning, or
-    that one firing makes."""
+    """Return how many firings without a stimulus are still plausible. For a net that might fire for
+    ever: each transition once with every token of the initial marking and every token that one
+    firing makes."""
     if not endless(flat):
         return FIRINGS_OF_A_FINITE_NET
     tokens = sum(net.initial) + sum(weight for arcs in net.produce for _, weight in arcs)
@@ -133,7 +133,7 @@ def _firing_limit(flat: Task, net: Net) -> int:
 
 
 def _contested(transitions: Sequence[CompiledTransition]) -> dict[int, frozenset[int]]:
-    """Transitions that wait for a pulse or a time do not wait for a token: they are left out."""
+    # A transition that waits for a pulse or a time does not wait for a token: it is left out.
     found: dict[int, set[int]] = {}
     for x, y in permutations(transitions, 2):
         both = {p for p, _ in x.plain} & {p for p, _ in y.plain}

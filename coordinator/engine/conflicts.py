@@ -1,5 +1,5 @@
-"""One maximal step: which of the fireable transitions fire together, and how conflicts among them
-are settled."""
+"""One maximal step: which of the fireable transitions fire together, and how conflicts between them
+are decided."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from petrobot.coordinator.task.wording import Severity
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """A conflict that a draw by weight has to settle."""
+    """A conflict that a draw by weight decides."""
 
     alternatives: tuple[str, ...]
     weights: tuple[float, ...]
@@ -30,12 +30,12 @@ def choose_step(
     *,
     ask: bool = False,
 ) -> list[Match] | Draw:
-    """The transitions that fire together on the marking as it is, in an order in which each can
-    fire after the others.
+    """Return the transitions that fire together in this marking, in an order in which each can fire
+    after those before it.
 
-    `choices` are the outcomes of earlier draws for this same step. With `ask` a conflict that is
-    else settled first come, first served, is drawn too, with the weight 0 for its transitions.
-    Looks at the dirty transitions and forgets them.
+    `choices` are the outcomes of earlier draws for this step. With `ask`, a conflict that is
+    otherwise decided by first come, first served is drawn, too, with weight 0 for its transitions.
+    Examines the dirty transitions and clears their set.
     """
     fireable = [found for x in _marked(draft, pulse, only) if (found := match(draft, x, pulse))]
     draft.dirty.clear()
@@ -45,8 +45,8 @@ def choose_step(
 
 
 def _marked(draft: Draft, pulse: str, only: Sequence[str] | None) -> Iterator[CompiledTransition]:
-    """The dirty transitions that the pulse may serve and whose input places hold enough: a cheap
-    sieve before `match`."""
+    """Yield the dirty transitions that the pulse may fire and whose input places hold enough
+    tokens: a cheap test before `match`."""
     transitions, marking = draft.compiled.transitions, draft.marking
     for t in sorted(draft.dirty):
         x = transitions[t]
@@ -91,8 +91,8 @@ def _settle(
 def _first_come(
     draft: Draft, head: Match, contest: list[Match], rest: list[Match], claims: Claims
 ) -> Match:
-    """Return the one that has lacked only the contested tokens for the longest; at a tie the first
-    in the file, with a report."""
+    """Return the match that has lacked only the contested tokens for the longest time; at a tie the
+    first in the file, with a report."""
     places = draft.compiled.net.places
     over = {places[p] for p, _ in _scarce(draft, rest, claims)}
 
@@ -104,7 +104,7 @@ def _first_come(
     tied = [m for m in contest if since(m) == longest]
     if len(tied) > 1:
         _report(draft, tied)
-    # `head` is the first in the file that bars no other one-sidedly.
+    # `head` is the first in the file that does not block another which would not block it.
     return head if head in tied else tied[0]
 
 
@@ -117,8 +117,8 @@ def _rank_and_place(m: Match) -> tuple[int, bool, int]:
 
 
 def _first(draft: Draft, pulse: str, rest: list[Match], claims: Claims) -> Match:
-    """The first by rank, unless it would bar the way (inhibitor, room) of another that does not bar
-    its own."""
+    """Return the first match by rank, unless it would block (by inhibitor or capacity) another one
+    that does not block it."""
     head, passed = rest[0], set[int]()
     while True:
         passed.add(head.transition.index)
@@ -136,7 +136,7 @@ def _first(draft: Draft, pulse: str, rest: list[Match], claims: Claims) -> Match
 
 
 def _bars(draft: Draft, pulse: str, claims: Claims, first: Match, then: Match) -> bool:
-    """Whether `then` could not fire after `first` with the tokens of this step's marking."""
+    """Return whether `then` could not fire after `first` with the tokens of this marking."""
     taken = claims.copy()
     taken.add(first)
     return match(draft, then.transition, pulse, taken) is None
@@ -145,8 +145,8 @@ def _bars(draft: Draft, pulse: str, claims: Claims, first: Match, then: Match) -
 def _rivals(
     draft: Draft, pulse: str, head: Match, rest: list[Match], claims: Claims
 ) -> list[Match]:
-    """Those that cannot all fire beside `head`: each bars the other, or together they ask for more
-    than there is."""
+    """Return the matches that cannot all fire beside `head`: they block each other, or together
+    they need more tokens than there are."""
     scarce = _scarce(draft, rest, claims) & _demands(head).keys()
     return [
         m
@@ -160,7 +160,7 @@ def _rivals(
 
 
 def _demands(m: Match) -> dict[tuple[int, str], int]:
-    """What a match takes, by (place, which tokens of it)."""
+    """Return how many tokens a match takes, by place and, for action places, by the arc's end."""
     demands = {(p, ""): w for p, w in m.transition.plain}
     demands |= {
         (a.place, a.end.value): a.weight for a in m.transition.actions if a.end is not End.GOING
@@ -169,7 +169,7 @@ def _demands(m: Match) -> dict[tuple[int, str], int]:
 
 
 def _scarce(draft: Draft, rest: list[Match], claims: Claims) -> set[tuple[int, str]]:
-    """The tokens that all of `rest` together ask too many of."""
+    """Return the kinds of tokens (as in `_demands`) of which `rest` together needs too many."""
     asked: dict[tuple[int, str], int] = {}
     there: dict[tuple[int, str], int] = {}
     for m in rest:

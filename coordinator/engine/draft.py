@@ -1,5 +1,5 @@
-"""A state being changed by one stimulus: the working copy, the instructions so far, and what has to
-be looked at again."""
+"""The working copy of a state while one stimulus changes it, with the instructions so far and the
+transitions to examine again."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from petrobot.coordinator.task.wording import Severity
 
 
 class Draft:
-    """The working copy. `freeze` gives the next state; the old one is untouched."""
+    """The working copy. `freeze` gives the next state; the old one does not change."""
 
     def __init__(self, compiled: Compiled, state: State) -> None:
         self.compiled = compiled
@@ -20,7 +20,7 @@ class Draft:
         self.dirty: set[int] = set()
         """Transitions that may have become fireable."""
         self.retime: set[int] = set()
-        """Transitions whose `after` timer may have to be armed or disarmed."""
+        """Timed transitions whose timer may have to be armed or disarmed."""
         self.mode = state.mode
         self.stimuli = state.stimuli + 1
         self.firings = state.firings
@@ -36,21 +36,21 @@ class Draft:
         self.seen = dict(state.seen)
         self.timers = dict(state.timers)
         self.timer_order = state.timer_order
-        self.waits = state.waits  # like `deferred` replaced when it changes
+        # `waits`, `deferred` and `early` may grow long and seldom change: replaced, never changed
+        # in place, so that no stimulus has to copy them.
+        self.waits = state.waits
         self.suspended = state.suspended
         self.backlog = list(state.backlog)
         self.breakpoints = state.breakpoints
         self.overrides = state.overrides
-        self.deferred = (
-            state.deferred
-        )  # like `early` replaced when it changes, which is seldom: it may grow long
+        self.deferred = state.deferred
         self.early = state.early
         self.told: set[str] = set(state.told)
         self.ending = state.ending
         self.closing = state.closing
 
     def freeze(self) -> State:
-        """The next state."""
+        """Return the next state."""
         return State(
             marking=tuple(self.marking),
             variables=self.variables,
@@ -84,58 +84,59 @@ class Draft:
         self.instructions.append(instruction)
 
     def report(self, severity: Severity, key: str, text: str, of: str = "") -> None:
-        """Tell people."""
+        """Add a message for people."""
         self.instructions.append(Report(severity, key, text, of))
 
     def report_once(self, severity: Severity, key: str, text: str, of: str) -> None:
-        """Tell people unless they were told already since `of` last moved."""
+        """Add a message for people, unless `of` was reported and has not changed since."""
         if of not in self.told:
             self.told.add(of)
             self.report(severity, key, text, of)
 
     def touch(self, place: int) -> None:
-        """Tokens, runs or room of the place have changed."""
+        """Note that tokens, runs or free capacity of the place have changed."""
         self.dirty.update(self.compiled.touching[place])
         self.retime.update(self.compiled.timed[place])
 
     def touch_all(self) -> None:
-        """Anything may have changed."""
+        """Note that anything may have changed."""
         self.dirty.update(range(len(self.compiled.transitions)))
         for timed in self.compiled.timed:
             self.retime.update(timed)
 
     def write(self, name: str, value: Value) -> None:
-        """A variable has a new value."""
+        """Give a variable a new value."""
         self.variables[name] = value
         self.dirty.update(self.compiled.reading.get(name, ()))
 
     def snapshot(self) -> Marking:
-        """The marking now."""
+        """Return the marking as it is now."""
         return tuple(self.marking)
 
     def stopping_in(self, place: str) -> int:
-        """How many cancelled runs of the place are not known to have stopped."""
+        """Return how many cancelled runs of the place have not confirmed that they stopped."""
         return sum(r.place == place for r in self.stopping.values()) if self.stopping else 0
 
     def occupied(self, place: int) -> int:
-        """Tokens of the place and its stopping runs: what exclusion and inhibitors count."""
+        """Return the number of tokens and stopping runs of the place, which inhibitor arcs and
+        capacities count."""
         if not self.stopping:
             return self.marking[place]
         return self.marking[place] + self.stopping_in(self.compiled.net.places[place])
 
     def find(self, run_id: str) -> Run | None:
-        """A run with a token, or a stopping one."""
+        """Return a run that has a token or is stopping; None if it is unknown or finished."""
         for run in self.tokens.get(run_id.rpartition("#")[0], ()):
             if run.id == run_id:
                 return run
         return self.stopping.get(run_id)
 
     def live(self) -> list[Run]:
-        """Runs whose end is still to come."""
+        """Return the runs with a token that have not ended."""
         return [r for runs in self.tokens.values() for r in runs if r.phase in LIVE]
 
     def enter(self, place: str, index: int) -> None:
-        """A token enters an action place: a run is born."""
+        """Let a token enter an action place: a new run."""
         number = self.started.get(place, 0) + 1
         self.started[place] = number
         self.run_order += 1
@@ -149,18 +150,18 @@ class Draft:
         self.touch(index)
 
     def leave(self, run: Run) -> None:
-        """A run's token leaves its place."""
+        """Take a run's token out of its place."""
         self.tokens[run.place] = tuple(r for r in self.tokens[run.place] if r.id != run.id)
         self.told.discard(run.id)
 
     def put(self, old: Run, **changes: object) -> Run:
-        """Replace a run by a changed one, wherever it is kept."""
+        """Replace a run by a changed copy, and return that."""
         new = old.changed(**changes)
         self.replace_run(new)
         return new
 
     def replace_run(self, new: Run) -> None:
-        """Put a changed run in the place of the one with its id."""
+        """Replace the run that has the same id."""
         if new.id in self.stopping:
             self.stopping[new.id] = new
         else:

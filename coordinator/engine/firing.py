@@ -1,4 +1,4 @@
-"""Whether a transition can fire, which runs it would take, and its firing."""
+"""The firing rule: whether a transition can fire, which runs it takes, and its firing."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from petrobot.coordinator.task.conditions.regions import can_hold
 from petrobot.coordinator.task.wording import Severity
 
 DEAD_END = "dead_end"
-"""Key of the report that nothing can happen any more although the net is not at an end."""
+"""Key of the report that nothing can happen any more although no final marking is reached."""
 
 
 class Match(NamedTuple):
@@ -27,7 +27,7 @@ class Match(NamedTuple):
 
 
 class Claims:
-    """What the transitions chosen so far for one step have taken and given."""
+    """What the transitions chosen so far for one step take and give."""
 
     __slots__ = ("change", "flags", "raised", "runs", "sets", "used")
 
@@ -40,7 +40,7 @@ class Claims:
         self.sets: set[str] = set()
 
     def copy(self) -> Claims:
-        """An independent copy."""
+        """Return an independent copy."""
         other = Claims()
         other.used, other.change = dict(self.used), dict(self.change)
         other.runs, other.flags, other.raised = set(self.runs), set(self.flags), set(self.raised)
@@ -48,7 +48,7 @@ class Claims:
         return other
 
     def add(self, match: Match) -> None:
-        """Take what the match takes."""
+        """Add what the match takes and gives."""
         x = match.transition
         for p, w in x.plain:
             self.used[p] = self.used.get(p, 0) + w
@@ -70,8 +70,8 @@ _NOTHING = Claims()
 def match(
     draft: Draft, x: CompiledTransition, pulse: str, claims: Claims = _NOTHING
 ) -> Match | None:
-    """How the transition can fire beside what was claimed, with the pulse that has just come; None
-    if it cannot."""
+    """Return how the transition can fire beside what is claimed, with the current pulse; None if it
+    cannot."""
     if (x.pulse and x.pulse != pulse) or x.never or not _marking_allows(draft, x, claims):
         return None
     for f in x.flags:
@@ -94,8 +94,8 @@ def match(
 
 
 def arcs_satisfied(draft: Draft, x: CompiledTransition) -> tuple[Run, ...] | None:
-    """The runs that the transition would take if its events came now; None while its arcs are not
-    satisfied."""
+    """Return the runs that the transition would take if its events occurred now; None if its arcs
+    are not satisfied."""
     if not _marking_allows(draft, x, _NOTHING):
         return None
     eligible = [eligible_runs(draft, arc, _NOTHING, heard=False) for arc in x.actions]
@@ -124,8 +124,8 @@ def awaited_place(draft: Draft, x: CompiledTransition) -> int | None:
 
 
 def token_enabled(draft: Draft, x: CompiledTransition) -> bool:
-    """Whether tokens, inhibitors and room enable the transition in the ordinary sense, whatever its
-    runs do."""
+    """Return whether tokens, inhibitors and capacities enable the transition, whatever the state of
+    its runs."""
     return _marking_allows(draft, x, _NOTHING)
 
 
@@ -220,8 +220,8 @@ def _tokens(place: str, wanted: int, held: int) -> str:
 
 
 def eligible_runs(draft: Draft, arc: ActionArc, claims: Claims, heard: bool = True) -> list[Run]:
-    """Runs that the arc may take, first come first: ended ones by their end, others by their
-    start."""
+    """Return the runs that the arc may take, in the order in which they ended or, for active ones,
+    started. With `heard`, only runs that raised the events of the arc."""
     runs = [r for r in draft.tokens.get(arc.name, ()) if _fits(arc, r) and r.id not in claims.runs]
     if heard and arc.raised:
         runs = [
@@ -235,7 +235,7 @@ def eligible_runs(draft: Draft, arc: ActionArc, claims: Claims, heard: bool = Tr
 
 
 def fire(draft: Draft, fireable: Match, cause: str) -> None:
-    """Fire: tokens move at once, preempted runs are asked to stop, new runs are born."""
+    """Fire: move the tokens, ask preempted runs to stop, and create new runs."""
     x, before, at = fireable.transition, draft.snapshot(), len(draft.instructions)
     for p, w in x.plain:
         draft.marking[p] -= w
@@ -261,8 +261,8 @@ def fire(draft: Draft, fireable: Match, cause: str) -> None:
 
 
 def cancel(draft: Draft, run: Run, counts: Counts, reason: str) -> None:
-    """The run's token is gone: a run that has begun is stopping until it is known to have
-    stopped."""
+    """Take the run's token away. A run that has started counts as stopping until it confirms that
+    it has stopped."""
     draft.leave(run)
     if run.phase not in ACTIVE:
         return
@@ -273,7 +273,7 @@ def cancel(draft: Draft, run: Run, counts: Counts, reason: str) -> None:
 
 
 def disarm(draft: Draft, name: str) -> None:
-    """The timer of a transition is not wanted any more."""
+    """Cancel the timer of a transition."""
     timer = draft.timers.pop(name, None)
     if timer is not None and not timer.elapsed:
         draft.emit(DisarmTimer(timer.key))
@@ -292,8 +292,8 @@ def _take_runs(draft: Draft, fireable: Match) -> Iterator[Run]:
 
 
 def _forget_lost(draft: Draft, fired: CompiledTransition) -> None:
-    """Between taking and giving: timers and latches whose transitions have lost their tokens are
-    forgotten."""
+    """Forget timers and latched events whose transitions have lost their tokens. Called between
+    taking and giving, so that a token which is taken and given back restarts its timer."""
     if draft.timers:
         disarm(draft, fired.name)
         for name in list(draft.timers):
@@ -307,15 +307,15 @@ def _forget_lost(draft: Draft, fired: CompiledTransition) -> None:
 
 
 def forget_flags(draft: Draft) -> None:
-    """Drop latched events that nothing waits for any more, unless they are declared `early =
-    "keep"`."""
+    """Drop latched events for which no transition waits any more, unless they are declared
+    `early = "keep"`."""
     for flag in tuple(draft.flags):
         if flag not in draft.compiled.kept and not awaited(draft, flag):
             draft.flags.discard(flag)
 
 
 def awaited(draft: Draft, event: str) -> bool:
-    """Whether tokens enable a transition that waits for the event."""
+    """Return whether tokens enable a transition that waits for the event."""
     compiled = draft.compiled.transitions
     return any(token_enabled(draft, compiled[t]) for t in draft.compiled.waiting.get(event, ()))
 
@@ -325,7 +325,7 @@ def _marking_allows(draft: Draft, x: CompiledTransition, claims: Claims) -> bool
     for p, w in x.needs:
         if marking[p] - used.get(p, 0) < w:
             return False
-    # A bar looks at all that occupies the place, also at runs that have not stopped yet.
+    # A bar counts runs that have not stopped yet, too: they still occupy the place.
     return all(draft.occupied(p) + claims.change.get(p, 0) < k for p, k in x.bars)
 
 
@@ -340,8 +340,8 @@ def _fits(arc: ActionArc, run: Run) -> bool:
 def _selections(
     x: CompiledTransition, eligible: list[list[Run]]
 ) -> Iterator[tuple[tuple[Run, ...], ...]]:
-    """Which runs to take: the first ones, or every choice where the condition depends on the
-    run."""
+    """Yield the runs to try: the first ones or, if the condition depends on the run, every
+    window."""
     if not x.judges_runs:
         yield tuple(
             [tuple(runs[: arc.weight]) for arc, runs in zip(x.actions, eligible, strict=True)]
@@ -383,7 +383,7 @@ def _condition_can_hold(
 
 
 def verdict_variables(run: Run) -> dict[str, Value]:
-    """The variables that tell how a run of its place ended."""
+    """Return the variables that tell how a run of its place ended."""
     status = None if run.status is None else run.status.value
     verdict: dict[str, Value] = {
         f"{run.place}.status": status,

@@ -1,4 +1,4 @@
-"""Instructions: what the engine asks of the world, and what it records of itself."""
+"""Instructions: orders of the engine to its surroundings, and records of what it did."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from petrobot.coordinator.task.wording import Severity as Severity
 
 @dataclass(frozen=True, slots=True)
 class StartRun:
-    """Start an action. Sent once for each run, when its action is chosen and its device free."""
+    """Start an action. Sent once for each run, when its action is chosen and its device is free."""
 
     run: str
     place: str
@@ -21,31 +21,31 @@ class StartRun:
     action: str
     arguments: Mapping[str, Value]
     deadline: float
-    """Seconds that the run may take."""
+    """Longest duration of the run (s)."""
 
 
 @dataclass(frozen=True, slots=True)
 class CancelRun:
-    """Stop a run; to be answered by `StopConfirmed`, `StopFailed` or, when it ended by itself
-    meanwhile, `RunEnded`."""
+    """Stop a run. The answer is `StopConfirmed`, `StopFailed` or, if it ended by itself meanwhile,
+    `RunEnded`."""
 
     run: str
     counts: Counts
     reason: str
     within: float
-    """Seconds until the device's stop routine and the end of its worker are due."""
+    """Time in which the device must have stopped (s); after that its worker is killed."""
 
 
 @dataclass(frozen=True, slots=True)
 class HoldRun:
-    """The operator pauses: the run is asked to hold; to be answered by `RunHeld`."""
+    """The operator pauses: ask the run to hold. The answer is `RunHeld`."""
 
     run: str
 
 
 @dataclass(frozen=True, slots=True)
 class ReleaseRun:
-    """The run goes on after a pause."""
+    """Let the run continue after a pause."""
 
     run: str
 
@@ -59,11 +59,11 @@ class Subject(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Choose:
-    """Choose one of the alternatives; to be answered by `Chosen` with the same key.
+    """Choose one of the alternatives. The answer is `Chosen` with the same key.
 
-    For an action, `of` is the primitive task and the key is the run's id: a selector decides. For a
-    conflict, `of` are the transitions' names and the answer is drawn by the weights from a
-    generator keyed by (seed, key).
+    For an action, `of` is the primitive task, the key is the run's id, and a selector chooses. For
+    a conflict, `of` names the transitions, and the answer is drawn by the weights with a generator
+    seeded by (seed, key).
     """
 
     key: str
@@ -75,7 +75,7 @@ class Choose:
 
 @dataclass(frozen=True, slots=True)
 class ArmTimer:
-    """Send `TimerFired` with this key after so many seconds."""
+    """Send `TimerFired` with this key after `seconds`."""
 
     key: str
     transition: str
@@ -84,29 +84,29 @@ class ArmTimer:
 
 @dataclass(frozen=True, slots=True)
 class DisarmTimer:
-    """The timer is not wanted any more."""
+    """Cancel the timer."""
 
     key: str
 
 
 @dataclass(frozen=True, slots=True)
 class HoldTimer:
-    """Stop the timer; what is left of it is kept."""
+    """Stop the timer and keep its remaining time."""
 
     key: str
 
 
 @dataclass(frozen=True, slots=True)
 class ReleaseTimer:
-    """The timer goes on with what is left."""
+    """Let the timer continue with its remaining time."""
 
     key: str
 
 
 @dataclass(frozen=True, slots=True)
 class Fired:
-    """Record: a transition fired. `cause` is the kind of stimulus (or `stability`: it needed
-    nothing more)."""
+    """Record: a transition fired. `cause` is the kind of stimulus, or `stability` if an earlier
+    firing made it fireable."""
 
     number: int
     transition: str
@@ -114,13 +114,13 @@ class Fired:
     after: Marking
     cause: str
     runs: tuple[str, ...] = ()
-    """Runs whose tokens it took."""
+    """The runs whose tokens it took."""
 
 
 @dataclass(frozen=True, slots=True)
 class Marked:
-    """Record: the operator changed the tokens of a control place, or the mission run began at
-    another marking (no `place`)."""
+    """Record: the operator changed the tokens of a control place, or, without `place`, the mission
+    run began at another marking."""
 
     place: str
     before: Marking
@@ -129,8 +129,8 @@ class Marked:
 
 @dataclass(frozen=True, slots=True)
 class RunRecorded:
-    """Record for the estimates: how a run that began ended. Status None is a censored run: it only
-    lasted so long."""
+    """Record for the estimates: how a run ended. Status None means censored: only its duration
+    counts."""
 
     run: str
     place: str
@@ -147,8 +147,7 @@ class RunRecorded:
 
 @dataclass(frozen=True, slots=True)
 class Corrected:
-    """Record for the estimates: a deferred verdict replaces the status of a run that was recorded
-    before."""
+    """Record for the estimates: a deferred verdict replaces the recorded status of a run."""
 
     run: str
     place: str
@@ -161,8 +160,7 @@ class Corrected:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Something that people should know. `key` is a fixed word for programs, `of` the element that
-    it is about."""
+    """A message for people. `key` is a fixed word for programs, `of` the element concerned."""
 
     severity: Severity
     key: str
@@ -172,22 +170,22 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Paused:
-    """Record: nothing fires from now on, and why."""
+    """Record: the net is paused, and why."""
 
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class Resumed:
-    """Record: the net goes on; `steps` is 1 for a single firing, 0 for no limit."""
+    """Record: the net continues; `steps` is 1 for a single firing, 0 for no limit."""
 
     steps: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """Record: the mission run is over. SUCCESS: `final` was reached. ERROR: given up, dead, or
-    aborted."""
+    """Record: the mission run has finished. SUCCESS: `final` was reached. ERROR: `final_error` was
+    reached, or it is dead or aborted."""
 
     status: Status
     reason: str
@@ -225,4 +223,4 @@ ORDERS = (
     HoldTimer,
     ReleaseTimer,
 )
-"""The instructions that someone has to carry out; all others are records."""
+"""The instructions that must be carried out; all others are records."""

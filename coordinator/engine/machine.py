@@ -1,4 +1,4 @@
-"""The engine: a task as a pure machine that takes stimuli in and gives instructions out."""
+"""The engine: a task as a pure state machine, from stimuli to instructions."""
 
 from __future__ import annotations
 
@@ -54,15 +54,12 @@ from petrobot.coordinator.engine.timers import elapse, hold_timers_of
 from petrobot.coordinator.task import Counts, EventMemory, Scope, Task, VariableType
 from petrobot.coordinator.task.wording import Severity
 
-# Where a mission run sets out that does not begin at the initial marking: tokens, runs that are
-# over, variables, latches.
 
+def start_at(draft: Draft, point: Point) -> None:
+    """Set the tokens, runs, variables and latched events of the point. Names that the task does not
+    have are reported.
 
-def set_out(draft: Draft, point: Point) -> None:
-    """Stand at the point: its tokens, its ended runs, its variables and latched events. What the
-    task does not know is reported.
-
-    Action places hold as many tokens as runs stand there, whatever the marking says, so that both
+    An action place gets one token for each of its runs, whatever the marking says, so that the two
     always agree.
     """
     net, before = draft.compiled.net, draft.snapshot()
@@ -121,16 +118,16 @@ _BEFORE_THE_BEGIN = (Begin, SetBreakpoints, Override)
 
 
 class Engine:
-    """A task compiled for execution. Immutable: all that changes is in the `State`.
+    """A task compiled for execution. It never changes; all that changes is in the `State`.
 
-    `devices` names the device of each action that uses one. Two runs never have one device at once;
-    an action of a primitive task with `start = "at_once"` is excepted.
+    `devices` names the device of each action that uses one. Two runs never use one device at the
+    same time, except for actions of a primitive task with `start = "at_once"`.
     """
 
     def __init__(
         self, task: Task, devices: Mapping[str, str] | None = None, policy: Policy | None = None
     ) -> None:
-        """Compile. Raises ValueError with every fault of an inconsistent task."""
+        """Compile the task. Raises ValueError with every fault of an inconsistent one."""
         self.task = task
         self.policy = policy or Policy()
         self.compiled = compile_task(task, devices or {})
@@ -160,12 +157,12 @@ class Engine:
         }
 
     def initial(self) -> State:
-        """The state before `Begin`."""
+        """Return the state before `Begin`."""
         return State(self.compiled.net.initial, self.compiled.task.initial_variables())
 
     def handle(self, state: State, stimulus: Stimulus) -> tuple[State, tuple[Instruction, ...]]:
-        """The next state and what is to be done. Pure; a stimulus that makes no sense is reported
-        and changes nothing."""
+        """Return the next state and what to do. Pure. A stimulus that does not fit the state is
+        reported and changes nothing."""
         draft = Draft(self.compiled, state)
         self._take(draft, stimulus)
         while draft.backlog and not _waits_for_draw(draft):
@@ -173,13 +170,13 @@ class Engine:
         return draft.freeze(), tuple(draft.instructions)
 
     def awaits(self, state: State, event: str) -> bool:
-        """Whether tokens enable a transition that waits for the event: any other pulse would change
-        nothing."""
+        """Return whether tokens enable a transition that waits for the event; if not, a pulse of it
+        changes nothing."""
         return awaited(Draft(self.compiled, state), event)
 
     def outstanding(self, state: State) -> tuple[Instruction, ...]:
-        """The orders that are still in force, for whoever takes over a state: choices, runs,
-        cancels, holds, timers."""
+        """Return the orders that are still in force, for a coordinator that takes over a state:
+        choices, runs, cancels, holds, timers."""
         draft = Draft(self.compiled, state)
         for run in [r for rs in state.tokens.values() for r in rs] + list(state.stopping.values()):
             self._order_again(draft, run)
@@ -206,9 +203,8 @@ class Engine:
             draft.emit(
                 StartRun(run.id, run.place, primitive.name, run.action, run.arguments, deadline)
             )
-            if (
-                draft.mode is Mode.PAUSED
-            ):  # whether or not its node had answered: it may have been released since
+            # Also if the node had answered: a run that lost its coordinator may have been released.
+            if draft.mode is Mode.PAUSED:
                 draft.emit(HoldRun(run.id))
         elif run.phase in (Phase.STOPPING, Phase.STUCK):
             draft.emit(
@@ -239,7 +235,7 @@ class Engine:
         draft.mode = Mode.RUNNING
         task = self.compiled.task
         if stimulus.point is not None:
-            set_out(draft, stimulus.point)
+            start_at(draft, stimulus.point)
         for name, value in stimulus.parameters.items():
             if name not in task.parameters or not VariableType.of(task.parameters[name]).admits(
                 value
@@ -424,7 +420,7 @@ def _waits_for_draw(draft: Draft) -> bool:
 
 
 def _write(draft: Draft, name: str, value: Any) -> bool:
-    """Write a watched variable; a value of another type is reported and leaves none."""
+    """Write a watched variable. A value of another type is reported, and the variable is none."""
     variable = draft.compiled.task.variables.get(name)
     if variable is None:
         _note(draft, "unknown_variable", f"{name!r} is no variable of the task; ignored", name)

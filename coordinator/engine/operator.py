@@ -1,5 +1,4 @@
-"""The operator's hand on the net: tokens in control places, forced exits, pause, step and
-breakpoints as stimuli."""
+"""Stimuli of the operator: tokens in control places, forced exits, pause, step, breakpoints."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ from petrobot.coordinator.task.wording import Severity, nearest
 
 
 def add_tokens(draft: Draft, policy: Policy, command: AddTokens) -> None:
-    """Tokens enter a control place, as far as its capacity allows."""
+    """Put tokens into a control place, if its capacity allows all of them."""
     p = _control_place(draft, command.place, command.tokens)
     if p is None:
         return
@@ -39,7 +38,7 @@ def add_tokens(draft: Draft, policy: Policy, command: AddTokens) -> None:
 
 
 def remove_tokens(draft: Draft, policy: Policy, command: RemoveTokens) -> None:
-    """Tokens leave a control place, as far as there are some."""
+    """Take tokens out of a control place, if it has so many."""
     p = _control_place(draft, command.place, command.tokens)
     if p is None:
         return
@@ -60,8 +59,8 @@ def set_breakpoints(draft: Draft, command: SetBreakpoints) -> None:
 
 
 def override(draft: Draft, command: Override) -> None:
-    """Fix the alternative of a primitive task, or free it; whoever answers a `Choose` looks here
-    first."""
+    """Fix the alternative of a primitive task, or free the choice. It takes precedence over the
+    selector."""
     name, action = command.primitive_task, command.action
     primitives = draft.compiled.task.primitive_tasks
     if name not in primitives:
@@ -97,7 +96,7 @@ def go_on(draft: Draft, policy: Policy) -> None:
 
 
 def single_step(draft: Draft, policy: Policy) -> None:
-    """One firing: at once if something can fire, else held runs go on until something can."""
+    """Let one transition fire. If none can fire now, held runs continue until one can."""
     if draft.mode not in (Mode.PAUSED, Mode.RUNNING, Mode.STEPPING):
         refuse(draft, f"no step: the mission run is {draft.mode}", "")
         return
@@ -109,8 +108,8 @@ def single_step(draft: Draft, policy: Policy) -> None:
 
 
 def force_exit(draft: Draft, policy: Policy, command: ForceExit) -> None:
-    """Fire a transition whatever its runs do, its events, time and condition; runs that go on count
-    none."""
+    """Fire a transition whatever the state of its runs, its events, time and condition. Active runs
+    do not count."""
     index = draft.compiled.net.transition_index.get(command.transition)
     if index is None:
         known = draft.compiled.net.transitions
@@ -139,7 +138,7 @@ def force_exit(draft: Draft, policy: Policy, command: ForceExit) -> None:
 
 
 def _forced(draft: Draft, index: int) -> Match | None:
-    """The runs that the transition would take by force; None if tokens do not allow it."""
+    """Return the runs that a forced firing takes; None if tokens do not allow it."""
     x = draft.compiled.transitions[index]
     runs = tuple(tuple(_forced_runs(draft, a.name, a.end)[: a.weight]) for a in x.actions)
     enough = all(len(taken) == a.weight for taken, a in zip(runs, x.actions, strict=True))
@@ -147,7 +146,7 @@ def _forced(draft: Draft, index: int) -> Match | None:
 
 
 def refuse(draft: Draft, text: str, of: str) -> None:
-    """A command that cannot be carried out changes nothing."""
+    """Report a command that cannot be carried out; it changes nothing."""
     draft.report(Severity.WARNING, "refused", text, of)
 
 
@@ -173,7 +172,7 @@ def _mark(draft: Draft, place: int, tokens: int) -> None:
 
 
 def _forced_runs(draft: Draft, place: str, end: End) -> list[Run]:
-    """Runs whose token a forced exit takes: ended ones first, then by age."""
+    """Return the runs whose tokens a forced firing takes: ended ones first, then by age."""
     runs = draft.tokens.get(place, ())
     if end is End.GOING:
         return [r for r in runs if r.phase in LIVE]
@@ -181,7 +180,7 @@ def _forced_runs(draft: Draft, place: str, end: End) -> list[Run]:
 
 
 def _others_allow(draft: Draft, index: int) -> bool:
-    """Whether plain inputs, inhibitors and room allow the forced exit."""
+    """Return whether plain inputs, inhibitors and capacities allow the forced firing."""
     x = draft.compiled.transitions[index]
     return arcs_satisfied(draft, replace(x, actions=(), needs=x.plain)) is not None
 

@@ -1,4 +1,4 @@
-"""Runs from the queue to their end: servers, choice of action, device fences, results, verdicts."""
+"""A run from the queue to its end: servers, choice of action, device fences, results, verdicts."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from petrobot.coordinator.task.wording import Severity
 
 
 def admit(draft: Draft) -> bool:
-    """Bring waiting runs as far as they can go, first come first served; True if one of them ended
-    in ERROR at once."""
+    """Advance waiting runs as far as possible, the oldest first. Return whether one of them ended in
+    ERROR at once."""
     waiting = [r for runs in draft.tokens.values() for r in runs if r.phase in UNSTARTED]
     if not waiting:
         return False
@@ -41,20 +41,19 @@ def admit(draft: Draft) -> bool:
 
 
 def chosen(draft: Draft, run: Run, action: str) -> None:
-    """The action of a run is known; it waits for its device from now on."""
+    """Note the action that was chosen for a run, which now waits for its device."""
     draft.replace_run(_translated(draft, run, action))
 
 
 def _translated(draft: Draft, run: Run, action: str) -> Run:
-    """The run with its action, before it has its device."""
+    """Return the run with its action, waiting for its device."""
     at_once = draft.compiled.primitives[run.place].start is Start.AT_ONCE
     device = draft.compiled.devices.get(action, "")
     return run.changed(phase=Phase.WAITING, action=action, device=device, at_once=at_once)
 
 
 def end_run(draft: Draft, run: Run, end: RunEnded) -> None:
-    """A run that went on is done: what it wrote and why it ended are known before anything
-    fires."""
+    """End an active run. Its results and its status are written before any transition fires."""
     draft.end_order += 1
     done = draft.put(
         run,
@@ -81,8 +80,8 @@ def end_run(draft: Draft, run: Run, end: RunEnded) -> None:
 
 
 def end_stopping(draft: Draft, run: Run, end: RunEnded) -> None:
-    """A result that came after the cancel: recorded, moves nothing, its writes are dropped; the run
-    has stopped."""
+    """Take a result that arrived after the cancel: the run has stopped. The result is recorded, but
+    writes no variable and moves no token."""
     _forget(draft, run)
     counted = run.counts or Counts.NONE
     status = (
@@ -93,7 +92,7 @@ def end_stopping(draft: Draft, run: Run, end: RunEnded) -> None:
 
 
 def confirm_stop(draft: Draft, run: Run, stop: StopConfirmed) -> None:
-    """A cancelled run has stopped: its device is free."""
+    """Note that a cancelled run has stopped: its device is free."""
     _forget(draft, run)
     counted = run.counts or Counts.NONE
     status = (
@@ -106,8 +105,8 @@ def confirm_stop(draft: Draft, run: Run, stop: StopConfirmed) -> None:
 
 
 def fail_stop(draft: Draft, run: Run, stop: StopFailed) -> None:
-    """A cancelled run could not be stopped: its device stays fenced, and runs that wait for it end
-    in ERROR."""
+    """Note that a cancelled run could not be stopped: its device stays fenced, and runs that wait
+    for it end in ERROR."""
     draft.put(run, phase=Phase.STUCK)
     text = f"{run.id} could not be stopped{': ' + stop.text if stop.text else ''}"
     draft.report(
@@ -119,8 +118,8 @@ def fail_stop(draft: Draft, run: Run, stop: StopFailed) -> None:
 
 
 def correct(draft: Draft, verdict: Verdict) -> None:
-    """A deferred verdict: once, and for the estimates alone. It may come from another node, and
-    overtake the run's end."""
+    """Take a deferred verdict, once, for the estimates only. It may come from another node and
+    arrive before the run's end."""
     known = draft.deferred.get(verdict.run)
     if known is not None:
         draft.deferred = {run: open_ for run, open_ in draft.deferred.items() if run != verdict.run}
@@ -147,7 +146,7 @@ def _forget(draft: Draft, run: Run) -> None:
 
 
 def _take_early(draft: Draft, run: Run) -> Early | None:
-    """The verdict that overtook the run's end, which has come now."""
+    """Remove and return the verdict that arrived before the run's end."""
     early = draft.early.get(run.id)
     if early is not None:
         draft.early = {known: one for known, one in draft.early.items() if known != run.id}
@@ -191,11 +190,11 @@ def _write_results(draft: Draft, run: Run, end: RunEnded) -> None:
 
 
 def _has_server(draft: Draft, place: str) -> bool:
-    going = sum(
+    served = sum(
         r.phase in ACTIVE or r.phase in (Phase.CHOOSING, Phase.WAITING) for r in draft.tokens[place]
     )
-    going += sum(r.place == place and r.phase is Phase.STOPPING for r in draft.stopping.values())
-    return going < (draft.compiled.task.places[place].servers or 1)
+    served += sum(r.place == place and r.phase is Phase.STOPPING for r in draft.stopping.values())
+    return served < (draft.compiled.task.places[place].servers or 1)
 
 
 def _choose(draft: Draft, run: Run, alternatives: tuple[str, ...]) -> None:
@@ -206,8 +205,8 @@ def _choose(draft: Draft, run: Run, alternatives: tuple[str, ...]) -> None:
 
 
 def _start(draft: Draft, run: Run) -> bool:
-    """Start the run if its device is free; True if the runtime ended it because the device is
-    fenced for good."""
+    """Start the run if its device is free. Return whether it ended instead, since the device stays
+    fenced."""
     holders = [] if run.at_once or not run.device else _holders(draft, run)
     if holders:
         draft.replace_run(run)
@@ -230,10 +229,10 @@ def _start(draft: Draft, run: Run) -> bool:
 
 
 def _holders(draft: Draft, run: Run) -> list[Run]:
-    """Other runs that have the run's device."""
-    going = [r for runs in draft.tokens.values() for r in runs if r.phase in ACTIVE]
+    """Return the other runs that use the run's device."""
+    active = [r for runs in draft.tokens.values() for r in runs if r.phase in ACTIVE]
     return [
-        r for r in (*going, *draft.stopping.values()) if r.device == run.device and r.id != run.id
+        r for r in (*active, *draft.stopping.values()) if r.device == run.device and r.id != run.id
     ]
 
 

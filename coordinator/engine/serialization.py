@@ -24,32 +24,32 @@ _KINDS: Mapping[str, type] = {c.__name__: c for c in (*get_args(Stimulus), *get_
 
 
 def to_plain(record: State | Stimulus | Instruction | Point) -> dict[str, Any]:
-    """The record as plain data."""
+    """Return the record as plain data."""
     plain: dict[str, Any] = _plain(record)
     return plain
 
 
 def state_from_plain(data: Mapping[str, Any]) -> State:
-    """The state that `to_plain` described. Raises ValueError naming the first field that does not
-    fit."""
+    """Return the state that `to_plain` described. Raises ValueError with the first field that does
+    not fit."""
     state: State = _reader(State)(data, "state")
     return state
 
 
 def stimulus_from_plain(data: Mapping[str, Any]) -> Stimulus:
-    """The stimulus that `to_plain` described. Raises ValueError."""
+    """Return the stimulus that `to_plain` described. Raises ValueError."""
     stimulus: Stimulus = _tagged(Stimulus, data)
     return stimulus
 
 
 def point_from_plain(data: Mapping[str, Any]) -> Point:
-    """The point that `to_plain` described. Raises ValueError."""
+    """Return the point that `to_plain` described. Raises ValueError."""
     point: Point = _reader(Point)(data, "point")
     return point
 
 
 def instruction_from_plain(data: Mapping[str, Any]) -> Instruction:
-    """The instruction that `to_plain` described. Raises ValueError."""
+    """Return the instruction that `to_plain` described. Raises ValueError."""
     instruction: Instruction = _tagged(Instruction, data)
     return instruction
 
@@ -92,7 +92,7 @@ def _tagged(union: Any, data: Any) -> Any:
 
 @cache
 def _reader(hint: Any) -> Reader:
-    """How a value with this annotation is read."""
+    """Return a function that reads a value with this annotation."""
     if hint is Any:
         return lambda value, where: value
     if get_origin(hint) in (Union, types.UnionType):

@@ -1,5 +1,5 @@
-"""The engine's state: marking, runs, latches, variables, timers. A value: never changed, only
-replaced."""
+"""The engine's state: marking, runs, latched events, variables, timers. It is immutable: each
+stimulus gives a new one."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from petrobot.coordinator.task.net import Marking
 
 
 class Mode(StrEnum):
-    """What the engine does with stimuli."""
+    """How the engine treats stimuli."""
 
     FRESH = "fresh"
     """Waits for `Begin`."""
     RUNNING = "running"
     PAUSED = "paused"
-    """Takes stimuli in; nothing fires, nothing starts."""
+    """Stimuli are handled, but nothing fires and nothing starts."""
     STEPPING = "stepping"
     """Runs until one transition has fired."""
     ABORTING = "aborting"
@@ -30,22 +30,22 @@ class Mode(StrEnum):
 
 
 class Phase(StrEnum):
-    """Where a run stands."""
+    """Stage of a run."""
 
     QUEUED = "queued"
-    """Its token waits for a server (or for the operator to go on)."""
+    """Its token waits for a server, or for the operator to resume."""
     CHOOSING = "choosing"
     """Its action is being chosen."""
     WAITING = "waiting"
-    """Its action is known, its device is not free."""
+    """Its action is known; its device is not free yet."""
     STARTING = "starting"
     RUNNING = "running"
     HELD = "held"
     DONE = "done"
     STOPPING = "stopping"
-    """Cancelled; its token is gone, its device not free yet."""
+    """Cancelled: its token is gone, but its device is not free yet."""
     STUCK = "stuck"
-    """Could not be stopped: its device stays fenced."""
+    """Could not be stopped, so its device stays fenced."""
 
 
 UNSTARTED = frozenset({Phase.QUEUED, Phase.CHOOSING, Phase.WAITING})
@@ -61,31 +61,31 @@ class Run:
     id: str
     place: str
     order: int
-    """Counts up over all runs: first come, first served."""
+    """Number of this run among all runs; the lowest is served first."""
     phase: Phase = Phase.QUEUED
     cleared: bool = True
-    """May start; False while the operator holds the net."""
+    """Whether it may start; False while the net is paused."""
     action: str = ""
     arguments: Mapping[str, Value] = field(default_factory=dict)
-    """What it was started with."""
+    """The arguments with which it was started."""
     device: str = ""
     at_once: bool = False
     status: Status | None = None
     cause: str = ""
     executed: Executed | None = None
-    """Whether it touched the world; kept only where a condition reads it."""
+    """Whether it acted on the world; kept only where a condition reads it."""
     ended: int = 0
-    """Counts up over all ends: first done, first taken."""
+    """Number of its end among all ends; the lowest is taken first."""
     raised: frozenset[str] = frozenset()
-    """Internal events that it raised and no firing has consumed."""
+    """Internal events that it raised and that no firing has consumed."""
     counts: Counts | None = None
     """How it counts after its cancellation."""
     reason: str = ""
     """Why it was cancelled."""
 
     def changed(self, **changes: object) -> Run:
-        """A copy with some fields changed. Like `dataclasses.replace`, at a fraction of its time:
-        it is the hot path."""
+        """Return a copy with some fields changed."""
+        # The hot path: `dataclasses.replace` takes several times as long.
         copy = object.__new__(Run)
         copy.__dict__.update(self.__dict__)
         copy.__dict__.update(changes)
@@ -98,17 +98,17 @@ class Timer:
 
     key: str
     runs: tuple[str, ...]
-    """Runs that the transition would take: with another set the timer starts anew."""
+    """Runs that the transition would take; if they change, the timer restarts."""
     elapsed: bool = False
     held: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Suspended:
-    """A step that waits for a draw, a breakpoint or the operator's next step, with the pulse that
-    made it fireable."""
+    """A step that waits for a draw, for a breakpoint or for the operator's next step."""
 
     pulse: str
+    """The event without memory that made it fireable; empty if there was none."""
     cause: str
     choices: tuple[str, ...] = ()
     """Transitions drawn so far in this step."""
@@ -119,21 +119,21 @@ class Suspended:
     passed: tuple[str, ...] = ()
     """Transitions whose breakpoint has been reported."""
     only: tuple[str, ...] | None = None
-    """If not None, the pulse serves only these transitions any more."""
+    """If not None, the pulse can fire only these transitions."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """A transition that lacks nothing but tokens of one place that others take too."""
+    """A transition that lacks only tokens of one place from which others take tokens, too."""
 
     place: str
     since: int
-    """Number of the stimulus since which that is so: first come, first served."""
+    """Number of the stimulus at which this began; the earliest is served first."""
 
 
 @dataclass(frozen=True, slots=True)
 class Deferred:
-    """A run whose verdict is still to come."""
+    """A run that ended provisionally and has no verdict yet."""
 
     place: str
     action: str
@@ -143,7 +143,7 @@ class Deferred:
 
 @dataclass(frozen=True, slots=True)
 class Early:
-    """A verdict that overtook the end of its run."""
+    """A verdict that arrived before the end of its run."""
 
     status: Status
     cause: str = ""
@@ -152,57 +152,58 @@ class Early:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """Everything that the next stimulus can depend on. Its mappings are never changed in place."""
+    """All that the effect of the next stimulus depends on. Its mappings are never changed in
+    place."""
 
     marking: Marking
     variables: Mapping[str, Value]
     mode: Mode = Mode.FRESH
     stimuli: int = 0
-    """How many have been handled."""
+    """Number of stimuli handled so far."""
     firings: int = 0
     timeless: int = 0
     """Firings since time last passed."""
     tokens: Mapping[str, tuple[Run, ...]] = field(default_factory=dict)
-    """By action place: the runs whose tokens are there, in the order in which they came."""
+    """By action place: the runs whose tokens are there, in order of arrival."""
     stopping: Mapping[str, Run] = field(default_factory=dict)
     """Cancelled runs not yet known to have stopped, by id."""
     started: Mapping[str, int] = field(default_factory=dict)
-    """By action place: how many runs it has had."""
+    """By action place: number of runs so far."""
     run_order: int = 0
     end_order: int = 0
     flags: frozenset[str] = frozenset()
-    """Latched external events that have come and wait."""
+    """Latched external events that no firing has consumed."""
     seen: Mapping[str, int] = field(default_factory=dict)
-    """By source: number of the newest event taken."""
+    """By source: number of the newest event that was accepted."""
     timers: Mapping[str, Timer] = field(default_factory=dict)
     """By transition."""
     timer_order: int = 0
     waits: Mapping[str, Wait] = field(default_factory=dict)
-    """By transition; only of transitions that may compete (`Compiled.contested`)."""
+    """By transition; only those that may compete for a token (`Compiled.contested`)."""
     suspended: Suspended | None = None
     backlog: tuple[Stimulus, ...] = ()
-    """Stimuli that came while a draw was outstanding."""
+    """Stimuli that arrived while a draw was outstanding."""
     breakpoints: frozenset[str] = frozenset()
     overrides: Mapping[str, str] = field(default_factory=dict)
     """By primitive task: the alternative that the operator has fixed."""
     deferred: Mapping[str, Deferred] = field(default_factory=dict)
-    """Runs that ended provisionally and were not judged yet."""
+    """By id: runs that ended provisionally and have no verdict yet."""
     early: Mapping[str, Early] = field(default_factory=dict)
-    """Verdicts on runs whose ends are still to come."""
+    """By id: verdicts on runs that are still active."""
     told: frozenset[str] = frozenset()
-    """Elements of standing reports that were made already."""
+    """Elements that have been reported and have not changed since."""
     ending: str = ""
     """Why the mission run was aborted or has finished."""
     closing: Status | None = None
     """How the mission run ends once the runs that only listened have stopped."""
 
     def runs(self) -> Iterator[Run]:
-        """All runs with a token, by place."""
+        """Yield the runs that have a token, by place."""
         for runs in self.tokens.values():
             yield from runs
 
     def run(self, run_id: str) -> Run | None:
-        """A run with a token or a stopping one; None if it is unknown or over."""
+        """Return a run that has a token or is stopping; None if it is unknown or finished."""
         place = run_id.rpartition("#")[0]
         for run in self.tokens.get(place, ()):
             if run.id == run_id:

@@ -1,4 +1,4 @@
-"""From a stimulus to a stable marking: maximal steps, breakpoints, admission of runs, and the end
+"""Fire from a stimulus to a stable marking: maximal steps, breakpoints, start of runs, and the end
 of the mission run."""
 
 from __future__ import annotations
@@ -48,24 +48,24 @@ MOVING = frozenset({Mode.RUNNING, Mode.STEPPING})
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """How the engine treats tasks that do not behave."""
+    """How the engine treats conflicts, dead ends and endless firings."""
 
     firing_limit: int | None = None
-    """Firings without time after which it pauses, as `RECORDED` runs did; None: end in ERROR after
-    `Compiled.firing_limit`."""
+    """Firings without a stimulus after which the engine pauses, as in `RECORDED` runs; None: after
+    `Compiled.firing_limit` of them the mission run ends in ERROR."""
     end_when_dead: bool = True
-    """End in ERROR when nothing can ever happen again; else only report it and leave it to the
-    operator."""
+    """End in ERROR when nothing can ever happen again; otherwise only report it, and leave the rest
+    to the operator."""
     report_dead_ends: bool = True
-    """Report every state from which neither a firing nor an end can be reached; journals with
-    `semantics` 2 in their header were recorded without that."""
+    """Report every state from which neither a firing nor an end can be reached. Journals with
+    `semantics` 1 or 2 in their header were recorded without that."""
     first_come: bool = True
-    """Settle a conflict over a token that neither priority nor weight settles first come, first
-    served; journals with `semantics` 3 or less in their header were recorded with the order in the
-    file alone."""
+    """Decide a conflict that neither priority nor weight decides by first come, first served.
+    Journals with `semantics` 3 or less in their header were recorded with the order in the file
+    instead."""
     ask_undecided: bool = False
-    """Ask with `Choose` for each conflict that neither priority nor weight settles. The analysis
-    does so to learn whether a verdict depends on it."""
+    """Ask with `Choose` for each conflict that neither priority nor weight decides. The analysis
+    uses this to see whether a verdict depends on the answer."""
 
 
 RECORDED: Final[Mapping[int, Policy]] = {
@@ -73,14 +73,14 @@ RECORDED: Final[Mapping[int, Policy]] = {
     2: Policy(report_dead_ends=False, first_come=False),
     3: Policy(first_come=False),
 }
-"""How the engine treated the runs of older journals, by the `semantics` of their header."""
+"""The engine's policy in older journals, by the `semantics` of their header."""
 
 
 def settle(
     draft: Draft, policy: Policy, cause: str, pulse: str = "", step: Suspended | None = None
 ) -> None:
-    """Fire what the stimulus made fireable (or go on with a suspended step), then until stable,
-    then start runs."""
+    """Fire what the stimulus made fireable, or continue a suspended step; then fire until the
+    marking is stable, and start runs."""
     if draft.mode in MOVING and draft.suspended is None:
         current = step or Suspended(pulse, cause)
         while True:
@@ -102,7 +102,7 @@ def settle(
 
 
 def _note_waits(draft: Draft) -> None:
-    """Keep since when each transition that may compete for a token lacks nothing else."""
+    """Note since when each transition that may compete for a token lacks nothing else."""
     places, waits = draft.compiled.net.places, dict[str, Wait]()
     for t, contested in draft.compiled.contested.items():
         x = draft.compiled.transitions[t]
@@ -116,7 +116,7 @@ def _note_waits(draft: Draft) -> None:
 
 
 def pause(draft: Draft, reason: str) -> None:
-    """Nothing fires or starts from now on; running actions are asked to hold."""
+    """Stop firing and starting, and ask active runs to hold."""
     draft.mode = Mode.PAUSED
     draft.emit(Paused(reason))
     for run in draft.live():
@@ -128,7 +128,7 @@ def pause(draft: Draft, reason: str) -> None:
 
 
 def resume(draft: Draft, mode: Mode) -> None:
-    """Go on, without end or for one firing."""
+    """Continue, without limit or (STEPPING) for one firing."""
     draft.mode = mode
     draft.emit(Resumed(1 if mode is Mode.STEPPING else 0))
     for run in draft.live():
@@ -140,7 +140,7 @@ def resume(draft: Draft, mode: Mode) -> None:
 
 
 def release(draft: Draft) -> None:
-    """Held runs and timers go on."""
+    """Let held runs and timers continue."""
     for run in draft.live():
         if run.phase in ACTIVE:
             draft.emit(ReleaseRun(run.id))
@@ -150,7 +150,7 @@ def release(draft: Draft) -> None:
 
 
 def abort(draft: Draft, reason: str) -> None:
-    """Cancel every run; the mission run ends when all have stopped."""
+    """Cancel every run; the mission run ends when all of them have stopped."""
     draft.mode, draft.suspended, draft.ending = (
         Mode.ABORTING,
         None,
@@ -189,13 +189,13 @@ def _fire_until_stable(draft: Draft, policy: Policy, current: Suspended) -> None
 
 
 def _new_values(draft: Draft, fireable: Match) -> list[tuple[str, Value]]:
-    """What the firing writes, read before any transition of its step fires."""
+    """Return what the firing writes, evaluated before any transition of its step fires."""
     return [(name, e.value(draft.variables)) for name, e in fireable.transition.sets]
 
 
 def _set_variables(draft: Draft, values: Mapping[str, Value]) -> None:
-    """Write what the firings of a step set. A transition that writes the same variable had to wait
-    for the next step."""
+    """Write what the firings of a step set. Two transitions that write one variable never fire in
+    the same step."""
     for name, value in values.items():
         draft.write(name, value)
         draft.dirty.update(draft.compiled.setting[name])
@@ -219,7 +219,7 @@ def _ask(draft: Draft, current: Suspended, draw: Draw) -> None:
 
 
 def _breaks(draft: Draft, current: Suspended, step: list[Match]) -> bool:
-    """Pause before a transition with a breakpoint; its step waits."""
+    """Pause before a transition with a breakpoint, and keep its step. Return whether it paused."""
     names = [m.transition.name for m in step]
     hit = [n for n in names if n in draft.breakpoints and n not in current.passed]
     if not hit:
@@ -232,7 +232,7 @@ def _breaks(draft: Draft, current: Suspended, step: list[Match]) -> bool:
 
 
 def _end_single_step(draft: Draft, current: Suspended, step: list[Match]) -> None:
-    """One transition has fired; what its pulse would still serve waits for the next step."""
+    """Pause after one firing; other transitions of the same pulse wait for the next step."""
     left = tuple(m.transition.name for m in step[1:] if m.transition.pulse)
     if left:
         draft.suspended = Suspended(current.pulse, current.cause, passed=current.passed, only=left)
@@ -242,7 +242,8 @@ def _end_single_step(draft: Draft, current: Suspended, step: list[Match]) -> Non
 
 
 def _stops_after(draft: Draft, policy: Policy, before: tuple[int, ...], step: list[Match]) -> bool:
-    """Pause after a token entered a place with a breakpoint; give up when firings take no end."""
+    """Pause after a token entered a place with a breakpoint, and give up on endless firings. Return
+    whether the step stops here."""
     places = draft.compiled.net.places
     entered = [
         places[p]
@@ -261,8 +262,7 @@ def _stops_after(draft: Draft, policy: Policy, before: tuple[int, ...], step: li
     )
     draft.report(Severity.ERROR, "timeless", text, step[-1].transition.name)
     if policy.firing_limit is None:
-        # Continued, it would fire for ever again: not even an operator could do more than edit the
-        # task.
+        # If it continued, it would fire for ever again. An operator could only edit the task.
         abort(draft, text)
     else:
         pause(draft, "firings without time")
@@ -270,8 +270,8 @@ def _stops_after(draft: Draft, policy: Policy, before: tuple[int, ...], step: li
 
 
 def _explain_waiting(draft: Draft) -> None:
-    """Runs that are done and whose every exit has a false condition have nowhere to go: say so
-    once."""
+    """Report, once, a run that has ended and whose outgoing transitions all have a false
+    condition."""
     if draft.mode not in MOVING or draft.suspended is not None:
         return
     for runs in draft.tokens.values():
@@ -303,7 +303,7 @@ def _nowhere_to_go(draft: Draft, run: Run) -> bool:
 
 
 class _Tokens(Mapping[str, int]):
-    """A marking by place name, as `final` reads it."""
+    """A marking by place name, for the condition `final`."""
 
     def __init__(self, compiled: Compiled, marking: Sequence[int]) -> None:
         self.index, self.marking = compiled.net.place_index, marking
@@ -354,7 +354,7 @@ def _stops_to_come(draft: Draft) -> bool:
 
 
 def _close(draft: Draft, listening: list[Run], status: Status, reason: str) -> None:
-    """End the mission run once the runs that only listen have stopped."""
+    """End the mission run when the runs that only listen have stopped."""
     for run in listening:
         cancel(draft, run, Counts.NONE, "the mission run is finished")
     if _stops_to_come(draft):

@@ -1,5 +1,5 @@
-"""Stimuli: everything that can happen to the engine. All carry plain data, so that a journal can
-hold them."""
+"""Stimuli: everything that can happen to the engine. All hold plain data, so that a journal can
+keep them."""
 
 from __future__ import annotations
 
@@ -12,37 +12,33 @@ from petrobot.coordinator.task import Executed, Status, Value
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """A token in an action place where a mission run begins: its run begins anew, or is over with a
-    status."""
+    """A token in an action place at the point where a mission run begins."""
 
     place: str
     status: Status | None = None
-    """How it ended; None: it begins anew."""
+    """How its run ended; None: its run starts again."""
     cause: str = ""
     action: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """Where a mission run begins that does not begin at the task's own beginning."""
+    """Where a mission run begins, if not at the task's initial marking."""
 
     marking: Mapping[str, int] = field(default_factory=dict)
-    """Tokens by resource and control place; places that are not named hold none."""
+    """Tokens by resource and control place; any other place holds none."""
     standing: tuple[Standing, ...] = ()
-    """The tokens of action places: those whose runs are over first, in the order in which they
-    ended, then by age."""
+    """The tokens of action places: first those whose runs have ended, in the order of their ends,
+    then the others by age."""
     variables: Mapping[str, Value] = field(default_factory=dict)
     flags: frozenset[str] = frozenset()
-    """Latched external events that have come and wait."""
+    """Latched external events that no firing has consumed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """The mission run begins. Given parameters replace the task's defaults; `variables` are what
-    global memory holds.
-
-    With a `point` it begins there and not at the task's initial marking.
-    """
+    """The mission run begins, at `point` or at the task's initial marking. `parameters` replace the
+    task's defaults; `variables` are the values that the global memory holds."""
 
     parameters: Mapping[str, Value] = field(default_factory=dict)
     variables: Mapping[str, Value] = field(default_factory=dict)
@@ -58,7 +54,7 @@ class RunStarted:
 
 @dataclass(frozen=True, slots=True)
 class RunEnded:
-    """A run is done. For a run that was cancelled it also says that it has stopped."""
+    """A run has ended. If it was cancelled, this also means that it has stopped."""
 
     run: str
     status: Status
@@ -67,16 +63,17 @@ class RunEnded:
     executed: Executed = Executed.YES
     values: Mapping[str, Value] = field(default_factory=dict)
     seconds: float = 0.0
-    """How long it took on the node's clock."""
+    """Duration on the node's clock (s)."""
     deferred: bool = False
-    """The status serves for routing; a `Verdict` may correct it once for the estimates."""
+    """The status is provisional: the net uses it, but a `Verdict` may correct it once for the
+    estimates."""
     cpu_seconds: float | None = None
-    """Processor time that it took; None: not measured. It moves nothing, the estimates keep it."""
+    """Processor time (s), for the estimates alone; None: not measured."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunRaised:
-    """A run that goes on raised one of its internal events."""
+    """An active run raised one of its internal events."""
 
     run: str
     event: str
@@ -84,8 +81,8 @@ class RunRaised:
 
 @dataclass(frozen=True, slots=True)
 class EventOccurred:
-    """An external event. `number` counts up by source from 1 so that none is taken twice; 0 stands
-    outside that order."""
+    """An external event. A source numbers its events from 1, so that none is accepted twice; 0 is
+    an event without a number."""
 
     event: str
     source: str = ""
@@ -94,7 +91,7 @@ class EventOccurred:
 
 @dataclass(frozen=True, slots=True)
 class TimerFired:
-    """A timer that the engine armed is over."""
+    """A timer that the engine armed has elapsed."""
 
     key: str
 
@@ -110,8 +107,8 @@ class VariableChanged:
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """The answer to a `Choose`: one of its alternatives, and why (`draw 0.31`, `selector: lowest
-    J`, `operator`)."""
+    """The answer to a `Choose`: one of its alternatives, and the reason (such as `draw 0.31`,
+    `selector: lowest J` or `operator`)."""
 
     key: str
     alternative: str
@@ -120,8 +117,7 @@ class Chosen:
 
 @dataclass(frozen=True, slots=True)
 class StopConfirmed:
-    """A cancelled run is known to have stopped (or never to have begun: `executed` is then
-    `no`)."""
+    """A cancelled run has stopped, or never began (`executed` is then `no`)."""
 
     run: str
     executed: Executed = Executed.YES
@@ -130,7 +126,7 @@ class StopConfirmed:
 
 @dataclass(frozen=True, slots=True)
 class StopFailed:
-    """A cancelled run could not be stopped in its time; its device stays fenced until a later
+    """A cancelled run could not be stopped in time; its device stays fenced until a later
     `StopConfirmed`."""
 
     run: str
@@ -139,7 +135,7 @@ class StopFailed:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The deferred verdict on a run: corrects its status once, for the estimates alone."""
+    """The deferred verdict on a run: corrects its status once, for the estimates only."""
 
     run: str
     status: Status
@@ -153,12 +149,12 @@ class Hold(StrEnum):
     HELD = "held"
     CANNOT = "cannot_hold"
     STOPPED = "stopped"
-    """The run could only be stopped; its end follows."""
+    """The run could not pause and was stopped; its end follows."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunHeld:
-    """What became of a run that was to hold."""
+    """A node's answer to a `HoldRun`."""
 
     run: str
     answer: Hold
@@ -166,34 +162,32 @@ class RunHeld:
 
 @dataclass(frozen=True, slots=True)
 class Pause:
-    """Operator: nothing fires or starts from now on, and running actions are asked to hold."""
+    """Operator: pause. Nothing fires or starts, and active runs are asked to hold."""
 
     reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Resume:
-    """Operator: go on."""
+    """Operator: end the pause."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Operator: one firing, now or, if nothing can fire yet, as soon as something can; then paused
-    again."""
+    """Operator: let one transition fire, now or as soon as one can, then pause again."""
 
 
 @dataclass(frozen=True, slots=True)
 class SetBreakpoints:
-    """Operator: pause before these transitions fire and after tokens enter these places (replaces
-    the earlier set)."""
+    """Operator: pause before these transitions fire and after tokens enter these places. Replaces
+    the earlier set."""
 
     names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """Operator: this alternative of a primitive task is run from now on; empty: the choice is free
-    again."""
+    """Operator: always run this alternative of a primitive task; empty: choose freely again."""
 
     primitive_task: str
     action: str = ""
@@ -224,18 +218,15 @@ class RaiseEvent:
 
 @dataclass(frozen=True, slots=True)
 class ForceExit:
-    """Operator: fire a transition out of an action place whatever its run does, its event, time and
-    condition.
-
-    A run that still goes on is cancelled and counts none.
-    """
+    """Operator: fire a transition out of an action place whatever the state of its run, its event,
+    its time and its condition. An active run is cancelled and does not count."""
 
     transition: str
 
 
 @dataclass(frozen=True, slots=True)
 class Abort:
-    """Operator: cancel every run and end in ERROR once all have stopped."""
+    """Operator: cancel every run, and end in ERROR when all have stopped."""
 
     reason: str = ""
 
@@ -277,4 +268,4 @@ OPERATOR = (
     ForceExit,
     Abort,
 )
-"""The stimuli that only the operator who holds the controls may send."""
+"""The stimuli that only the operator with the controls may send."""

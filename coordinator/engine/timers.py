@@ -1,4 +1,4 @@
-"""`after` timers: armed while the arcs of their transition are satisfied by the same runs."""
+"""`after` timers: armed while the same runs satisfy the arcs of their transition."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from petrobot.coordinator.task.compiled_task import CompiledTransition
 
 
 def refresh_timers(draft: Draft) -> None:
-    """Arm and disarm what the changes of this stimulus call for."""
+    """Arm and disarm timers after the changes of this stimulus."""
     for t in sorted(draft.retime):
         x = draft.compiled.transitions[t]
         taken = arcs_satisfied(draft, x)
@@ -27,13 +27,13 @@ def refresh_timers(draft: Draft) -> None:
 
 
 def disarm_all(draft: Draft) -> None:
-    """The mission run is over."""
+    """Disarm all timers: the mission run has finished."""
     for name in list(draft.timers):
         disarm(draft, name)
 
 
 def hold_timers(draft: Draft) -> None:
-    """The net is paused: timers stop, but for those of runs that have not said yet whether they
+    """Stop the timers during a pause, except those of runs that have not yet answered whether they
     hold."""
     for name, timer in list(draft.timers.items()):
         if not timer.held and not timer.elapsed and not _concerns_active(draft, timer):
@@ -42,7 +42,7 @@ def hold_timers(draft: Draft) -> None:
 
 
 def release_timers(draft: Draft) -> None:
-    """The net goes on."""
+    """Let the timers continue after a pause."""
     for name, timer in list(draft.timers.items()):
         if timer.held:
             draft.timers[name] = replace(timer, held=False)
@@ -50,7 +50,7 @@ def release_timers(draft: Draft) -> None:
 
 
 def elapse(draft: Draft, key: str) -> bool:
-    """Mark a timer as over; False if it is not wanted any more."""
+    """Mark a timer as elapsed. Return False if it was disarmed before."""
     for name, timer in draft.timers.items():
         if timer.key == key:
             draft.timers[name] = replace(timer, elapsed=True, held=False)
@@ -60,7 +60,7 @@ def elapse(draft: Draft, key: str) -> bool:
 
 
 def hold_timers_of(draft: Draft, run_id: str) -> None:
-    """A run is held: its timers stop."""
+    """Stop the timers of a run that is held."""
     for name, timer in list(draft.timers.items()):
         if run_id in timer.runs and not timer.held and not timer.elapsed:
             draft.timers[name] = replace(timer, held=True)
