@@ -20,8 +20,8 @@ from petrobot.coordinator.task.wording import Severity
 
 
 def admit(draft: Draft) -> bool:
-    """Advance waiting runs as far as possible, the oldest first. Return whether one of them ended in
-    ERROR at once."""
+    """Advance waiting runs as far as possible, the oldest first. Return whether one of them ended
+    in ERROR at once."""
     waiting = [r for runs in draft.tokens.values() for r in runs if r.phase in UNSTARTED]
     if not waiting:
         return False

@@ -152,6 +152,17 @@ class JournalWriter:
         self.next_number += 1
         return number
 
+    def cut(self, number: int) -> None:
+        """Drop a record and all after it when the next ones are written. Nothing may wait to be
+        written."""
+        assert not self._buffer
+        raw, offset = self.path.read_bytes(), len(MAGIC)
+        for _ in range(number):
+            payload = _payload(raw, offset)
+            assert payload is not None
+            offset += PREFIX.size + len(payload)
+        self._torn, self.next_number = offset, number
+
     @property
     def pending(self) -> bool:
         """Whether records wait for the next sync."""

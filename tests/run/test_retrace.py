@@ -14,7 +14,7 @@ import pytest
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.run.folder import JOURNAL, RESULT, SEMANTICS
 from petrobot.coordinator.run.journal import JournalWriter, read_journal
-from petrobot.coordinator.run.recording import ReplayError, RetracingStore
+from petrobot.coordinator.run.recording import ReplayError, RetracingStore, unmeasured
 from petrobot.coordinator.task import Task, model
 from petrobot.coordinator.task.expansion import expand
 from petrobot.coordinator.task.file import load, loads
@@ -103,6 +103,54 @@ def test_measured_processor_time_is_no_difference(tmp_path: Path) -> None:
     again = RetracingStore(JournalWriter(path), read_journal(path))
     with pytest.raises(ReplayError, match="record 1 was stage"):
         again.stage("prepared", {})
+
+
+def nudged(value: Any, share: float) -> Any:
+    """Plain data whose floats are larger by a share of themselves."""
+    if isinstance(value, dict):
+        return {key: nudged(one, share) for key, one in value.items()}
+    if isinstance(value, list):
+        return [nudged(one, share) for one in value]
+    return value * (1.0 + share) if isinstance(value, float) else value
+
+
+def recorded_elsewhere(folder: Path, share: float) -> list[tuple[str, Any]]:
+    """Cut the run off after 20 records, and let those from the tenth on have been computed by
+    another processor."""
+    kill_at(folder, 20)
+    journal = read_journal(folder / JOURNAL)
+    (folder / JOURNAL).unlink()
+    with closing(JournalWriter(folder / JOURNAL, journal.header)) as writer:
+        for record in journal.records:
+            data = dict(record.data)
+            if record.number >= 10 and record.kind == "stimulus":
+                data["stimulus"] = nudged(data["stimulus"], share)
+                data["instructions"] += share > 0
+            writer.append(record.kind, data)
+    return [(record.kind, record.data) for record in journal.records]
+
+
+def test_a_run_of_another_processor_is_resumed_as_one_run(recorded_run: Path) -> None:
+    """Its last digits differ: the journal replays afterwards."""
+    expected = json.loads((recorded_run / RESULT).read_text())
+    before = recorded_elsewhere(recorded_run, 1e-12)
+    assert main(["resume", str(recorded_run), "--quiet", "--no-page"]) == 0
+    result = json.loads((recorded_run / RESULT).read_text())
+    assert {**result, "wall_s": 0} == {**expected, "wall_s": 0}
+    after = read_journal(recorded_run / JOURNAL).records
+    assert [(r.kind, unmeasured(r.data)) for r in after][: len(before)] == [
+        (kind, unmeasured(data)) for kind, data in before
+    ]
+    assert main(["replay", str(recorded_run)]) == 0
+
+
+def test_a_run_that_differs_by_more_than_last_digits_is_not_written_over(
+    recorded_run: Path,
+) -> None:
+    recorded_elsewhere(recorded_run, 1e-3)
+    there = (recorded_run / JOURNAL).read_bytes()
+    assert main(["resume", str(recorded_run), "--quiet", "--no-page"]) == 2
+    assert (recorded_run / JOURNAL).read_bytes() == there
 
 
 def test_a_journal_of_a_newer_petrobot_is_refused(

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.cli import main
+from petrobot.coordinator.run.recording import alike
 from tests.sim.conftest import needs_bullet
 
 FILES = Path(__file__).parent / "written_at_1eefa30"
@@ -52,9 +53,10 @@ def test_a_killed_run_resumes_to_the_end_that_it_had_without_the_kill(
         == 0
     )
     end, whole = given(tmp_path / "end.json"), given(FILES / "runs" / name / "result.json")
-    assert {key: end[key] for key in whole if key not in ("wall_s", "journal")} == {
-        key: value for key, value in whole.items() if key not in ("wall_s", "journal")
-    }
+    # Another processor computes other last digits.
+    differs = [k for k in whole if k not in ("wall_s", "journal") and not alike(whole[k], end[k])]
+    assert not differs
+    assert main(["replay", str(folder)]) == 0
 
 
 @needs_bullet
