@@ -191,7 +191,9 @@ class Child:
                 named = ", ".join(map(_named, received))
                 _log.debug("from %d: %s", self._worker, named)
             self._heard(self, received)
-        if self.pipe.closed and not self._let_go:
+        # Not `closed`: that may also come from a message that could not be sent, while what the
+        # process sent before its end still waits to be read.
+        if self.pipe.ended and not self._let_go:
             self._close_pipe()
             self._limit(PIPE_LIMIT, lambda: self.kill("it closed its pipe, and was killed"))
 

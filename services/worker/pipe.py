@@ -60,16 +60,16 @@ def _become_copy() -> None:
 
 
 class Pipe:
-    """One end. `post` sends as much as fits; `read` returns whole items. `closed` is set once the
-    other end is gone; what it has sent before can still be read."""
+    """One end. `post` sends as much as fits; `read` returns whole items. `closed` is set when the
+    other end is gone; what that one sent before can still be read until `ended`."""
 
     def __init__(self, end: socket.socket) -> None:
         end.setblocking(False)
         _ENDS.add(end)
         self.socket = end
         self.closed = False
-        self._ended = False
-        """Whether everything has been read."""
+        self.ended = False
+        """Whether it is closed and everything that came has been read."""
         self._unsent = bytearray()
         self._packer = msgpack.Packer()
         self._unpacker = msgpack.Unpacker(max_buffer_size=LARGEST)
@@ -120,7 +120,7 @@ class Pipe:
         if _Copy.made:
             os._exit(0)
         items: list[Item] = []
-        while not self._ended:
+        while not self.ended:
             try:
                 count = self.socket.recv_into(_BUFFER)
             except BlockingIOError:
@@ -128,7 +128,7 @@ class Pipe:
             except OSError:
                 count = 0
             if not count:
-                self.closed = self._ended = True
+                self.closed = self.ended = True
                 break
             self._feed(_BUFFER[:count])
             # Taken out before more is read: several large items that came together are more than
@@ -148,7 +148,7 @@ class Pipe:
 
     def close(self) -> None:
         """Let it go."""
-        self.closed = self._ended = True
+        self.closed = self.ended = True
         self.socket.close()
 
 

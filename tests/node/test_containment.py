@@ -12,9 +12,24 @@ from pathlib import Path
 
 import pytest
 
+from petrobot.services.comm.protocol.messages import Call, Outcome
+from petrobot.services.node.child import Child
+from petrobot.services.worker.pipe import Item
+from petrobot.services.worker.process import READY, Setup
+from tests.node.conftest import OUTSIDE
 from tests.node.test_kills import passing
-from tests.node.test_processes import CELL, PATIENCE, Nodes, Operator, operator_of, pids
+from tests.node.test_processes import (
+    CELL,
+    OUTSIDE,
+    PATIENCE,
+    ROOT,
+    Nodes,
+    Operator,
+    operator_of,
+    pids,
+)
 from tests.processes import alive, kill
+from tests.waiting import Limit
 
 pytestmark = pytest.mark.processes
 DEADLINE = 1.0
@@ -198,7 +213,7 @@ async def test_many_at_once_run_once_each_beside_what_blocks_crashes_and_waits(
         20: ("segfault", 20.0, {}),
         30: ("nap", 20.0, {"seconds": 1.0}),
         40: ("segfault", 20.0, {}),
-        50: ("block", DEADLINE, {"seconds": 0.05}),
+        50: ("block", 20.0, {"seconds": 0.05}),
     }
     for batch in range(3):
         calls = []
@@ -221,6 +236,37 @@ async def test_many_at_once_run_once_each_beside_what_blocks_crashes_and_waits(
         ]
     expected = [f"{batch} {n}" for batch in range(3) for n in range(80) if n not in bad]
     assert sorted(file.read_text().split("\n")[:-1]) == sorted(expected)
+
+
+async def test_what_a_process_sent_before_its_end_is_read_although_nothing_can_be_sent_to_it(
+    own_nodes: Nodes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The node is busy while its process ends two runs and crashes, and notices that first when it
+    sends it another call."""
+    monkeypatch.setenv("PYTHONPATH", f"{ROOT}{os.pathsep}{OUTSIDE}")
+    results: list[str] = []
+    over = asyncio.Event()
+
+    def hear(child: Child, items: list[Item]) -> None:
+        results.extend(item.id for item in items if isinstance(item, Outcome))
+        if isinstance(items[0], list) and items[0][0] == READY:
+            for line in ("1", "2"):
+                child.give(
+                    Call(line, "write_down", {"file": str(tmp_path / "lines"), "line": line})
+                )
+            child.give(Call("3", "segfault", {}))
+            limit = Limit("the end of the process")
+            while child.process.poll() is None and limit.left():
+                time.sleep(0.01)
+            child.give(Call("4", "write_down", {}))
+            assert child.closed and not results
+
+    setup = Setup(str(own_nodes.file), own_nodes.file.read_text(), "left", "")
+    child = Child(setup, hear, lambda child: over.set())
+    async with asyncio.timeout(PATIENCE):
+        await over.wait()
+    assert results == ["1", "2"]
+    assert child.code == -signal.SIGSEGV
 
 
 async def test_at_the_limit_a_run_is_refused_and_says_so(operator: Operator) -> None:
