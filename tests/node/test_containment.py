@@ -20,7 +20,6 @@ from tests.node.conftest import OUTSIDE
 from tests.node.test_kills import passing
 from tests.node.test_processes import (
     CELL,
-    OUTSIDE,
     PATIENCE,
     ROOT,
     Nodes,
