@@ -59,6 +59,10 @@ class Result:
     deferred: bool = False
     """The status is provisional: it routes the task now, and a later verdict may correct it once
     for the estimates."""
+    executed: str = "yes"
+    """Whether the world was touched: "yes", "no" (an ERROR before anything began) or "unknown" (a
+    link was lost in between). `dataclasses.replace(result, executed="unknown")` sets it; a place's
+    `tries` and the conditions of a task look at it."""
 
 
 def success(**values: Any) -> Result:

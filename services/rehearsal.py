@@ -157,7 +157,12 @@ class _Stage:
         played = self.played
         if isinstance(report, Outcome):
             played.result = Result(
-                Status(report.status), report.values, report.cause, report.text, report.deferred
+                Status(report.status),
+                report.values,
+                report.cause,
+                report.text,
+                report.deferred,
+                report.executed,
             )
             played.seconds = report.seconds
         elif isinstance(report, Sent):

@@ -16,6 +16,7 @@ from petrobot.services.comm.protocol.messages import (
     Call,
     Cancel,
     Event,
+    Executed,
     Feedback,
     Message,
     Outcome,
@@ -59,7 +60,9 @@ def checked_result(identity: str, returned: Any, where: str = "result") -> Resul
         if type(values) is not dict:
             raise ValueError(f"{where}: expected values by name, found a {type(values).__name__}")
         said = (plain(str(returned.cause)), plain(str(returned.text)), bool(returned.deferred))
-        result = Result(Status(returned.status), values, *said)
+        result = Result(
+            Status(returned.status), values, *said, executed=Executed(returned.executed)
+        )
         checked(
             Outcome(
                 identity, result.status, values, result.cause, result.text, deferred=result.deferred

@@ -582,7 +582,8 @@ class Runner:
         identity = run.call.id
         self._outlets.close(identity)
         del self._runs[identity]
-        said = (result.status, result.values, result.cause, result.text, Executed.YES)
+        executed = Executed(result.executed)
+        said = (result.status, result.values, result.cause, result.text, executed)
         # Not `now`: the action may have blocked since this step began.
         took = self._clock() - run.started
         self._reports.append(Outcome(identity, *said, took, run.cpu, result.deferred))

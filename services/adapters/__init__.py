@@ -1,0 +1,1 @@
+"""Robots and programs of others: one folder each, written against petrobot's public API alone."""

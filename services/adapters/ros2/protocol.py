@@ -1,0 +1,318 @@
+"""The rosbridge protocol (version 2) without a socket: what a message may hold, and the life of a
+goal or service call as a table of phases."""
+
+from __future__ import annotations
+
+import json
+import math
+import uuid
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+Message = dict[str, Any]
+DEPTH, ITEMS = 16, 20_000
+"""Deepest nesting and most items of the values of a message."""
+REPEAT = 1.0
+"""Seconds after which a cancel is sent again: rosbridge ignores one that comes before it has begun
+the goal."""
+
+
+def parse(text: str) -> Message:
+    """Return a message of rosbridge. Raises ValueError for anything else.
+
+    A number that is not finite becomes None, as newer rosbridge servers send it themselves.
+    """
+    try:
+        message = json.loads(text, parse_constant=lambda word: None, parse_float=_finite)
+    except (ValueError, RecursionError) as fault:
+        raise ValueError(f"not JSON: {fault}") from None
+    if not isinstance(message, dict) or not isinstance(message.get("op"), str):
+        raise ValueError(f"expected an object with a text `op`, found {text[:60]!r}")
+    return message
+
+
+def _finite(text: str) -> float | None:
+    number = float(text)
+    return number if math.isfinite(number) else None
+
+
+def unfit(values: Any) -> str:
+    """Return what is wrong with the values of a message, "" if they are finite and can be sent on.
+
+    ROS messages have no null: rosbridge writes it for NaN and infinity.
+    """
+    if not isinstance(values, dict):
+        return f"expected a message, found {str(values)[:60]!r}"
+    for count, (path, value) in enumerate(_leaves(values, "", 0)):
+        if count > ITEMS:
+            return f"has more than {ITEMS} items"
+        if value is None or (isinstance(value, float) and not math.isfinite(value)):
+            return f"{path}: is not a finite number"
+        if isinstance(value, int) and not -(2**63) <= value < 2**64:
+            return f"{path}: {str(value)[:30]} does not fit into 64 bits"
+        if isinstance(value, dict | list) and value:
+            return f"{path}: is nested more than {DEPTH} deep"
+        if isinstance(value, str) and not value.isascii():
+            try:
+                value.encode()
+            except UnicodeError:
+                return f"{path}: is not Unicode text"
+    return ""
+
+
+def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
+    inner = value.items() if isinstance(value, dict) else enumerate(value)
+    for name, item in inner:
+        here = f"{path}.{name}" if path else str(name)
+        if isinstance(item, dict | list) and item and depth < DEPTH:
+            yield here, 0  # counts as an item
+            yield from _leaves(item, here, depth + 1)
+        else:
+            yield here, item
+
+
+def pick(values: Any, path: str) -> Any:
+    """Return what stands at a path such as "pose.position.x" or "points.0". Raises ValueError."""
+    found = values
+    for name in path.split("."):
+        try:
+            found = found[int(name)] if isinstance(found, list) else found[name]
+        except (KeyError, IndexError, TypeError, ValueError):
+            has = list(found)[:12] if isinstance(found, dict) else f"a {type(found).__name__}"
+            raise ValueError(f"{path}: there is no {name!r}, but {has}") from None
+    return found
+
+
+def filled(base: Mapping[str, Any], values: Mapping[str, Any]) -> Message:
+    """Return a copy of a message in which the values stand at their paths."""
+    message: Message = json.loads(json.dumps(base, allow_nan=False))
+    for path, value in values.items():
+        *tables, last = path.split(".")
+        table = message
+        for name in tables:
+            table = table.setdefault(name, {})
+            if not isinstance(table, dict):
+                raise ValueError(f"{path}: {name!r} is not a table")
+        table[last] = value
+    return message
+
+
+class Phase(StrEnum):
+    """Where a goal or a service call is."""
+
+    PENDING = "pending"
+    ACTIVE = "active"
+    """The server has sent feedback: it has accepted the goal."""
+    CANCELLING = "cancelling"
+    LOST = "lost"
+    """The link broke: nobody knows what became of it."""
+    RECALLED = "recalled"
+    """After LOST: its cancel was sent over the next link."""
+    SUCCEEDED = "succeeded"
+    CANCELLED = "cancelled"
+    ABORTED = "aborted"
+    REJECTED = "rejected"
+    """Refused before anything began."""
+    UNANSWERED = "unanswered"
+    """Cancelled, and the server has said nothing for too long."""
+    GONE = "gone"
+    """After LOST: the server has ended it, or had time enough to."""
+
+
+class Word(StrEnum):
+    """What happens to a goal."""
+
+    FEEDBACK = "feedback"
+    SUCCEEDED = "succeeded"
+    CANCELLED = "cancelled"
+    ABORTED = "aborted"
+    REFUSED = "refused"
+    """rosbridge answers `result: false`: rejected, no such server, wrong fields."""
+    CANCEL = "cancel"
+    DOWN = "down"
+    UP = "up"
+    SILENCE = "silence"
+
+
+RUNNING = frozenset({Phase.PENDING, Phase.ACTIVE, Phase.CANCELLING})
+MOVING = RUNNING | {Phase.LOST, Phase.RECALLED}
+"""Phases in which the robot may be moving for it."""
+
+_ENDS = {
+    Word.SUCCEEDED: Phase.SUCCEEDED,
+    Word.CANCELLED: Phase.CANCELLED,
+    Word.ABORTED: Phase.ABORTED,
+    Word.DOWN: Phase.LOST,
+}
+TABLE: Mapping[tuple[Phase, Word], Phase] = {
+    **{(phase, word): end for phase in RUNNING for word, end in _ENDS.items()},
+    (Phase.PENDING, Word.FEEDBACK): Phase.ACTIVE,
+    (Phase.PENDING, Word.REFUSED): Phase.REJECTED,
+    (Phase.ACTIVE, Word.REFUSED): Phase.ABORTED,
+    (Phase.CANCELLING, Word.REFUSED): Phase.ABORTED,
+    (Phase.PENDING, Word.CANCEL): Phase.CANCELLING,
+    (Phase.ACTIVE, Word.CANCEL): Phase.CANCELLING,
+    (Phase.CANCELLING, Word.SILENCE): Phase.UNANSWERED,
+    (Phase.LOST, Word.UP): Phase.RECALLED,
+    (Phase.RECALLED, Word.DOWN): Phase.LOST,
+    (Phase.RECALLED, Word.SILENCE): Phase.GONE,
+    **{
+        (Phase.RECALLED, word): Phase.GONE
+        for word in (Word.SUCCEEDED, Word.CANCELLED, Word.ABORTED, Word.REFUSED)
+    },
+}
+"""What is not listed changes nothing."""
+
+_STATUS = {4: Word.SUCCEEDED, 5: Word.CANCELLED, 6: Word.ABORTED}
+"""action_msgs/msg/GoalStatus."""
+
+
+@dataclass
+class Exchange:
+    """A goal, or a service call: what was sent, and what came back."""
+
+    request: Message
+    """The operation that began it; its `id` names it."""
+    keep: frozenset[str] | None
+    """Fields of its result that are kept, None for all of them."""
+    heard: float
+    """When the server last said something of it, or was last asked to end it (s)."""
+    asked: float = math.inf
+    """When its cancel was last sent (s)."""
+    phase: Phase = Phase.PENDING
+    feedback: Message = field(default_factory=dict)
+    count: int = 0
+    """Feedback messages so far."""
+    values: Message = field(default_factory=dict)
+    text: str = ""
+    fault: str = ""
+    """Why the values of its result cannot be used."""
+
+
+class Exchanges:
+    """The goals and calls of one client, by a name that the client chooses. Ids on the wire are
+    unique in the world: all clients of a rosbridge server share one table of them."""
+
+    def __init__(self, patience: float) -> None:
+        self.open: dict[str, Exchange] = {}
+        self.refused = 0
+        """Messages that could not be used."""
+        self.fault = ""
+        """What was wrong with the last one."""
+        self._patience = patience
+        self._own = uuid.uuid4().hex
+
+    def begin(self, now: float, name: str, request: Message, keep: Any = None) -> Message:
+        """Begin a goal or a call; return what is to be sent."""
+        message = {**request, "id": f"petrobot:{self._own}:{name}:{uuid.uuid4().hex[:8]}"}
+        kept = None if keep is None else frozenset(keep)
+        self.open[name] = Exchange(message, kept, now)
+        return message
+
+    def cancel(self, now: float, name: str) -> list[Message]:
+        """Cancel a goal, or forget a call, which cannot be cancelled; return what is to be sent."""
+        one = self.open.get(name)
+        if one is None or one.phase not in RUNNING:
+            return []
+        if one.request["op"] == "call_service":
+            one.phase = Phase.UNANSWERED
+            return []
+        if one.phase is Phase.CANCELLING:
+            return []
+        self._move(one, Word.CANCEL)
+        return [self._cancel(now, one)]
+
+    def forget(self, name: str) -> None:
+        """The client has read the result."""
+        if name in self.open and self.open[name].phase not in MOVING:
+            del self.open[name]
+
+    def link(self, now: float, up: bool) -> list[Message]:
+        """The link came or went; return what is to be sent: cancels of goals that were lost."""
+        sent = []
+        for one in self.open.values():
+            before = self._move(one, Word.UP if up else Word.DOWN)
+            if one.phase is not before and one.request["op"] == "call_service":
+                one.phase = Phase.GONE
+            elif up and one.phase is Phase.RECALLED:
+                sent.append(self._cancel(now, one))
+        return sent
+
+    def advance(self, now: float) -> list[Message]:
+        """Repeat cancels that were not answered, and give them up in the end."""
+        sent = []
+        for one in self.open.values():
+            if one.phase not in (Phase.CANCELLING, Phase.RECALLED):
+                continue
+            if now - one.heard >= self._patience:
+                self._move(one, Word.SILENCE)
+            elif now - one.asked >= REPEAT:
+                heard = one.heard
+                sent.append(self._cancel(now, one))
+                one.heard = heard
+        return sent
+
+    def receive(self, now: float, message: Message) -> None:
+        """Take feedback, a result, a response, or rosbridge's word that an operation failed."""
+        identity = message.get("id")
+        one = next((e for e in self.open.values() if e.request["id"] == identity), None)
+        if one is None or one.phase not in MOVING:
+            return
+        one.heard = now
+        op, said = message["op"], message.get("values")
+        if op == "action_feedback":
+            self._move(one, Word.FEEDBACK)
+            if fault := unfit(said):
+                self.refuse(f"feedback of {one.request['action']}: {fault}")
+            else:
+                one.feedback, one.count = dict(said or {}), one.count + 1
+        elif op == "status":
+            if message.get("level") == "error":
+                one.text = str(message.get("msg"))[:500]
+                self._move(one, Word.REFUSED)
+        elif op in ("action_result", "service_response"):
+            self._end(one, message)
+
+    def _end(self, one: Exchange, message: Message) -> None:
+        said, status = message.get("values"), message.get("status")
+        nested = isinstance(said, dict) and set(said) == {"status", "result"}
+        if (
+            nested and status is None and isinstance(said, dict)
+        ):  # rosbridge before it told a status
+            said, status = said["result"], said["status"]
+        if message.get("result") is False and status not in (5, 6):
+            one.text = str(said or "rosbridge gives no reason")[:500]
+            self._move(one, Word.REFUSED)
+            return
+        if message["op"] == "service_response" or status is None:
+            word = Word.SUCCEEDED
+        else:
+            word = _STATUS.get(status if isinstance(status, int) else 0, Word.ABORTED)
+            one.text = "" if word is not Word.ABORTED else f"the goal ended with status {status}"
+        if isinstance(said, str):
+            one.text, said = said[:500], {}
+        values = said if said else {}
+        if one.keep is not None and isinstance(values, dict):
+            values = {name: value for name, value in values.items() if name in one.keep}
+        one.fault = unfit(values)
+        if not one.fault:
+            one.values = values
+        self._move(one, word)
+
+    def refuse(self, fault: str) -> None:
+        """Note a message that cannot be used."""
+        self.refused, self.fault = self.refused + 1, fault[:300]
+
+    @staticmethod
+    def _move(one: Exchange, word: Word) -> Phase:
+        before = one.phase
+        one.phase = TABLE.get((before, word), before)
+        return before
+
+    @staticmethod
+    def _cancel(now: float, one: Exchange) -> Message:
+        one.heard = one.asked = now
+        request = one.request
+        return {"op": "cancel_action_goal", "id": request["id"], "action": request["action"]}

@@ -1,0 +1,438 @@
+"""Actions of ROS 2 as primitive actions, in simulated time before a fake rosbridge."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import pytest
+
+from petrobot import Rehearsal, Result, check_driver, rehearse
+from petrobot.services.adapters.ros2 import actions
+from petrobot.services.adapters.ros2.bridge import Bridge
+from petrobot.services.adapters.ros2.link import Item
+from tests.services.adapters.ros2.fake import Fake, Message
+
+HERE = "tests.services.adapters.ros2.fake:Fake"
+
+
+class ScriptedLink:
+    """A fake behind a link that the test breaks and mends."""
+
+    def __init__(self) -> None:
+        self.fake, self.epoch, self.now = Fake(), 1, 0.0
+        self.inbox: list[Item] = [("up", 1)]
+
+    def poll(self, now: float) -> list[Item]:
+        told = self.fake.step(now)
+        if self.epoch:
+            self.inbox += [("message", message) for message in told]
+        items, self.inbox = self.inbox, []
+        return items
+
+    def send(self, now: float, epoch: int, messages: list[Message]) -> None:
+        for message in messages:
+            assert epoch == self.epoch
+            self.inbox += [("message", said) for said in self.fake.receive(now, message)]
+
+    def pull(self) -> None:
+        self.epoch, self.inbox = 0, [("down", "pulled")]
+
+    def mend(self) -> None:
+        self.epoch = 2
+        self.inbox.append(("up", 2))
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def robot(**config: Any) -> tuple[Bridge, ScriptedLink]:
+    bridge, link = Bridge({"url": HERE, **config}, None), ScriptedLink()  # type: ignore[arg-type]
+    bridge.link = link  # type: ignore[assignment]
+    return bridge, link
+
+
+def play(
+    name: str,
+    bridge: Bridge | None = None,
+    world: Callable[[float], None] | None = None,
+    **more: Any,
+) -> Rehearsal:
+    """Rehearse a goal for the action server of this name."""
+    return rehearse(
+        actions.goal,
+        device=bridge or robot()[0],
+        world=world,
+        action=name,
+        action_type="moveit_msgs/action/MoveGroup",
+        **more,
+    )
+
+
+def said(result: Result) -> tuple[str, str, str]:
+    return result.status, result.cause, result.executed
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "ended"),
+    [
+        ("/ok", {}, ("success", "", "yes")),
+        ("/nested", {}, ("success", "", "yes")),
+        ("/ok", {"expect": {"error_code.val": 1}}, ("success", "", "yes")),
+        ("/ok", {"expect": {"error_code.val": [0, 2]}}, ("success", "", "yes")),
+        ("/ok", {"expect": {"error_code.val": 7}}, ("failure", "unexpected", "yes")),
+        ("/ok", {"values": {"code": "error_code.value"}}, ("error", "bad_result", "yes")),
+        ("/aborts", {}, ("error", "aborted", "yes")),
+        ("/rejects", {}, ("error", "rejected", "no")),
+        ("/absent", {}, ("error", "rejected", "no")),
+        ("/nan", {}, ("error", "bad_result", "yes")),
+        ("/nan", {"values": {"code": "error_code.val"}}, ("success", "", "yes")),
+        ("/wide", {}, ("error", "bad_result", "yes")),
+        ("/silent", {"timeout": 1.0}, ("error", "timeout", "unknown")),
+        ("/slow", {"timeout": 1.0}, ("error", "timeout", "yes")),
+        ("/late", {"timeout": 0.1}, ("error", "timeout", "yes")),
+        ("/races", {"timeout": 1.0}, ("success", "", "yes")),
+        ("/stubborn", {"timeout": 1.0}, ("error", "timeout", "unknown")),
+        ("/ok", {"x": 1.0}, ("error", "bad_goal", "no")),
+        ("/ok", {"goal": {"x": math.nan}}, ("error", "bad_goal", "no")),
+    ],
+)
+def test_each_end_of_a_goal_is_one_result(
+    name: str, options: dict[str, Any], ended: tuple[str, str, str]
+) -> None:
+    bridge, link = robot()
+    result = play(name, bridge, **options).result
+    assert said(result) == ended, result
+    if name not in ("/silent", "/stubborn"):
+        assert bridge.stopped() and not link.fake.goals
+
+
+def test_what_a_result_has() -> None:
+    assert play("/ok").result.values == {"error_code": {"val": 1}, "text": "done"}
+    named = play("/ok", values={"code": "error_code.val"}).result
+    assert named.values == {"code": 1}
+    assert play("/rejects").result.text == "Action goal was rejected"
+
+
+def test_a_goal_is_built_from_what_stands_fast_and_the_tasks_arguments() -> None:
+    bridge, link = robot()
+    fields = {"x": "pose.pose.position.x", "frame": "pose.header.frame_id"}
+    play("/ok", bridge, goal={"behavior_tree": "t"}, fields=fields, x=2.5, frame="map")
+    sent = link.fake.log[0]
+    assert sent["op"] == "send_action_goal" and sent["feedback"] is True
+    pose = {"pose": {"position": {"x": 2.5}}, "header": {"frame_id": "map"}}
+    assert sent["args"] == {"behavior_tree": "t", "pose": pose}
+
+
+def test_feedback_is_progress_variables_and_set_points() -> None:
+    played = rehearse(
+        actions.goal,
+        device=robot()[0],
+        streams={"gap": 0.05},
+        action="/ok",
+        action_type="a/action/B",
+        remaining="distance",
+        to_memory={"robot_state": "state"},
+        to_streams={"gap": ["distance"]},
+    )
+    shares = [share for _, share in played.progress]
+    assert len(shares) >= 3 and shares == sorted(shares) and 0 < shares[-1] < 1
+    assert played.memory.values()["robot_state"].value == "moving"
+    assert {stream for _, stream, _ in played.published} == {"gap"}
+
+
+@pytest.mark.parametrize("name", ["/slow", "/silent"])
+def test_a_cancelled_run_cancels_its_goal(name: str) -> None:
+    bridge, link = robot()
+    played = play(name, bridge, cancel_after=0.5)
+    assert played.result.cause == "cancelled"
+    goal, *cancels = [m for m in link.fake.log if m["op"] != "subscribe"]
+    assert {m["op"] for m in cancels} == {"cancel_action_goal"}
+    assert {m["id"] for m in cancels} == {goal["id"]}
+    assert bridge.stopped() is (name == "/slow")
+
+
+@pytest.mark.parametrize("at", [0.0, 0.02, 0.06, 0.1, 0.14, 0.18, 0.2, 0.22])
+def test_a_link_lost_at_any_moment(at: float) -> None:
+    """The run ends at once and says that nobody knows; over the next link its goal is cancelled."""
+    bridge, link = robot()
+    pulled = False
+
+    def world(now: float) -> None:
+        nonlocal pulled
+        if now >= at and not pulled and (at == 0.0 or link.fake.log):
+            pulled = True
+            link.pull()
+
+    result = play("/slow", bridge, world).result
+    if not link.fake.log:
+        assert said(result) == ("error", "link_down", "no")
+        return
+    assert said(result) == ("error", "link_lost", "unknown") and not bridge.stopped()
+    link.mend()
+    for tick in range(5):
+        bridge.step(60.0 + tick)
+    assert [m["op"] for m in link.fake.log] == ["send_action_goal", "cancel_action_goal"]
+    assert link.fake.log[0]["id"] == link.fake.log[1]["id"]
+    assert bridge.stopped() and not link.fake.goals
+
+
+def test_a_goal_that_is_recalled_does_not_touch_the_next_one() -> None:
+    bridge, link = robot()
+
+    def world(now: float) -> None:
+        if abs(now - 0.2) < 1e-6:
+            link.pull()
+        if abs(now - 0.6) < 1e-6:
+            link.mend()
+
+    assert play("/slow", bridge, world).result.cause == "link_lost"
+    later = rehearse(
+        actions.goal,
+        device=bridge,
+        world=lambda now: link.mend() if abs(now - 0.6) < 1e-6 else None,
+        action="/ok",
+        action_type="a/action/B",
+    )
+    assert said(later.result) == ("success", "", "yes")
+    assert [m["op"] for m in link.fake.log[1:]] == ["cancel_action_goal", "send_action_goal"]
+
+
+def test_a_server_that_never_answers_frees_the_device_in_the_end() -> None:
+    bridge, _ = robot(patience=1.0)
+    assert play("/silent", bridge, timeout=0.2).result.executed == "unknown"
+    assert bridge.stopped()
+
+
+@pytest.mark.parametrize(
+    ("service", "ended"),
+    [("/add", ("success", "", "yes")), ("/fails", ("error", "failed", "yes"))],
+)
+def test_services(service: str, ended: tuple[str, str, str]) -> None:
+    options: dict[str, Any] = {"request": {"a": 1}, "fields": {"b": "b"}, "b": 2}
+    played = rehearse(actions.call, device=robot()[0], service=service, **options)
+    assert said(played.result) == ended
+    assert played.result.values == ({"sum": 3} if service == "/add" else {})
+    silent = rehearse(actions.call, device=robot()[0], service="/silent", timeout=0.5)
+    assert said(silent.result) == ("error", "timeout", "unknown")
+
+
+class Ports:
+    """What a driver may reach, scripted."""
+
+    def __init__(self, files: Mapping[str, str] | None = None) -> None:
+        self.now, self.events = 0.0, list[tuple[str, Any]]()
+        self.files, self.point = files or {}, Point()
+
+    def raise_event(self, name: str, **data: Any) -> None:
+        self.events.append((name, data))
+
+    def file(self, path: str) -> bytes:
+        return self.files[path].encode()
+
+    def stream(self, name: str) -> Point:
+        return self.point
+
+
+class Point:
+    """The receiving end of a stream."""
+
+    def __init__(self) -> None:
+        self.values: tuple[float, ...] | None = None
+        self.count = 0
+
+    def take(self, *values: float) -> None:
+        self.values, self.count = values or None, self.count + 1
+
+
+BUTTON = {"topic": "/button", "type": "std_msgs/msg/Bool"}
+
+
+def shown(bridge: Bridge, *messages: Any, topic: str = "/button") -> None:
+    told = [("message", {"op": "publish", "topic": topic, "msg": m}) for m in messages]
+    bridge.link.inbox += told  # type: ignore[union-attr]
+    bridge.step(0.0)
+
+
+def wired(ports: Ports, **config: Any) -> tuple[Bridge, ScriptedLink]:
+    bridge, link = robot(**config)
+    bridge.ports = ports  # type: ignore[assignment]
+    return bridge, link
+
+
+@pytest.mark.parametrize(
+    ("when", "raised"), [({}, [0, 1, 1, 0, 1]), ({"data": 1}, [1, 1]), ({"data": [1, 2]}, [1, 1])]
+)
+def test_topics_are_external_events(when: dict[str, Any], raised: list[int]) -> None:
+    """Each message without a condition; with one, each time that it begins to hold."""
+    ports = Ports()
+    bridge, link = wired(ports, subscribe={"b": {**BUTTON, "event": "pressed", "when": when}})
+    if not when:
+        del bridge.subscribe["b"]["when"]
+    shown(bridge, *({"data": n} for n in (0, 1, 1, 0, 1)))
+    assert ports.events == [("pressed", {"msg": {"data": n}}) for n in raised]
+    link.pull()
+    link.mend()
+    shown(bridge, {"data": 1})  # a latched value comes again with the link: not an edge
+    assert len(ports.events) == len(raised) + (not when)
+
+
+def test_topics_are_values_that_an_action_waits_for() -> None:
+    bridge, link = robot(subscribe={"battery": {**BUTTON, "topic": "/battery"}})
+
+    def world(now: float) -> None:
+        if abs(now - 0.5) < 1e-6:
+            shown(bridge, {"level": 0.9, "cells": [3.9]}, topic="/battery")
+
+    options: dict[str, Any] = {"topic": "battery", "when": {"level": [0.8, 1.0]}}
+    waited = rehearse(
+        actions.wait_for, device=bridge, world=world, values={"cell": "cells.0"}, **options
+    )
+    assert waited.result.values == {"cell": 3.9} and waited.seconds == pytest.approx(0.5, abs=0.05)
+    link.pull()
+    bridge.step(1.0)
+    late = rehearse(actions.wait_for, device=bridge, timeout=0.5, **options)
+    assert late.result.cause == "timeout"  # what was true before the link broke
+
+
+@pytest.mark.parametrize("bad", [{"x": None}, [], None, {"x": 2**80}, {"x": "y" * 70_000}])
+def test_a_topic_message_that_cannot_be_used_is_refused(bad: Any) -> None:
+    bridge, _ = wired(Ports(), subscribe={"b": BUTTON})
+    shown(bridge, {"data": 1}, bad)
+    state = bridge.state()
+    assert state["refused"] == 1 and state["fault"].startswith("/button: ")
+    assert state["topics"]["b"]["msg"] == {"data": 1}
+
+
+SPEED = {
+    "topic": "/cmd_vel",
+    "type": "geometry_msgs/msg/Twist",
+    "fields": ["linear.x", "angular.z"],
+}
+
+
+def test_set_points_go_to_a_topic_while_an_action_lets_them() -> None:
+    """Nothing before; rest when they stop coming, at a pause, at a stop and at the end."""
+    ports = Ports()
+    bridge, link = wired(ports, setpoints={"speed": SPEED})
+    drive = {"drive": ["speed"]}
+
+    def published() -> list[tuple[float, float]]:
+        bridge.step(0.0)
+        sent = [m["msg"] for m in link.fake.log if m["op"] == "publish"]
+        link.fake.log.clear()
+        return [(m["linear"]["x"], m["angular"]["z"]) for m in sent]
+
+    ports.point.take(0.5, 0.1)
+    assert published() == []
+    bridge.command(0.0, drive)
+    assert published() == [(0.5, 0.1)] and not bridge.stopped()
+    assert published() == []
+    ports.point.take(0.5, 0.1)
+    assert published() == [(0.5, 0.1)]
+    ports.point.values = None  # stale
+    assert published() == [(0.0, 0.0)] and bridge.stopped() and published() == []
+    ports.point.take(0.4, math.nan)
+    assert published() == []
+    for _ in "12":
+        ports.point.take(0.4, 0.2)
+        assert published() == [(0.4, 0.2)]
+        assert bridge.hold(0.0) == "held" and published() == [(0.0, 0.0)]
+        ports.point.take(0.4, 0.2)
+        assert published() == []
+        bridge.release(0.0)
+    assert published() == [(0.4, 0.2)]
+    bridge.stop(0.0)
+    ports.point.take(0.4, 0.2)
+    assert published() == [(0.0, 0.0)] and published() == [] and bridge.stopped()
+    bridge.command(0.0, drive)
+    assert published() == [(0.4, 0.2)]
+    link.pull()
+    assert published() == [] and not bridge.stopped()
+    link.mend()
+    ports.point.values = None
+    assert published() == [(0.0, 0.0)] and bridge.stopped()
+
+
+ACTION = "float64[] joints\n---\nint32 code\n---\nfloat64 left\n"
+
+
+def test_goals_are_checked_against_the_users_file() -> None:
+    ports = Ports({"a.action": ACTION})
+    config = {"url": HERE, "definitions": {"a/action/B": "a.action"}}
+    bridge, link = Bridge(config, ports), ScriptedLink()  # type: ignore[arg-type]
+    bridge.link, bridge.ports = link, None  # type: ignore[assignment]
+    for more, wrong in (
+        ({"goal": {"joint": [1]}}, "did you mean 'joints'?"),
+        ({"goal": {"joints": ["a"]}}, "joints.0: expected float64"),
+        ({"values": {"x": "error_code.val"}}, "has no ['error_code'], but: code"),
+    ):
+        played = rehearse(
+            actions.goal, device=bridge, action="/ok", action_type="a/action/B", **more
+        )
+        assert said(played.result) == ("error", "bad_goal", "no") and wrong in played.result.text
+    assert not link.fake.log
+
+
+@pytest.mark.parametrize(
+    ("config", "wrong"),
+    [
+        ({"subscribe": {"b": {"topic": "/b"}}}, "subscribe.b: is missing ['type']"),
+        ({"subscribe": {"b": {**BUTTON, "evnt": "x"}}}, "unknown keys ['evnt']"),
+        ({"setpoints": {"s": {**SPEED, "rest": [0.0]}}}, "one value for each of `fields`"),
+        ({"urll": "ws://x"}, "did you mean"),
+    ],
+)
+def test_a_wrong_table_is_refused(config: dict[str, Any], wrong: str) -> None:
+    with pytest.raises(ValueError) as refused:
+        robot(**config)
+    assert wrong in str(refused.value)
+
+
+def test_the_driver_keeps_the_rules() -> None:
+    assert check_driver(lambda: wired(Ports())[0], simulated=True).faults == []
+
+
+@pytest.mark.parametrize(
+    ("action", "options", "action_type", "part"),
+    [
+        (
+            actions.navigate_to_pose,
+            {"x": 1, "y": 2, "yaw": math.pi},
+            "nav2_msgs/action/NavigateToPose",
+            ("pose.pose.orientation.z", 1.0),
+        ),
+        (
+            actions.move_group,
+            {"joints": {"j1": 1}, "group": "arm"},
+            "moveit_msgs/action/MoveGroup",
+            ("request.goal_constraints.0.joint_constraints.0.position", 1.0),
+        ),
+        (
+            actions.follow_joint_trajectory,
+            {"joints": ["a"], "positions": [[0.5]], "times": [1.25], "expect": {}},
+            "control_msgs/action/FollowJointTrajectory",
+            ("trajectory.points.0.time_from_start", {"sec": 1, "nanosec": 250_000_000}),
+        ),
+    ],
+)
+def test_shipped_goals(
+    action: Callable[..., Any], options: dict[str, Any], action_type: str, part: tuple[str, Any]
+) -> None:
+    from petrobot.services.adapters.ros2.protocol import pick
+
+    bridge, link = robot()
+    options = {"remaining": "distance", **options}
+    played = rehearse(action, device=bridge, action="/ok", **options)
+    assert played.result.status == "success", played.result
+    (sent,) = link.fake.log
+    assert sent["action_type"] == action_type and pick(sent["args"], part[0]) == pytest.approx(
+        part[1]
+    )
+
+
+def test_a_trajectory_that_does_not_fit_is_not_sent() -> None:
+    options: dict[str, Any] = {"joints": ["a", "b"], "positions": [[0.5]], "times": [1.0]}
+    played = rehearse(actions.follow_joint_trajectory, device=robot()[0], action="/ok", **options)
+    assert said(played.result) == ("error", "bad_goal", "no")

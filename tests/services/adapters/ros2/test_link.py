@@ -1,0 +1,195 @@
+"""The connection to a rosbridge in another process: lost, cut, restarted, and fed with rubbish."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from petrobot.services.adapters.ros2.bridge import Bridge
+from petrobot.services.adapters.ros2.protocol import Phase
+from tests.ports import free_ports
+from tests.services.adapters.ros2.conftest import FakeProcess
+from tests.services.adapters.ros2.test_actions import Ports
+from tests.waiting import Limit
+
+pytestmark = pytest.mark.processes
+
+
+class Stepped(Bridge):
+    """A driver that the test steps, on the clock of the process."""
+
+    def until(self, condition: Callable[[], object], awaited: str) -> None:
+        limit = Limit(f"{awaited}: {self.state()}", 20.0)
+        while not condition() and limit.left():
+            self.ports.now = time.monotonic()  # type: ignore[misc]
+            self.step(time.monotonic())
+            time.sleep(0.005)
+
+    def goal(self, name: str, run: str = "run") -> None:
+        request = {"op": "send_action_goal", "action": name, "action_type": "a/action/B"}
+        self.command(
+            time.monotonic(), {"goal": {**request, "args": {}, "feedback": True}, "run": run}
+        )
+
+    def phase(self, run: str = "run") -> Phase:
+        return self.exchanges.open[run].phase
+
+    def until_phase(self, phase: Phase, run: str = "run") -> None:
+        self.until(lambda: self.phase(run) is phase, phase)
+
+
+def bridge_to(url: str, **config: Any) -> Stepped:
+    return Stepped({"url": url, **config}, Ports())  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def bridge(fake: FakeProcess) -> Iterator[Stepped]:
+    made = bridge_to(fake.url)
+    made.until(lambda: made.epoch, "the first connection")
+    yield made
+    made.close()
+
+
+def test_goals_through_a_socket(bridge: Stepped, fake: FakeProcess) -> None:
+    for name, phase in (
+        ("/ok", Phase.SUCCEEDED),
+        ("/aborts", Phase.ABORTED),
+        ("/rejects", Phase.REJECTED),
+        ("/nested", Phase.SUCCEEDED),
+    ):
+        bridge.goal(name, name)
+        bridge.until_phase(phase, name)
+    bridge.goal("/slow")
+    bridge.until_phase(Phase.ACTIVE)
+    assert not bridge.stopped()
+    bridge.stop(time.monotonic())
+    bridge.until_phase(Phase.CANCELLED)
+    assert bridge.stopped()
+
+
+def test_no_server_at_first() -> None:
+    (port,) = free_ports(1)
+    bridge = bridge_to(f"ws://127.0.0.1:{port}")
+    bridge.until(lambda: "not connected" not in bridge.down, "a refused connection")
+    with pytest.raises(ValueError, match="no connection to"):
+        bridge.goal("/ok")
+    later = FakeProcess(port)
+    bridge.until(lambda: bridge.epoch, "the server")
+    bridge.goal("/ok")
+    bridge.until_phase(Phase.SUCCEEDED)
+    bridge.close()
+    later.end()
+
+
+def test_a_cut_link_recalls_its_goal(bridge: Stepped, fake: FakeProcess) -> None:
+    bridge.goal("/slow")
+    bridge.until_phase(Phase.ACTIVE)
+    fake.post("drop")
+    bridge.until_phase(Phase.LOST)
+    assert not bridge.stopped()
+    bridge.until(bridge.stopped, "the recall")
+    goal, *cancels = fake.log("send_action_goal", "cancel_action_goal")
+    assert cancels and {m["id"] for m in cancels} == {goal["id"]}
+
+
+def test_a_killed_server_and_its_successor() -> None:
+    """The new server knows no goal: the cancel is ignored, and the goal given up after patience."""
+    fake = FakeProcess()
+    bridge = bridge_to(fake.url, patience=1.2)
+    bridge.until(lambda: bridge.epoch, "the connection")
+    bridge.goal("/slow")
+    bridge.until_phase(Phase.ACTIVE)
+    fake.end()
+    bridge.until_phase(Phase.LOST)
+    successor = FakeProcess(fake.port)
+    bridge.until_phase(Phase.RECALLED)
+    bridge.until_phase(Phase.GONE)
+    assert bridge.stopped()
+    assert {m["op"] for m in successor.log()} == {"cancel_action_goal"}
+    bridge.close()
+    successor.end()
+
+
+def test_a_frozen_server_is_a_lost_link(fake: FakeProcess) -> None:
+    bridge = bridge_to(fake.url, heartbeat=0.4)
+    bridge.until(lambda: bridge.epoch, "the connection")
+    bridge.goal("/slow")
+    bridge.until_phase(Phase.ACTIVE)
+    os.kill(fake.process.pid, signal.SIGSTOP)
+    bridge.until_phase(Phase.LOST)
+    os.kill(fake.process.pid, signal.SIGCONT)
+    bridge.until(bridge.stopped, "the recall")
+    bridge.close()
+
+
+RUBBISH = [
+    "",
+    "{",
+    "[]",
+    "[" * 50_000,
+    '{"op": 3}',
+    '{"op": "publish"}',
+    '{"op": "publish", "topic": "/b", "msg": {"x": NaN}}',
+    '{"op": "publish", "topic": "/b", "msg": {"x": 1e999}}',
+    '{"op": "publish", "topic": "/b", "msg": "text"}',
+    '{"op": "publish", "topic": ["/b"], "msg": {}}',
+    '{"op": "action_result"}',
+    '{"op": "action_result", "id": ["run"], "result": true}',
+    '{"op": "action_feedback", "id": 7, "values": null}',
+    '{"op": "unheard_of", "id": "run"}',
+    '{"op": "fragment", "id": "0", "data": "x", "num": 0, "total": 2}',
+    '{"op": "png", "data": "iVBO"}',
+]
+
+
+def test_rubbish_changes_nothing(bridge: Stepped, fake: FakeProcess) -> None:
+    """Frames that are no messages, or messages of nothing that was asked for."""
+    bridge.subscribe = {"b": {"topic": "/b", "type": "a/msg/B"}}
+    bridge.goal("/slow")
+    bridge.until_phase(Phase.ACTIVE)
+    for text in RUBBISH:
+        fake.post("send", text)
+    fake.post("send", json.dumps({"op": "publish", "topic": "/b", "msg": {"x": 1}}))
+    bridge.until(lambda: "b" in bridge.topics, "the message after it")
+    assert bridge.topics["b"] == {"msg": {"x": 1}, "count": 1} and bridge.epoch == 1
+    assert bridge.phase() is Phase.ACTIVE and bridge.exchanges.refused == 9
+
+
+@pytest.mark.parametrize("values", [None, [], 7, "text", {"x": None}, {"x": 2**70}])
+def test_odd_values_of_an_active_goal(bridge: Stepped, fake: FakeProcess, values: Any) -> None:
+    bridge.goal("/slow")
+    bridge.until_phase(Phase.ACTIVE)
+    one = bridge.exchanges.open["run"]
+    said = {"id": one.request["id"], "action": "/slow", "values": values}
+    fake.post("send", json.dumps({"op": "action_feedback", **said}))
+    bridge.until(lambda: bridge.exchanges.refused, "the refused feedback")
+    assert one.feedback["state"] == "moving"
+    fake.post("send", json.dumps({"op": "action_result", **said, "status": 4, "result": True}))
+    bridge.until_phase(Phase.SUCCEEDED)
+    assert bool(one.fault) is bool(values and values != "text") and one.values == {}
+
+
+def test_a_message_that_is_too_long_costs_the_link_only(bridge: Stepped, fake: FakeProcess) -> None:
+    fake.post("send", "x" * (5 << 20))
+    bridge.until(lambda: bridge.epoch == 2, "the next connection")
+    bridge.goal("/ok")
+    bridge.until_phase(Phase.SUCCEEDED)
+
+
+def test_a_full_way_out_ends_the_connection(bridge: Stepped, fake: FakeProcess) -> None:
+    """The server does not read: nothing is kept without bound, and no step waits."""
+    os.kill(fake.process.pid, signal.SIGSTOP)
+    message = {"text": "x" * 60_000}
+    limit = Limit("a full queue")
+    while bridge.epoch == 1 and limit.left():
+        body = {"topic": "/t", "type": "a/msg/B", "msg": message}
+        bridge.command(time.monotonic(), {"publish": body})
+        bridge.step(time.monotonic())
+    os.kill(fake.process.pid, signal.SIGCONT)
+    bridge.until(lambda: bridge.epoch == 2, "the next connection")

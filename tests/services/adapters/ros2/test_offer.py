@@ -1,0 +1,400 @@
+"""A task as an action of ROS 2: goals start runs, cancels abort them, and each has a result."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from petrobot.services.adapters.ros2 import __main__ as offering
+from petrobot.services.adapters.ros2.link import Item
+from petrobot.services.adapters.ros2.protocol import Phase
+from tests.ports import free_ports
+from tests.services.adapters.ros2.conftest import FakeProcess
+from tests.services.adapters.ros2.test_link import bridge_to
+from tests.waiting import until
+
+ROOT = Path(__file__).parents[4]
+RUN_TASK = re.search(
+    r"```\n(# RunTask.action.*?)```",
+    (ROOT / "docs" / "robots" / "ros2.md").read_text(encoding="utf-8"),
+    re.DOTALL,
+)
+
+
+class Page:
+    """The coordinator's page, scripted: a run lasts until the test ends it."""
+
+    def __init__(self) -> None:
+        self.state, self.run, self.marking = "idle", "", {"a": 1}
+        self.commands: list[tuple[str, dict[str, Any]]] = []
+        self.gone, self.held, self.obeys = False, False, True
+
+    async def snapshot(self) -> dict[str, Any]:
+        if self.gone:
+            raise OSError("the page does not answer")
+        mission = {"id": self.run, "state": self.state, "reason": "because"}
+        runs = {"1": {"action": "rest"}} if self.state == "running" else {}
+        return {"mission": mission, "marking": self.marking, "runs": runs, "result": {"n": 1}}
+
+    async def command(self, verb: str, **data: Any) -> dict[str, Any]:
+        if self.gone:
+            raise OSError("the page does not answer")
+        self.commands.append((verb, data))
+        if verb == "start" and self.held:
+            return {"ok": False, "code": "not_holder", "text": "ana holds the controls"}
+        if verb == "start":
+            self.run, self.state = f"run-{len(self.commands)}", "running"
+        if verb == "abort" and self.obeys:
+            self.state = "aborted"
+        return {"ok": True, "run": self.run}
+
+
+class Link:
+    """rosbridge, scripted."""
+
+    def __init__(self) -> None:
+        self.inbox: list[Item] = [("up", 1)]
+        self.sent: list[dict[str, Any]] = []
+
+    def poll(self, now: float) -> list[Item]:
+        items, self.inbox = self.inbox, []
+        return items
+
+    def send(self, now: float, epoch: int, messages: list[dict[str, Any]]) -> None:
+        self.sent += json.loads(json.dumps(messages))
+
+    def say(self, op: str, goal: str, **more: Any) -> None:
+        self.inbox.append(("message", {"op": op, "id": goal, "action": "/rest", **more}))
+
+    def results(self) -> list[tuple[str, int, str]]:
+        told = [m for m in self.sent if m["op"] == "action_result"]
+        assert all(m["result"] is True for m in told)
+        return [(m["id"], m["status"], m["values"].get("state", "")) for m in told]
+
+
+Steps = Callable[[Page, Link], Any]
+
+
+def played(steps: Steps, **more: Any) -> tuple[Page, Link]:
+    """Serve while the test's steps are taken; then stop."""
+    page, link = Page(), Link()
+    given = {"task": "rest", "action": "/rest", "type": offering.TYPE, "mode": "realtime"}
+    options = argparse.Namespace(**{**given, "definition": None, **more})
+
+    async def play() -> None:
+        stop = asyncio.Event()
+        offer = offering.Offer(link, page, options)  # type: ignore[arg-type]
+        serving = asyncio.create_task(offer.serve(stop))
+        await steps(page, link)
+        stop.set()
+        await asyncio.wait_for(serving, 20)
+
+    asyncio.run(play())
+    assert link.sent[0]["op"] == "advertise_action"
+    assert link.sent[-1] == {"op": "unadvertise_action", "action": "/rest"}
+    return page, link
+
+
+@pytest.mark.parametrize(("state", "status"), [("success", 4), ("error", 6), ("stopped", 6)])
+def test_a_goal_is_a_run(state: str, status: int) -> None:
+    async def steps(page: Page, link: Link) -> None:
+        args = {"seconds": 2.0, "parameters": '{"more": [1]}', "seed": 7, "runs": 0}
+        link.say("send_action_goal", "g1", args=args)
+        await until(lambda: page.state == "running" and len(link.sent) > 1, "the feedback")
+        page.marking = {"a": 0, "b": 2}
+        await until(lambda: len(link.sent) > 2, "the next feedback")
+        page.state = state
+        await until(link.results, "the result")
+
+    page, link = played(steps)
+    assert page.commands[:2] == [
+        ("take_controls", {}),
+        (
+            "start",
+            {
+                "task": "rest",
+                "mode": "realtime",
+                "parameters": {"seconds": 2.0, "more": [1]},
+                "seed": 7,
+            },
+        ),
+    ]
+    told = [m["values"] for m in link.sent if m["op"] == "action_feedback"]
+    assert told[-1] == {"places": ["b"], "tokens": [2], "active": ["rest"]}
+    assert link.results() == [("g1", status, state)]
+    assert page.commands[-1] == ("release_controls", {})
+
+
+def test_a_cancel_aborts_the_run() -> None:
+    async def steps(page: Page, link: Link) -> None:
+        link.say("send_action_goal", "g1", args={})
+        await until(lambda: page.state == "running", "the run")
+        link.say("cancel_action_goal", "another")
+        link.say("cancel_action_goal", "g1")
+        await until(link.results, "the result")
+
+    page, link = played(steps)
+    assert link.results() == [("g1", 5, "aborted")] and ("abort", {}) in page.commands
+
+
+def test_a_cancel_that_comes_too_late_leaves_the_success() -> None:
+    async def steps(page: Page, link: Link) -> None:
+        page.obeys = False
+        link.say("send_action_goal", "g1", args={})
+        await until(lambda: page.state == "running", "the run")
+        link.say("cancel_action_goal", "g1")
+        await until(lambda: ("abort", {}) in page.commands, "the abort")
+        page.state = "success"
+        await until(link.results, "the result")
+
+    assert played(steps)[1].results() == [("g1", 4, "success")]
+
+
+def test_an_operator_who_aborts_is_no_cancel() -> None:
+    """rclpy refuses `cancelled` for a goal whose client did not cancel it."""
+
+    async def steps(page: Page, link: Link) -> None:
+        link.say("send_action_goal", "g1", args={})
+        await until(lambda: page.state == "running", "the run")
+        page.state = "aborted"
+        await until(link.results, "the result")
+
+    assert played(steps)[1].results() == [("g1", 6, "aborted")]
+
+
+@pytest.mark.parametrize(
+    ("args", "held", "word"),
+    [
+        ({}, True, "ana holds the controls"),
+        ([], False, "expected a goal with fields"),
+        ({"parameters": "{"}, False, "Expecting"),
+        ({"parameters": "[]"}, False, "expected a JSON object"),
+    ],
+)
+def test_a_goal_that_cannot_be_started_is_aborted_with_the_reason(
+    args: Any, held: bool, word: str
+) -> None:
+    async def steps(page: Page, link: Link) -> None:
+        page.held = held
+        link.say("send_action_goal", "g1", args=args)
+        await until(link.results, "the result")
+        page.held = False
+        link.say("send_action_goal", "g2", args={})
+        await until(lambda: page.state == "running", "the next goal's run")
+
+    _, link = played(steps)
+    assert link.results()[0] == ("g1", 6, "refused")
+    (reason, *_) = [m["values"]["reason"] for m in link.sent if m["op"] == "action_result"]
+    assert word in reason
+
+
+def test_one_goal_at_a_time() -> None:
+    async def steps(page: Page, link: Link) -> None:
+        link.say("send_action_goal", "g1", args={})
+        link.say("send_action_goal", "g2", args={})
+        await until(link.results, "the refusal")
+
+    assert played(steps)[1].results()[0] == ("g2", 6, "refused")
+
+
+@pytest.mark.parametrize("lost", ["link", "page", "stop"])
+def test_whoever_is_lost_no_run_goes_on_unseen(lost: str) -> None:
+    """A link that breaks aborts the run: its client can no longer cancel it."""
+
+    async def steps(page: Page, link: Link) -> None:
+        link.say("send_action_goal", "g1", args={})
+        await until(lambda: page.state == "running", "the run")
+        if lost == "page":
+            page.gone = True
+            await until(link.results, "the result")
+        elif lost == "link":
+            link.inbox += [("down", "pulled"), ("up", 2)]
+            await until(lambda: page.state == "aborted", "the abort")
+            await until(link.results, "a result")
+
+    page, link = played(steps)
+    if lost == "page":
+        assert link.results() == [("g1", 6, "refused")]
+    else:
+        assert page.state == "aborted" and link.results() == [("g1", 6, "aborted")]
+    offered = [m for m in link.sent if m["op"] == "advertise_action"]
+    assert len(offered) == (2 if lost == "link" else 1)
+
+
+def test_what_is_told_fits_the_definition(tmp_path: Path) -> None:
+    """rosbridge drops a message with an unknown field: its goal would never end."""
+    (tmp_path / "Mine.action").write_text("---\nstring state\n---\nstring[] places\n")
+
+    async def steps(page: Page, link: Link) -> None:
+        link.say("send_action_goal", "g1", args={})
+        await until(lambda: page.state == "running" and len(link.sent) > 1, "the feedback")
+        page.state = "success"
+        await until(link.results, "the result")
+
+    definition = tmp_path / "Mine.action"
+    _, link = played(steps, type="mine/action/Mine", definition=definition)
+    shapes = {m["op"]: set(m["values"]) for m in link.sent if "values" in m}
+    assert shapes == {"action_feedback": {"places"}, "action_result": {"state"}}
+
+
+def test_the_definition_in_the_page_is_what_is_sent() -> None:
+    from petrobot.services.adapters.ros2.definitions import faults, read
+
+    assert RUN_TASK is not None
+    known = read(offering.TYPE, RUN_TASK[1], "ros2.md")
+
+    async def steps(page: Page, link: Link) -> None:
+        link.say("send_action_goal", "g1", args={})
+        await until(lambda: page.state == "running" and len(link.sent) > 1, "the feedback")
+
+    _, link = played(steps)
+    for part, op in (("Feedback", "action_feedback"), ("Result", "action_result")):
+        for values in [m["values"] for m in link.sent if m["op"] == op]:
+            assert set(values) == set(known[f"{offering.TYPE}.{part}"])
+            assert faults(values, f"{offering.TYPE}.{part}", known) == []
+
+
+# --- with a coordinator ------------------------------------------------------------------------
+
+TASK = """
+schema = 1
+[task]
+name = "rest"
+final = "rested == 1"
+final_error = "tired == 1"
+[task.parameters]
+seconds = 0.2
+[errors]
+to = "tired"
+[primitive_tasks.rest]
+goal = "Time has passed"
+alternatives = ["rest"]
+deadline = 60.0
+[places]
+begin = { kind = "control", tokens = 1 }
+rest = { kind = "action", task = "rest", args = { seconds = { var = "seconds" } } }
+rested = { kind = "control" }
+tired = { kind = "control" }
+[transitions]
+start = { in = ["begin"], out = ["rest"] }
+done = { in = ["rest:normal"], out = ["rested"] }
+"""
+CELL = """
+schema = 1
+[nodes.pc]
+host = "127.0.0.1"
+port = {port}
+[actions.rest]
+run = "resting:rest"
+node = "pc"
+"""
+ACTION = """
+from petrobot import success
+
+async def rest(ctx, *, seconds: float):
+    await ctx.sleep(seconds)
+    return success()
+"""
+
+
+@pytest.fixture(scope="module")
+def offered(
+    process: FakeProcess, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[FakeProcess]:
+    """A fake rosbridge at which the task `rest` of a served coordinator is offered."""
+    folder = tmp_path_factory.mktemp("offer")
+    (folder / "tasks").mkdir()
+    (folder / "tasks" / "rest.toml").write_text(TASK)
+    (folder / "services.toml").write_text(CELL.format(port=free_ports(1)[0]))
+    (folder / "resting.py").write_text(ACTION)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+
+    def begun(*arguments: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", *arguments]
+        pipe = subprocess.PIPE
+        return subprocess.Popen(command, cwd=folder, env=environment, stdout=pipe, text=True)
+
+    serving = begun("petrobot.coordinator", "serve", "--up")
+    assert serving.stdout is not None
+    page = serving.stdout.readline().partition("page: ")[2].strip()
+    name = "petrobot.services.adapters.ros2"
+    offer = begun(name, "rest", "--page", page, "--url", process.url)
+    assert offer.stdout is not None
+    assert "is offered" in offer.stdout.readline()
+    yield process
+    for started in (offer, serving):
+        started.terminate()
+        assert started.wait(30) == 0
+        assert started.stdout is not None
+        started.stdout.close()
+
+
+@pytest.mark.processes
+def test_petrobot_starts_petrobot(offered: FakeProcess) -> None:
+    """Our client, rosbridge's way, our offer: success, cancel and refusal of real runs."""
+    bridge = bridge_to(offered.url)
+    bridge.until(lambda: bridge.epoch, "the connection")
+    bridge.goal("/rest", "first")
+    bridge.until_phase(Phase.SUCCEEDED, "first")
+    one = bridge.exchanges.open["first"]
+    assert one.values["state"] == "success" and json.loads(one.values["result"])["task"] == "rest"
+    assert one.feedback["places"]
+    request = {"op": "send_action_goal", "action": "/rest", "action_type": offering.TYPE}
+    bridge.command(0.0, {"goal": {**request, "args": {"seconds": 50.0}}, "run": "second"})
+    bridge.until_phase(Phase.ACTIVE, "second")
+    bridge.command(0.0, {"cancel": "second"})
+    bridge.until_phase(Phase.CANCELLED, "second")
+    bridge.command(0.0, {"goal": {**request, "args": {"hours": 50.0}}, "run": "third"})
+    bridge.until_phase(Phase.ABORTED, "third")
+    assert "hours" in bridge.exchanges.open["third"].values["reason"]
+    bridge.close()
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    ("goal", "cancel", "status"), [({"seconds": 0.5}, [], 4), ({"seconds": 50.0}, ["cancel"], 5)]
+)
+def test_a_foreign_client_starts_petrobot(
+    offered: FakeProcess, goal: dict[str, float], cancel: list[str], status: int
+) -> None:
+    told = foreign(offered, "/rest", json.dumps(goal), *cancel)
+    assert told[-1]["status"] == status and "feedback" in told[0]
+    assert set(told[-1]["result"]) == {"state", "reason", "result"}
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    ("action", "cancel", "status"),
+    [("/ok", [], 4), ("/aborts", [], 6), ("/slow", ["cancel"], 5)],
+)
+def test_the_fake_is_a_rosbridge_for_a_foreign_client(
+    fake: FakeProcess, action: str, cancel: list[str], status: int
+) -> None:
+    """What the other tests rely on: roslibpy takes the fake for a rosbridge."""
+    assert foreign(fake, action, "{}", *cancel)[-1]["status"] == status
+
+
+def foreign(fake: FakeProcess, *arguments: str) -> list[dict[str, Any]]:
+    """What roslibpy tells of a goal."""
+    if importlib.util.find_spec("roslibpy") is None:
+        pytest.skip("roslibpy is not installed")
+    script = Path(__file__).parent / "foreign.py"
+    ran = subprocess.run(
+        [sys.executable, str(script), str(fake.port), *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert ran.returncode == 0, ran.stderr
+    return [json.loads(line) for line in ran.stdout.splitlines() if line.startswith("{")]

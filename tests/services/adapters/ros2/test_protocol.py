@@ -1,0 +1,210 @@
+"""What a rosbridge message may hold, and the table of phases of a goal."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from petrobot.services.adapters.ros2.protocol import (
+    MOVING,
+    RUNNING,
+    TABLE,
+    Exchanges,
+    Phase,
+    Word,
+    filled,
+    parse,
+    pick,
+    unfit,
+)
+from petrobot.services.comm.protocol.plain import plain
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        "7",
+        '"op"',
+        "{}",
+        '{"op": 7}',
+        "[" * 100_000,
+        '{"op": "x", "n": ' + "9" * 5000,
+    ],
+)
+def test_what_is_no_message_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"not JSON|expected an object"):
+        parse(text)
+
+
+def test_numbers_that_are_not_finite_become_null() -> None:
+    """As newer servers send them; older ones send JavaScript's words."""
+    told = parse('{"op": "publish", "msg": {"a": NaN, "b": [-Infinity, 1e999, 1.5]}}')
+    assert told["msg"] == {"a": None, "b": [None, None, 1.5]}
+    assert unfit(told["msg"]) == "a: is not a finite number"
+    assert unfit({"b": [1.0, {"c": None}]}) == "b.1.c: is not a finite number"
+
+
+@given(st.dictionaries(st.text(), VALUES, max_size=5))
+def test_what_fits_can_be_sent_on(values: dict[str, Any]) -> None:
+    """Values that are let through are plain data of finite numbers, as petrobot sends them."""
+    fault = unfit(values)
+    try:
+        text = json.dumps(values, allow_nan=False)
+        sound = "null" not in text or None not in _flat(values)
+        plain(values)
+    except (ValueError, TypeError):
+        sound = False
+    assert (fault == "") == sound, fault
+
+
+def _flat(value: Any) -> list[Any]:
+    if isinstance(value, dict | list):
+        inner = value.values() if isinstance(value, dict) else value
+        return [leaf for item in inner for leaf in _flat(item)]
+    return [value]
+
+
+@pytest.mark.parametrize(
+    ("values", "word"),
+    [
+        ([], "expected a message"),
+        ({"a": 2**70}, "64 bits"),
+        ({"a": "\ud800"}, "Unicode"),
+        ({"a": [0] * 30_000}, "more than 20000 items"),
+        (json.loads('{"a": ' * 30 + "[1]" + "}" * 30), "deep"),
+    ],
+)
+def test_what_cannot_be_sent_on_is_refused(values: Any, word: str) -> None:
+    assert word in unfit(values)
+
+
+def test_paths() -> None:
+    message = filled({"pose": {"z": 1}}, {"pose.x": 2.0, "header.frame_id": "map"})
+    assert message == {"pose": {"z": 1, "x": 2.0}, "header": {"frame_id": "map"}}
+    assert pick({"points": [{"x": 3}]}, "points.0.x") == 3
+    for path in ("points.1.x", "points.x", "lines", "points.0.x.y"):
+        with pytest.raises(ValueError, match=path):
+            pick({"points": [{"x": 3}]}, path)
+    with pytest.raises(ValueError, match="not a table"):
+        filled({"pose": 3}, {"pose.x": 1})
+
+
+GOAL = {"op": "send_action_goal", "action": "/a", "action_type": "p/action/A", "args": {}}
+RESULTS = {
+    Word.SUCCEEDED: {"status": 4, "result": True, "values": {"n": 4}},
+    Word.CANCELLED: {"status": 5, "result": True, "values": {"n": 5}},
+    Word.ABORTED: {"status": 6, "result": True, "values": {"n": 6}},
+    Word.REFUSED: {"status": 0, "result": False, "values": "Action goal was rejected"},
+}
+ENDED = set(Phase) - RUNNING
+
+
+@given(st.lists(st.tuples(st.sampled_from(Word), st.floats(0.0, 3.0)), max_size=30))
+def test_a_goal_ends_once_and_as_the_first_word_says(words: list[tuple[Word, float]]) -> None:
+    """Whatever comes in whatever order: the first end counts, a run never sees another one, a lost
+    goal is recalled over the next link, and a cancel goes out only for a goal that may move."""
+    patience = 5.0
+    exchanges = Exchanges(patience)
+    identity = exchanges.begin(0.0, "run", GOAL)["id"]
+    one, now, up = exchanges.open["run"], 0.0, True
+    ended: Phase | None = None
+    for word, pause in words:
+        now += pause
+        before = one.phase
+        if word is Word.CANCEL:
+            sent = exchanges.cancel(now, "run")
+        elif word in (Word.DOWN, Word.UP):
+            up = word is Word.UP
+            sent = exchanges.link(now, up)
+            assert not sent or up
+            assert before is not Phase.LOST or not up or [m["id"] for m in sent] == [identity]
+        elif word is Word.SILENCE:
+            sent = exchanges.advance(now)
+            waited = now - one.heard >= patience
+            assert one.phase is TABLE.get((before, word), before) or not waited
+        elif word is Word.FEEDBACK:
+            sent, told = [], {"op": "action_feedback", "id": identity, "values": {"t": now}}
+            exchanges.receive(now, told)
+        else:
+            sent = []
+            exchanges.receive(now, {"op": "action_result", "id": identity, **RESULTS[word]})
+        assert all(m["op"] == "cancel_action_goal" and m["id"] == identity for m in sent)
+        assert not sent or one.phase in MOVING
+        if ended is None and one.phase in ENDED:
+            ended = one.phase
+            if word in RESULTS and word is not Word.REFUSED:
+                assert one.values == {"n": RESULTS[word]["status"]}
+        if ended is not None:  # what a run may tell of it stays the same
+            lost = {Phase.LOST, Phase.RECALLED, Phase.GONE}
+            assert one.phase is ended or {one.phase, ended} <= lost
+    # however it stands, it comes to rest
+    for settled in (False, True):
+        exchanges.link(now, settled)
+    exchanges.cancel(now, "run")
+    exchanges.advance(now + patience + 1e-6)
+    assert one.phase not in MOVING
+    exchanges.forget("run")
+    assert not exchanges.open
+
+
+def test_a_repeated_cancel_waits_no_longer() -> None:
+    """A server that never answers: the cancel is repeated each second, and given up in the end."""
+    exchanges = Exchanges(5.0)
+    exchanges.begin(0.0, "run", GOAL)
+    sent = exchanges.cancel(0.0, "run")
+    for tick in range(1, 100):
+        sent += exchanges.advance(tick * 0.1)
+    assert exchanges.open["run"].phase is Phase.UNANSWERED
+    assert len(sent) == 5
+
+
+def test_ids_are_unique_in_the_world() -> None:
+    """All clients of a rosbridge server share one table of goals by id."""
+    ids = [e.begin(0.0, "run", GOAL)["id"] for e in (Exchanges(1.0), Exchanges(1.0)) for _ in "12"]
+    assert len(set(ids)) == 4
+
+
+@pytest.mark.parametrize(
+    ("said", "phase", "text"),
+    [
+        ({"op": "status", "level": "error", "msg": "Unknown operation"}, Phase.REJECTED, "Unknown"),
+        ({"op": "status", "level": "warning", "msg": "slow"}, Phase.PENDING, ""),
+        ({"op": "action_result", "status": 6, "result": False}, Phase.ABORTED, "status 6"),
+        ({"op": "action_result", "status": 2, "result": True}, Phase.ABORTED, "status 2"),
+        ({"op": "action_result", "result": True, "values": {}}, Phase.SUCCEEDED, ""),
+        ({"op": "action_result", "result": False}, Phase.REJECTED, "no reason"),
+        ({"op": "action_result", "status": [], "result": True}, Phase.ABORTED, "status"),
+        ({"op": "action_feedback", "values": {"x": None}}, Phase.ACTIVE, ""),
+    ],
+)
+def test_words_of_unusual_servers(said: dict[str, Any], phase: Phase, text: str) -> None:
+    exchanges = Exchanges(1.0)
+    identity = exchanges.begin(0.0, "run", GOAL)["id"]
+    exchanges.receive(0.0, {"id": identity, **said})
+    one = exchanges.open["run"]
+    assert one.phase is phase and text in one.text and one.feedback == {}
+    exchanges.receive(0.0, {"op": "action_result", "id": "another", "result": True})
+    assert one.phase is phase
+
+
+def test_a_result_keeps_only_the_fields_that_are_asked_for() -> None:
+    exchanges = Exchanges(1.0)
+    identity = exchanges.begin(0.0, "run", GOAL, ["code"])["id"]
+    values = {"code": {"val": 1}, "trajectory": [math.nan]}
+    said = {"op": "action_result", "id": identity, "status": 4, "result": True, "values": values}
+    exchanges.receive(0.0, said)
+    assert exchanges.open["run"].values == {"code": {"val": 1}}
