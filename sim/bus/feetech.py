@@ -1,5 +1,4 @@
-"""Feetech STS3215 bus servos, sans-I/O: register map, protocol, motion, protection; and a pseudo
-terminal that carries their bus.
+"""Feetech STS3215 bus servos, sans-I/O: register map, protocol, motion, protection.
 
 The protocol and the registers are those of the STS memory table (Feetech, magnetic encoder series).
 A servo is a DC motor whose duty cycle is proportional to its position error: at a steady state the
@@ -10,15 +9,9 @@ TheRobotStudio/SO-ARM100: 17.8 N m/rad, 0.052 N m, 3.35 N m).
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import math
-import os
-import select
-import tty
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Final
 
 STEPS: Final = 4096
@@ -324,46 +317,6 @@ def status(servo: Servo, content: bytes) -> bytes:
     """Return the status packet of a servo."""
     body = bytes((servo.memory[ID], len(content) + 2, servo.fault)) + content
     return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
-
-
-class PtyLine:
-    """The master's end of a line as a serial port that any program can open: `path`, a link to a
-    pseudo terminal. `poll` answers by `take`; closing it is a pulled cable."""
-
-    def __init__(self, path: Path, take: Callable[[bytes], bytes]) -> None:
-        """Raises FileExistsError if something else than a link is at `path`."""
-        self.path, self._take = path, take
-        self._master, self._slave = os.openpty()  # our own slave end keeps it open between masters
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        if path.is_symlink():
-            path.unlink()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.symlink_to(os.ttyname(self._slave))
-
-    def fileno(self) -> int:
-        """Return what `select` waits for."""
-        return self._master
-
-    def poll(self, timeout: float = 0.0) -> None:
-        """Answer what has come; wait up to `timeout` seconds for something."""
-        if not select.select([self._master], [], [], timeout)[0]:
-            return
-        with contextlib.suppress(BlockingIOError):
-            answer = self._take(os.read(self._master, 65536))
-            if answer:
-                os.write(self._master, answer)
-
-    def close(self) -> None:
-        """Pull the cable: the program that has it open gets an error."""
-        with contextlib.suppress(OSError):
-            self.path.unlink()
-        for number in (self._slave, self._master):
-            try:
-                os.close(number)
-            except OSError as fault:
-                if fault.errno != errno.EBADF:
-                    raise
 
 
 def so101(angles: Sequence[float] = (0.0,) * 6) -> FeetechBus:

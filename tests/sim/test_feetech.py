@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from petrobot.sim.bus import feetech
-from petrobot.sim.bus.feetech import FeetechBus, PtyLine, Servo, so101
+from petrobot.sim.bus.feetech import FeetechBus, Servo, so101
+from petrobot.sim.bus.serial_line import PtyLine
 
 STEP = 0.004
 
