@@ -18,6 +18,7 @@ from petrobot.services.comm.canopen.bus import CanBus
 from petrobot.services.comm.location_file.reading import nearest
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.comm.streams.image import ImageSource
+from petrobot.services.comm.streams.serial_line import SerialLine
 
 if TYPE_CHECKING:
     import numpy as np
@@ -57,6 +58,12 @@ class Ports(Protocol):
 
     def can(self) -> CanBus:
         """The CAN bus of this device."""
+
+    def serial(self, port: str, baud: int) -> SerialLine:
+        """Open a serial line (8 data bits, no parity, 1 stop bit); again after it was lost. `port`
+        is the device's key of that name: a path, or "pty:PATH" at a simulated laboratory. In lock
+        step it is the laboratory's whatever it says. Raises ConnectionError when it is not
+        there."""
 
     def images(self) -> ImageSource:
         """The image source of this device."""

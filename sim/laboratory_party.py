@@ -89,12 +89,22 @@ class LaboratoryParty(ABC):
     def close(self) -> None:
         """Release what the world holds."""
 
+    def take_on_serial(self, now: float, device: str, data: bytes) -> bytes:
+        """Process what a device's driver sent on its serial line; return the answer. A world with
+        such devices overrides this."""
+        return b""
+
     # The party
 
     def receive(self, now: float, envelope: Envelope) -> None:
         """Process frames, requests for images, and calls."""
         if envelope.channel == "can":
             self.receive_frames(now, envelope.source, read_can(envelope.body))
+        elif envelope.channel == "serial":
+            device = envelope.source
+            if answer := self.take_on_serial(now, device, envelope.body):
+                party = self._where(device)
+                self._out.append(Envelope(party, self.name, device, "serial", answer))
         elif envelope.channel == "control":
             wanted = read_images_wanted(envelope.body)
             if wanted is not None:

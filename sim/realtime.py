@@ -19,11 +19,14 @@ import logging
 import os
 import queue
 import secrets
+import select
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
+from functools import partial
+from pathlib import Path
 from typing import Final
 
 from petrobot.services.comm.calls.callee import Callee, Offer, Order
@@ -35,6 +38,7 @@ from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.comm.protocol.messages import Call, Outcome
 from petrobot.services.comm.streams.camera import ImageServer
 from petrobot.services.comm.tls.credentials import credentials
+from petrobot.sim.bus.serial_line import PtyLine
 from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.laboratory_party import LaboratoryParty, answer_command
 
@@ -44,6 +48,8 @@ SLIP: Final = 0.1
 """s behind the clock from which the world's time slips."""
 
 
+LOOK = 0.001
+"""s between two looks at the serial lines of a laboratory that also waits for its bus."""
 PRIORITY = 5
 """Priority of the pacemaker's thread under SCHED_FIFO; below that of the driver processes."""
 
@@ -53,9 +59,14 @@ class Pacemaker:
     a thread of its own."""
 
     def __init__(
-        self, laboratory: LaboratoryParty, hub: CanHub | None, images: ImageServer | None
+        self,
+        laboratory: LaboratoryParty,
+        hub: CanHub | None,
+        images: ImageServer | None,
+        serial: Mapping[str, Path] | None = None,
     ) -> None:
-        """`hub`: the bus, `images`: the camera's end of the wire; None where the cell has none."""
+        """`hub`: the bus, `images`: the camera's end of the wire; None where the cell has none.
+        `serial`: by device, where its serial line is to be."""
         self.lock = threading.Lock()
         self.slipped = 0.0
         """s by which the world has permanently fallen behind the clock."""
@@ -63,6 +74,10 @@ class Pacemaker:
         self._hub = hub
         self._port = hub.port() if hub else None
         self._images = images
+        self._lines = [
+            PtyLine(path, partial(self._answer_serial, device))
+            for device, path in (serial or {}).items()
+        ]
         self._generation = 0
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Outcome], Future[Outcome]]] = (
             queue.SimpleQueue()
@@ -110,21 +125,31 @@ class Pacemaker:
                 done.set_exception(fault)
 
     def _wait(self, deadline: float) -> None:
-        """Wait until the deadline, answering frames from the bus."""
+        """Wait until the deadline, answering what comes from the bus and the serial lines."""
         while True:
-            left = deadline - time.monotonic()
-            if self._hub is None or self._port is None:
-                if left > 0.0:
-                    self._stopped.wait(left)
+            left = max(0.0, deadline - time.monotonic())
+            if self._hub is not None and self._port is not None:
+                self._hub.poll(min(left, LOOK) if self._lines else left)
+                if frames := self._port.receive():
+                    with self.lock:
+                        self._laboratory.receive_frames(self._laboratory.now, "bus", frames)
+                        self._send_frames()
+            elif not self._lines:
+                self._stopped.wait(left)
+            if self._lines and select.select(self._lines, [], [], 0.0 if self._hub else left)[0]:
+                for line in self._lines:
+                    line.poll()
+            if left == 0.0:
                 return
-            self._hub.poll(max(left, 0.0))
-            frames = self._port.receive()
-            if frames:
-                with self.lock:
-                    self._laboratory.receive_frames(self._laboratory.now, "bus", frames)
-                    self._send_frames()
-            if left <= 0.0:
-                return
+
+    def _answer_serial(self, device: str, data: bytes) -> bytes:
+        with self.lock:
+            return self._laboratory.take_on_serial(self._laboratory.now, device, data)
+
+    def close(self) -> None:
+        """Close the serial lines, after `run` has ended."""
+        for line in self._lines:
+            line.close()
 
     def _send_frames(self) -> None:
         if self._port is not None:
@@ -163,7 +188,10 @@ class LaboratoryShell:
             f"{':'.join(map(str, address or ()))}"
         ):
             self._images = ImageServer(*address) if address else None
-        self.pacemaker = Pacemaker(self.laboratory, self._hub, self._images)
+        with _had(f"{directory.source}: a simulated serial line"):
+            self.pacemaker = Pacemaker(
+                self.laboratory, self._hub, self._images, serial_lines(directory)
+            )
         offers = {
             service: Offer(
                 inline=None if service == self.laboratory.between_ticks else self._answer
@@ -208,6 +236,7 @@ class LaboratoryShell:
             self._hub.close()
         if self._images is not None:
             self._images.close()
+        self.pacemaker.close()
         self.laboratory.close()
         if self._fault is not None:
             raise self._fault
@@ -294,6 +323,17 @@ def bus_channel(directory: Directory) -> str:
             "one; use one"
         )
     return channels.pop() if channels else ""
+
+
+def serial_lines(directory: Directory) -> dict[str, Path]:
+    """Return where the laboratory's serial lines are to be, by device: those with `port =
+    "pty:PATH"`, relative to services.toml."""
+    ports = {d.name: str(d.config.get("port", "")) for d in directory.devices.values()}
+    return {
+        name: directory.source.parent / port.removeprefix("pty:")
+        for name, port in ports.items()
+        if port.startswith("pty:")
+    }
 
 
 def camera_address(directory: Directory) -> tuple[str, int] | None:

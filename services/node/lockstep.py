@@ -34,6 +34,7 @@ from petrobot.services.comm.protocol.messages import (
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.comm.streams.camera import MemoryImages, open_images
 from petrobot.services.comm.streams.image import ImageSource
+from petrobot.services.comm.streams.serial_line import SerialLine
 from petrobot.services.node.drivers import make_driver
 from petrobot.services.node.inline_host import Host, InlineHost
 from petrobot.services.node.node import GENERAL, Node
@@ -79,6 +80,27 @@ class MemoryCan:
             raise ConnectionError("this port has left the bus")
 
 
+class MemorySerial(SerialLine):
+    """A serial line to the laboratory: bytes out are collected, bytes in are put in."""
+
+    def __init__(self) -> None:
+        self.out = b""
+        self.arrived = b""
+
+    def send(self, data: bytes) -> None:
+        """Send bytes."""
+        self.out += data
+
+    def receive(self) -> bytes:
+        """The bytes that arrived since the last call."""
+        arrived, self.arrived = self.arrived, b""
+        return arrived
+
+    def close(self) -> None:
+        """Drop what is on its way."""
+        self.out = self.arrived = b""
+
+
 class LockstepPorts:
     """Implements `services.device.Ports` for one device; `post` takes what goes out to the
     laboratory."""
@@ -95,6 +117,7 @@ class LockstepPorts:
         self._clock = clock
         self._post = post
         self._can: MemoryCan | None = None
+        self._serial: MemorySerial | None = None
         self._images: MemoryImages | None = None
         self._wish = 0
         self._streams: dict[str, SetpointReceiver] = {}
@@ -113,6 +136,13 @@ class LockstepPorts:
             self._laboratory()
             self._can = MemoryCan()
         return self._can
+
+    def serial(self, port: str, baud: int) -> MemorySerial:
+        """The laboratory's serial line to this device."""
+        if self._serial is None:
+            self._laboratory()
+            self._serial = MemorySerial()
+        return self._serial
 
     def images(self) -> ImageSource:
         """The laboratory's camera when the device says `source = "sim"`, else what it names (a
@@ -152,6 +182,8 @@ class LockstepPorts:
         """Take what the laboratory or a stream sends to this device."""
         if envelope.channel == "can" and self._can is not None:
             self._can.arrived += read_can(envelope.body)
+        elif envelope.channel == "serial" and self._serial is not None:
+            self._serial.arrived += envelope.body
         elif envelope.channel == "image" and self._images is not None:
             image, wish = read_image(envelope.body, self.now)
             if wish == self._wish:
@@ -162,7 +194,10 @@ class LockstepPorts:
                 self._streams[point.stream].take(point.values, point.held)
 
     def flush(self) -> None:
-        """Send the frames of this tick."""
+        """Send the frames and bytes of this tick."""
+        if self._serial is not None and self._serial.out:
+            self._send("serial", self._serial.out)
+            self._serial.out = b""
         if self._can is not None and self._can.out:
             self._send("can", can_body(self._can.out))
             self._can.out.clear()

@@ -11,6 +11,7 @@ from petrobot.services.comm.location_file import DeviceEntry, Directory
 from petrobot.services.comm.protocol.messages import Event
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.comm.streams.image import ImageSource
+from petrobot.services.comm.streams.serial_line import SerialLine, SerialPort
 from petrobot.services.comm.streams.stream import Incoming, StreamReceiver
 from petrobot.services.comm.tls.credentials import credentials
 from petrobot.services.worker.context import Draws, checked
@@ -60,6 +61,13 @@ class ProcessPorts:
                 config.get("can") or {key: config[key] for key in CAN_KEYS if key in config}
             )
         return self._can
+
+    def serial(self, port: str, baud: int) -> SerialLine:
+        """Open a serial port of this host; "pty:PATH" is one of a simulated laboratory, with its
+        path relative to services.toml."""
+        if port.startswith("pty:"):
+            port = str(self._directory.source.parent / port.removeprefix("pty:"))
+        return SerialPort(port, baud)
 
     def images(self) -> ImageSource:
         """The image source that the device's key `source` names."""

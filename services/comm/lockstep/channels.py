@@ -5,6 +5,8 @@ stream's socket:
 
 - "can": all frames that one port sent in a tick, from a device to the laboratory and back, as a
   tuple of `Frame`;
+- "serial": the bytes that one end of a serial line sent in a tick, from a device to the laboratory
+  and back;
 - "control": from a device to the laboratory, the rate at which it wants images (`images_wanted`);
 - "image": from the laboratory to a device (`image_body`), with its age when it was sent, as on the
   wire;

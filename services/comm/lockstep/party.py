@@ -21,9 +21,9 @@ class Envelope(NamedTuple):
     """A message between endpoints. `source` and `target` are endpoint names (an action, a device, a
     service or a party), not processes.
 
-    `channel` says what `body` is: "call" a message of the node protocol, "can" frames, "image" an
-    image body, "stream" a set point, "control" a request of the cell itself (for example the start
-    of images). `party` is the receiving party.
+    `channel` says what `body` is: "call" a message of the node protocol, "can" frames, "serial"
+    bytes, "image" an image body, "stream" a set point, "control" a request of the cell itself (for
+    example the start of images). `party` is the receiving party.
     """
 
     party: str
