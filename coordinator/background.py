@@ -149,7 +149,9 @@ class BackgroundProcess:
         return newest
 
 
-async def analyse_in_background(text: str, filename: str) -> dict[str, Any]:
+async def analyse_in_background(
+    text: str, filename: str, cell: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     """Return the result of `analysed` from a process of its own.
 
     Without the forecast if that takes too long. Raises RefusedError.
@@ -157,26 +159,30 @@ async def analyse_in_background(text: str, filename: str) -> dict[str, Any]:
     apart = BackgroundProcess()
     try:
         answer: dict[str, Any] = json.loads(
-            await apart.do("analysis", {"text": text, "filename": filename})
+            await apart.do("analysis", {"text": text, "filename": filename, "cell": cell})
         )
     finally:
         await apart.close()
     return answer
 
 
-def analysed(text: str, filename: str, view: str = "ordinary") -> dict[str, Any]:
-    """Analyse a task file for the operator's page.
+def analysed(
+    text: str, filename: str, cell: Mapping[str, Any] | None, view: str = "ordinary"
+) -> dict[str, Any]:
+    """Analyse a task file for the operator's page. `cell` holds the fields of its `Cell`.
 
     Return {complete, markings, verdicts, notes, heat, figures}; a verdict is {name, words, holds,
     reason, assumption, witness, complete}, false ones first. With the view "gspn" the forecast is
     included: `heat` is the share of the time that each action place takes. Raises TaskFileError.
     """
-    from petrobot.coordinator.analysis.may_run import BUDGET, WORDS
+    from petrobot.coordinator.analysis.may_run import BUDGET, WORDS, Cell, assumed, devices_of
     from petrobot.coordinator.analysis.report import analyse, heat
     from petrobot.coordinator.task.file import loads
 
     task = loads(text, filename)
-    analysis = analyse(task, view=view, limits=BUDGET.limits(), steps=BUDGET.steps)
+    known = None if cell is None else Cell(**cell)
+    devices = devices_of(known)
+    analysis = analyse(task, view=view, limits=BUDGET.limits(), steps=BUDGET.steps, devices=devices)
     space = analysis.qualitative.space
     verdicts = [
         {"name": name, "words": WORDS.get(name, name.replace("_", " ")), **verdict.to_json()}
@@ -199,15 +205,15 @@ def analysed(text: str, filename: str, view: str = "ordinary") -> dict[str, Any]
         "complete": space.complete,
         "markings": len(space),
         "verdicts": verdicts,
-        "notes": list(analysis.notes),
+        "notes": [*analysis.notes, assumed(known)],
         "heat": heat(analysis),
         "figures": analysis.figures(),
     }
 
 
-def _analysis(text: str, filename: str) -> Iterator[dict[str, Any]]:
+def _analysis(text: str, filename: str, cell: Mapping[str, Any] | None) -> Iterator[dict[str, Any]]:
     for view in ("ordinary", "gspn"):  # verdicts first, because a forecast may take long
-        yield analysed(text, filename, view)
+        yield analysed(text, filename, cell, view)
 
 
 def work_of(name: str) -> Callable[..., Any]:

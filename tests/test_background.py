@@ -53,7 +53,7 @@ def test_a_search_that_ran_out_of_states_leaves_verdicts_unknown(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("petrobot.coordinator.analysis.may_run.BUDGET", Budget(10))
-    answer = analysed(CATCH_BALL.replace("tokens = 4", "tokens = 4000"), "catch_ball.toml")
+    answer = analysed(CATCH_BALL.replace("tokens = 4", "tokens = 4000"), "catch_ball.toml", None)
     assert answer["complete"] is False
     assert None in {verdict["holds"] for verdict in answer["verdicts"]}
 

@@ -22,6 +22,7 @@ from petrobot.coordinator.analysis.formats.netfile import (
     unit_rates,
 )
 from petrobot.coordinator.analysis.limits import OutOfTime, until
+from petrobot.coordinator.analysis.may_run import Cell, assumed, devices_of
 from petrobot.coordinator.analysis.net.ends_net import ends_net
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.picture import graph_svg
@@ -53,7 +54,10 @@ SEARCHED = 0.5
 """Share of the seconds of an analysis that its searches may use; the rest is for the verdicts."""
 
 LoadTask = Callable[[Path], Task]
-Measure = Callable[[Task], Measured]
+Measure = Callable[[Task, Cell | None], Measured]
+"""Returns what was measured of a task that runs in a cell."""
+CellOf = Callable[[Task], Cell | None]
+"""Returns the cell in which a task runs; None: there is no location file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +89,7 @@ def analyse_command(
     changes: Sequence[str] = (),
     measure: Measure | None = None,
     measures: Sequence[str] = (),
+    cell_of: CellOf | None = None,
 ) -> CommandResult:
     """Run `petrobot analyse`: code 0 if `Analysis.ok`, 1 if not (or unknown), 2 for bad input.
 
@@ -93,7 +98,8 @@ def analyse_command(
     compared with the file as it is; code and text are those of the changed model.
 
     `measure` gives the measurements of a task; without it the declared estimates count. `measures`
-    are expressions of the user (see `time.measures`); they need the numbers over time.
+    are expressions of the user (see `time.measures`); they need the numbers over time. `cell_of`
+    gives the cell of a task; without one its actions share no devices.
 
     The seconds of `limits` are for everything together: searches get SEARCHED of them, and what
     follows stops at their end with "unknown". `structure` asks for invariants, siphons and traps
@@ -108,7 +114,9 @@ def analyse_command(
         model = open_model(path, load_task)
         view = view or _view(model, rates)
         subject, name, notes = _subject(model, rates, view)
-        known = _measured(model, measure)
+        cell = _cell(model, cell_of)
+        known = _measured(model, measure, cell)
+        notes = (*notes, *_assumed(model, cell))
         wanted = [read_change(text) for text in changes]
         altered = _changed(subject, known, wanted) if wanted else None
         plain = model.net if isinstance(model, NetFile) and rates is not None else None
@@ -130,6 +138,7 @@ def analyse_command(
                     limits=replace(limits, due=searched),
                     engine=engine,
                     ordinary=tokens,
+                    devices=devices_of(cell),
                 )
 
         now = found(subject, known)
@@ -221,7 +230,17 @@ def _told(found: Analysis, structure: bool) -> tuple[Analysis, dict[str, Any], l
 Subject = Task | Net | Gspn
 
 
-def _measured(model: Task | NetFile, measure: Measure | None) -> Measured:
+def _cell(model: Task | NetFile, cell_of: CellOf | None) -> Cell | None:
+    """Return the cell of a task; a net of another tool has none."""
+    return cell_of(model) if cell_of is not None and isinstance(model, Task) else None
+
+
+def _assumed(model: Task | NetFile, cell: Cell | None) -> tuple[str, ...]:
+    """Say which cell is assumed for a task."""
+    return (assumed(cell),) if isinstance(model, Task) else ()
+
+
+def _measured(model: Task | NetFile, measure: Measure | None, cell: Cell | None = None) -> Measured:
     """Return the measurements of a task. Raises NetFileError if the model is not a task."""
     if measure is None:
         return Measured()
@@ -229,7 +248,7 @@ def _measured(model: Task | NetFile, measure: Measure | None) -> Measured:
         raise NetFileError(
             "--estimates", model.name, "this is a net; estimates are of tasks", "give --rates"
         )
-    return measure(model)
+    return measure(model, cell)
 
 
 def _changed(
@@ -310,6 +329,7 @@ def simulate_command(
     changes: Sequence[str] = (),
     measure: Measure | None = None,
     progress: Callable[[int, float], None] | None = None,
+    cell_of: CellOf | None = None,
 ) -> CommandResult:
     """Run `petrobot simulate`: a task until it is final or dead, a net until `horizon` (s).
 
@@ -317,11 +337,18 @@ def simulate_command(
     """
     try:
         model, wanted = open_model(path, load_task), [read_change(text) for text in changes]
-        known = _measured(model, measure)
+        cell = _cell(model, cell_of)
+        known = _measured(model, measure, cell)
         if isinstance(model, Task):
             _subject(model, rates, "gspn")  # refuses rates
             model, measured = change_task(model, known, wanted)
-            view = stochastic_view(model, measured, stages=stages, timer_stages=stages)
+            view = stochastic_view(
+                model,
+                measured,
+                stages=stages,
+                timer_stages=stages,
+                devices=devices_of(cell),
+            )
             ends = OrdinaryView(model)
             goal = goal_by_marking(lambda m: ends.is_final(view.projected(m)))
             seen = simulate(
@@ -334,7 +361,7 @@ def simulate_command(
                 firings=firings,
                 progress=progress,
             )
-            return _simulated(model.name, seen, view.assumptions)
+            return _simulated(model.name, seen, (*view.assumptions, assumed(cell)))
         subject, name, notes = _subject(model, rates, "gspn")
         assert isinstance(subject, Gspn)
         gspn = change_gspn(subject, wanted)
@@ -408,6 +435,7 @@ def convert_command(
     view: str | None = None,
     exact: bool = False,
     measure: Measure | None = None,
+    cell_of: CellOf | None = None,
 ) -> CommandResult:
     """Run `petrobot convert`: formats follow from the file endings; losses are listed.
 
@@ -423,10 +451,11 @@ def convert_command(
             told = "the ends net of a task without times; leave out --view and --estimates"
             raise NetFileError("--exact", str(source), f"expected {told}", "or leave out --exact")
         if isinstance(model, Task):
-            known = _measured(model, measure)
             timed = target.suffix.lower() in (".drn", ".pnpro") or measure is not None
             wanted = view or ("exact" if exact else "gspn" if timed else "ordinary")
-            model, lost, assumed = _exported(model, wanted, known, stages)
+            cell = _cell(model, cell_of if wanted == "gspn" else None)
+            known = _measured(model, measure, cell)
+            model, lost, assumed = _exported(model, wanted, known, stages, cell)
             which = f" ({WRITTEN[wanted]})"
         elif view == "gspn" and model.gspn is None:
             raise NetFileError(str(source), "rates", "the file has none", "convert it as it is")
@@ -460,12 +489,14 @@ WRITTEN = {
 
 
 def _exported(
-    task: Task, view: str, measured: Measured, stages: int
+    task: Task, view: str, measured: Measured, stages: int, cell: Cell | None
 ) -> tuple[NetFile, list[str], list[str]]:
     """Return a task as a net file in one of its views, what is lost, and what is assumed."""
     if view == "gspn":
-        timed = stochastic_view(task, measured, stages=stages, timer_stages=stages)
-        return NetFile(timed.gspn.net, task.name, timed.gspn), [], list(timed.assumptions)
+        devices = devices_of(cell)
+        timed = stochastic_view(task, measured, stages=stages, timer_stages=stages, devices=devices)
+        made = NetFile(timed.gspn.net, task.name, timed.gspn)
+        return made, [], [*timed.assumptions, assumed(cell)]
     flat = task.flat
     transitions = flat.transitions.values()
     n = ends_net(task) if view == "exact" else None
@@ -532,20 +563,26 @@ def graph_command(
 
 
 def gspn_of(
-    path: Path, load_task: LoadTask, *, measure: Measure | None = None
-) -> tuple[NetFile, Mapping[str, str]]:
-    """Return the GSPN of a task or net file, and where each rate and weight comes from, by name.
+    path: Path,
+    load_task: LoadTask,
+    *,
+    measure: Measure | None = None,
+    cell_of: CellOf | None = None,
+) -> tuple[NetFile, Mapping[str, str], str]:
+    """Return the GSPN of a task or net file, where each rate and weight comes from, by name, and
+    which cell is assumed (empty for a net file).
 
     Raises NetFileError, NoEstimate and the errors of `load_task`.
     """
     model = open_model(path, load_task)
-    known = _measured(model, measure)
+    cell = _cell(model, cell_of)
+    known = _measured(model, measure, cell)
     if isinstance(model, Task):
-        view = stochastic_view(model, known)
-        return NetFile(view.gspn.net, model.name, view.gspn), view.sources
+        view = stochastic_view(model, known, devices=devices_of(cell))
+        return NetFile(view.gspn.net, model.name, view.gspn), view.sources, assumed(cell)
     if model.gspn is None:
         raise NetFileError(str(path), "rates", "the file has none", "give a file with rates")
-    return model, dict.fromkeys(model.net.transitions, f"from {path.name}")
+    return model, dict.fromkeys(model.net.transitions, f"from {path.name}"), ""
 
 
 def limited(limits: SearchLimits, progress: Callable[[int, int], None]) -> SearchLimits:

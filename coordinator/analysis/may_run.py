@@ -33,6 +33,18 @@ class Cell:
     """The primitive task that each action translates, as its file says; None: not compared."""
 
 
+def devices_of(cell: Cell | None) -> Mapping[str, str] | None:
+    """Return the device of each action that has one; None where that is not known."""
+    return None if cell is None else cell.devices
+
+
+def assumed(cell: Cell | None) -> str:
+    """Say which cell a judgement assumes."""
+    if cell is None or cell.devices is None:
+        return "no location file: actions are assumed not to share devices"
+    return f"two runs never use one device at a time; the devices are those of {cell.source}"
+
+
 @dataclass(frozen=True, slots=True)
 class Budget:
     """What a judgement may cost. It is counted in states and not in seconds, so that a task gets
@@ -114,7 +126,7 @@ def may_run(task: Task, cell: Cell | None = None, budget: Budget | None = None) 
     broken = any(finding.code == "inconsistent" for finding in report.errors)
     if broken or budget is None:
         return MayRun(task, report, None)
-    analysis = _search(task, budget, cell.devices if cell is not None else None)
+    analysis = _search(task, budget, devices_of(cell))
     return MayRun(task, _with_contests(report, analysis), analysis)
 
 

@@ -537,7 +537,7 @@ def _analyse_task(
             if progress is None or not progress.x.complete:
                 shown = proven(n, found.space, ordinary)
         if view == "gspn" and CUT not in notes:
-            numbers = _forecast(task, measured, stages, limits, notes)
+            numbers = _forecast(task, measured, stages, limits, notes, devices)
     except KeyboardInterrupt:
         notes.append(CUT)
     return Analysis(
@@ -563,9 +563,11 @@ def _forecast(
     stages: int,
     limits: SearchLimits | None,
     notes: list[str],
+    devices: Mapping[str, str] | None,
 ) -> Forecast | None:
     try:
-        found = forecast(stochastic_view(task, measured, stages=stages), limits=limits)
+        view = stochastic_view(task, measured, stages=stages, devices=devices)
+        found = forecast(view, limits=limits)
     except (ValueError, ArithmeticError, MemoryError) as why:
         if INTERRUPTED in str(why):
             raise KeyboardInterrupt from why

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     add_estimates_argument,
+    add_services_argument,
+    cell_finder,
     measurements,
     task_path,
     write_json,
@@ -82,6 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "locate_ball.error.share=0.05, serve.rate=2 (may be repeated)",
     )
     add_estimates_argument(parser)
+    add_services_argument(parser)
     parser.add_argument(
         "--measure",
         action="append",
@@ -122,6 +125,7 @@ def run(options: argparse.Namespace) -> int:
             structure=bool(options.json),
             measure=measurements(options.estimates),
             measures=options.measure,
+            cell_of=cell_finder(options.services, options.file),
         )
     code = give(outcome, options.json)
     if options.pictures and outcome.analysis is not None:

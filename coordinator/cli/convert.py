@@ -6,7 +6,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from petrobot.coordinator.cli.loading import add_estimates_argument, measurements, task_path
+from petrobot.coordinator.cli.loading import (
+    add_estimates_argument,
+    add_services_argument,
+    cell_finder,
+    measurements,
+    task_path,
+)
 
 EXAMPLE = "petrobot convert catch_ball catch_ball.pnml"
 
@@ -34,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "execution",
     )
     add_estimates_argument(parser)
+    add_services_argument(parser)
     parser.add_argument(
         "--json", metavar="FILE", help="write what was not kept as JSON (- for standard output)"
     )
@@ -52,5 +59,6 @@ def run(options: argparse.Namespace) -> int:
         view=options.view,
         exact=options.exact,
         measure=measurements(options.estimates),
+        cell_of=cell_finder(options.services, options.source),
     )
     return give(found, options.json)

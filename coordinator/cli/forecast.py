@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     add_services_argument,
+    cell_finder,
     load_directory,
     load_task,
     write_json,
@@ -127,7 +128,8 @@ def _forecast(options: argparse.Namespace) -> int:
     requests = {name: _request(task, trainings, name, options) for name in names}
     if options.services is not None:
         _refuse_other_cell(task, options.services, requests, about)
-    made = register(task, trainings, requests, about, estimates)
+    cell = cell_finder(options.services, options.task)(task)
+    made = register(task, trainings, requests, about, estimates, cell)
     doubtful = any(said["doubts"] for said in made["regimes"].values())
     registered = options.out is not None and (options.doubtful or not doubtful)
     if registered:

@@ -49,11 +49,12 @@ def add_estimates_argument(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def measurements(file: Path | None) -> Callable[[Task], Measured] | None:
-    """Return how a task gets the measurements of an estimates file; None without a file. Raises
-    CommandError."""
+def measurements(file: Path | None) -> Callable[[Task, Cell | None], Measured] | None:
+    """Return how a task in a cell gets the measurements of an estimates file; None without a file.
+    Raises CommandError."""
     if file is None:
         return None
+    from petrobot.coordinator.analysis.may_run import devices_of
     from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
     from petrobot.coordinator.learning.propagation import measured_from
 
@@ -64,8 +65,9 @@ def measurements(file: Path | None) -> Callable[[Task], Measured] | None:
     except EstimatesError as fault:
         raise CommandError(2, str(fault)) from fault
 
-    def of(task: Task) -> Measured:
-        found = measured_from(task, kept.estimates, kinds=kept.kinds)
+    def of(task: Task, cell: Cell | None) -> Measured:
+        devices = devices_of(cell)
+        found = measured_from(task, kept.estimates, kinds=kept.kinds, devices=devices)
         if not found.runs:
             known = ", ".join(sorted({k.primitive_task for k in kept.estimates.tallies})) or "none"
             text = f"{file}: nothing was measured of {task.name}; it knows: {known}"
@@ -154,6 +156,17 @@ def find_cell(given: Path | None, name: str, task: Task) -> Path | None:
             2, f"{file_line(written, 'task.services')}: task.services: {what}; {remedy}"
         )
     return path
+
+
+def cell_finder(given: Path | None, name: str) -> Callable[[Task], Cell | None]:
+    """Return how a task gets its cell: that of the location file of `find_cell`, None if there is
+    none. Raises CommandError."""
+
+    def of(task: Task) -> Cell | None:
+        path = find_cell(given, name, task)
+        return None if path is None else cell_of(load_directory(path))
+
+    return of
 
 
 def cell_of(directory: Directory) -> Cell:

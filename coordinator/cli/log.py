@@ -131,14 +131,10 @@ def _write(path: str, lines: Iterator[str]) -> None:
 
 
 def _ended(run: RunRecorded) -> str:
-    """How a run ended, and as what it counts. One whose token was taken away has a result of its
-    own only if that came before it was stopped."""
+    """How a run ended, and as what it counts."""
     status = run.status.value.upper() if run.status else ""
     if run.cancelled:
-        reason, _, late = run.text.partition("; it had ended with ")
-        counts = f"counts as {status}" if status else "is not counted"
-        own = "" if late in ("", "error, cancelled") else f"; its own result came too late: {late}"
-        return f"{status or '-'}  {reason}, which {counts}{own}"
+        return f"{status or '-'}  {run.taken_away}"
     why = f"  {run.cause}: {run.text}" if run.cause else ""
     return "provisional " * run.deferred + status + why
 

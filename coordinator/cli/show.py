@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     add_estimates_argument,
+    add_services_argument,
+    cell_finder,
     load_task,
     measurements,
     task_path,
@@ -43,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "their rates and weights, and where these come from",
     )
     add_estimates_argument(parser)
+    add_services_argument(parser)
     parser.add_argument(
         "--heat",
         action="store_true",
@@ -81,7 +84,7 @@ def _net(options: argparse.Namespace) -> str:
     from petrobot.coordinator.drawing import draw
 
     task = load_task(options.task)
-    overlay = _heat(task, options.estimates) if options.heat else None
+    overlay = _heat(task, options) if options.heat else None
     try:
         return draw(task, error_branches=options.errors, overlay=overlay, inside=options.inside)
     except ValueError as fault:
@@ -90,16 +93,16 @@ def _net(options: argparse.Namespace) -> str:
 
 def _refuse_idle(options: argparse.Namespace) -> None:
     """Refuse an option that this drawing would ignore. Raises CommandError."""
-    if options.estimates is not None and (
-        options.graph or not (options.heat or options.view == "gspn")
-    ):
-        raise CommandError(2, "--estimates is for --heat and --view gspn; add one of them")
+    timed = not options.graph and (options.heat or options.view == "gspn")
+    for name in ("estimates", "services"):
+        if getattr(options, name) is not None and not timed:
+            raise CommandError(2, f"--{name} is for --heat and --view gspn; add one of them")
 
 
 def _gspn(options: argparse.Namespace) -> str:
     """Draw the stochastic view of a task, or a net file that has rates. Raises CommandError."""
     from petrobot.coordinator.analysis.commands import gspn_of
-    from petrobot.coordinator.drawing import draw
+    from petrobot.coordinator.drawing import Overlay, draw
     from petrobot.coordinator.task.file import load
 
     for name in ("errors", "inside", "heat"):
@@ -108,7 +111,12 @@ def _gspn(options: argparse.Namespace) -> str:
             raise CommandError(2, problem)
     path = task_path(options.task)
     try:
-        model, sources = gspn_of(path, load, measure=measurements(options.estimates))
+        model, sources, assumed = gspn_of(
+            path,
+            load,
+            measure=measurements(options.estimates),
+            cell_of=cell_finder(options.services, options.task),
+        )
     except (ValueError, OverflowError) as fault:
         text = str(fault)
         named = text if text.startswith(str(path)) else f"{path}: {text}"
@@ -121,7 +129,8 @@ def _gspn(options: argparse.Namespace) -> str:
     captions = {
         name: _caption(gspn, t, old, sources.get(old, "")) for t, (name, old) in enumerate(pairs)
     }
-    return draw(renamed.net, title=model.name or path.stem, captions=captions)
+    overlay = Overlay(legend=f"Assumed: {assumed}." if assumed else "")
+    return draw(renamed.net, title=model.name or path.stem, captions=captions, overlay=overlay)
 
 
 def _caption(gspn: Gspn, t: int, name: str, source: str) -> Caption:
@@ -140,14 +149,17 @@ def _caption(gspn: Gspn, t: int, name: str, source: str) -> Caption:
     return Caption(tuple(text for text in (name, said, source) if text), hint, kind)
 
 
-def _heat(task: Task, estimates: Path | None) -> Overlay:
+def _heat(task: Task, options: argparse.Namespace) -> Overlay:
     """The forecast's bottleneck: how much of the mean time each action place takes. Raises
     CommandError."""
+    from petrobot.coordinator.analysis.may_run import assumed, devices_of
     from petrobot.coordinator.analysis.report import analyse, heat
     from petrobot.coordinator.drawing import Overlay
 
-    measure = measurements(estimates)
-    analysis = analyse(task, view="gspn", measured=measure(task) if measure else None)
+    cell = cell_finder(options.services, options.task)(task)
+    measure = measurements(options.estimates)
+    known = measure(task, cell) if measure else None
+    analysis = analyse(task, view="gspn", measured=known, devices=devices_of(cell))
     shares = heat(analysis)
     if not shares:
         raise CommandError(
@@ -156,7 +168,7 @@ def _heat(task: Task, estimates: Path | None) -> Overlay:
     most = max(shares, key=lambda place: shares[place])
     told = (
         f"Warm: share of the mean time by the forecast; the bottleneck is {most} with "
-        f"{100 * shares[most]:.0f} %."
+        f"{100 * shares[most]:.0f} %. Assumed: {assumed(cell)}."
     )
     return Overlay(heat=shares, legend=told)
 

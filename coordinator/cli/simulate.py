@@ -6,7 +6,13 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from petrobot.coordinator.cli.loading import add_estimates_argument, measurements, task_path
+from petrobot.coordinator.cli.loading import (
+    add_estimates_argument,
+    add_services_argument,
+    cell_finder,
+    measurements,
+    task_path,
+)
 from petrobot.services.host.command_line import LARGEST_SEED, number, whole
 
 EXAMPLE = "petrobot simulate catch_ball --replicas 2000 --seed 1"
@@ -43,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="seed of all random numbers (default: %(default)s)",
     )
     add_estimates_argument(parser)
+    add_services_argument(parser)
     parser.add_argument(
         "--what-if",
         "-w",
@@ -72,4 +79,5 @@ def run(options: argparse.Namespace) -> int:
     }
     given["changes"] = options.what_if
     given["measure"] = measurements(options.estimates)
+    given["cell_of"] = cell_finder(options.services, options.file)
     return give(simulate_command(task_path(options.file), load, random, **given), options.json)

@@ -144,6 +144,17 @@ class RunRecorded:
     cancelled: bool = False
     deferred: bool = False
 
+    @property
+    def taken_away(self) -> str:
+        """For a run whose token was taken away: by what, and as what it counts; else empty. A
+        result of its own is named only if that came before it was stopped."""
+        if not self.cancelled:
+            return ""
+        reason, _, late = self.text.partition("; it had ended with ")
+        counts = f"counts as {self.status.value.upper()}" if self.status else "is not counted"
+        own = "" if late in ("", "error, cancelled") else f"; its own result came too late: {late}"
+        return f"{reason}, which {counts}{own}"
+
 
 @dataclass(frozen=True, slots=True)
 class Corrected:

@@ -19,7 +19,12 @@ import numpy as np
 
 from petrobot.coordinator.analysis.net.graph import sum_by
 from petrobot.coordinator.analysis.net.space import SearchLimits
-from petrobot.coordinator.analysis.time.stochastic import Measured, is_cause, stochastic_view
+from petrobot.coordinator.analysis.time.stochastic import (
+    Measured,
+    contended,
+    is_cause,
+    stochastic_view,
+)
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.learning.batch import Array
 from petrobot.coordinator.learning.estimate import CENSORED, Tally, merge_tallies
@@ -106,6 +111,7 @@ def measured_from(
     context: str | None = None,
     choice: ChoiceShares | None = None,
     kinds: Mapping[tuple[str, str], Mapping[str, int]] | None = None,
+    devices: Mapping[str, str] | None = None,
 ) -> Measured:
     """Return the input of the stochastic view from estimates of one context (None: of all contexts
     together).
@@ -115,8 +121,10 @@ def measured_from(
     the sources. For a place whose runs can be preempted, the ends of its runs and the events or
     timers that preempt them are competing risks. A transition that preempts as soon as the marking
     allows it (another run ended) is not a risk; it only cuts the run off, as an abort does, and the
-    net says when.
+    net says when. `devices`: the device of each action that has one, if the view knows them; where
+    runs may have to wait for one, their measured wait is left out, since the view has it itself.
     """
+    held = contended(task, devices or {})
     runs: dict[tuple[str, str], dict[Status, Estimate]] = {}
     sources: dict[tuple[str, str], str] = {}
     preempted: dict[tuple[str, str], dict[str, Estimate]] = {}
@@ -132,7 +140,8 @@ def measured_from(
                 continue
             often.setdefault(place.task, {})[action] = float(started)
             key = (place.name, action)
-            runs[key], preempted[key] = _ends(tally, takers)
+            waits_in_view = (devices or {}).get(action, "") in held
+            runs[key], preempted[key] = _ends(tally, takers, 0.0 if waits_in_view else None)
             sources[key] = _source(tally, (kinds or {}).get((place.task, action), {}))
             if not takers:
                 del preempted[key]
@@ -163,11 +172,14 @@ def _preempting(task: Task, place: str) -> set[str]:
     }
 
 
-def _ends(tally: Tally, takers: set[str]) -> tuple[dict[Status, Estimate], dict[str, Estimate]]:
+def _ends(
+    tally: Tally, takers: set[str], extra: float | None = None
+) -> tuple[dict[Status, Estimate], dict[str, Estimate]]:
     """Return the duration distributions of a run's own ends by status, and of its preemptions by
-    transition."""
+    transition. Its own ends come `extra` s later; by default as long as it was seen to wait."""
     causes = {exit_: _cause(exit_, takers) for exit_ in tally.durations}
-    extra = tally.waited.mean if tally.waited.n else 0.0
+    if extra is None:
+        extra = tally.waited.mean if tally.waited.n else 0.0
     ends = _exact(tally, causes) if None not in causes.values() else _incident(tally, causes)
     own = {
         Status(c): Estimate(

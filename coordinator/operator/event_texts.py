@@ -20,6 +20,7 @@ from petrobot.coordinator.engine import (
     RunEnded,
     RunHeld,
     RunRaised,
+    RunRecorded,
     RunStarted,
     SetBreakpoints,
     Step,
@@ -110,6 +111,14 @@ def reason_of(status: Status | None, cause: str, text: str, executed: Executed) 
         "text": text[:LONGEST_TEXT],
         "executed": executed.value,
     }
+
+
+def reason_recorded(run: RunRecorded) -> dict[str, Any]:
+    """Return `reason_of` a recorded run. The error with which a cancelled run answers is not a
+    reason: what counts is why its token was taken away."""
+    if run.cancelled:
+        return reason_of(run.status, "", run.taken_away, run.executed)
+    return reason_of(run.status, run.cause, run.text, run.executed)
 
 
 def plain_value(value: Any, depth: int = 4) -> Any:

@@ -11,7 +11,7 @@ from typing import Any
 
 from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.engine import Engine, Fired, Phase, Report, RunRecorded, StartRun
-from petrobot.coordinator.operator.event_texts import reason_of, told
+from petrobot.coordinator.operator.event_texts import reason_recorded, told
 from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.run.folder import JOURNAL, RESULT
 from petrobot.coordinator.run.journal import Journal, JournalError, read_journal
@@ -159,16 +159,15 @@ class _Teller:
     def record(self, step: RecordedStep) -> dict[str, Any]:
         """Return {number, t, text, firings, marking (changed places), notes, error, going (places
         with active runs)}."""
-        firings, notes = [], []
+        firings, notes, text = [], [], told(step.stimulus)
         for instruction in step.instructions:
             if isinstance(instruction, StartRun):
                 self._actions[instruction.run] = instruction.action
                 notes.append(f"{instruction.action} starts in {instruction.place}")
             elif isinstance(instruction, RunRecorded):
-                end = reason_of(
-                    instruction.status, instruction.cause, instruction.text, instruction.executed
-                )
-                self._ends[instruction.run] = end
+                self._ends[instruction.run] = reason_recorded(instruction)
+                if instruction.cancelled:
+                    text = f"{instruction.place} has stopped: {instruction.taken_away}"
             elif isinstance(instruction, Report) and instruction.severity.value != "note":
                 notes.append(instruction.text)
             elif isinstance(instruction, Fired):
@@ -179,7 +178,7 @@ class _Teller:
         return {
             "number": step.number,
             "t": round(step.time, 4),
-            "text": told(step.stimulus),
+            "text": text,
             "firings": firings,
             "marking": changed,
             "notes": notes,

@@ -71,8 +71,8 @@ class StartsPort(Protocol):
 
     def __call__(self, name: str, /) -> Awaitable[Mapping[str, Any]]:
         """Return {task, runs ({default, place} or None), seed, modes, parameters: [{name, type,
-        default, text}], learn: {selectors, selector, contexts, estimates}} of a task file. Raises
-        StoreError, TaskFileError."""
+        default, text}], learn: {selectors, selector, credits, contexts, estimates}} of a task
+        file. Raises StoreError, TaskFileError."""
 
 
 class OffersPort(Protocol):

@@ -34,7 +34,12 @@ from petrobot.coordinator.engine import (
 )
 from petrobot.coordinator.engine.state import ACTIVE
 from petrobot.coordinator.operator.changes import empty_state
-from petrobot.coordinator.operator.event_texts import plain_value, reason_of, told
+from petrobot.coordinator.operator.event_texts import (
+    plain_value,
+    reason_of,
+    reason_recorded,
+    told,
+)
 from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.task import End, Executed, Scope, Task
@@ -276,7 +281,7 @@ class Narrator:
             self.feed.emit("paused", time=time, paused={**paused, "nodes": dict(self._held)})
 
     def _recorded(self, time: float, record: RunRecorded) -> None:
-        reason = reason_of(record.status, record.cause, record.text, record.executed)
+        reason = reason_recorded(record)
         self._ends.setdefault(record.run, reason)
         status = record.status.value if record.status is not None else "none"
         self.feed.emit(

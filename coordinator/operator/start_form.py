@@ -20,7 +20,7 @@ from tomlkit.items import Item
 
 from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.learning.learner import usual_contexts
-from petrobot.coordinator.learning.selectors import DEFAULT, RULES
+from petrobot.coordinator.learning.selectors import CREDITS, DEFAULT, RULES
 from petrobot.coordinator.learning.session import LearningSetting
 from petrobot.coordinator.operator.session import (
     LOCKSTEP,
@@ -141,6 +141,7 @@ def start_form(task: Task, text: str, estimates: Path) -> dict[str, Any]:
         "learn": {
             "selectors": list(RULES),
             "selector": DEFAULT,
+            "credits": list(CREDITS),
             "contexts": list(usual_contexts(task).parts),
             "estimates": sorted(
                 p.stem for p in estimates.glob(f"*{SUFFIX}") if _NAME.fullmatch(p.stem)
@@ -199,7 +200,7 @@ def _with_regime(data: Mapping[str, Any]) -> dict[str, Any]:
 
 def _learn(given: Any, folder: Path) -> LearningSetting:
     if not isinstance(given, Mapping):
-        raise ValueError("learn: expected {file, selector, target, contexts, frozen}")
+        raise ValueError("learn: expected {file, selector, target, credit, contexts, frozen}")
     name, selector = given.get("file"), given.get("selector") or DEFAULT
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise ValueError(
@@ -208,6 +209,9 @@ def _learn(given: Any, folder: Path) -> LearningSetting:
         )
     if selector not in RULES:
         raise ValueError(f"learn.selector: {_shown(selector)} is not one of {', '.join(RULES)}")
+    credit = given.get("credit") or CREDITS[0]
+    if credit not in CREDITS:
+        raise ValueError(f"learn.credit: {_shown(credit)} is not one of {', '.join(CREDITS)}")
     target, contexts, frozen = (
         given.get("target"),
         given.get("contexts"),
@@ -230,6 +234,7 @@ def _learn(given: Any, folder: Path) -> LearningSetting:
         None if target is None else float(target),
         parts,
         frozen=frozen,
+        credit=credit,
     )
 
 

@@ -281,8 +281,8 @@ class Station:
 
     async def _faults(self, text: TaskText) -> Answer | None:
         """Return why a task may not run: the findings of the check."""
-        where = {action: entry.node for action, entry in self.directory.actions.items()}
-        given = {"text": text.text, "filename": f"{text.name}.toml", "where": where}
+        offers = {action: entry.node for action, entry in self.directory.actions.items()}
+        given = {"text": text.text, "filename": f"{text.name}.toml", "cell": {"offers": offers}}
         found = json.loads(await self._apart.do("findings", given))
         faults = [finding for finding in found if finding["severity"] == "error"]
         if not faults:

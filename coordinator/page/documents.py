@@ -43,7 +43,7 @@ async def _list(request: web.Request) -> web.Response:
 
 async def _open(request: web.Request) -> web.StreamResponse:
     house = request.app[HOUSE]
-    given = {**house.store.folders, "name": request.match_info["name"], "where": _where(house)}
+    given = {**house.store.folders, "name": request.match_info["name"], "cell": _cell(house)}
     return await _done(request, "opening", given)
 
 
@@ -68,7 +68,7 @@ async def _save(request: web.Request) -> web.StreamResponse:
         if isinstance(body.get("text"), str)
         else {"document": _document(body)}
     )
-    about = {**house.store.folders, "name": request.match_info["name"], "where": _where(house)}
+    about = {**house.store.folders, "name": request.match_info["name"], "cell": _cell(house)}
     return await _done(
         request, "saving", {**about, "base": body.get("base"), "content": content} | _renames(body)
     )
@@ -85,7 +85,7 @@ async def _check(request: web.Request) -> web.StreamResponse:
     body = await read_object(request)
     desk = str(body.get("desk") or "")[:DESK_AT_MOST]
     house.analyses.give_up(desk)
-    return await _done(request, "check", {**_drawing(house, body), "where": _where(house)}, desk)
+    return await _done(request, "check", {**_drawing(house, body), "cell": _cell(house)}, desk)
 
 
 async def _analyse(request: web.Request) -> web.StreamResponse:
@@ -98,7 +98,9 @@ async def _analyse(request: web.Request) -> web.StreamResponse:
     try:
         text = json.loads(await house.apart.do("drawing", drawing))["text"]
         said = await house.analyses.do(
-            "analysis", {"text": text, "filename": f"{drawing['name']}.toml"}, desk
+            "analysis",
+            {"text": text, "filename": f"{drawing['name']}.toml", "cell": _cell(house)},
+            desk,
         )
     except RefusedError as refusal:
         return _refusal(refusal)
@@ -170,10 +172,15 @@ def _refusal(refusal: RefusedError) -> web.Response:
     raise refused(refusal) from refusal
 
 
-def _where(house: House) -> dict[str, str] | None:
+def _cell(house: House) -> dict[str, Any] | None:
+    """Return the fields of the `Cell` that the nodes are."""
     if house.offers is None:
         return None
-    return {str(offer["action"]): str(offer["node"]) for offer in house.offers()}
+    offers = list(house.offers())
+    return {
+        "offers": {str(offer["action"]): str(offer["node"]) for offer in offers},
+        "devices": {str(o["action"]): str(o["device"]) for o in offers if o["device"]},
+    }
 
 
 def _drawing(house: House, body: Mapping[str, Any]) -> dict[str, Any]:

@@ -91,7 +91,8 @@ def _free(label: str, taken: set[str]) -> str:
     return name
 
 
-Where = Mapping[str, str] | None
+Fields = Mapping[str, Any] | None
+"""Fields of a `Cell`; None: it is not known which actions are offered."""
 
 
 class FormatError(ValueError):
@@ -106,16 +107,13 @@ class Made:
     content_type: str
 
 
-def findings(text: str, filename: str, where: Mapping[str, str] | None) -> list[dict[str, Any]]:
-    """Return errors and warnings of the task: {severity, key, text, remedy}; errors first.
-
-    `where` gives the node of each offered action; None leaves offers out.
-    """
+def findings(text: str, filename: str, cell: Fields) -> list[dict[str, Any]]:
+    """Return errors and warnings of the task: {severity, key, text, remedy}; errors first."""
     try:
         task = loads(text, filename)
     except TaskFileError as error:
         return [_finding("error", fault.key, fault.text, fault.remedy) for fault in error.faults]
-    report = may_run(task, None if where is None else Cell(where)).report
+    report = may_run(task, None if cell is None else Cell(**cell)).report
     return [_finding(f.severity.value, f.key, f.text, f.remedy) for f in report.findings]
 
 
@@ -164,21 +162,21 @@ def _refused(fault: StoreError) -> RefusedError:
     return RefusedError(fault.status, str(fault))
 
 
-def _described(task: TaskText, where: Where) -> dict[str, Any]:
+def _described(task: TaskText, cell: Fields) -> dict[str, Any]:
     """Return a task file for the designer: its document, its text, and the findings of the
     check."""
     try:
         document = plain(parse(task.text))
     except EditError as fault:
         raise RefusedError(422, f"{task.name}.toml: {fault}") from fault
-    found = findings(task.text, f"{task.name}.toml", where)
+    found = findings(task.text, f"{task.name}.toml", cell)
     about = {"name": task.name, "revision": task.revision, "own": task.own}
     return {**about, "text": task.text, "document": document, "findings": found}
 
 
-def _open(tasks: str, shipped: str, name: str, where: Where) -> dict[str, Any]:
+def _open(tasks: str, shipped: str, name: str, cell: Fields) -> dict[str, Any]:
     try:
-        return _described(_store(tasks, shipped).read(name), where)
+        return _described(_store(tasks, shipped).read(name), cell)
     except StoreError as fault:
         raise _refused(fault) from fault
 
@@ -187,7 +185,7 @@ def _save(
     tasks: str,
     shipped: str,
     name: str,
-    where: Where,
+    cell: Fields,
     base: str | None,
     content: dict[str, Any],
     renames: list[Any],
@@ -197,13 +195,13 @@ def _save(
     store = _store(tasks, shipped)
     try:
         if "text" in content:
-            return _described(store.save_text(name, base, content["text"]), where)
-        return _described(store.save(name, base, content["document"], _renames(renames)), where)
+            return _described(store.save_text(name, base, content["text"]), cell)
+        return _described(store.save(name, base, content["document"], _renames(renames)), cell)
     except Conflict as conflict:
         both = {
             "conflict": str(conflict),
             "yours": conflict.yours,
-            "theirs": _described(conflict.theirs, where),
+            "theirs": _described(conflict.theirs, cell),
         }
         raise RefusedError(409, str(conflict), both) from conflict
     except StoreError as fault:
@@ -222,10 +220,10 @@ def _drawn(
         raise _refused(fault) from fault
 
 
-def _check(where: Where, name: str, **drawing: Any) -> dict[str, Any]:
+def _check(cell: Fields, name: str, **drawing: Any) -> dict[str, Any]:
     """Return the text that a drawing would be saved as, and the findings of the check."""
     made = _drawn(name=name, **drawing)
-    return {"findings": findings(made["text"], f"{name}.toml", where), **made}
+    return {"findings": findings(made["text"], f"{name}.toml", cell), **made}
 
 
 def _export(tasks: str, shipped: str, name: str, form: str) -> dict[str, Any]:

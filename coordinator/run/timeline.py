@@ -68,8 +68,8 @@ class Timeline:
                 bar,
                 ended=time,
                 status=instruction.status,
-                cause=instruction.cause,
-                text=instruction.text,
+                cause="" if instruction.cancelled else instruction.cause,
+                text=instruction.taken_away or instruction.text,
             )
         elif isinstance(instruction, Corrected) and instruction.run in self.bars:
             judged = (instruction.status, instruction.cause, instruction.text)

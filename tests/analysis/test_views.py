@@ -13,6 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from petrobot.coordinator.analysis.execution.chain import chain_of
+from petrobot.coordinator.analysis.execution.progress import progress_of
 from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.space import SearchLimits, explore
@@ -24,6 +26,7 @@ from petrobot.coordinator.analysis.time.stochastic import (
     Measured,
     NoEstimate,
     StochasticView,
+    contended,
     stochastic_view,
 )
 from petrobot.coordinator.analysis.time.task_forecast import forecast
@@ -41,11 +44,13 @@ from petrobot.coordinator.task import (
     Place,
     PrimitiveTask,
     Scope,
+    Start,
     Status,
     Task,
     Transition,
 )
 from petrobot.coordinator.task.conditions import parse
+from petrobot.coordinator.task.file import load
 
 SHIPPED = sorted((Path(__file__).parents[2] / "coordinator" / "tasks").glob("*.toml"))
 EXPONENTIAL = {
@@ -263,6 +268,74 @@ def test_servers_run_in_parallel_and_other_runs_queue() -> None:
         return completed(task)[1].mean
 
     assert [mean(k) for k in (1, 2, 3)] == pytest.approx([3.0, 2.0, 1 + 1 / 2 + 1 / 3])
+
+
+def beside(*names: str, stopped: str = "", servers: int | None = None) -> Task:
+    """A run of mean 1, 2, 4, ... s in each place, which an event of mean 0.5 s begins. The event
+    `bell` stops that of `stopped`; after an error the task never completes."""
+    steps = []
+    for i, name in enumerate(names):
+        ends = {Status.SUCCESS: Estimate(0.9, 2.0**i), Status.ERROR: Estimate(0.1, 1.0)}
+        steps.append(action(name, ends, alternatives=(f"do_{name}",), servers=servers))
+    moves, idle = list[Transition](), [Place(f"idle_{n}", Kind.CONTROL, 1) for n in names]
+    events = {f"go_{n}": Event(f"go_{n}", Scope.EXTERNAL, mean_wait=0.5) for n in names}
+    for name in names:
+        begin = (Input(f"idle_{name}"),), (Output(name),)
+        moves.append(Transition(f"begin_{name}", *begin, events=(f"go_{name}",)))
+        moves.append(Transition(f"{name}_ok", (taken(name, End.NORMAL),), (Output("done"),)))
+        moves.append(Transition(f"{name}_bad", (taken(name, End.ERROR),), (Output("lost"),)))
+    if stopped:
+        cut = (taken(stopped, End.PREEMPT, Counts.NONE),)
+        moves.append(Transition("cut", cut, (Output("done"),), events=("bell",)))
+        events["bell"] = Event("bell", Scope.EXTERNAL, EventMemory.PULSE, mean_wait=1.5)
+    finals = [Place("done", Kind.CONTROL), Place("lost", Kind.CONTROL)]
+    return task_of(steps, [*idle, *finals], moves, f"done == {len(names)}", events=events)
+
+
+@pytest.mark.parametrize("stopped", ["", "a", "b"])
+@pytest.mark.parametrize("shared", ["ab", "bc", "abc", ""])
+def test_runs_that_share_a_device_take_turns(shared: str, stopped: str) -> None:
+    """As the engine runs them: against the chain on its execution graph, which knows the devices
+    and the order of waiting. Where three wait and one is stopped that order matters, and the view
+    only assumes one."""
+    task = beside("a", "b", "c", stopped=stopped)
+    devices = {f"do_{name}": "arm" for name in shared}
+    assert contended(task, devices) == ({"arm"} if shared else frozenset())
+    found = progress_of(OrdinaryView(task), 20_000, None, devices)
+    expected = chain_of(found.x).back(np.flatnonzero(found.x.source == 0), found.x.final)
+    view, done = completed(task, devices=devices)
+    near = 1e-9 if len(shared) < 3 or not stopped else 0.05
+    assert expected is not None
+    assert done.probability == pytest.approx(expected[0], rel=near)
+    first = 0.5 / 3  # s until the first of three events, from which the chain counts
+    assert done.mean - first == pytest.approx(expected[1], rel=near)
+    assert any("wait for this device" in text for text in view.assumptions) == bool(shared)
+
+
+def test_devices_that_never_have_to_be_waited_for_are_left_out() -> None:
+    task = load(SHIPPED[0].parent / "catch_ball.toml")
+    actions = [a for p in task.primitive_tasks.values() for a in p.alternatives]
+    one = stochastic_view(task, devices=dict.fromkeys(actions, "arm"))
+    assert "device arm" in one.gspn.net.places  # track_ball and move_to_point go together
+    own = {a: p.name for p in task.primitive_tasks.values() for a in p.alternatives}
+    assert stochastic_view(task, devices=own).gspn == stochastic_view(task).gspn
+
+
+def test_several_servers_of_a_place_share_its_device() -> None:
+    steps = action("act", {Status.SUCCESS: Estimate(1.0, 1.0)}, servers=3)
+    moves = [
+        Transition("go", (Input("jobs", 3),), (Output("act", 3),)),
+        Transition("ok", (taken("act", End.NORMAL),), (Output("done"),)),
+        Transition("bad", (taken("act", End.ERROR),), (Output("jobs"),)),
+    ]
+    task = task_of(
+        [steps], [Place("jobs", Kind.CONTROL, 3), Place("done", Kind.CONTROL)], moves, "done == 3"
+    )
+    assert completed(task)[1].mean == pytest.approx(1 + 1 / 2 + 1 / 3)
+    assert completed(task, devices={"a": "arm"})[1].mean == pytest.approx(3.0)
+    quick = replace(task.primitive_tasks["act"], start=Start.AT_ONCE)
+    at_once = replace(task, primitive_tasks={"act": quick})
+    assert completed(at_once, devices={"a": "arm"})[1].mean == pytest.approx(1 + 1 / 2 + 1 / 3)
 
 
 def test_conditions_on_statuses_choose_their_branch_and_others_are_switches() -> None:

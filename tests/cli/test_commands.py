@@ -299,6 +299,84 @@ def test_analyse_and_convert(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert (foreign["states"], foreign["edges"]) == (whole["states"], whole["edges"])
 
 
+SHARED = """
+schema = 1
+
+[task]
+name = "shared"
+final = "done == 2"
+
+[primitive_tasks.look]
+goal = "done"
+deadline = 9.0
+alternatives = ["look"]
+[primitive_tasks.look.estimates]
+success = { share = 1.0, mean = 2.0, cv = 1.0 }
+
+[primitive_tasks.point]
+goal = "done"
+deadline = 9.0
+alternatives = ["point"]
+[primitive_tasks.point.estimates]
+success = { share = 1.0, mean = 3.0, cv = 1.0 }
+
+[places]
+idle = { tokens = 1 }
+look = { kind = "action", task = "look" }
+point = { kind = "action", task = "point" }
+done = {}
+
+[transitions]
+begin = { in = ["idle"], out = ["look", "point"] }
+seen = { in = ["look:normal"], out = ["done"] }
+shown = { in = ["point:normal"], out = ["done"] }
+lost = { in = ["look:error"], out = ["done"] }
+missed = { in = ["point:error"], out = ["done"] }
+"""
+CELL = """
+schema = 1
+[nodes.head]
+host = "127.0.0.1"
+port = 7000
+[devices.camera]
+node = "head"
+driver = "here:Camera"
+[actions.look]
+run = "here:look"
+device = "camera"
+deadline = 5.0
+[actions.point]
+run = "here:point"
+device = "camera"
+deadline = 5.0
+"""
+
+
+def test_every_view_knows_the_devices_of_the_location_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two runs on one device take 2 + 3 s; without a location file both views say what they assume,
+    and the longer of two exponential times is 2 + 3 - 1 / (1/2 + 1/3) s."""
+    monkeypatch.chdir(tmp_path)
+    Path("shared.toml").write_text(SHARED, encoding="utf-8")
+    found = []
+    for cell in ("", CELL):
+        if cell:
+            Path("services.toml").write_text(cell, encoding="utf-8")
+        word = "the devices are those of services.toml" if cell else "no location file"
+        assert main(["analyse", "shared.toml", "--view", "gspn", "--json", "-"]) == 0
+        data = json.loads(capsys.readouterr().out)
+        assert any(word in note for note in data["notes"])
+        found.append((data["execution"]["states"], data["forecast"]["mean"]))
+        assert main(["show", "shared.toml", "--view", "gspn"]) == 0
+        drawn = capsys.readouterr().out
+        assert word in drawn and ("device camera" in drawn) == bool(cell)
+    assert found[0][1] == pytest.approx(3.8) and found[1][1] == pytest.approx(5.0)
+    assert found[1][0] != found[0][0]
+    assert main(["show", "shared.toml", "--services", "services.toml"]) == 2
+    assert "--services is for --heat and --view gspn" in capsys.readouterr().err
+
+
 def test_show_draws_svg(capsys: pytest.CaptureFixture[str]) -> None:
     """Error branches only when asked for."""
     assert main(["show", "catch_ball"]) == 0

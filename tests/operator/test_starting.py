@@ -113,6 +113,7 @@ def test_every_option_of_the_command_line_is_read(tmp_path: Path) -> None:
     learn = {
         "file": "mine",
         "selector": "thompson",
+        "credit": "task",
         "target": 1,
         "contexts": ["regime", " "],
         "frozen": True,
@@ -123,10 +124,12 @@ def test_every_option_of_the_command_line_is_read(tmp_path: Path) -> None:
     assert order.parameters == {"speed": 1.0, "quiet": True, "regime": "wild"}
     assert type(order.parameters["speed"]) is float
     assert order.learning is not None and order.learning.path == tmp_path / "mine.db"
-    assert (order.learning.selector, order.learning.contexts, order.learning.frozen) == (
+    learning = order.learning
+    assert (learning.selector, learning.contexts, learning.frozen, learning.credit) == (
         "thompson",
         ("regime",),
         True,
+        "task",
     )
 
 
@@ -160,6 +163,7 @@ BAD = [
     ({"learn": {"file": ["a"]}}, "learn.file"),
     ({"learn": {"file": "a", "selector": "best"}}, "learn.selector: 'best' is not one of"),
     ({"learn": {"file": "a", "target": 2}}, "learn.target: 2"),
+    ({"learn": {"file": "a", "credit": "ball"}}, "learn.credit: 'ball' is not one of action, task"),
     ({"learn": {"file": "a", "contexts": "regime"}}, "learn.contexts"),
     ({"learn": {"file": "a", "frozen": "yes"}}, "learn.frozen: 'yes'"),
     ({"marking": {"jobs": 3}}, "start: unknown 'marking'"),

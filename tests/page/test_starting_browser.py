@@ -99,6 +99,7 @@ async def test_every_option_of_the_command_line(
     await tab.screenshot(path=shots / "start-refused.png")
     await dialog.get_by_label("Estimates file").fill("known")
     await dialog.get_by_label("Selector").select_option("thompson")
+    await dialog.get_by_label("Credit").select_option("how its own run ended")
     await dialog.get_by_role("button", name="Start").click()
     await expect(dialog).to_be_hidden()
     await expect(mission(tab)).to_contain_text("Success")
@@ -115,6 +116,7 @@ async def test_every_option_of_the_command_line(
     }
     assert (
         header["learning"]["selector"] == "thompson"
+        and header["learning"]["credit"] == "action"
         and (cell.folder / "estimates" / "known.db").exists()
     )
     await learning_view(tab, shots)

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from petrobot.coordinator.engine import Engine
+from petrobot.coordinator.engine import Engine, RunRecorded
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.run.executor import Executor
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.run.timeline import Timeline
-from petrobot.coordinator.task import Status, Task
+from petrobot.coordinator.task import Executed, Status, Task
 from petrobot.coordinator.task.file import loads
 from petrobot.services.action import Status as ActionStatus
 from petrobot.services.comm.calls.caller import Caller
@@ -49,6 +50,39 @@ def test_four_runs_reach_final(catch_ball: Task) -> None:
     assert result["firings"] == len(timeline.firings) > 4 * 5
     assert result["sim_s"] > 4 * 2.0
     assert [c.number for c in mission.tally.cycles] == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("status", "text", "told"),
+    [
+        (Status.SUCCESS, "by caught", "by caught, which counts as SUCCESS"),
+        (None, "by caught", "by caught, which is not counted"),
+        (
+            Status.SUCCESS,
+            "by caught; it had ended with error, cancelled",
+            "by caught, which counts as SUCCESS",
+        ),
+        (
+            None,
+            "by caught; it had ended with failure, slow",
+            "by caught, which is not counted; its own result came too late: failure, slow",
+        ),
+    ],
+)
+def test_a_run_whose_token_was_taken_says_by_what(
+    status: Status | None, text: str, told: str
+) -> None:
+    """The error with which a cancelled action answers is no reason; as what it counts is told."""
+    timeline = Timeline()
+    why = f"preempted {text}"
+    run = RunRecorded(
+        "catch#1", "catch", "catch", "wait", status, "cancelled", why, Executed.YES, 1.0, True
+    )
+    timeline.instruction(1.0, run)
+    bar = timeline.bars["catch#1"]
+    assert (bar.status, bar.cause, bar.text) == (status, "", f"preempted {told}")
+    timeline.instruction(1.0, replace(run, cancelled=False))
+    assert timeline.bars["catch#1"].cause == "cancelled"
 
 
 @pytest.mark.parametrize("runs", [1, 7])

@@ -8,6 +8,9 @@ run has finished and waits for an outgoing transition).
 A run first chooses its alternative (immediate, weight pi_a), then its status (immediate, q_as),
 then takes a phase-type delay that belongs to this status (preselection). Preempting events race
 with the delay. What is left of a preempted run is flushed at once; a repeated run draws again.
+
+Where the cell is known, a token in `device d` is a run that holds the device d, and a run that has
+chosen its action waits until it is free. Devices that never have to be waited for are left out.
 """
 
 from __future__ import annotations
@@ -15,11 +18,22 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import product
+from itertools import combinations, product
 
+from petrobot.coordinator.analysis.net.structure import exclusive_places, place_semiflows
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit, gamma_quantile
-from petrobot.coordinator.task import End, Estimate, Input, Kind, Place, Status, Task, Transition
+from petrobot.coordinator.task import (
+    End,
+    Estimate,
+    Input,
+    Kind,
+    Place,
+    Start,
+    Status,
+    Task,
+    Transition,
+)
 from petrobot.coordinator.task.conditions import ConditionFault
 from petrobot.coordinator.task.net import Marking, Net
 
@@ -69,6 +83,28 @@ def is_cause(transition: Transition) -> bool:
     runs = [a for a in transition.inputs if a.end is not None]
     waits = bool(transition.events) or transition.after is not None
     return waits and len(runs) == 1 and runs[0].end is End.PREEMPT
+
+
+def contended(task: Task, devices: Mapping[str, str]) -> frozenset[str]:
+    """Return the devices for which runs may have to wait for each other: one place has several
+    servers, or the place invariants do not exclude that two places are marked together. `devices`
+    gives the device of each action that has one."""
+    if not devices:
+        return frozenset()
+    flat, net = task.flat, task.flat.net
+    users: dict[str, list[int]] = {}
+    for place in flat.places.values():
+        if place.kind is Kind.ACTION:
+            used = {devices.get(a, "") for a in task.primitive_task_of(place.name).alternatives}
+            for device in used - {""}:
+                own = net.place_index[place.name]
+                users.setdefault(device, []).extend([own] * (place.servers or 1))
+    never = exclusive_places(net, place_semiflows(net))
+    return frozenset(
+        device
+        for device, places in users.items()
+        if any(pair not in never for pair in combinations(sorted(places), 2))
+    )
 
 
 class NoEstimate(ValueError):  # noqa: N818 - names what is missing
@@ -179,20 +215,33 @@ def stochastic_view(
     *,
     stages: int = STAGES,
     timer_stages: int = STAGES,
+    devices: Mapping[str, str] | None = None,
 ) -> StochasticView:
     """Return the GSPN of a task.
 
-    `stages` and `timer_stages` limit the phases of one duration and of one timer. Raises
-    NoEstimate, and ValueError for what a GSPN cannot express.
+    `stages` and `timer_stages` limit the phases of one duration and of one timer. `devices` gives
+    the device of each action that has one: one run at a time holds it. Raises NoEstimate, and
+    ValueError for what a GSPN cannot express.
     """
-    return _Derivation(task.flat, measured or Measured(), stages, timer_stages).result()
+    known = measured or Measured()
+    return _Derivation(task.flat, known, stages, timer_stages, devices or {}).result()
 
 
 class _Derivation:
     """Builds the GSPN place by place and transition by transition."""
 
-    def __init__(self, task: Task, measured: Measured, stages: int, timer_stages: int) -> None:
+    def __init__(
+        self,
+        task: Task,
+        measured: Measured,
+        stages: int,
+        timer_stages: int,
+        devices: Mapping[str, str],
+    ) -> None:
         self.task, self.measured = task, measured
+        self.devices, self.contended = devices, contended(task, devices)
+        self.held: dict[str, str] = {}
+        """By place in which a run is active: the place of the device that it holds."""
         self.stages, self.timer_stages = stages, timer_stages
         net = task.net
         self.places: Weights = dict(zip(net.places, net.initial, strict=True))
@@ -211,6 +260,12 @@ class _Derivation:
         self.sources: dict[str, str] = {}
         self.phases: dict[str, list[str]] = {}
         self.by: dict[tuple[str, str], str] = {}
+        for device in sorted(self.contended):
+            self.places[f"device {device}"] = 0
+            self.assumptions.append(
+                f"{device}: if several runs wait for this device, each is as likely to be "
+                "the next (they are served in the order in which they came)"
+            )
         for place in task.places.values():
             if place.kind is Kind.ACTION:
                 self._action_place(place)
@@ -274,7 +329,7 @@ class _Derivation:
         if place.servers is not None:
             self.places[f"{name}.server"] = place.servers
         self.possible[name], self.phases[name] = set(), []
-        shared: dict[tuple[Status, PhaseType], list[tuple[str, float]]] = {}
+        shared: dict[tuple[Status, PhaseType, str], list[tuple[str, float]]] = {}
         alternatives = self.numbers.alternatives(place)
         if alternatives and all(
             (name, action) in self.measured.preempted for action in alternatives
@@ -285,8 +340,13 @@ class _Derivation:
             known = {s: e for s, e in self.numbers.estimates(place, action).items() if e.share > 0}
             for status, estimate in known.items():
                 self._status(place, action, status, estimate, shared)
+            begun, device = f"{name}.{action}", self._device(action)
             if not known:  # no run ever ended by itself: it stays active until it is preempted
-                self.phases[name].append(f"{name}.{action}")
+                self.phases[name].append(begun)
+                if not self.measured.preempted.get((name, action)):
+                    self._takes(begun, place, device, [begun])
+            elif device:  # it may wait there
+                self.phases[name].append(begun)
         preempted = any(
             a.place == name and a.end is End.PREEMPT
             for t in self.task.transitions.values()
@@ -301,6 +361,21 @@ class _Derivation:
         if preempted:
             self._flush(name)
 
+    def _device(self, action: str) -> str:
+        """Return the place of the device that a run may have to wait for; empty if it need not."""
+        device = self.devices.get(action, "")
+        return f"device {device}" if device in self.contended else ""
+
+    def _takes(self, name: str, place: Place, device: str, active: Iterable[str]) -> None:
+        """Let an immediate transition wait for the device and give it to a run of the place, which
+        holds it while its token is in one of `active`."""
+        if device:
+            need, give = self.arcs[name]
+            self.arcs[name] = (need, {**give, device: 1})
+            self.held |= dict.fromkeys(active, device)
+            if self.task.primitive_task_of(place.name).start is not Start.AT_ONCE:
+                self.inhibit[name] = {device: 1}
+
     def _causes(self, place: Place, actions: Iterable[str]) -> None:
         """Add preemption as a cause by which a run ends: a token in `p.by.t` means that t takes
         it."""
@@ -313,10 +388,11 @@ class _Derivation:
         for action in actions:
             for transition, estimate in self.measured.preempted[name, action].items():
                 if estimate.share > 0 and (name, transition) in self.by:
-                    self._cause(name, action, transition, estimate)
+                    self._cause(place, action, transition, estimate)
 
-    def _cause(self, name: str, action: str, transition: str, estimate: Estimate) -> None:
+    def _cause(self, place: Place, action: str, transition: str, estimate: Estimate) -> None:
         """Add the choice of a preemption, and the phases of the time until it happens."""
+        name, device = place.name, self._device(action)
         key, end = f"{name}.{action}.by.{transition}", self.by[name, transition]
         duration = self._duration(
             key, estimate.mean, (estimate.cv * estimate.mean) ** 2, self.stages
@@ -333,9 +409,11 @@ class _Derivation:
                 CHOICE,
                 self._source(name, action),
             )
+            self._takes(f"{key} {i + 1}", place, device, chain)
             for phase, following in zip(chain, [*chain[1:], end], strict=True):
                 source = self._source(name, action)
-                self._timed(phase, {phase: 1}, {following: 1}, branch.rate, source)
+                need = {phase: 1} | ({device: 1} if device and following == end else {})
+                self._timed(phase, need, {following: 1}, branch.rate, source)
 
     def _source(self, place: str, action: str) -> str:
         """Return where the numbers of an action in a place come from."""
@@ -362,7 +440,7 @@ class _Derivation:
         action: str,
         status: Status,
         estimate: Estimate,
-        shared: dict[tuple[Status, PhaseType], list[tuple[str, float]]],
+        shared: dict[tuple[Status, PhaseType, str], list[tuple[str, float]]],
     ) -> None:
         """Add the choice of a status, and the phases of its delay.
 
@@ -373,16 +451,18 @@ class _Derivation:
         duration = self._duration(
             key, estimate.mean, (estimate.cv * estimate.mean) ** 2, self.stages
         )
-        source = self._source(name, action)
-        if (status, duration) not in shared:
-            shared[status, duration] = self._phases(place, status, duration, len(shared), source)
-        entries = shared[status, duration]
+        source, device = self._source(name, action), self._device(action)
+        same = (status, duration, device)
+        if same not in shared:
+            shared[same] = self._phases(place, status, duration, len(shared), source, device)
+        entries = shared[same]
         for i, (entry, share) in enumerate(entries):
             label = key if len(entries) == 1 else f"{key}.{i + 1}"
             self.statuses[label] = (name, action, status)
             self._immediate(
                 label, {f"{name}.{action}": 1}, {entry: 1}, estimate.share * share, CHOICE, source
             )
+            self._takes(label, place, device, ())
 
     def _duration(self, key: str, mean: float, variance: float, stages: int) -> PhaseType:
         if not mean > 0:
@@ -395,7 +475,13 @@ class _Derivation:
         return duration
 
     def _phases(
-        self, place: Place, status: Status, duration: PhaseType, number: int, source: str
+        self,
+        place: Place,
+        status: Status,
+        duration: PhaseType,
+        number: int,
+        source: str,
+        device: str,
     ) -> list[tuple[str, float]]:
         """Add chains of phases; return the places where a run enters, with their probabilities.
 
@@ -409,9 +495,11 @@ class _Derivation:
             chain = [f"{stem}{i}" for i in range(1, longest + 1)]
             self.places |= dict.fromkeys(chain, 0)
             self.phases[place.name] += chain
+            self.held |= dict.fromkeys(chain if device else (), device)
             for i in range(1, longest):
                 self._timed(f"{stem}{i}", {f"{stem}{i}": 1}, {f"{stem}{i + 1}": 1}, rate, source)
             need = {f"{stem}{longest}": 1, f"{place.name}.going": 1}
+            need |= {device: 1} if device else {}
             give = {f"{place.name}.{status}": 1} | (
                 {f"{place.name}.server": 1} if place.servers is not None else {}
             )
@@ -420,11 +508,12 @@ class _Derivation:
         return entries
 
     def _flush(self, name: str) -> None:
-        """Remove what is left of a preempted run at once, and release its server."""
+        """Remove what is left of a preempted run at once, and release its server and device."""
         served = f"{name}.server" in self.places
         give = {f"{name}.server": 1} if served else {}
         for p in self.phases[name]:
-            self._immediate(f"flush {p}", {p: 1}, dict(give), 1.0, FLUSH)
+            need = {p: 1} | ({self.held[p]: 1} if p in self.held else {})
+            self._immediate(f"flush {p}", need, dict(give), 1.0, FLUSH)
             self.inhibit[f"flush {p}"] = {f"{name}.going": 1}
 
     # Transitions of the task.

@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from petrobot.coordinator.analysis.may_run import Cell, assumed, devices_of
 from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.time.completion import completion_time
 from petrobot.coordinator.analysis.time.sensitivity import reliability_slopes
@@ -50,9 +51,10 @@ def register(
     requests: Mapping[str, Request],
     about: Mapping[str, Any],
     estimates: Estimates | None = None,
+    cell: Cell | None = None,
 ) -> dict[str, Any]:
     """Make a forecast of the regimes in `requests`; `about` describes its basis. With `estimates`,
-    the solution of the stochastic view is added.
+    the solution of the stochastic view in the cell is added.
 
     Raises ForecastError.
     """
@@ -65,7 +67,7 @@ def register(
         try:
             regimes[name] = predict(trainings[name], request) | {"choices": request.choices}
             if estimates is not None:
-                regimes[name]["gspn"] = exact(task, estimates, name, request.choices)
+                regimes[name]["gspn"] = exact(task, estimates, name, request.choices, cell)
         except ValueError as fault:
             raise ForecastError(f"regime {name or '-'}: {fault}") from fault
     told = {
@@ -73,6 +75,7 @@ def register(
         "task": task.name,
         "registered_at": datetime.now(UTC).isoformat(timespec="seconds"),
         "method": METHOD,
+        "assumed": assumed(cell),
         **about,
         "regimes": regimes,
     }
@@ -128,7 +131,13 @@ def _no_forecast(path: Path, why: str) -> ForecastError:
     )
 
 
-def exact(task: Task, estimates: Estimates, regime: str, choice: ChoiceShares) -> dict[str, Any]:
+def exact(
+    task: Task,
+    estimates: Estimates,
+    regime: str,
+    choice: ChoiceShares,
+    cell: Cell | None = None,
+) -> dict[str, Any]:
     """Return the figures of the stochastic view for one trial; only `why` if it cannot be solved.
 
     `P_complete_interval` contains what the estimates leave open (see `_share_error`),
@@ -137,12 +146,15 @@ def exact(task: Task, estimates: Estimates, regime: str, choice: ChoiceShares) -
     """
     context = context_of(regime)
     try:
-        known = measured_from(task, estimates, context, choice)
-        view = stochastic_view(task, replace(known, runs={**known.runs, **_unentered(task, known)}))
+        devices = devices_of(cell)
+        known = measured_from(task, estimates, context, choice, devices=devices)
+        unentered = _unentered(task, known)
+        known = replace(known, runs={**known.runs, **unentered})
+        view = stochastic_view(task, known, devices=devices)
         if task.runs_place:
             view = replace(view, gspn=view.gspn.marked({task.runs_place: 1}))
         found = solve(view, limits=SearchLimits(states=LARGEST))
-        _refuse_guesses(task, found, _unentered(task, known))
+        _refuse_guesses(task, found, unentered)
     except (NoEstimate, ValueError, ArithmeticError) as fault:
         return {"why": str(fault)}
     try:

@@ -60,6 +60,11 @@ def forecast_text(made: Mapping[str, Any]) -> str:
             lines.append(f"    note: {said['endless']:.1%} of the simulated trials never end")
         lines += [f"    note: {note}" for note in (*said["notes"], *said["assumptions"])]
         lines += [f"    DOUBTFUL: {doubt}" for doubt in said["doubts"]]
+    if "assumed" in made and any("gspn" in said for said in made["regimes"].values()):
+        lines.append(
+            f"  measured times include waits for devices; the exact solution assumes: "
+            f"{made['assumed']}"
+        )
     return "\n".join(lines)
 
 

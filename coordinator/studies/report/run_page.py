@@ -131,7 +131,7 @@ def _bar(bar: Bar, row: int, scale: float, end: float, left: int) -> str:
     ended = end if bar.ended is None else min(end, bar.ended)
     colour = f"var(--{bar.status.value if bar.status else 'none'})"
     name = f"{bar.run}: {bar.action}, {bar.begun:.2f} to {ended:.2f} s"
-    why = f" ({bar.cause}: {bar.text})" if bar.cause else ""
+    why = f" ({_why(bar)})" if bar.cause or bar.text else ""
     how = bar.status.value if bar.status else "preempted"
     x, width = left + bar.begun * scale, max(1.5, (ended - bar.begun) * scale)
     tip = f"<title>{escape(f'{name}, {how}{why}')}</title>"
@@ -188,12 +188,32 @@ def _faults(timeline: Timeline) -> str:
 
 
 def _why(bar: Bar) -> str:
-    return f"{bar.cause}: {bar.text}" if bar.text else bar.cause
+    return ": ".join(part for part in (bar.cause, bar.text) if part)
+
+
+BECAUSE: Mapping[str, str] = {
+    "AddTokens": "the operator's tokens",
+    "Begin": "the mission began",
+    "EventOccurred": "an event",
+    "ForceExit": "forced by the operator",
+    "RaiseEvent": "an event, raised by the operator",
+    "RunEnded": "a run ended",
+    "RunRaised": "an event, raised by a run",
+    "TimerFired": "its time has passed",
+    "VariableChanged": "a variable changed",
+    "stability": "followed at once",
+}
+"""By cause of a firing: how it reads."""
 
 
 def _firings(timeline: Timeline) -> str:
     rows: Iterable[Mapping[str, Any]] = (
-        {"": f.number, "time": f"{f.time:.3f} s", "transition": f.transition, "because of": f.cause}
+        {
+            "": f.number,
+            "time": f"{f.time:.3f} s",
+            "transition": f.transition,
+            "because of": BECAUSE.get(f.cause, f.cause),
+        }
         for f in timeline.firings
     )
     body = table(list(rows)) if timeline.firings else "<p>None.</p>"

@@ -5,6 +5,7 @@ import { fill, h, words } from "./dom.js";
 
 const MODE_WORD = { realtime: "on the cell, in real time", lockstep: "simulated, in lock step" };
 const PACE = [["1", "real time"], ["10", "ten times as fast"], ["0", "as fast as possible"]];
+const CREDIT_WORD = { action: "how its own run ended", task: "whether the task met its goal" };
 const GOING = [["again", "starts again"], ["success", "finished: success"], ["failure", "finished: failure"], ["error", "finished: error"]];
 
 const select = (label, options, chosen, onchange) =>
@@ -96,12 +97,14 @@ class LearningPart {
     this.on = h("input", { type: "checkbox", onchange: () => this.show() });
     this.file = h("input", { type: "text", "aria-label": "Estimates file", list: "estimates-known", value: about.estimates[0] ?? "learned" });
     this.selector = select("Selector", about.selectors.map((name) => [name, words(name)]), about.selector);
+    this.credit = select("Credit", about.credits.map((name) => [name, CREDIT_WORD[name] ?? name]), about.credits[0]);
     this.target = h("input", { type: "number", min: 0, max: 1, step: "any", "aria-label": "Target reliability", placeholder: "none" });
     this.contexts = h("input", { type: "text", "aria-label": "Learn separately for each", value: about.contexts.join(", ") });
     this.frozen = h("input", { type: "checkbox" });
     this.inner = h("div", { class: "inner", hidden: true },
       h("div", { class: "two" }, field("Estimates file", this.file, "a name without a path; the coordinator keeps the file"), field("Selector", this.selector)),
-      h("div", { class: "two" }, field("Target reliability", this.target, "choose only among alternatives that reach it"), field("Learn separately for each", this.contexts, "parameters, variables or conditions")),
+      h("div", { class: "two" }, field("Credit", this.credit, "what judges a choice"), field("Target reliability", this.target, "choose only among alternatives that reach it")),
+      field("Learn separately for each", this.contexts, "parameters, variables or conditions"),
       h("label", { class: "tick" }, this.frozen, "Frozen: use the best alternatives learned so far, learn nothing new"),
       h("datalist", { id: "estimates-known" }, about.estimates.map((name) => h("option", { value: name }))));
     this.root = h("fieldset", {}, h("legend", {}, "Learning"), h("label", { class: "tick" }, this.on, "Learn which actions are best"), this.inner);
@@ -117,7 +120,7 @@ class LearningPart {
 
   get value() {
     const contexts = this.contexts.value.split(",").map((c) => c.trim()).filter(Boolean);
-    return { file: this.file.value.trim(), selector: this.selector.value, target: numberIn(this.target, "Target reliability"), contexts, frozen: this.frozen.checked };
+    return { file: this.file.value.trim(), selector: this.selector.value, credit: this.credit.value, target: numberIn(this.target, "Target reliability"), contexts, frozen: this.frozen.checked };
   }
 }
 

@@ -63,7 +63,7 @@ export class Verdicts {
     attribute(this.root, "data-state", against ? "error" : null);
     this.heat = answer.heat;
     this.heatButton.hidden = !Object.keys(answer.heat).length;
-    fill(this.list, answer.verdicts.map((v) => this.row(v)));
+    fill(this.list, [...answer.verdicts.map((v) => this.row(v)), ...answer.notes.map((text) => h("li", { class: "muted" }, text))]);
   }
 
   row(verdict) {
