@@ -1,7 +1,7 @@
 """One child process of a node and the pipe to it, in the node's asyncio loop.
 
-Its end is that of the process, never that of the pipe: what user code has left running may hold the
-pipe open, or close it.
+A child counts as ended when its process has ended, not when its pipe has: what user code leaves
+running may hold the pipe open, and user code may close it.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ _log = logging.getLogger(__name__)
 
 NONE = -1
 LEAVE_LIMIT = 4.0
-"""Seconds that a process has to end in good order."""
+"""Time in which a process must end by itself (s)."""
 PIPE_LIMIT = 0.5
-"""Seconds after the end of its pipe when a process is killed: the node can neither order nor hear
-anything any more."""
+"""Time after the end of its pipe at which a process is killed (s): the node can reach it no
+more."""
 KEEPER_LIMIT = 3.0
-"""Seconds that a keeper has to carry out the order to kill; then it is killed itself, and its
-worker by the kernel."""
+"""Time in which a keeper must carry out an order to kill (s). After that it is killed itself, and
+the kernel kills its worker."""
 
 
 class Child:
-    """A running process of `services.worker` under its keeper. `heard(child, received)` receives
-    the items that it has sent, all that came at once; `ended(child)` is called once, when neither
-    it nor anything that it has started runs any more."""
+    """A running process of `services.worker` under its keeper. `heard(child, received)` is called
+    with the items that arrived together; `ended(child)` is called once, when the process and
+    everything that it started have ended."""
 
     def __init__(
         self,
@@ -47,8 +47,8 @@ class Child:
         ended: Callable[[Child], None],
         link: socket.socket | None = None,
     ) -> None:
-        """Start it; `link` is the worker's end of the link to its device, closed here. Raises
-        OSError when that fails."""
+        """Start the process. `link` is the worker's end of the link to its device; it is closed
+        here. Raises OSError if the process cannot be started."""
         self._heard = heard
         self._ended = ended
         self._loop = asyncio.get_running_loop()
@@ -96,35 +96,34 @@ class Child:
 
     @property
     def pid(self) -> int:
-        """Process id of the worker; until it has said so, that of its keeper."""
+        """Process id of the worker; until the worker has reported it, that of its keeper."""
         return self._worker or self.process.pid
 
     @property
     def closed(self) -> bool:
-        """Whether it can be ordered nothing any more: its pipe has ended."""
+        """Whether its pipe has ended, so that it receives no orders."""
         return self.pipe.closed
 
     @property
     def code(self) -> int | None:
-        """Its exit code, minus the number of the signal that ended it, None while it runs."""
+        """Its exit code; minus the signal number if a signal ended it; None while it runs."""
         return self.process.poll()
 
     def give(self, call: Call) -> None:
-        """Send it a call, with the permit to begin it."""
+        """Send a call, with the permit to begin it."""
         self._permits.give()
         self.post(call)
 
     def take_back(self) -> int:
-        """Take back the permits of the calls that it has not begun: it will not begin them, and
-        they are the last ones that it was given. Return how many these are; also after its
-        death."""
+        """Take back the permits of the calls that it has not begun, and return how many these are:
+        the last ones that it was given. Also works after its end."""
         count = 0
         while self._permits.take():
             count += 1
         return count
 
     def post(self, item: Item) -> None:
-        """Send it an item; what does not fit now is sent when it reads."""
+        """Send an item; what does not fit into the pipe now is sent when the process reads."""
         if _log.isEnabledFor(logging.DEBUG):
             _log.debug("to %d: %s", self._worker, _named(item))
         self.pipe.post(item)
@@ -137,36 +136,36 @@ class Child:
             self._loop.remove_writer(self.pipe.socket)
 
     def pass_link(self, end: socket.socket, word: str) -> None:
-        """Pass it an end of a socket, and tell it so; the end is closed here."""
+        """Pass one end of a socket, then send `word`; the end is closed here."""
         with contextlib.suppress(OSError):
             socket.send_fds(self._descriptors, [b"."], [end.fileno()])
         end.close()
         self.post([word])
 
     def kill(self, why: str = "") -> None:
-        """End it at once, and all that it has started."""
+        """Kill it at once, with everything that it started."""
         if self.process.poll() is None:
             self._killed = self._killed or why
             self.process.send_signal(KILL_ORDER)
             self._limit(KEEPER_LIMIT, self.process.kill)
 
     def leave(self) -> None:
-        """Let it end in good order: its pipe closes, so that it stops its device and leaves. Killed
-        after `LEAVE_LIMIT`."""
+        """Close its pipe, so that it stops its device and exits. It is killed after
+        `LEAVE_LIMIT`."""
         if not self._let_go:
             self._close_pipe()
             self._limit(LEAVE_LIMIT, self.kill)
 
     async def wait(self) -> None:
-        """Wait until it has ended."""
+        """Wait until the process has ended."""
         await self._watch
 
     def describe(self) -> str:
-        """How it ended, for people."""
+        """Return how it ended, in words."""
         code = self.process.poll()
         if code is None or (self._killed and code == -signal.SIGKILL):
             return self._killed or "it closed its pipe"
-        # Else it had ended by itself before the order to kill it came.
+        # Otherwise it had ended by itself before it could be killed.
         if code >= 0:
             return f"it exited with code {code}"
         name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
@@ -203,13 +202,13 @@ class Child:
         for limit in self._limits:
             limit.cancel()
         if not self._let_go:
-            self._read()  # its last words
+            self._read()  # what it sent last
             self._close_pipe()
         for limit in self._limits:
             limit.cancel()
         if self._worker:
-            # It has ended before its keeper, unless that was killed: then it ends now, as the
-            # kernel sees to.
+            # The worker ends before its keeper, unless the keeper was killed: then the kernel kills
+            # the worker now.
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(LEAVE_LIMIT):
                     await until_ended(self._worker)

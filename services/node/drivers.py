@@ -1,5 +1,5 @@
-"""Makes the driver of a device from services.toml; whatever it does not like is one fault that
-names the device."""
+"""Makes the driver of a device from services.toml. Everything that can go wrong becomes one error
+that names the device."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ _log = logging.getLogger(__name__)
 
 
 def make_driver(directory: Directory, device: DeviceEntry, ports: Ports) -> Driver:
-    """The device's driver, `Class(config, ports)`. Raises DirectoryError naming the device, its
-    driver and what was wrong."""
+    """Return the device's driver, `Class(config, ports)`. Raises DirectoryError with the device,
+    its driver and what is wrong."""
     here = f"{directory.source}: devices.{device.name}"
     try:
         driver: Driver = resolve(device.driver)(device.config, ports)
@@ -31,7 +31,7 @@ def make_driver(directory: Directory, device: DeviceEntry, ports: Ports) -> Driv
         raise DirectoryError(
             (f"{here}: {device.driver} refuses it: {told}; mend the keys of this table",)
         ) from fault
-    except Exception as fault:  # not what a constructor says of bad keys, but a fault of its code
+    except Exception as fault:  # not a bad key, which raises one of the above, but a bug
         _log.exception("device %s: its driver cannot be made", device.name)
         raise DirectoryError(
             (f"{here}: {device.driver} failed: {describe(fault)}; mend the driver",)
@@ -43,7 +43,8 @@ def make_driver(directory: Directory, device: DeviceEntry, ports: Ports) -> Driv
     ]
     if missing:
         text = (
-            f"{device.driver} is no driver: it has no {', '.join(missing)}; see services/device.py"
+            f"{device.driver} is not a driver: it has no {', '.join(missing)}; derive it from "
+            "petrobot.Driver"
         )
         raise DirectoryError((f"{here}.driver: {text}",))
     period = driver.period

@@ -1,8 +1,7 @@
-"""Devices of a node that were stopped in an emergency and obey nobody, as the latch on disk says
-and keeps it.
+"""Devices of a node that are in emergency stop and accept no command, as the latch on disk says.
 
-The node looks at the latch, and so does each process that has a driver: a node that is frozen, or
-whose loop is blocked, can stop nothing.
+The node reads the latch, and so does each process that has a driver, because a node that is frozen,
+or whose loop is blocked, can stop nothing.
 """
 
 from __future__ import annotations
@@ -13,30 +12,28 @@ from petrobot.services.host.emergency_latch import ALL, Latch, LatchError
 from petrobot.services.worker.remote import EMERGENCY_STOP, NODE_SILENT
 
 LOOK = 0.25
-"""Seconds between looks at the latch: somebody may have set it in this node's place while it could
-not be asked."""
+"""Time between reads of the latch (s): `petrobot estop` sets it directly when the node does not
+answer."""
 NEVER = float("inf")
 BEAT = "beat"
-"""What a node says to its processes every `BEAT_EVERY` seconds, so that they know that its loop
-runs."""
+"""Message of a node to its processes every `BEAT_EVERY` seconds: its loop runs."""
 BEAT_EVERY = 0.2
 SILENCE = 0.8
-"""Seconds without any word of the node after which its processes stop their devices: with the time
-that a stop takes to get to the drives that is less than a second."""
+"""Time without a message of the node after which its processes stop their devices (s). With the
+time that a stop takes to reach the drives, that is less than a second."""
 AGAIN = 0.2
-"""Seconds that a silent node gets to be heard after this process itself stood still."""
+"""Time that a silent node gets after this process itself was not scheduled (s): its messages may
+still have to be read."""
 GUARD_LOOK = 0.05
-"""Seconds between looks of a process at the latch and at its node's silence."""
+"""Time between checks of the latch and of the node's silence, in a process (s)."""
 
 
 class Guard:
-    """What a process with a driver watches by itself: the latch of its node, and whether its node
-    speaks.
+    """Watches the latch and the messages of the node, in a process with a driver.
 
-    Silence counts from the node's first beat on, or from its first word that lets the device move:
-    a node that is frozen right after that may never have sent a beat. A process that was not
-    scheduled itself for a while gives its node another moment: what that one said meanwhile still
-    has to be read.
+    Silence counts from the node's first beat or, if that comes earlier, from its first message that
+    lets the device move: a node that freezes right after that may never have sent a beat. A process
+    that was not scheduled for a while gives its node `AGAIN` seconds more.
     """
 
     def __init__(self, device: str, latch: Latch) -> None:
@@ -45,20 +42,20 @@ class Guard:
         self._device = device
         self._latch = latch
         self._heard = NEVER
-        """When the node last said something (s)."""
+        """When the node last sent a message (s)."""
         self._again = False
-        """Whether it has got another moment since."""
+        """Whether the node was given more time since."""
 
     def heard(self, now: float, counts: bool) -> None:
-        """Note that the node has said something. With `counts` its silence counts from now on."""
+        """Note a message of the node. With `counts`, its silence counts from now on."""
         if counts or self._heard < NEVER:
             self._heard, self._again = now, False
 
     def look(self, now: float) -> str:
-        """Cause for which the device must stand: EMERGENCY_STOP, NODE_SILENT, or empty. Call it
-        when `due`, after reading."""
+        """Return why the device must stand still: EMERGENCY_STOP, NODE_SILENT, or empty. Call this
+        when `due`, after reading the node's messages."""
         if now - self.due > SILENCE / 2 and self._heard < NEVER and not self._again:
-            # Once only: a process that is late at each look must not wait for ever.
+            # Once only: a process that is late at every check must not wait for ever.
             self._heard, self._again = max(self._heard, now - SILENCE + AGAIN), True
         self.due = now + GUARD_LOOK
         stopped = self._latch.stopped()
@@ -68,7 +65,8 @@ class Guard:
 
 
 class EmergencyStops:
-    """`devices` are those of the node; without a latch (lock step) nothing outlives the process."""
+    """The devices of a node that are in emergency stop. Without a latch (lock step) they are
+    forgotten with the process."""
 
     def __init__(self, devices: Iterable[str], latch: Latch | None = None) -> None:
         self.due = 0.0 if latch is not None else NEVER
@@ -82,17 +80,17 @@ class EmergencyStops:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Devices that obey nobody."""
+        """Devices in emergency stop."""
         return tuple(sorted(self._stopped))
 
     def at_start(self) -> list[str]:
-        """Devices that come up stopped: by the latch, or all of them where none can be kept, since
-        perhaps one was not."""
+        """Return the devices that start in emergency stop: those of the latch, or all of them if
+        the latch cannot be kept, because then one may have been lost."""
         unsure = self._latch is not None and not self._latch.kept
         return self._add(self._devices) if unsure else self.look(0.0)
 
     def look(self, now: float) -> list[str]:
-        """Devices that the latch stops since the last look."""
+        """Return the devices that the latch has stopped since the last call."""
         if self._latch is None:
             return []
         self.due = now + LOOK if self._devices else NEVER
@@ -102,7 +100,7 @@ class EmergencyStops:
         )
 
     def stop(self, devices: Collection[str]) -> str:
-        """These are stopped; gives why that is not kept on disk, empty if it is."""
+        """Stop these devices. Return why that could not be stored on disk; empty if it was."""
         self._add(devices)
         try:
             if self._latch is not None and devices:
@@ -112,7 +110,8 @@ class EmergencyStops:
         return ""
 
     def clear(self, devices: Sequence[str]) -> str:
-        """These obey again; gives why not: what the disk still says to be stopped stays so."""
+        """Let these devices accept commands again. Return why not; empty if they do. What is still
+        stopped on disk stays stopped."""
         try:
             if self._latch is not None:
                 self._latch.clear(devices, self._devices)

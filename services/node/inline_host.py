@@ -1,5 +1,5 @@
-"""Where the runs of one device (or of none) take place; inline: the device's driver and its actions
-in the node itself."""
+"""Hosts of runs: what a node needs of one (`Host`), and the host whose driver and actions run in
+this process (`InlineHost`)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
 
 
 HOLD, RELEASE = Command("", "hold"), Command("", "release")
-"""What holds the runs of a process, and releases them."""
+"""Orders that hold the runs of a process and release them."""
 
 
 def stopped_by(verb: str) -> str:
@@ -53,12 +53,12 @@ def answer_of(id_: str, word: str, data: Mapping[str, Any]) -> Answer:
 
 
 class Host(Protocol):
-    """Runs of one device, or of all actions that need none. Orders in, reports out, nothing
-    blocks."""
+    """Carries out the runs of one device, or of all actions that need none. Orders in, reports out;
+    nothing blocks."""
 
     @property
     def idle(self) -> bool:
-        """Whether `advance` would do nothing and `reports` say nothing until an order or a command
+        """Whether `advance` does nothing and `reports` is empty until an order or a command
         comes."""
 
     def take(self, now: float, order: Order) -> None:
@@ -66,8 +66,8 @@ class Host(Protocol):
 
     def command(self, now: float, command: Command) -> None:
         """Carry out an operator's `hold`, `release`, `stop`, `emergency_stop`, `clear_emergency`,
-        `status` or `picture`; an Answer with its id follows, with the device's word as `answer` in
-        its data."""
+        `status` or `picture`. An Answer with its id follows; `answer` in its data is the device's
+        reply."""
 
     def advance(self, now: float) -> None:
         """Do all that is due."""
@@ -83,10 +83,11 @@ class Host(Protocol):
 
 
 class InlineHost:
-    """A place whose actions run in this process: in lock step, in a worker, and for services of the
+    """A host whose actions run in this process: in lock step, in a worker, and for services in the
     node's loop.
 
-    Its device is a `driver` of this process, or one elsewhere at the end of a `remote`, or none.
+    Its device is a `driver` in this process, or one in another process reached by a `remote`, or
+    none.
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class InlineHost:
         virtual: bool = False,
         reseed: Callable[[int], None] | None = None,
     ) -> None:
-        """`reseed` receives the seed of each call, for the draws of the driver."""
+        """`reseed` is called with the seed of each call, for the random draws of the driver."""
         self._actions = actions
         self._reseed = reseed
         self._driver = driver
@@ -109,8 +110,8 @@ class InlineHost:
         self._remote = RemoteDriver(self._post, clock)
         self._outside = remote if isinstance(remote, RemoteDriver) else None
         self.failed = ""
-        """Why the driver works no more: what it raised, and where. Its runs have ended, and no
-        other begins."""
+        """Why the driver failed: what it raised, and where. Its runs have ended, and no other
+        begins."""
         if self._cyclic is not None:
             self._remote.expect(self._cyclic.state)
         self._commands: list[DeviceCommand] = []
@@ -135,8 +136,8 @@ class InlineHost:
         self._commands.append(command)
 
     def warm(self) -> None:
-        """Import all actions now, so that no call waits for it. One that fails says so when it is
-        called."""
+        """Import all actions now, so that no call has to wait for that. An import that fails is
+        reported when the action is called."""
         for action in self._actions:
             with contextlib.suppress(ImportError):
                 self._runner.load(action)
@@ -166,7 +167,7 @@ class InlineHost:
         self._told.append(answer_of(command.id, "not ready", {"text": self.failed}))
 
     def bar(self, now: float, cause: str) -> None:
-        """Stop the device and its runs without an order: nobody may be able to give one."""
+        """Stop the device and its runs without an order of the node, which may be frozen."""
         for run in self._runner.runs:
             self._runner.take(now, Cancel(run, stop_reason(cause, BARRED[cause])))
         try:
@@ -175,8 +176,7 @@ class InlineHost:
             self._fail(now, fault)
 
     def _fail(self, now: float, fault: Exception) -> None:
-        """The driver has raised what it must not: its runs end, and it is stopped as far as it
-        still can be."""
+        """End the runs of a driver that raised an exception, and try to stop its device."""
         self.failed = f"its driver failed: {describe(fault)}"
         _log.error("the driver of a device failed", exc_info=fault)
         driver, self._driver, self._cyclic = self._driver, None, None
@@ -239,7 +239,7 @@ class InlineHost:
         return self._cyclic is None and not self._told and self._runner.idle
 
     def advance(self, now: float) -> None:
-        """Runs first, then as many cycles of the driver as are due."""
+        """Advance the runs, then do the cycles of the driver that are due."""
         if self.failed:
             return
         try:
@@ -286,10 +286,10 @@ class InlineHost:
         return reports
 
     def close(self, now: float) -> None:
-        """Stop routine, then let the device go."""
+        """Run the stop routine, then close the driver."""
         if self._driver is not None:
             try:
                 self._driver.stop(now)
                 self._driver.close()
             except Exception:
-                _log.exception("a driver failed while it was let go")
+                _log.exception("a driver failed while it was being closed")

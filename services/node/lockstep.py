@@ -1,5 +1,5 @@
-"""A node as a party of a lock-step cell: drivers and actions inline, the outside world through
-envelopes."""
+"""A node as a party of a lock-step cell: drivers and actions run inline, and everything outside is
+reached by envelopes."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 
 class MemoryCan:
-    """A port on the laboratory's bus: frames out are collected, frames in are put in."""
+    """A port on the laboratory's bus. Collects outgoing frames; incoming ones are put in."""
 
     def __init__(self) -> None:
         self.out: list[Frame] = []
@@ -66,7 +66,7 @@ class MemoryCan:
         self.out.append(frame)
 
     def receive(self) -> Sequence[Frame]:
-        """All frames that arrived since the last call, oldest first."""
+        """Return the frames that arrived since the last call, oldest first."""
         self._check()
         arrived, self.arrived = self.arrived, []
         return arrived
@@ -102,8 +102,7 @@ class MemorySerial(SerialLine):
 
 
 class LockstepPorts:
-    """Implements `services.device.Ports` for one device; `post` takes what goes out to the
-    laboratory."""
+    """Implements `services.device.Ports` for one device; `post` sends to the laboratory."""
 
     def __init__(
         self,
@@ -145,8 +144,8 @@ class LockstepPorts:
         return self._serial
 
     def images(self) -> ImageSource:
-        """The laboratory's camera when the device says `source = "sim"`, else what it names (a
-        file)."""
+        """Return the laboratory's camera if the device has `source = "sim"`, otherwise the source
+        that it names (a file)."""
         if self._device.config.get("source") != "sim":
             return open_images(self._device.config, self._clock)
         if self._images is None:
@@ -155,8 +154,8 @@ class LockstepPorts:
         return self._images
 
     def stream(self, name: str) -> SetpointReceiver:
-        """The receiving end of a stream that services.toml leads to this device. Raises ValueError
-        for any other."""
+        """Return the receiving end of a stream that services.toml directs to this device. Raises
+        ValueError for any other."""
         entry = self._directory.streams.get(name)
         if entry is None or entry.to != self._device.name:
             raise ValueError(
@@ -230,16 +229,16 @@ class LockstepPorts:
 
 Substitutes = Mapping[str, Callable[..., Any]]
 _ANSWERS = (Welcome, Refuse, Accept, Feedback, Outcome, Event, Answer, Pong)
-"""Messages that a called end sends."""
+"""Messages of a callee."""
 
 
 class LockstepNode:
     """Implements `services.comm.lockstep.party.Party` for one node of services.toml. Raises
-    DirectoryError when a driver refuses.
+    DirectoryError if a driver refuses its keys.
 
-    Endpoints send under their own names (action, device, service, timer), whatever node they live
-    on, and a call to one's own node takes the same way as any other: so moving an action to another
-    node changes nothing.
+    Endpoints (action, device, service, timer) send under their own names, whatever their node, and
+    a call within one node takes the same way as any other. So moving an action to another node
+    changes nothing.
     """
 
     def __init__(
@@ -253,11 +252,11 @@ class LockstepNode:
         self._out: list[Envelope] = []
         self._ports: dict[str, LockstepPorts] = {}
         self._heard = True
-        """Whether a message has come since the last tick."""
+        """Whether a message arrived since the last tick."""
         self._parties: dict[str, str] = {}
-        """By endpoint, as far as it was asked: the party that it lives in."""
+        """By endpoint that was looked up: its party."""
         self._ends: dict[str, tuple[str, str]] = {}
-        """By call id: the endpoint that calls, and the one that is called."""
+        """By call id: the calling endpoint and the called one."""
         devices = [d for d in directory.devices.values() if d.node == name]
         places: dict[str, Host] = {d.name: self._place(d.name) for d in devices}
         places[GENERAL] = self._place(GENERAL)
@@ -296,7 +295,7 @@ class LockstepNode:
     # --- party --------------------------------------------------------------------------------
 
     def receive(self, now: float, envelope: Envelope) -> None:
-        """Take an envelope that is due. Raises CellError when code that is called hangs."""
+        """Take an envelope that is due. Raises CellError if code that is called hangs."""
         self._guarded(lambda: self._receive(now, envelope))
 
     def _receive(self, now: float, envelope: Envelope) -> None:
@@ -308,14 +307,14 @@ class LockstepNode:
             self._ports[envelope.target].receive(envelope)
 
     def advance(self, now: float) -> None:
-        """Do all that is due. Raises CellError when code that is called hangs."""
+        """Do all that is due. Raises CellError if code that is called hangs."""
         self._guarded(lambda: self._advance(now))
 
     def _guarded(self, step: Callable[[], None]) -> None:
         self._watchdog.begin()
         try:
             step()
-        except Hung as fault:  # not in an action, or its run would have ended with it
+        except Hung as fault:  # in a driver or a service; an action would have ended its own run
             raise CellError(f"node {self.name}: {describe(fault)}") from fault
         finally:
             self._watchdog.end()
@@ -333,8 +332,8 @@ class LockstepNode:
             self._send_messages(now)
 
     def _advance_node(self, now: float) -> bool:
-        """Let the node do all that is due; says whether anything may have come of it. In most ticks
-        no message has come, and the ends of calls need not be looked at."""
+        """Let the node do all that is due. Return whether it may have produced messages. In most
+        ticks no message arrived, and calls need not be looked at."""
         node = self.node
         if self._heard or not node.ends_quiet(now):
             self._heard = False
@@ -355,7 +354,7 @@ class LockstepNode:
         self.node.sent.clear()
 
     def drain(self) -> Sequence[Envelope]:
-        """What was sent since the last call, in order."""
+        """Return what was sent since the last call, in order."""
         if not self._out:
             return ()
         out = self._out[:]
@@ -363,7 +362,7 @@ class LockstepNode:
         return out
 
     def close(self) -> None:
-        """Let the devices go."""
+        """Close the devices."""
         self._watchdog.close()
         self.node.close(self._now)
 

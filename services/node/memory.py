@@ -1,5 +1,4 @@
-"""The global memory: named values with a version, read and written from every node, watched by
-whoever subscribes."""
+"""The global memory: named values with a version, which every node can read, write and watch."""
 
 from __future__ import annotations
 
@@ -13,22 +12,22 @@ from petrobot.services.action import Result, error, failure, success
 from petrobot.services.comm.location_file import MEMORY_CALLS
 
 VALUE_BYTES = 1 << 20
-"""Largest value (bytes as msgpack). The event that tells it is allowed twice as much."""
+"""Largest value (bytes as msgpack). Its event may have twice the size."""
 VARIABLES = 10_000
-"""Most variables."""
+"""Largest number of variables."""
 TOTAL_BYTES = 64 << 20
-"""Most that all values take together (bytes as msgpack)."""
+"""Largest size of all values together (bytes as msgpack)."""
 NAME_LENGTH = 200
 
 
 def event_name(variable: str) -> str:
-    """Name of the event that tells a variable's new value."""
+    """Return the name of the event that carries a variable's new value."""
     return f"memory:{variable}"
 
 
 @dataclass(frozen=True, slots=True)
 class StoredValue:
-    """A value, how often it was written (from 1), and its size in bytes."""
+    """A value, its version (1 after the first write), and its size in bytes."""
 
     value: Any
     version: int
@@ -36,8 +35,8 @@ class StoredValue:
 
 
 class GlobalMemory:
-    """A machine without clock: `call` answers the services `memory.*`; each change goes to
-    `changed(name, value, version)`."""
+    """The variables. `call` answers the services `memory.*`; `changed(name, value, version)` is
+    called at each change."""
 
     def __init__(self, changed: Callable[[str, Any, int], None]) -> None:
         self._changed = changed
@@ -57,7 +56,7 @@ class GlobalMemory:
             return error("bad_arguments", f"{service}: {str(fault).replace('GlobalMemory._', '')}")
 
     def values(self) -> Mapping[str, StoredValue]:
-        """All variables, for people and reports."""
+        """Return all variables, for people and reports."""
         return dict(self._variables)
 
     def _get(self, name: str) -> Result:
@@ -73,8 +72,8 @@ class GlobalMemory:
         present = self._variables.get(_checked(name))
         if not isinstance(version, int) or isinstance(version, bool):
             raise TypeError(
-                f"version is {version!r}; give the integer that memory.get told, 0 for never "
-                "written"
+                f"version is {version!r}; give the integer that memory.get returned, or 0 for a "
+                "variable that was never written"
             )
         current = present.version if present else 0
         if current != version:

@@ -1,5 +1,5 @@
-"""A node as one machine for lock step and real time: its offers, the places of its runs, its
-memory, timers and calls."""
+"""A node as one sans-I/O state machine, for lock step and real time: its offers, the hosts of its
+runs, its memory, timers and calls."""
 
 from __future__ import annotations
 
@@ -59,18 +59,15 @@ from petrobot.services.worker.runner import Hung, stop_reason
 
 _log = logging.getLogger(__name__)
 
-# EventTimers of a node: external pulse events on an absolute grid.
-
-SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
+SLACK = 1e-6
+"""Rounding (s) by which a pulse may be early; without it a period that is no binary fraction would
+cost a whole tick."""
 
 
 class EventTimers:
-    """A machine: `advance(now)` gives the names whose time has come. Who listens is the event
-    board's business.
-
-    Pulses lie on the grid start + k * period, where start is the moment of the first advance: so
-    they do not drift, and neither listening nor load moves them. Pulses missed while the process
-    stood still are left out, not made up for.
+    """External pulse events at fixed times: start + k * period, where start is the time of the
+    first `advance`. So they do not drift, and load does not move them. Pulses that are missed while
+    the process stands still are left out.
     """
 
     def __init__(self, periods: Mapping[str, float]) -> None:
@@ -78,7 +75,7 @@ class EventTimers:
         self._next: dict[str, float] = {}
 
     def advance(self, now: float) -> list[str]:
-        """Names whose pulse is due, in the order of services.toml."""
+        """Return the names whose pulse is due, in the order of services.toml."""
         fired = []
         for name, period in self._periods.items():
             due = self._next.setdefault(name, now + period)
@@ -89,24 +86,22 @@ class EventTimers:
         return fired
 
     def due(self) -> float | None:
-        """When the next pulse comes (s), None without timers."""
+        """Return when the next pulse is due (s), None without timers."""
         return min(self._next.values(), default=None)
 
 
-# A general-purpose service written as a plain function, answered on the spot in the node's loop.
-
-
 def inline_service(service: ServiceEntry, raised: Callable[[Event], None]) -> Inline:
-    """The callee's end of such a service. Raises ImportError when its function cannot be loaded.
+    """Return a service that is a plain function and is answered in the node's loop. Raises
+    ImportError if the function cannot be loaded.
 
-    The function takes a context and keyword arguments like an action; of its context it may use
-    what does not wait. `raised` receives its events, and its verdicts on earlier runs.
+    The function gets a context and keyword arguments, like an action; it must not use what waits.
+    `raised` is called with its events and with its verdicts on earlier runs.
     """
     function = resolve(service.run)
 
     def report(told: Report) -> None:
         if isinstance(told, Event):
-            raised(replace(told, run=""))  # an event of the outside world: it is no run
+            raised(replace(told, run=""))  # an external event: a service is not a run
 
     def answer(now: float, call: Call) -> Outcome:
         context = RunContext(
@@ -121,9 +116,7 @@ def inline_service(service: ServiceEntry, raised: Callable[[Event], None]) -> In
         before = time.process_time()
         try:
             result = function(context, **call.arguments)
-        except (
-            BaseException
-        ) as fault:  # a service may raise SystemExit or its like: that must not end the node
+        except BaseException as fault:  # SystemExit of a service must not end the node
             if from_outside(fault):
                 raise
             log_fault(_log, fault, "call %s of service %s raised", call.id, service.name)
@@ -149,28 +142,29 @@ def inline_service(service: ServiceEntry, raised: Callable[[Event], None]) -> In
 
 
 GENERAL = ""
-"""Key of the place of actions that need no device."""
+"""Key of the host of actions that need no device."""
 LOOP = "*"
-"""Key of the place of services that wait, in the node's own loop."""
+"""Key of the host of services that wait, in the node's own loop."""
 STREAM_PREFIX = "stream:"
+"""The service that gives a stream's address is named by this and the stream's name."""
 SENDERS = frozenset((COORDINATOR, NODE))
-"""Roles that may ask for the ticket of a stream: an action of a node sends set points, a
+"""Roles that may ask for the ticket of a stream: actions on nodes send set points, and a
 coordinator may order anything."""
-"""Name of a stream's address service: this and the stream's name."""
 ACCEPT_AFTER = 0.002
-"""Seconds for which ACCEPT is held in real time: longer than most quick actions take, and shorter
-than a person or a coordinator could notice. In lock step it is sent at once."""
+"""How long ACCEPT is held back in real time (s): the result of a quick action makes it superfluous.
+In lock step it is sent at once."""
 ANSWER_WITHIN = 1.0
-"""Seconds that the devices have to answer an operator's command."""
+"""Time in which the devices must answer an operator's command (s)."""
 VERBS = frozenset({"hold", "release", "stop", "status", PICTURE, EMERGENCY_STOP, CLEAR_EMERGENCY})
-"""What a COMMAND may order."""
+"""Verbs of a COMMAND."""
 _OWN_CAUSES = ("deadline", "orphan", EMERGENCY_STOP)
 _WELL_HELD = ("held", "stopped")
 
 
 @dataclass
 class _Commanded:
-    """An operator's command under way: whose answers are missing, and those that are there."""
+    """An operator's command that has not been answered: the answers so far, and the hosts whose
+    answers are missing."""
 
     verb: str
     due: float
@@ -178,15 +172,15 @@ class _Commanded:
     answers: dict[str, str] = field(default_factory=dict)
     data: dict[str, Any] = field(default_factory=dict)
     note: str = ""
-    """What else is to be told."""
+    """A remark for the operator."""
 
 
 class Node:
-    """Everything of a node but sockets, processes and the clock.
+    """All of a node except sockets, processes and the clock.
 
-    `callee` and `callers` (one for each peer) are driven by a shell: it brings them what comes in
-    and takes out what goes. `places` are by device, `GENERAL` for actions without. Then
-    `advance(now)` does all that is due; `due()` says when next.
+    A shell passes incoming messages to `callee` and `callers` (one for each peer) and sends their
+    outgoing ones. `places` are the hosts by device, `GENERAL` for actions without a device.
+    `advance(now)` does all that is due; `due()` says when it is needed next.
     """
 
     def __init__(
@@ -202,9 +196,9 @@ class Node:
         stream_address: Callable[[str], Mapping[str, Any] | None] | None = None,
         latch: Latch | None = None,
     ) -> None:
-        """`connect(peer)` is called when the first call to a peer is about to be made;
-        `stream_address(stream)` tells where a set-point stream of this node is received; `latch`
-        keeps an emergency stop over a restart."""
+        """`connect(peer)` is called before the first call to a peer; `stream_address(stream)` gives
+        the address at which this node receives a set-point stream; `latch` keeps an emergency stop
+        over a restart."""
         self.directory = directory
         self.name = name
         self.boot = boot
@@ -228,8 +222,8 @@ class Node:
         )
         self.callers: dict[str, Caller] = {}
         self.sent: list[tuple[str, Sent]] = []
-        """Set points that left since the shell looked, with the action that published them (inline
-        places only)."""
+        """Set points that inline hosts sent since the shell looked, with the action that published
+        them."""
         self._timers = EventTimers(
             {t.name: t.period for t in directory.timers.values() if t.node == name}
         )
@@ -266,7 +260,7 @@ class Node:
         return {service.name: Offer(scope, inline=inline)}
 
     def caller(self, peer: str) -> Caller:
-        """The calling end for a peer, made when first wanted."""
+        """Return the caller for a peer; it is made at the first use."""
         if peer not in self.callers:
             self.callers[peer] = Caller(peer, self.hello(), auto_ack=True)
             if self._connect is not None:
@@ -274,7 +268,7 @@ class Node:
         return self.callers[peer]
 
     def hello(self) -> Hello:
-        """How this node introduces itself to a peer."""
+        """Return the HELLO of this node to a peer."""
         return Hello(
             OLDEST_VERSION, NEWEST_VERSION, "node", self.name, self.boot, 0, self.directory.hash
         )
@@ -291,7 +285,7 @@ class Node:
     # --- time ---------------------------------------------------------------------------------
 
     def advance(self, now: float) -> None:
-        """Do all that is due: orders of callers, runs, devices, timers, and what comes of them."""
+        """Do all that is due: orders of callers, runs, devices, timers, and their results."""
         self._now = now
         if now >= self._stops.due:
             self._stop_places(now, self._stops.look(now))
@@ -302,9 +296,11 @@ class Node:
         self.settle(now)
 
     def advance_places(self, now: float) -> bool:
-        """EventTimers, runs and devices alone; says whether anything came of it. That is all that
-        `advance` does while nothing has come in and `ends_quiet` holds: a shell that knows may call
-        this instead, then `settle` if something came."""
+        """Advance only timers, runs and devices, and return whether they reported anything.
+
+        While no message arrives and `ends_quiet` holds, `advance` does no more than this; so a
+        shell that knows may call this instead, and `settle` if there were reports.
+        """
         self._now = now
         news = False
         for name in self._timers.advance(now):
@@ -320,8 +316,8 @@ class Node:
         return news
 
     def take_reports(self, now: float) -> None:
-        """Take what runs and devices have reported. Nothing else is looked at: for a shell that
-        knows that only results of runs have come."""
+        """Take the reports of runs and devices, and nothing else: for a shell that knows that only
+        results of runs arrived."""
         self._now = now
         for key, place in self.places.items():
             if not place.idle:
@@ -329,18 +325,18 @@ class Node:
                     self._take_report(now, key, report)
 
     def settle(self, now: float) -> None:
-        """What follows from what `advance_places` has found."""
+        """Answer runs and commands after `advance_places` returned True."""
         self._answer_runs(now)
         self._answer_commands(now)
 
     def ends_quiet(self, now: float) -> bool:
-        """Whether time alone gives calls, commands and the emergency stop nothing to do yet."""
+        """Return whether no call, no command and no emergency stop is due yet."""
         if self._commands or now >= self.callee.soonest or now >= self._stops.due:
             return False
         return all(now < caller.soonest for caller in self.callers.values())
 
     def _advance_ends(self, now: float) -> None:
-        """What time does at both ends of calls; asking for the next due time keeps `soonest` up to
+        """Advance callee and callers that are due; calling `due` keeps their `soonest` up to
         date."""
         ends: tuple[Callee | Caller, ...] = (self.callee, *self.callers.values())
         for end in ends:
@@ -349,8 +345,8 @@ class Node:
                 end.due()
 
     def due(self) -> float | None:
-        """When `advance` has something to do at the latest (s), None if only what comes in can
-        matter. Both ends of calls are left out: server and clients have timers of their own."""
+        """Return when `advance` is needed at the latest (s), None if only a message can make it
+        necessary. Callee and callers are left out: server and clients have timers of their own."""
         # A plain loop: lists of times cost as much as the rest.
         soonest = self._stops.due
         for command in self._commands.values():
@@ -365,7 +361,7 @@ class Node:
         return soonest if soonest < NEVER else None
 
     def close(self, now: float) -> None:
-        """Stop routines of all devices, and let them go."""
+        """Run the stop routines of all devices, and close them."""
         for place in self.places.values():
             place.close(now)
 
@@ -427,7 +423,7 @@ class Node:
                 )
 
     def stopped_in_emergency(self) -> tuple[str, ...]:
-        """Devices that obey nobody until that is cleared."""
+        """Devices in emergency stop."""
         return self._stops.names
 
     def _stop_places(self, now: float, keys: Iterable[str]) -> None:
@@ -484,9 +480,9 @@ class Node:
         self.callee.finish(now, end, plain_already=True)  # its host has checked it
 
     def _raise(self, event: Event, key: str = "") -> None:
-        """Send an event of a run to its caller, or any other to its subscribers: one of a device
-        (`key`), of a service, or a verdict, which goes to the coordinator of the judged run. All
-        are latched, so that a lost link only delays them."""
+        """Send an event of a run to its caller, and any other event to its subscribers: that of a
+        device (`key`) or of a service, or a verdict, which goes to the coordinator of the judged
+        run. All are kept until acknowledged, so a lost link only delays them."""
         if event.run and self.callee.service_of(event.run) is None:
             return
         source = self.action_of(event.run) if event.run else event.source or key or self.name
@@ -495,7 +491,7 @@ class Node:
         )
 
     def _ask(self, now: float, key: str, call: Call) -> None:
-        """A run calls a service."""
+        """Call a service for a run."""
         try:
             peer = self.directory.where(call.service)
         except DirectoryError as fault:
@@ -511,7 +507,7 @@ class Node:
                 self.take_notices(now, notices)
 
     def take_notices(self, now: float, notices: Iterable[Notice]) -> None:
-        """Hand the ends of calls to the runs that made them."""
+        """Give the results of calls to the runs that made them."""
         for notice in notices:
             if isinstance(notice, Outcome):
                 # The id of a call that a run makes is that of the run, a slash and a number.
@@ -532,11 +528,11 @@ class Node:
         self.callee.raise_event(self._now, event_name(name), data, source=MEMORY, latched=True)
 
     def _stream_call(self, now: float, call: Call) -> Outcome:
-        """Where a set-point stream is received, and the ticket that opens it."""
+        """Return where a set-point stream is received, and the ticket that opens it."""
         stream = call.service.removeprefix(STREAM_PREFIX)
         address = self._stream_address(stream) if self._stream_address else None
         if address is None:
-            text = f"nobody receives {stream!r} at the moment"
+            text = f"stream {stream!r} is not received at the moment"
             return Outcome(call.id, Status.ERROR, {}, "not_ready", text, Executed.NO)
         return Outcome(call.id, Status.SUCCESS, address)
 
@@ -546,5 +542,5 @@ def _as_action(service: ServiceEntry) -> ActionEntry:
 
 
 def stream_service(stream: str) -> str:
-    """Name of the service that tells where a stream is received."""
+    """Return the name of the service that gives a stream's address."""
     return STREAM_PREFIX + stream

@@ -1,5 +1,5 @@
-"""What a driver may reach in real time: a real or simulated bus, a camera, and the receiving ends
-of streams."""
+"""The ports of a driver in real time: a real or simulated bus, a camera, and the receiving ends of
+streams."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class ProcessPorts:
         return SerialPort(port, baud)
 
     def images(self) -> ImageSource:
-        """The image source that the device's key `source` names."""
+        """Return the image source that the device's key `source` names."""
         if self._images is None:
             from petrobot.services.comm.streams.camera import open_images
 
@@ -78,8 +78,8 @@ class ProcessPorts:
         return self._images
 
     def _located(self, config: Mapping[str, Any]) -> Mapping[str, Any]:
-        """With the path of a recording taken relative to services.toml. Raises ValueError if it is
-        not there."""
+        """Return the source with the path of a recording made absolute (it is relative to
+        services.toml). Raises ValueError if there is no such file."""
         kind, _, path = str(config.get("source", "")).partition(":")
         if kind != "file" or not path:
             return config
@@ -91,8 +91,8 @@ class ProcessPorts:
         return {**config, "source": f"file:{recording}"}
 
     def stream(self, name: str) -> SetpointReceiver:
-        """The receiving end of a stream that services.toml leads to this device. Raises ValueError
-        for any other."""
+        """Return the receiving end of a stream that services.toml directs to this device. Raises
+        ValueError for any other."""
         entry = self._directory.streams.get(name)
         if entry is None or entry.to != self._device.name:
             raise ValueError(
@@ -124,7 +124,7 @@ class ProcessPorts:
         return self._directory.file(path).read_bytes()
 
     def stream_ports(self) -> dict[str, int]:
-        """Port of each stream that is received here."""
+        """Return the TCP port of each stream that is received here."""
         return (
             {}
             if self._receiver is None
@@ -132,7 +132,7 @@ class ProcessPorts:
         )
 
     def poll(self) -> None:
-        """Take in the set points that have come."""
+        """Read the set points that arrived."""
         if self._receiver is not None:
             self._receiver.poll()
 
@@ -142,6 +142,6 @@ class ProcessPorts:
         return self._receiver is not None
 
     def raised(self) -> list[tuple[str, Mapping[str, Any]]]:
-        """Events raised since the last call, in order."""
+        """Return the events raised since the last call, in order."""
         raised, self._raised = self._raised, []
         return raised

@@ -35,18 +35,18 @@ from petrobot.services.worker.remote import IN_EMERGENCY
 _log = logging.getLogger(__name__)
 
 LOOK = 0.25
-"""Seconds after a run was given to a worker when its node looks at it at the latest."""
+"""Time after which a node looks at a run that it gave to a worker, at the latest (s)."""
 
 
 class NodeShell:
-    """A running node. Between `start` and `close` it serves; its loop does protocol and quick
-    services only."""
+    """A running node. It serves between `start` and `close`. Its loop runs only the protocol and
+    quick services."""
 
     def __init__(
         self, directory: Directory, name: str, text: str, *, mock: str = "", memory: int = 0
     ) -> None:
-        """`text` is that of services.toml, as all processes of the node shall know it; `memory`
-        limits workers (bytes)."""
+        """`text` is the text of services.toml for all processes of the node; `memory` limits
+        workers (bytes)."""
         self._directory = directory
         self._name = name
         self._loop = asyncio.get_running_loop()
@@ -101,8 +101,8 @@ class NodeShell:
     # --- life ---------------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Bring the devices up, then listen. Raises DirectoryError when a device cannot be started
-        or the address cannot be had, KeyNeededError."""
+        """Start the devices, then listen. Raises DirectoryError if a device cannot be started or
+        the address cannot be used, and KeyNeededError."""
         host, port = self._directory.address(self._name)
         require_key(self._name, host, self._credentials.guarded)
         refuse_unusable(self._directory, self._name)
@@ -129,8 +129,7 @@ class NodeShell:
         self._step()
 
     def _beat(self) -> None:
-        """Let the processes of devices know that this loop runs: they stop their devices when it
-        does not."""
+        """Send the processes of devices a beat: without it they stop their devices."""
         for place in self._workers.values():
             for child in place.children():
                 if not child.pipe.unsent:  # it does not read: more of the same would only pile up
@@ -146,7 +145,7 @@ class NodeShell:
             await self._change.wait()
 
     async def close(self) -> None:
-        """Stop routines of all devices, then good-bye to all."""
+        """Run the stop routines of all devices, then close all connections."""
         if self._beating is not None:
             self._beating.cancel()
         self._cancel_timers()
@@ -173,9 +172,9 @@ class NodeShell:
         self.node.obey(now, orders)
         quiet = self.node.places[LOOP].idle and not any(p.news for p in self._workers.values())
         if quiet and all(type(order) is Call for order in orders):
-            # Workers have been told; what they answer brings the next step. Only a worker that
-            # says nothing needs one by itself, and that in some seconds: computing when would cost
-            # every run more than a look now and then.
+            # Workers have their orders, and their answers cause the next step. Only a worker that
+            # stays silent needs a step by itself, some seconds later. Computing that time would
+            # cost every run more than a look now and then.
             self._arm_at(now + LOOK)
         else:
             self._changed()
@@ -185,14 +184,14 @@ class NodeShell:
         self._changed()
 
     def _changed(self) -> None:
-        """Something came in: step once in this turn of the loop, however much it was."""
+        """Step once in this turn of the loop, however many messages arrived."""
         self._change.set()
         if self._soon is None:
             self._soon = self._loop.call_soon(self._step)
 
     def _heard(self, plain_ends: bool) -> None:
-        """A process has said all that it had to say, or has ended: step now, since a turn of the
-        loop more costs as much as the step. After mere results only these are passed on."""
+        """Step after a process has sent something or ended: at once, because another turn of the
+        loop costs as much as the step. If only results arrived, only these are passed on."""
         if (
             not plain_ends
             or not self._serving
@@ -220,9 +219,9 @@ class NodeShell:
         self._arm()
 
     def _arm(self) -> None:
-        """Have a step taken when one is due. A timer that is set for an earlier time stays: most
-        runs end long before their deadlines, and a step too many then costs less than a timer for
-        each run."""
+        """Set the timer of the next step. A timer that is set for an earlier time stays: most runs
+        end long before their deadlines, and a superfluous step costs less than a timer for each
+        run."""
         due = self.node.due()
         if due is not None:
             self._arm_at(due)
@@ -257,7 +256,7 @@ class NodeShell:
         return {"host": host, "port": place.streams[stream], "ticket": self._tickets[stream]}
 
     def _find_stream(self, device: str, stream: str) -> None:
-        """An action wants to send a stream: ask its receiver's node where to."""
+        """Ask the receiver's node for the address of a stream that an action sends."""
         task = self._loop.create_task(self._tell_stream(device, stream))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -272,16 +271,16 @@ class NodeShell:
 
 
 def _tickets(directory: Directory, node: str) -> dict[str, str]:
-    """What opens each stream that a node receives: a secret of the receiving device, a dot, and one
-    of the stream."""
+    """Return the ticket of each stream that a node receives: a secret of the receiving device, a
+    dot, and a secret of the stream."""
     streams = [s for s in directory.streams.values() if directory.where(s.name) == node]
     devices = {stream.to: secrets.token_hex(16) for stream in streams}
     return {stream.name: f"{devices[stream.to]}.{secrets.token_hex(16)}" for stream in streams}
 
 
 def _end_with_launcher(launcher: int, over: asyncio.Event) -> None:
-    """End in good order when the launcher is gone; by force if that takes too long, be it that a
-    service hangs in the loop."""
+    """Close the node when its launcher is gone; by force if that takes too long, for example
+    because a service hangs in the loop."""
     outlive(launcher, GOOD_ORDER)
     try:
         asyncio.get_running_loop().add_reader(os.pidfd_open(launcher), over.set)

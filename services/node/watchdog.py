@@ -1,9 +1,9 @@
-"""Ends what hangs in lock step, where no other process could: code that does not come back would
-stop simulated time for ever.
+"""Interrupts code that hangs in lock step: code that does not return would stop simulated time for
+ever, and there is no other process that could end it.
 
-A thread looks now and then at the step that a node is in. What counts is the processor time that
-the step has used, and the time that it slept: on a busy machine a step takes long without hanging,
-and then it does neither.
+A thread checks the current step of a node. It counts the processor time that the step has used and
+the time that it slept. On a busy machine a step that does not hang may take long, but then it does
+neither.
 """
 
 from __future__ import annotations
@@ -23,55 +23,53 @@ from petrobot.services.worker.runner import Execution, Hung
 
 _log = logging.getLogger(__name__)
 LIMIT = 10.0
-"""Seconds of processor time or sleep that one step of a node may take: a thousand times what the
-slowest honest one takes."""
+"""Longest processor time or sleep of one step of a node (s): a thousand times that of the slowest
+step that was measured."""
 COMPILER = "numba"
-"""Package that may take longer: it compiles a kernel when that is first called, once on each
-machine."""
+"""Package that may take longer: it compiles a kernel at its first call, once on each machine."""
 LOOK = 0.5
-"""Seconds between looks."""
+"""Time between checks (s)."""
 IDLE = 1e-3
-"""Seconds of processor time between two looks below which a thread did nothing."""
+"""Processor time between two checks below which a thread was idle (s)."""
 ATTEMPTS, AGAIN = 4, 2.0
-"""How often the code is interrupted, and the seconds of the same kind in between: it may catch
-that. Then the process ends."""
+"""How often the code is interrupted, and the processor time in between (s), since it may catch the
+exception. After that the process ends."""
 _SERVICES = str(Path(__file__).parents[1])
 _raise_in_thread = ctypes.pythonapi.PyThreadState_SetAsyncExc
 
 
 class Watchdog:
-    """Watches the steps of one node. `begin` and `end` cost next to nothing: they are called each
+    """Watches the steps of one node. `begin` and `end` must be cheap: they are called at each
     tick."""
 
     def __init__(self, node: str) -> None:
         self._node = node
         self._step = 0
-        """Odd while a step is being taken."""
+        """Odd during a step."""
         self._thread: threading.Thread | None = None
         self._over = threading.Event()
         self._watched = self._clock = 0
         self._seen, self._used, self._before, self._attempts = 0, 0.0, 0.0, 0
 
     def begin(self) -> None:
-        """The node's code is called now, in this thread."""
+        """Note that the node's code is called now, in this thread."""
         if self._thread is None:
-            # It must not keep alive what it watches: a cell that nobody closes is gone with its
-            # last user.
+            # A weak reference: a cell that is not closed must still be freed with its last user.
             self._thread = threading.Thread(
                 target=_look_on, args=(weakref.ref(self), self._over), daemon=True
             )
             self._thread.start()
         self._watched = threading.get_ident()
-        # Asked for by the thread itself: of a thread that has ended it would crash the process.
+        # The thread asks for its own clock: asking for that of an ended thread crashes the process.
         self._clock = time.pthread_getcpuclockid(self._watched)
         self._step += 1
 
     def end(self) -> None:
-        """It has come back."""
+        """Note that the code has returned."""
         self._step += 1
 
     def close(self) -> None:
-        """Watch no more."""
+        """Stop watching."""
         self._over.set()
 
     def look(self) -> None:
@@ -81,8 +79,8 @@ class Watchdog:
             self._seen, self._used, self._attempts = self._step, 0.0, 0
         else:
             spent = now - self._before
-            # Who looks holds the interpreter, so the other thread waits for it now, whatever it did
-            # before: it slept only if it has used no time either.
+            # This thread holds the interpreter now, so the other one waits for it, whatever it did
+            # before: it slept only if it has used no processor time either.
             self._used += LOOK if spent < IDLE and _sleeps(self._watched) else spent
             if self._used >= LIMIT:
                 self._used, self._attempts = LIMIT - AGAIN, self._attempts + 1
@@ -114,7 +112,7 @@ def _look_on(watchdog: weakref.ref[Watchdog], over: threading.Event) -> None:
 
 
 def _described(frame: FrameType | None) -> str:
-    """Whose code a stack is in, and at which line."""
+    """Return whose code a stack is in, and at which line."""
     line, whose = "", "its code"
     while frame is not None:
         code = frame.f_code
@@ -159,7 +157,8 @@ def _processor_time(clock: int) -> float:
 
 
 def _sleeps(thread: int) -> bool:
-    """Whether a thread waits for something, as against being ready to run on a busy machine."""
+    """Return whether a thread waits for something; False if it is ready to run on a busy
+    machine."""
     native = next((t.native_id for t in threading.enumerate() if t.ident == thread), None)
     try:
         return (

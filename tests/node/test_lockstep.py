@@ -443,7 +443,7 @@ def test_a_driver_that_refuses_its_keys_is_one_fault() -> None:
     with pytest.raises(DirectoryError, match="no stream 'points' leads here"):
         LockstepNode(directory(**{'to = "slide"': 'to = "eye"'}), "left")
     with pytest.raises(
-        DirectoryError, match="collections:ChainMap is no driver: it has no period, state"
+        DirectoryError, match="collections:ChainMap is not a driver: it has no period, state"
     ):
         LockstepNode(directory(**{"toy_cell.drivers:Slide": "collections:ChainMap"}), "left")
 

@@ -136,7 +136,7 @@ TestMemory.settings = settings(max_examples=25, stateful_step_count=25, deadline
             "memory.compare_and_set",
             {"name": "x", "version": "1", "value": 1},
             "bad_arguments",
-            "memory.get told",
+            "memory.get returned",
         ),
         ("memory.put", {"name": "x", "value": bytes(1 << 21)}, "too_large", "the limit is 1048576"),
     ],
