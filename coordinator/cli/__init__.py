@@ -83,6 +83,7 @@ COMMANDS = (
     Subcommand("abort", "abort the active run", "operate.abort"),
     Subcommand("estop", "emergency stop: stop all devices through their nodes and their bus"),
     Subcommand("log", "print or export a recorded run"),
+    Subcommand("film", "make a film of a recorded lock-step run"),
     Subcommand("campaign", "run a task many times in parallel lock-step cells"),
     Subcommand("report", "write a report of a run or a campaign, or compare two campaigns"),
     Subcommand("forecast", "forecast further runs from measured ones, and compare"),
@@ -103,7 +104,7 @@ COMMANDS = (
     Subcommand("new", "write a working robot, or a skeleton of a driver, an action or a task"),
 )
 PLAIN = (
-    *("calibrate", "convert", "keys", "learned", "log", "new", "node", "nodes", "report"),
+    *("calibrate", "convert", "film", "keys", "learned", "log", "new", "node", "nodes", "report"),
     *("serve", "show", "sim", "up"),
 )
 """Commands that neither run nor judge anything: their exit codes are few."""

@@ -199,6 +199,8 @@ class Overlay:
     heat: Mapping[str, float] = field(default_factory=dict)
     path: Sequence[str] = ()
     legend: str = ""
+    moving: Mapping[Edge, float] = field(default_factory=dict)
+    """Tokens on arcs: by the two ends of an arc, how far its token has come, 0 to 1."""
 
     def on(self, node: DrawnNode, shown: Mapping[str, str]) -> DrawnNode:
         """Return the node with its overlay.
@@ -241,11 +243,17 @@ class Scene:
     legend: str = ""
     shown: Mapping[str, str] = field(default_factory=dict)
     """Places and transitions that are drawn as another node: the macro place around them."""
+    moving: Mapping[Edge, float] = field(default_factory=dict)
+    """Tokens on arcs, as in `Overlay`."""
 
     def under(self, overlay: Overlay) -> Scene:
         """Return the scene with an overlay."""
         nodes = {name: overlay.on(node, self.shown) for name, node in self.nodes.items()}
-        return replace(self, nodes=nodes, legend=overlay.legend)
+        moving = {
+            (self.shown.get(a, a), self.shown.get(b, b)): way
+            for (a, b), way in overlay.moving.items()
+        }
+        return replace(self, nodes=nodes, legend=overlay.legend, moving=moving)
 
 
 def scene_of_task(

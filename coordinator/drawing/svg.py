@@ -106,6 +106,11 @@ def render(scene: Scene) -> str:
     ]
     lines += [line for w in words for line in _words(w)]
     lines += [line for path in paths if path.arc.weight > 1 for line in _weight(path)]
+    lines += [
+        _moving(path, scene.moving[ends])
+        for path in paths
+        if (ends := (path.arc.source, path.arc.target)) in scene.moving
+    ]
     if scene.legend:
         lines += _text(
             scene.legend, left + _MARGIN / 2, top + height - _MARGIN / 2, "start", "legend"
@@ -187,6 +192,12 @@ def _tokens(node: DrawnNode) -> Iterator[str]:
         return
     for dx, dy in _DOTS.get(node.tokens, ()):
         yield f'<circle class="token" cx="{x + dx:g}" cy="{y + dy:g}" r="4.2"/>'
+
+
+def _moving(path: ArcPath, way: float) -> str:
+    """Return a token on its way along an arc."""
+    x, y = path.point(way)
+    return f'<circle class="token" cx="{x:.1f}" cy="{y:.1f}" r="5.5"/>'
 
 
 def _badge(node: DrawnNode, spot: Point) -> Iterator[str]:

@@ -23,6 +23,7 @@ from petrobot.sim.catching.physics import choose, version
 from petrobot.sim.catching.puma import ArmPlant
 from petrobot.sim.catching.puma_model import Frame3
 from petrobot.sim.catching.referee import CatchReferee
+from petrobot.sim.catching.side_view import side_view
 from petrobot.sim.catching.site import CupMount, Site, laboratory_file, site_of
 from petrobot.sim.catching.thrower import Thrower, draw_throw
 from petrobot.sim.catching.truth import LaboratoryError, Truth, read_toml
@@ -172,6 +173,12 @@ class CatchingLaboratory(LaboratoryParty):
             self.truth.light(now),
             () if self._second is None else self._second.seen(now),
         )
+
+    def side_view(self) -> str:
+        """Return the world as it is now, seen from beside the table (SVG), for `petrobot film`."""
+        ball, cup = self.world.ball, self._cup_now()
+        balls = [] if ball is None else [ball.position]
+        return side_view(self._site.cell, self._solid_parts, cup, balls)
 
     # World
 
