@@ -85,6 +85,10 @@ class Ports(Protocol):
     def file(self, path: str) -> bytes:
         """A file named in services.toml, relative to it."""
 
+    def write_file(self, path: str, content: bytes) -> None:
+        """Write such a file whole: after a power cut there is the old one or the new one. It may
+        take longer than a period."""
+
 
 CAMERA_KEYS = (
     "source",

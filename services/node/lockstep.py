@@ -35,6 +35,7 @@ from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.comm.streams.camera import MemoryImages, open_images
 from petrobot.services.comm.streams.image import ImageSource
 from petrobot.services.comm.streams.serial_line import SerialLine
+from petrobot.services.host.whole_file import write_whole
 from petrobot.services.node.drivers import make_driver
 from petrobot.services.node.inline_host import Host, InlineHost
 from petrobot.services.node.node import GENERAL, Node
@@ -176,6 +177,10 @@ class LockstepPorts:
     def file(self, path: str) -> bytes:
         """A file named in services.toml, relative to it."""
         return self._directory.file(path).read_bytes()
+
+    def write_file(self, path: str, content: bytes) -> None:
+        """Write a file named in services.toml, relative to it."""
+        write_whole(self._directory.source.parent / path, content)
 
     def receive(self, envelope: Envelope) -> None:
         """Take what the laboratory or a stream sends to this device."""

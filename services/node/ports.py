@@ -14,6 +14,7 @@ from petrobot.services.comm.streams.image import ImageSource
 from petrobot.services.comm.streams.serial_line import SerialLine, SerialPort
 from petrobot.services.comm.streams.stream import Incoming, StreamReceiver
 from petrobot.services.comm.tls.credentials import credentials
+from petrobot.services.host.whole_file import write_whole
 from petrobot.services.worker.context import Draws, checked
 from petrobot.services.worker.setpoints import SetpointReceiver
 
@@ -122,6 +123,10 @@ class ProcessPorts:
     def file(self, path: str) -> bytes:
         """A file named in services.toml, relative to it."""
         return self._directory.file(path).read_bytes()
+
+    def write_file(self, path: str, content: bytes) -> None:
+        """Write a file named in services.toml, relative to it."""
+        write_whole(self._directory.source.parent / path, content)
 
     def stream_ports(self) -> dict[str, int]:
         """Return the TCP port of each stream that is received here."""

@@ -146,7 +146,9 @@ class Servo:
 
     def advance(self, dt: float) -> None:
         """Let `dt` seconds pass."""
-        on = bool(self.memory[TORQUE]) and self.connected
+        if not self.connected:
+            self.memory[TORQUE] = 0  # without power it forgets
+        on = bool(self.memory[TORQUE])
         if on:
             self._move_profile(dt)
             limit = min(self._word(TORQUE_LIMIT), self._word(MOST_TORQUE)) / 1000

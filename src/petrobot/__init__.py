@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         provisional,
         success,
     )
+    from petrobot.services.comm.streams.serial_line import SerialLine
     from petrobot.services.conformance import DriverCheck, check_driver
     from petrobot.services.device import Driver, Ports, Remote, Setpoint, key
     from petrobot.services.rehearsal import Rehearsal, rehearse
@@ -38,6 +39,7 @@ __all__ = [
     "Rehearsal",
     "Remote",
     "Result",
+    "SerialLine",
     "Setpoint",
     "Status",
     "check_driver",
@@ -50,7 +52,9 @@ __all__ = [
 ]
 
 _HOMES = {
-    **dict.fromkeys(("Driver", "Ports", "Remote", "Setpoint", "key"), "petrobot.services.device"),
+    **dict.fromkeys(
+        ("Driver", "Ports", "Remote", "SerialLine", "Setpoint", "key"), "petrobot.services.device"
+    ),
     **dict.fromkeys(("DriverCheck", "check_driver"), "petrobot.services.conformance"),
     **dict.fromkeys(("Rehearsal", "rehearse"), "petrobot.services.rehearsal"),
 }

@@ -1,0 +1,77 @@
+"""Primitive actions of the SO-101: move_joints, move_to, grasp, release.
+
+Error causes: `arm_fault` (the driver reports it), `unreachable`, `not_reached`, `command_refused`.
+`grasp` fails with `empty`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from petrobot import Context, Remote, Result, error, failure, success
+from petrobot.services.adapters.so101.kinematics import forward, inverse
+
+State = Mapping[str, Any]
+
+
+async def move_joints(
+    ctx: Context[Remote], *, joints: Sequence[float], speed: float = 1.0, timeout: float = 10.0
+) -> Result:
+    """Bring the five joints to these angles (rad), with this share of the arm's speed."""
+    command = {"do": "move", "joints": list(joints), "speed": speed}
+    return await _do(ctx, command, lambda state: state["at_goal"], timeout) or success()
+
+
+async def move_to(
+    ctx: Context[Remote],
+    *,
+    x: float,
+    y: float,
+    z: float,
+    pitch: float = -math.pi / 2,
+    roll: float = 0.0,
+    speed: float = 1.0,
+    timeout: float = 10.0,
+) -> Result:
+    """Bring the gripper's tip to a point (m, frame of `kinematics`). `pitch` is the gripper's angle
+    above the horizontal, `roll` that of its last joint (rad). The joints move together, the tip not
+    on a line."""
+    try:
+        joints = inverse(x, y, z, pitch, roll)
+    except ValueError as fault:
+        return error("unreachable", str(fault))
+    result = await move_joints(ctx, joints=joints, speed=speed, timeout=timeout)
+    tip = forward(ctx.device.state["q"])
+    return result if result.cause else success(off=math.dist(tip[:3], (x, y, z)))
+
+
+async def grasp(ctx: Context[Remote], *, squeeze: float = 0.25, timeout: float = 4.0) -> Result:
+    """Close the gripper until it holds something with this share of its stall torque; `angle`
+    (rad) is how far it is open then. FAILURE `empty` if it closed on nothing."""
+    ends = ("holding", "closed")
+    command = {"do": "close", "squeeze": squeeze}
+    fault = await _do(ctx, command, lambda state: any(state["gripper"][e] for e in ends), timeout)
+    gripper = ctx.device.state["gripper"]
+    if fault is None and not gripper["holding"]:
+        return failure("empty", "the gripper closed on nothing", angle=gripper["angle"])
+    return fault or success(angle=gripper["angle"])
+
+
+async def release(ctx: Context[Remote], *, angle: float = 1.0, timeout: float = 4.0) -> Result:
+    """Open the gripper to an angle (rad)."""
+    command = {"do": "open", "angle": angle}
+    return await _do(ctx, command, lambda state: state["gripper"]["open"], timeout) or success()
+
+
+async def _do(
+    ctx: Context[Remote], command: State, done: Callable[[State], bool], timeout: float
+) -> Result | None:
+    """Send a command and wait until it is done; None if it was."""
+    await ctx.command(command)
+    device = ctx.device
+    await ctx.wait(lambda: done(device.state) or bool(device.state["faults"]), timeout)
+    if device.state["faults"]:
+        return error("arm_fault", "; ".join(device.state["faults"].values()))
+    return None if done(device.state) else error("not_reached", f"not within {timeout:g} s")

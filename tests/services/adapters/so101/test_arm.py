@@ -1,0 +1,433 @@
+"""The driver of the SO-101 and its actions, on simulated servos."""
+
+from __future__ import annotations
+
+import math
+import random
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from petrobot import Rehearsal, check_driver, rehearse
+from petrobot.services.adapters.so101 import actions, bus
+from petrobot.services.adapters.so101.arm import STILL, Joint
+from petrobot.services.adapters.so101.kinematics import JOINTS
+from petrobot.services.comm.streams.serial_line import SerialPort
+from petrobot.sim.bus import feetech
+from petrobot.sim.bus.feetech import FeetechBus, Servo, so101
+from petrobot.sim.bus.serial_line import PtyLine
+from tests.services.adapters.so101.rig import Rig, SimulatedArm
+
+THERE = {"do": "move", "joints": [0.5, -0.5, 0.5, 0.2, 1.0]}
+BACK = {"do": "move", "joints": [-0.5, 0.1, 0.0, 0.3, 0.0]}
+DOWN = {"do": "open", "angle": 1.2}
+SHUT = {"do": "open", "angle": 0.1}
+
+
+@pytest.mark.parametrize("commands", [(THERE, BACK), (DOWN, SHUT)])
+def test_it_keeps_the_rules_of_drivers(commands: Any) -> None:
+    rig = Rig()
+    found = check_driver(lambda: rig.arm(), commands, simulated=True, cable=rig.cable)
+    assert (found.faults, found.notes) == ([], [])
+
+
+def test_it_keeps_the_rules_on_a_port_that_is_unplugged(tmp_path: Path) -> None:
+    """The same with the port that a real arm has, on a pseudo terminal that is closed and opened
+    again."""
+    rig, path = Rig(), tmp_path / "so101"
+    far = [PtyLine(path, rig.bus.receive)]
+
+    class Near(SerialPort):
+        """The bus answers at once, as if it were another process."""
+
+        def send(self, data: bytes) -> None:
+            super().send(data)
+            far[0].poll()
+
+    def cable(plugged: bool) -> None:
+        if plugged:
+            far[0] = PtyLine(path, rig.bus.receive)
+        else:
+            far[0].close()
+
+    rig.open = lambda: Near(str(path), 1_000_000)
+    found = check_driver(lambda: rig.arm(), (THERE, BACK), simulated=True, cable=cable)
+    far[0].close()
+    assert (found.faults, found.notes) == ([], [])
+
+
+# --- movements ----------------------------------------------------------------------------------
+
+
+@given(st.lists(st.tuples(st.floats(-1.5, 1.5), st.integers(1, 60)), min_size=1), st.booleans())
+def test_set_points_keep_the_limits_whenever_a_new_goal_comes(goals: Any, held: bool) -> None:
+    joint = Joint("elbow_flex", 3, -1.5, 1.5, fastest=2.0)
+    speed = 0.0
+    for goal, steps in [*goals, (goals[-1][0], 400)]:
+        joint.goal = goal
+        for step in range(steps):
+            last, aim = speed, joint.aim
+            joint.lead(0.02, 8.0, held and step % 50 > 20)
+            speed = (joint.aim - aim) / 0.02
+            assert abs(speed) <= 2.0 + 1e-6 and abs(joint.aim) <= 1.5 + 1e-6
+            assert abs(speed - last) <= 8.0 * 0.02 + 1e-6
+    assert joint.aim == joint.goal and joint.velocity == 0.0
+
+
+def test_all_joints_arrive_together() -> None:
+    arm = Rig().arm().ready()
+    arm.command(arm.ports.now, THERE)
+    arrived: dict[str, float] = {}
+    for _ in range(200):
+        arm.run(arm.period)
+        for joint in arm.arm:
+            if joint.aim == joint.goal:
+                arrived.setdefault(joint.name, arm.ports.now)
+    assert max(arrived.values()) - min(arrived.values()) <= 3 * arm.period
+
+
+@pytest.mark.parametrize(
+    ("keys", "seconds"), [({}, 1.0), ({"speed": 0.25}, 3.0), ({"acceleration": 1.0}, 2.0)]
+)
+def test_it_takes_as_long_as_speed_and_acceleration_say(keys: Any, seconds: float) -> None:
+    arm = Rig().arm(**keys).ready()
+    begin = arm.ports.now
+    arm.command(begin, {"do": "move", "joints": [1.0, 0, 0, 0, 0]})
+    while arm.joints[0].aim != 1.0 and arm.ports.now < begin + 10.0:
+        arm.run(arm.period)
+    fastest, rate = arm.fastest * arm.speed, arm.acceleration
+    due = 1.0 / fastest + fastest / rate if fastest**2 / rate < 1.0 else 2 * math.sqrt(1.0 / rate)
+    assert arm.ports.now - begin == pytest.approx(due, abs=0.1) and due > 0.8 * seconds
+
+
+def test_a_load_does_not_keep_it_from_its_goal() -> None:
+    rig = Rig()
+    arm = rig.arm().ready()
+    for number, load in ((2, -0.3), (3, -0.2)):
+        rig.bus.servos[number].external = load
+    arm.command(arm.ports.now, THERE)
+    arm.run(3.0)
+    assert arm.state()["at_goal"]
+    assert arm.state()["q"] == pytest.approx(THERE["joints"], abs=0.006)
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({"do": "move", "joints": [9, 0, 0, 0, 0]}, "shoulder_pan: expected -1.920 to 1.920 rad"),
+        ({"do": "move", "joints": [0, 0, 0, 0]}, "expected five angles"),
+        ({"do": "move", "joints": [0, 0, 0, 0, math.nan]}, "expected five angles"),
+        ({"do": "move", "joints": [0] * 5, "speed": 2.0}, "speed: expected a share"),
+        ({"do": "open", "angle": 3.0}, "gripper: expected -0.175 to 1.745 rad"),
+        ({"do": "close", "squeeze": 0.9}, "squeeze: expected at most 0.5"),
+        ({"do": "dance"}, "do: move, open, close, free, calibrate, reset"),
+        ({"do": "calibrate"}, "calibration ="),
+    ],
+)
+def test_a_command_outside_its_limits_is_refused(body: Any, words: str) -> None:
+    arm = Rig().arm().ready()
+    with pytest.raises(ValueError, match=words):
+        arm.command(arm.ports.now, body)
+    assert arm.stopped()
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"ids": [1, 2, 3]}, "ids: expected six different numbers"),
+        ({"limits": {"elbow": [0.0, 1.0]}}, "no joint 'elbow'"),
+        ({"limits": {"gripper": [1.0, 0.0]}}, "limits.gripper"),
+        ({"reverse": ["nose"]}, "no joint 'nose'"),
+        ({"speed": 0.0}, "speed: expected a number above 0"),
+        ({"baud": 9600}, "period: expected at least"),
+        ({"on_estop": "fall"}, "on_estop"),
+        ({"bauds": 9600}, "unknown key 'bauds'"),
+    ],
+)
+def test_a_wrong_key_is_refused_with_its_name(keys: Any, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        Rig().arm(**keys)
+
+
+# --- calibration --------------------------------------------------------------------------------
+
+
+def test_zero_positions_are_calibrated_by_a_command_and_kept(tmp_path: Path) -> None:
+    horn = 300.0  # steps by which a servo was mounted wrongly
+    rig = Rig(folder=tmp_path)
+    rig.bus.servos[2].position += horn
+    arm = rig.arm(calibration="arm.toml", reverse=["elbow_flex"], enable=False)
+    arm.run(0.3)
+    with pytest.raises(ValueError, match="torque is off"):
+        arm.command(arm.ports.now, THERE)
+    pose = [0.0, 0.2, 0.3, 0.0, 0.0, 0.0]
+    for number in (2, 3):
+        rig.bus.servos[number].position += (pose[number - 1] / bus.RAD) * (-1) ** (number == 3)
+    arm.run(0.3)
+    arm.command(arm.ports.now, {"do": "calibrate", "pose": pose})
+    assert arm.state()["q"] == pytest.approx(pose[:5], abs=0.002)
+    again = rig.arm(calibration="arm.toml", reverse=["elbow_flex"]).ready()
+    assert again.state()["q"] == pytest.approx(pose[:5], abs=0.002)
+    again.command(again.ports.now, THERE)
+    again.run(3.0)
+    assert rig.bus.servos[2].angle - horn * bus.RAD == pytest.approx(-0.5, abs=0.01)
+    assert rig.bus.servos[3].angle == pytest.approx(-0.5, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("zero = [1, 2]\nids = [1, 2, 3, 4, 5, 6]", r"arm.toml: expected ids .* found"),
+        ("zero = [1, 2, 3, 4, 5, 6]\nids = [1, 2, 3, 4, 5, 7]", "is it this arm's"),
+        ("nothing", "arm.toml: "),
+        ("\xff", "arm.toml: "),
+    ],
+)
+def test_a_wrong_calibration_file_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "arm.toml").write_bytes(text.encode("latin-1"))
+    with pytest.raises(ValueError, match=words):
+        Rig(folder=tmp_path).arm(calibration="arm.toml")
+
+
+def test_without_its_calibration_file_it_does_not_move(tmp_path: Path) -> None:
+    arm = Rig(folder=tmp_path).arm(calibration="arm.toml")
+    arm.run(0.3)
+    assert "uncalibrated" in arm.state()["faults"]
+    with pytest.raises(ValueError, match=r"arm\.toml is not there yet"):
+        arm.command(arm.ports.now, THERE)
+
+
+# --- faults -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("chained", [False, True])
+@pytest.mark.parametrize("lost", [(1,), (3,), (6,), (2, 5), (1, 2, 3, 4, 5)])
+def test_a_missing_servo_hides_none_of_the_others(lost: tuple[int, ...], chained: bool) -> None:
+    rig = Rig(FeetechBus((Servo(number) for number in range(1, 7)), chained=chained))
+    arm = rig.arm().ready()
+    arm.command(arm.ports.now, THERE)
+    arm.run(0.2)
+    for number in lost:
+        rig.bus.servos[number].connected = False
+    arm.run(1.0)
+    names = ", ".join(list(JOINTS)[number - 1] for number in lost)
+    assert arm.state()["faults"] == {"missing": f"no answer from {names}"}
+    assert (
+        not arm.stopped()
+        and not arm.state()["at_goal"]
+        and arm.hold(arm.ports.now) == "cannot hold"
+    )
+    heard = [joint for joint in arm.joints if joint.servo not in lost]
+    assert all(joint.still >= STILL and joint.velocity == 0.0 for joint in heard)
+    with pytest.raises(ValueError, match="no answer from"):
+        arm.command(arm.ports.now, BACK)
+    for number in lost:
+        rig.bus.servos[number].connected = True
+    arm.run(0.5)
+    # The servos lost their torque with their cable: the arm does not go on by itself.
+    assert list(arm.state()["faults"]) == ["power"]
+    assert arm.stopped() and not arm.state()["at_goal"]
+
+
+def test_one_servo_that_is_missing_from_the_start() -> None:
+    rig = Rig()
+    rig.bus.servos[4].connected = False
+    arm = rig.arm()
+    arm.run(1.0)
+    assert arm.state()["faults"] == {"missing": "no answer from wrist_flex"}
+    rig.bus.servos[4].connected = True
+    arm.run(0.5)
+    assert arm.stopped() and arm.state()["faults"] == {}
+
+
+@pytest.mark.parametrize(("seed", "echo"), [(1, False), (2, True), (3, True)])
+def test_noise_and_echoes_do_not_disturb_it(seed: int, echo: bool) -> None:
+    chance = random.Random(seed)
+    rig = Rig(FeetechBus((Servo(number) for number in range(1, 7)), echo=echo))
+
+    def spoil(answer: bytes) -> bytes:
+        at = chance.randrange(len(answer))
+        kind = chance.randrange(6)
+        if kind == 0:
+            return answer[:at]
+        if kind == 1:
+            return answer[:at] + bytes((answer[at] ^ 1 << chance.randrange(8),)) + answer[at + 1 :]
+        return chance.randbytes(chance.randrange(4)) + answer if kind == 2 else answer
+
+    rig.bus.noise = spoil
+    arm = rig.arm()
+    arm.run(0.5)
+    arm.command(arm.ports.now, THERE)
+    arm.run(3.0)
+    assert arm.state()["at_goal"] and arm.state()["faults"] == {}
+
+
+def test_a_pulled_cable_is_unknown_and_the_port_is_opened_again() -> None:
+    rig = Rig()
+    arm = rig.arm().ready()
+    arm.command(arm.ports.now, THERE)
+    arm.run(0.3)
+    rig.cable(False)
+    arm.run(10.0)
+    assert not arm.stopped() and arm.hold(arm.ports.now) == "cannot hold"
+    assert "the cable is pulled" in arm.state()["faults"]["missing"] or "no /dev" in str(
+        arm.state()["faults"]
+    )
+    assert 5 <= rig.opened <= 9  # 0.2, 0.4, ... 3.2 s between two attempts
+    with pytest.raises(ValueError, match="no answer from"):
+        arm.command(arm.ports.now, BACK)
+    where = [servo.angle for servo in rig.bus.servos.values()]
+    rig.cable(True)
+    arm.run(4.0)
+    assert arm.stopped() and arm.state()["faults"] == {} and not arm.state()["at_goal"]
+    assert [servo.angle for servo in rig.bus.servos.values()] == pytest.approx(where, abs=0.003)
+    arm.command(arm.ports.now, BACK)
+    arm.run(3.0)
+    assert arm.state()["at_goal"]
+
+
+def trouble(kind: str) -> Callable[[Servo], None]:
+    def happen(servo: Servo) -> None:
+        if kind == "heat":
+            servo.heat = 66.0
+        elif kind == "power":
+            servo.write(feetech.TORQUE, b"\0")
+        elif kind == "voltage":
+            servo.voltage = 3.0
+        else:
+            servo.high = servo.position + 5.0
+
+    return happen
+
+
+@pytest.mark.parametrize("kind", ["heat", "power", "voltage", "overload"])
+def test_trouble_stops_it_until_a_reset(kind: str) -> None:
+    rig = Rig()
+    arm = rig.arm().ready()
+    servo = rig.bus.servos[3]
+    arm.command(arm.ports.now, {"do": "move", "joints": [0, 0, 1.5, 0, 0]})
+    arm.run(0.4)
+    trouble(kind)(servo)
+    arm.run(2.0)
+    assert list(arm.state()["faults"]) == [kind] and arm.stopped()
+    assert abs(servo.duty) < 0.2  # it gave way
+    with pytest.raises(ValueError, match="reset"):
+        arm.command(arm.ports.now, BACK)
+    servo.heat, servo.voltage, servo.high = 30.0, 7.4, math.inf
+    arm.run(0.1)
+    arm.command(arm.ports.now, {"do": "reset"})
+    arm.run(0.3)
+    arm.command(arm.ports.now, BACK)
+    arm.run(3.0)
+    assert arm.state()["at_goal"]
+
+
+@pytest.mark.parametrize(("on_estop", "falls"), [("hold", False), ("off", True)])
+def test_a_quick_stop_holds_or_lets_go(on_estop: str, falls: bool) -> None:
+    rig = Rig()
+    arm = rig.arm(on_estop=on_estop).ready()
+    arm.command(arm.ports.now, THERE)
+    arm.run(0.4)
+    at = rig.bus.servos[1].angle
+    arm.quick_stop(arm.ports.now)
+    arm.run(0.5)
+    assert abs(rig.bus.servos[1].angle - at) < 0.1 and arm.stopped()
+    rig.bus.servos[2].external = -0.3
+    at = rig.bus.servos[2].angle
+    arm.run(0.5)
+    assert (abs(rig.bus.servos[2].angle - at) > 0.2) == falls
+    assert arm.state()["torque"] != falls
+
+
+def test_a_driver_made_again_takes_the_arm_over_without_a_movement() -> None:
+    rig = Rig()
+    rig.bus.servos[2].external = -0.3
+    arm = rig.arm().ready()
+    arm.command(arm.ports.now, THERE)
+    arm.run(3.0)
+    before = rig.bus.servos[2].angle
+    again = rig.arm().ready()
+    again.run(1.0)
+    assert rig.bus.servos[2].angle == pytest.approx(before, abs=0.003)
+
+
+def test_a_period_takes_a_small_part_of_its_time() -> None:
+    arm = Rig().arm().ready()
+    arm.command(arm.ports.now, THERE)
+    begin = time.process_time()
+    for _ in range(100):
+        super(SimulatedArm, arm).step(arm.ports.now)
+    assert time.process_time() - begin < 100 * arm.period / 4
+
+
+def test_a_joint_reads_and_writes_steps() -> None:
+    joint = Joint("elbow_flex", 3, -1.0, 1.0, sign=-1, zero=2000)
+    joint.take(0.0, bus.Reading(True, 0, 2100, 0, -0.25, 7.4, 25))
+    assert joint.q == pytest.approx(-100 * bus.RAD) and joint.load == 0.25
+    assert joint.steps(joint.q) == 2100 and joint.steps(99.0) == 0
+
+
+# --- actions ------------------------------------------------------------------------------------
+
+
+def played(action: Any, rig: Rig, **arguments: Any) -> Rehearsal:
+    return rehearse(action, device=rig.arm().ready(), **arguments)
+
+
+def test_move_to_brings_the_tip_there() -> None:
+    rig = Rig()
+    rig.bus.servos[2].external = -0.2
+    result = played(actions.move_to, rig, x=0.25, y=0.05, z=0.03).result
+    assert result.status == "success" and result.values["off"] < 0.004
+
+
+@pytest.mark.parametrize(
+    ("action", "arguments", "cause"),
+    [
+        (actions.move_to, {"x": 0.7, "y": 0.0, "z": 0.0}, "unreachable"),
+        (actions.move_joints, {"joints": [0, 9, 0, 0, 0]}, "command_refused"),
+        (actions.move_joints, {"joints": [1, 0, 0, 0, 0], "timeout": 0.2}, "not_reached"),
+    ],
+)
+def test_an_action_says_why_it_failed(action: Any, arguments: Any, cause: str) -> None:
+    result = played(action, Rig(), **arguments).result
+    assert (result.status, result.cause) == ("error", cause)
+
+
+def test_an_action_ends_when_the_arm_has_a_fault() -> None:
+    rig = Rig()
+    rig.bus.servos[2].high = 2148.0
+    found = played(actions.move_joints, rig, joints=[0, 1, 0, 0, 0])
+    assert (found.result.status, found.result.cause) == ("error", "arm_fault")
+    assert "shoulder_lift" in found.result.text and found.seconds < 2.0
+
+
+def test_the_gripper_holds_what_is_there_while_the_arm_moves() -> None:
+    rig = Rig(so101([0.0] * 5 + [1.0]))
+    rig.bus.servos[6].low = 2048.0 + 200.0
+    arm = rig.arm().ready()
+    result = rehearse(actions.grasp, device=arm, squeeze=0.3).result
+    assert result.status == "success" and result.values["angle"] == pytest.approx(0.307, abs=0.01)
+    arm.run(1.0)
+    assert rig.bus.servos[6].duty == pytest.approx(-0.3, abs=0.02)
+    result = rehearse(actions.move_joints, device=arm, joints=[0.5, 0, 0, 0, 0]).result
+    arm.stop(arm.ports.now)
+    arm.run(0.5)
+    assert result.status == "success" and arm.state()["gripper"]["holding"]
+    rig.bus.servos[6].low = -math.inf  # it slips out
+    arm.run(0.5)
+    assert not arm.state()["gripper"]["holding"]
+
+
+def test_the_gripper_finds_nothing_and_opens() -> None:
+    rig = Rig(so101([0.0] * 5 + [1.0]))
+    arm = rig.arm().ready()
+    result = rehearse(actions.grasp, device=arm).result
+    assert (result.status, result.cause) == ("failure", "empty")
+    assert rehearse(actions.release, device=arm, angle=0.8).result.status == "success"
+    assert arm.state()["gripper"]["angle"] == pytest.approx(0.8, abs=0.03)
