@@ -10,9 +10,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
-from petrobot.services.action import Cancelled, Context, Result, error, failure, success
+from petrobot.services.action import (
+    Cancelled,
+    Context,
+    Result,
+    Status,
+    error,
+    failure,
+    provisional,
+    success,
+)
 from petrobot.services.mobile import paths
 from petrobot.services.mobile.odometry import Pose, turned
 from petrobot.services.mobile.sight import TrackEnd
@@ -71,18 +81,28 @@ async def enable_drives(ctx: Context, *, timeout: float = 8.0, forget: bool = Fa
 
 
 async def follow_feed_forward(
-    ctx: Context, *, speed: float = 0.5, timeout: float = 240.0, patience: float = 6.0
+    ctx: Context,
+    *,
+    speed: float = 0.5,
+    timeout: float = 240.0,
+    patience: float = 6.0,
+    recovery: str = "",
 ) -> Result:
     """Follow the track to its end by its own curvature plus PD on the error at the axle. See
     `_follow`."""
-    return await _follow(ctx, "feed_forward", speed, timeout, patience)
+    return await _follow(ctx, "feed_forward", speed, timeout, patience, recovery)
 
 
 async def follow_pursuit(
-    ctx: Context, *, speed: float = 0.5, timeout: float = 240.0, patience: float = 6.0
+    ctx: Context,
+    *,
+    speed: float = 0.5,
+    timeout: float = 240.0,
+    patience: float = 6.0,
+    recovery: str = "",
 ) -> Result:
     """Follow the track to its end by pure pursuit of a point ahead on it. See `_follow`."""
-    return await _follow(ctx, "pursuit", speed, timeout, patience)
+    return await _follow(ctx, "pursuit", speed, timeout, patience, recovery)
 
 
 async def home_on_reflector(
@@ -91,12 +111,19 @@ async def home_on_reflector(
     line_end: Sequence[float] | None = None,
     speed: float = 0.5,
     timeout: float = 25.0,
+    judged: bool = False,
 ) -> Result:
     """Recover the track by the reflector above the point where it resumes: drive the circle through
-    that point. See `_recovered`.
+    that point. See `_recovered` and `_found`.
 
     FAILURE `no_reflector` when none answers from where the track can resume.
     """
+    return _found(ctx, await _home(ctx, line_end, speed, timeout), judged)
+
+
+async def _home(
+    ctx: Context, line_end: Sequence[float] | None, speed: float, timeout: float
+) -> Result:
     end, gates = _geometry(ctx, line_end)
     where: tuple[float, float] | None = None
 
@@ -126,9 +153,10 @@ async def dead_reckon(
     speed: float = 0.5,
     curvature: float = 0.0,
     timeout: float = 25.0,
+    judged: bool = False,
 ) -> Result:
     """Recover the track by driving on along the curve that the missing element is expected to have.
-    See `_recovered`.
+    See `_recovered` and `_found`.
 
     `curvature` (1/m, positive to the left): 0 expects a straight, 1 or -1 a quarter arc.
     """
@@ -140,9 +168,8 @@ async def dead_reckon(
     square, _ = ctx.device.state["element"]
     length = square if curvature == 0.0 else 0.5 * math.pi / abs(curvature)
     last = Pose(*paths.arc(end, curvature, length)[-1], end.heading + curvature * length)
-    return await _along(
-        drive, paths.arc(end, curvature, length) + paths.arc(last, 0.0, BEYOND - 0.2)
-    )
+    way = paths.arc(end, curvature, length) + paths.arc(last, 0.0, BEYOND - 0.2)
+    return _found(ctx, await _along(drive, way), judged)
 
 
 async def search_pattern(
@@ -152,13 +179,21 @@ async def search_pattern(
     speed: float = 0.4,
     rate: float = 1.2,
     timeout: float = 60.0,
+    judged: bool = False,
 ) -> Result:
     """Recover the track by driving into the empty square and looking straight on, to the left and
     to the right.
 
     Needs no sensor and no guess, and finds the way back from a wrong guess; takes longest. A rover
-    that stands looks around where it is first: the line may be in view. See `_recovered`.
+    that stands looks around where it is first: the line may be in view. See `_recovered` and
+    `_found`.
     """
+    return _found(ctx, await _search(ctx, line_end, speed, rate, timeout), judged)
+
+
+async def _search(
+    ctx: Context, line_end: Sequence[float] | None, speed: float, rate: float, timeout: float
+) -> Result:
     end, gates = _geometry(ctx, line_end)
     drive = _Drive(ctx, "feed_forward", speed, timeout)
     stuck = await drive.start(gates)
@@ -205,13 +240,18 @@ def _stands(state: Mapping[str, Any]) -> bool:
     return bool(state["standing"]) and (state["ahead"] < 0.05 or state["reason"] == "no_line")
 
 
-async def _follow(ctx: Context, law: str, speed: float, timeout: float, patience: float) -> Result:
+async def _follow(
+    ctx: Context, law: str, speed: float, timeout: float, patience: float, recovery: str
+) -> Result:
     """Follow the streamed track until its end is near; the rover keeps rolling for the next action.
 
     SUCCESS: `at_t` says whether the T or an interruption ends it, `line_end` where (pose in the
     odometry frame). FAILURE `unannounced_end` (same values) when the line just ceased. ERROR:
     `no_line` when none was seen within `patience` s, `stale_set_point` when the stream ceased, or
     as the driver reports.
+
+    `recovery` is the run that found the line, if it is to be judged: a line that is followed to an
+    end that was announced belongs to the track, one that ceases does not.
     """
     drive = _Drive(ctx, law, speed, timeout)
     begun, way = ctx.now, ctx.device.state["way"]
@@ -245,9 +285,22 @@ async def _follow(ctx: Context, law: str, speed: float, timeout: float, patience
     except Cancelled:
         ctx.device.send({"do": "rest"})
         raise
+    if recovery and result.status is Status.SUCCESS:
+        ctx.verdict(recovery, Status.SUCCESS)
+    elif recovery and result.cause in ("unannounced_end", "no_line"):
+        ctx.verdict(recovery, Status.FAILURE, "not_the_track", result.text)
     if result.cause:
         await drive.rest()
     return result
+
+
+def _found(ctx: Context, result: Result, judged: bool) -> Result:
+    """Return the result of a recovery; if it is to be judged, a found line is provisional, and
+    `run` is what following it judges."""
+    if not judged or result.status is Status.ERROR:
+        return result
+    result = replace(result, values={**result.values, "run": ctx.run})
+    return provisional(result) if result.status is Status.SUCCESS else result
 
 
 async def _along(drive: _Drive, plan: paths.Points) -> Result:

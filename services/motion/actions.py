@@ -9,9 +9,19 @@ All are coroutines that reach the driver only through `ctx.device`, a `Remote` o
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Final
 
-from petrobot.services.action import Cancelled, Context, Result, Status, error, failure, success
+from petrobot.services.action import (
+    Cancelled,
+    Context,
+    Result,
+    Status,
+    error,
+    failure,
+    provisional,
+    success,
+)
 
 RENEW: Final = 0.1
 """Seconds between repeated `follow` commands; the driver holds if it receives none for 0.5 s."""
@@ -36,11 +46,12 @@ async def intercept_upright(
     timeout: float = 8.0,
     patience: float = 3.0,
     sigma: float = 0.008,
+    judged: bool = False,
 ) -> Result:
     """Bring the upright cup to where the ball will fall into it, about `depth` m below the exit.
     See `_intercept`."""
     return await _intercept(
-        ctx, {"strategy": "upright", "preferred": depth}, timeout, patience, sigma
+        ctx, {"strategy": "upright", "preferred": depth}, timeout, patience, sigma, judged
     )
 
 
@@ -52,23 +63,35 @@ async def intercept_tilted(
     timeout: float = 8.0,
     patience: float = 3.0,
     sigma: float = 0.008,
+    judged: bool = False,
 ) -> Result:
     """Bring the cup, tilted by `tilt` (rad) against the ball, into its path about `depth` m below
     the exit. See `_intercept`."""
     return await _intercept(
-        ctx, {"strategy": "tilted", "tilt": tilt, "preferred": depth}, timeout, patience, sigma
+        ctx,
+        {"strategy": "tilted", "tilt": tilt, "preferred": depth},
+        timeout,
+        patience,
+        sigma,
+        judged,
     )
 
 
 async def follow_and_wait(
-    ctx: Context, *, margin: float = 0.4, patience: float = 1.0, timeout: float = 10.0
+    ctx: Context,
+    *,
+    margin: float = 0.4,
+    patience: float = 1.0,
+    timeout: float = 10.0,
+    moved: str = "",
 ) -> Result:
     """Keep the cup at the newest prediction and wait for the ball until `margin` s after its
     predicted arrival.
 
     SUCCESS when the ball lies in the cup, unless the external event `ball_caught` ends the run
     first; FAILURE `missed`. ERROR `no_setpoint` if no prediction arrives within `patience` s or the
-    stream ceases long before the ball arrives, and the driver's own errors.
+    stream ceases long before the ball arrives, and the driver's own errors. `moved` is the run that
+    brought the cup there, if it is to be judged: by whether the ball is in the cup.
     """
     following = _Following(ctx, {})
     try:
@@ -79,6 +102,10 @@ async def follow_and_wait(
             await ctx.sleep(GRACE)
     finally:
         ctx.device.send({"do": "hold"})  # Also when the run is preempted.
+        if moved and ctx.device.state["ball_in_cup"]:
+            ctx.verdict(moved, Status.SUCCESS)
+    if moved and result.status is Status.FAILURE:
+        ctx.verdict(moved, Status.FAILURE, result.cause, result.text)
     return result
 
 
@@ -137,14 +164,20 @@ async def reset_and_home(ctx: Context, *, speed: float = 0.3, timeout: float = 1
 
 
 async def _intercept(
-    ctx: Context, how: Mapping[str, Any], timeout: float, patience: float, sigma: float
+    ctx: Context,
+    how: Mapping[str, Any],
+    timeout: float,
+    patience: float,
+    sigma: float,
+    judged: bool,
 ) -> Result:
     """Follow the catch points of the stream until the cup is in place for one that is good enough.
 
     SUCCESS: in place, and sigma_y of the prediction is at most `sigma` (m) or the ball is about to
     arrive; FAILURE `late`: the predicted arrival has passed; ERROR: `no_setpoint` (none within
     `patience` s, or the stream has ceased), `unreachable`, or as the driver reports. After SUCCESS
-    and FAILURE the arm keeps following, for `follow_and_wait`.
+    and FAILURE the arm keeps following, for `follow_and_wait`. If it is to be `judged`, both are
+    provisional, and `run` is what `follow_and_wait` judges by whether the ball is caught.
     """
     following = _Following(ctx, how)
     try:
@@ -156,6 +189,8 @@ async def _intercept(
         raise
     if result.status is Status.ERROR:
         ctx.device.send({"do": "hold"})
+    elif judged:
+        result = provisional(replace(result, values={**result.values, "run": ctx.run}))
     return result
 
 

@@ -57,7 +57,8 @@ async def locate_background(ctx: Context, **options: float) -> Result:
     cheap in steady light.
 
     Options: those of `LocateSpecification`. SUCCESS and FAILURE (cause `inaccurate` or `late`)
-    return `ball` and `images`; ERROR has cause `no_ball`, `no_image` or `bad_image`.
+    return `ball` and `images`; ERROR has cause `no_ball`, `no_image` or `bad_image`. With `within`,
+    SUCCESS is provisional, and the tracker of this ball judges.
     """
     return await locate(ctx, "background", _background, 0.0007, LocateSpecification.of(options))
 
@@ -105,8 +106,9 @@ async def predict_least_squares(
 
     Publishes [time_to_go, x, y, z, vx, vy, vz, sigma_y, sigma_t] (s, m, m/s) at each image until
     the ball leaves the table. Options: those of `TrackSpecification`. SUCCESS: the predictions
-    agreed in time; FAILURE: `unsteady`, `late`, `side_exit` or `stays`; ERROR: `ball_lost`,
-    `no_image`, `bad_image` or `bad_ball`. Values: `exit`, `images`, `seen`.
+    were right in time; FAILURE: `off` or `unsteady`, `late`, `unseen`, `side_exit` or `stays`;
+    ERROR: `ball_lost`, `no_image`, `bad_image` or `bad_ball`. Values: `exit`, `images`, `seen`, and
+    `left`, where and when it was seen to leave.
     """
     return await _predict(ctx, LeastSquares, ball, stream, options)
 

@@ -10,11 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.services.action import Cancelled, Context, Result, error, failure, success
+from petrobot.services.action import (
+    Cancelled,
+    Context,
+    Result,
+    error,
+    failure,
+    provisional,
+    success,
+)
 from petrobot.services.comm.streams.image import Image
 from petrobot.services.vision.camera import Camera, CameraError, Mark
 from petrobot.services.vision.location import BallDetector, MixtureOfGaussians
@@ -166,6 +175,9 @@ class LocateSpecification(Specification):
     """Images/s; 0: the camera's usual rate."""
     image_timeout: float = 0.8
     """s without an image after which the camera counts as dead."""
+    within: float = 0.0
+    """m that the last place may be beside the ball's path, which the tracker measures: it gives
+    the verdict. 0: the scatter of the places (`max_residual`) judges at once."""
     max_residual: float = 0.0015
     """m, rms of the places about a straight line of constant speed; above it FAILURE
     `inaccurate`."""
@@ -253,7 +265,7 @@ class _Search:
         """Return the confirmed ball as plain data; SUCCESS when it meets the specification."""
         asked = self._specification
         ahead = float(track.places[-1, 0]) - self._camera.view.near_edge
-        ball = {
+        ball: dict[str, Any] = {
             "sequence": image.sequence,
             "age": self._ctx.now - image.time,
             "sigma": sigma,
@@ -262,6 +274,8 @@ class _Search:
                 for t, (x, y) in zip(track.times, track.places, strict=True)
             ],
         }
+        if asked.within > 0.0:
+            ball |= {"run": self._ctx.run, "within": asked.within}
         values = {"ball": ball, "images": self._images, "residual": track.residual, "ahead": ahead}
         if ahead < asked.min_ahead:
             return failure(
@@ -269,6 +283,8 @@ class _Search:
                 f"confirmed {ahead:.2f} m before the near edge, not {asked.min_ahead} m",
                 **values,
             )
+        if asked.within > 0.0:
+            return provisional(success(**values))
         if track.residual > asked.max_residual:
             text = (
                 f"places scatter by {track.residual * 1e3:.1f} mm, not "

@@ -278,12 +278,15 @@ class BallWindow:
     """
 
     CONTRAST = 25.0
-    """Grey levels by which a ball must be brighter than the background."""
+    """Grey levels by which a ball must be brighter than the background, if nothing else is
+    asked."""
     LEAST_COVER, MOST_COVER = 0.72, 1.30
     """Smallest and largest area relative to the expected one."""
 
-    def __init__(self, view: TableView) -> None:
+    def __init__(self, view: TableView, contrast: float = CONTRAST) -> None:
+        """`contrast`: grey levels by which a ball must be brighter than the background."""
         self.view = view
+        self._contrast = contrast
 
     def measure(
         self,
@@ -343,10 +346,10 @@ class BallWindow:
         brighter = region - empty
         smooth = cv2.blur(brighter, (3, 3))
         peak = float(smooth.max())
-        if peak < self.CONTRAST:
+        if peak < self._contrast:
             return None
         level = cv2.mean(region, (smooth > 0.6 * peak).view(np.uint8))[0]
-        return np.asarray(brighter / np.maximum(level - empty, self.CONTRAST), np.float32)
+        return np.asarray(brighter / np.maximum(level - empty, self._contrast), np.float32)
 
     def _nearest(
         self,

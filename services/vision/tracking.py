@@ -3,13 +3,13 @@ will leave the table."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from petrobot.services.action import Cancelled, Context, Result, error, failure, success
+from petrobot.services.action import Cancelled, Context, Result, Status, error, failure, success
 from petrobot.services.comm.streams.image import Image
 from petrobot.services.vision.camera import Camera, CameraError, Mark
 from petrobot.services.vision.location import BallWindow
@@ -25,6 +25,13 @@ GROWTH_PX = 4.0
 OTHERWISE = 5
 """Images in a row that predict another exit than over the near edge, after which the ball is given
 up."""
+LEAST_SIGHTS = 5
+"""Sights of a ball that must have been there."""
+JUDGED_SPAN = 0.15
+"""s of sights from which it is measured where the ball left, and where it was when located."""
+
+Predictions = Sequence[tuple[float, float, float]]
+"""When each was made, and when (s) and where (y, m) the ball will leave by it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,14 +42,41 @@ class TrackSpecification(Specification):
     """Images/s; 0: the camera's usual rate."""
     image_timeout: float = 0.5
     """s without an image after which the camera counts as dead."""
+    contrast: float = BallWindow.CONTRAST
+    """Grey levels by which a ball must be brighter than the table."""
     lost_after: float = 0.20
     """s without a sight of a ball that should be in plain view."""
     lead: float = 0.45
-    """s before the ball leaves; from then on predictions must agree with the last one."""
+    """s before the ball leaves; from then on predictions are judged."""
+    place_within: float = 0.0
+    """m along the near edge that they may be off where the last sights show that the ball left,
+    else FAILURE `off`. 0: they are compared with the last prediction."""
+    time_within: float = 0.0
+    """s that they may be off when it left, else FAILURE `off`; given with `place_within`."""
     max_time_spread: float = 0.010
-    """s, else FAILURE `unsteady`."""
+    """s by which they may differ from the last prediction, else FAILURE `unsteady`."""
     max_place_spread: float = 0.008
-    """m along the near edge, else FAILURE `unsteady`."""
+    """m along the near edge, the same."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError if only one of the two limits is given."""
+        if (self.place_within > 0.0) != (self.time_within > 0.0):
+            raise ValueError("give both place_within (m) and time_within (s), or neither")
+
+    @property
+    def measures(self) -> bool:
+        """Whether predictions are judged by where and when the ball was seen to leave."""
+        return self.place_within > 0.0
+
+    @property
+    def most_place(self) -> float:
+        """m that predictions may be off along the near edge."""
+        return self.place_within or self.max_place_spread
+
+    @property
+    def most_time(self) -> float:
+        """s that they may be off."""
+        return self.time_within or self.max_time_spread
 
 
 async def track(
@@ -52,8 +86,8 @@ async def track(
     stream: str,
     specification: TrackSpecification,
 ) -> Result:
-    """Track `ball` (as a locator returned it) with the predictor that `make` makes; the images end
-    with the run."""
+    """Track `ball` (as a locator returned it) with the predictor that `make` makes, and give the
+    verdict on the locator's run if it is to be judged; the images end with the run."""
     camera: Camera = ctx.device
     chase = _Chase(ctx, camera, make(camera.surface), stream, specification)
     try:
@@ -69,7 +103,9 @@ async def track(
         ctx.withdraw(stream)
         camera.end()
         raise
-    if result.cause not in ("", "unsteady", "late"):
+    if result.cause not in ("no_image", "bad_image"):
+        chase.judge_locator(ball)
+    if result.cause not in ("", "unsteady", "off", "late"):
         ctx.withdraw(stream)
     camera.end()
     return result
@@ -91,13 +127,17 @@ class _Chase:
         self._predictor = predictor
         self._stream = stream
         self._specification = specification
-        self._window = BallWindow(camera.view)
+        self._window = BallWindow(camera.view, specification.contrast)
         self._exit: PredictedExit | None = None
         self._made: list[tuple[float, float, float]] = []
+        self._sights: list[tuple[float, float, float]] = []
+        """Time (s) and place (m) of each sight."""
         self._latencies: list[float] = []
         """s from the middle of an exposure to the set point that it led to."""
         self._images = self._seen = self._misses = self._otherwise = 0
         self._seen_at = 0.0
+        self._located = (0.0, 0.0, 0.0)
+        """Time (s) and last place (m) as located."""
 
     def begin(self, ball: Mapping[str, Any]) -> None:
         """Take the located places. Raises KeyError, TypeError or ValueError when they are
@@ -107,7 +147,8 @@ class _Chase:
             time = self._ctx.now - float(ball["age"])
         sigma = max(float(ball["sigma"]), 1e-4)
         for ago, x, y in ball["places"]:
-            self._predictor.add(time + float(ago), float(x), float(y), sigma)
+            self._located = (time + float(ago), float(x), float(y))
+            self._predictor.add(*self._located, sigma)
         if self._predictor.count < 2:
             raise ValueError("fewer than two places")
         self._seen_at = time
@@ -129,8 +170,35 @@ class _Chase:
             elif self._ctx.now >= silent + asked.image_timeout:
                 return error("no_image", f"no image for {asked.image_timeout} s", **self._values())
             if self._left():
-                return self._judge()
+                return await self._judged()
             self._publish()
+
+    async def _judged(self) -> Result:
+        """Judge the predictions, now that the ball has left."""
+        asked, made = self._specification, tuple(self._made)
+        if not made:
+            return failure("late", "the ball left before it was predicted", **self._values())
+        if not asked.measures:
+            return self._judge(made, *made[-1][1:], "unsteady", self._values())
+        await self._see_it_leave()
+        crossing = self._crossing()
+        if crossing is None:
+            text = f"the ball was seen {len(self._sights)} times, too few to say where it left"
+            return failure("unseen", text, **self._values())
+        left, y = crossing
+        values = {**self._values(), "left": {"ago": self._ctx.now - left, "y": y}}
+        return self._judge(made, left, y, "off", values)
+
+    async def _see_it_leave(self) -> None:
+        """Read the images that are still on their way when the ball has left."""
+        self._ctx.withdraw(self._stream)  # What follows is too late for the arm.
+        until = self._ctx.now + self._specification.image_timeout
+        while self._exit is not None and self._ctx.now < until:
+            image = await self._camera.read(self._ctx, until - self._ctx.now)
+            if image is None or image.time > self._exit.time:
+                break
+            if self._look(image) is not None:
+                break
 
     def _left(self) -> bool:
         return (
@@ -156,6 +224,7 @@ class _Chase:
             return self._missed(image.time, expected)
         x, y = view.to_table(seen.centre)
         self._predictor.add(image.time, float(x), float(y))
+        self._sights.append((image.time, float(x), float(y)))
         self._seen, self._misses, self._seen_at = self._seen + 1, 0, image.time
         ended = self._predicted(image.time)
         self._mark((seen.centre,), (float(x), float(y)))
@@ -219,27 +288,72 @@ class _Chase:
             self._stream, [to_go, *point, vx, vy, 0.0, exit_.sigma_place, exit_.sigma_time]
         )
 
-    def _judge(self) -> Result:
-        """Compare the predictions of the last moments with the last one: the ball has left."""
+    def judge_locator(self, ball: Mapping[str, Any]) -> None:
+        """Give the verdict on the run that located the ball, if it asked for one: was a ball there,
+        and as near to its last place as `within` (m)?"""
+        run, within = ball.get("run"), ball.get("within")
+        if not run or within is None:
+            return
+        seen = len(self._sights)
+        if seen < LEAST_SIGHTS:
+            text = f"a ball that rolls from there was seen {seen} times, not {LEAST_SIGHTS}"
+            self._ctx.verdict(run, Status.FAILURE, "not_there", text)
+            return
+        time, *place = self._located
+        first = np.array([s for s in self._sights if s[0] <= self._sights[0][0] + JUDGED_SPAN])
+        if len(first) < LEAST_SIGHTS:
+            first = np.array(self._sights[:LEAST_SIGHTS])
+        # Of second order, because the ball may still slide: that slows it by 2 m/s^2.
+        fit = np.polynomial.polynomial.polyfit(first[:, 0] - time, first[:, 1:], 2)
+        off = float(np.hypot(*(fit[0] - place)))
+        if off > within:
+            text = f"located {off * 1e3:.1f} mm beside the ball's path, not {within * 1e3:.1f} mm"
+            self._ctx.verdict(run, Status.FAILURE, "inaccurate", text)
+        else:
+            self._ctx.verdict(run, Status.SUCCESS)
+
+    def _crossing(self) -> tuple[float, float] | None:
+        """Return when (s) and where (y, m) the last sights show that the ball left over the near
+        edge; None if there are too few."""
+        if len(self._sights) < LEAST_SIGHTS:
+            return None
+        rows = np.array([s for s in self._sights if s[0] >= self._sights[-1][0] - JUDGED_SPAN])
+        if len(rows) < LEAST_SIGHTS:
+            rows = np.array(self._sights[-LEAST_SIGHTS:])
+        surface, end = self._camera.surface, self._sights[-1][0]
+        t = rows[:, 0] - end
+        (x0, y0), (vx, vy) = np.polynomial.polynomial.polyfit(t, rows[:, 1:], 1)
+        if vx >= 0.0:
+            return None
+        # The way from the last sight at a speed that rolling lowers: hidden, slow balls need it.
+        speed = float(np.hypot(vx, vy))
+        way = (surface.near_edge - x0) / vx * speed
+        left = speed**2 - 2.0 * surface.rolling * way
+        if left <= 0.0:
+            return None
+        after = (speed - float(np.sqrt(left))) / surface.rolling if way > 0.0 else way / speed
+        return end + after, float(y0 + vy / speed * way)
+
+    def _judge(
+        self, made: Predictions, left: float, place: float, cause: str, values: dict[str, Any]
+    ) -> Result:
+        """Compare the predictions of the last moments with when (s) and where (y, m) the ball
+        left."""
         asked = self._specification
-        if self._exit is None or not self._made:
-            return failure("late", "the ball left before it was predicted", **self._values())
-        _, left, place = self._made[-1]
-        first = self._made[0][0]
+        first = made[0][0]
         if first > left - asked.lead:
             text = f"first prediction {left - first:.2f} s before the ball left, not {asked.lead} s"
-            return failure("late", text, **self._values())
+            return failure("late", text, **values)
         # The prediction in force at the lead time, and all later ones.
-        begin = max(made for made, _, _ in self._made if made <= left - asked.lead)
-        judged = [(time, y) for made, time, y in self._made if made >= begin]
-        time_spread = max(abs(time - left) for time, _ in judged)
-        place_spread = max(abs(y - place) for _, y in judged)
-        values = {**self._values(), "time_spread": time_spread, "place_spread": place_spread}
-        if time_spread > asked.max_time_spread or place_spread > asked.max_place_spread:
-            text = (
-                f"predictions moved by {time_spread * 1e3:.0f} ms and {place_spread * 1e3:.0f} mm"
-            )
-            return failure("unsteady", text, **values)
+        begin = max(at for at, _, _ in made if at <= left - asked.lead)
+        judged = [(time, y) for at, time, y in made if at >= begin]
+        time_off = max(abs(time - left) for time, _ in judged)
+        place_off = max(abs(y - place) for _, y in judged)
+        values |= {"time_spread": time_off, "place_spread": place_off}
+        if time_off > asked.most_time or place_off > asked.most_place:
+            what = "were off" if cause == "off" else "moved"
+            text = f"predictions {what} by {time_off * 1e3:.0f} ms and {place_off * 1e3:.0f} mm"
+            return failure(cause, text, **values)
         return success(**values)
 
     def _values(self) -> dict[str, Any]:

@@ -6,11 +6,21 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from petrobot.coordinator.cli.loading import load_task
+from petrobot.coordinator.launch import Setting, lockstep_mission, lockstep_party
+from petrobot.coordinator.learning.learner import LearningSelector
+from petrobot.coordinator.learning.learning import Learning
+from petrobot.coordinator.learning.records import Correction, RunEnd
+from petrobot.coordinator.run.lockstep import CoordinatorParty
+from petrobot.coordinator.task import Status
+from petrobot.services.comm.location_file import load
+from petrobot.services.comm.lockstep.cell import Delays, LockStepCell
 from tests.integration.cell_files import ROOT, services_file
 
 pytestmark = pytest.mark.processes
@@ -95,3 +105,39 @@ def test_another_seed_gives_other_throws(usual: dict[str, Any], tmp_path: Path) 
     """The seed is what decides."""
     other = run(services_file(tmp_path), seed=6)
     assert [t["speed"] for t in other["throws"]] != [t["speed"] for t in usual["throws"]]
+
+
+@pytest.mark.parametrize(
+    ("place", "asked", "cause"),
+    [
+        ("", {}, ""),
+        ("locate_ball", {"within": 1e-6}, "inaccurate"),
+        ("locate_ball", {"min_ahead": 1.49}, "late"),
+        ("track_ball", {"place_within": 1e-6}, "off"),
+        ("track_ball", {"time_within": 1e-6}, "off"),
+        ("track_ball", {"lead": 3.0}, "late"),
+    ],
+)
+def test_the_numbers_of_the_task_file_are_what_judges(
+    place: str, asked: dict[str, float], cause: str
+) -> None:
+    """A ball that is caught: each action met its specification, unless the task asks for more."""
+    task, directory = load_task("catch_ball"), load(ROOT / "services.toml")
+    if place:
+        stricter = replace(task.places[place], args={**task.places[place].args, **asked})
+        task = replace(task, places={**task.places, place: stricter})
+    selector = LearningSelector(Learning(task, "fixed"))
+    setting = Setting(task, {"regime": "B"}, 1, 5, selector)
+    party = CoordinatorParty(directory, lockstep_mission(directory, setting))
+    nodes = [lockstep_party(directory, node) for node in directory.nodes.values()]
+    LockStepCell([party, *nodes], Delays(directory.delays())).run(lambda: party.over, 5_000)
+    judged = dict.fromkeys(("locate_ball", "track_ball", "move_to_point"), Status.SUCCESS)
+    ends = {}
+    for record in selector.records:
+        if isinstance(record, RunEnd) and record.primitive_task in judged:
+            ends[record.primitive_task] = (record.outcome.status, record.outcome.cause)
+        elif isinstance(record, Correction):
+            ends[record.primitive_task] = (record.status, record.cause)
+    assert ends == dict.fromkeys(judged, (Status.SUCCESS, "")) | (
+        {place: (Status.FAILURE, cause)} if place else {}
+    )

@@ -70,9 +70,9 @@ def enabled(yard: Yard) -> Yard:
     return yard
 
 
-def gap_yard(kind: str, *, reflector: bool = True) -> tuple[Yard, Any]:
+def gap_yard(kind: str, *, reflector: bool = True, bar: bool = False) -> tuple[Yard, Any]:
     """A rover that has followed the track to an interruption, and the result of following."""
-    floor = DrawnFloor("S" + kind + "SS")
+    floor = DrawnFloor("S" + kind + "SS", bar=bar)
     resumes = floor.at(2.0 + (2.0 if kind == "s" else math.pi / 2))
     yard = enabled(Yard(floor, START, reflectors=[(resumes.x, resumes.y)] if reflector else ()))
     followed = play(yard, driving.follow_feed_forward, speed=0.5).result
@@ -159,6 +159,28 @@ def test_a_search_needs_neither_sensor_nor_guess(kind: str) -> None:
     yard, followed = gap_yard(kind, reflector=False)
     result = play(yard, driving.search_pattern, line_end=followed.values["line_end"]).result
     assert result.status == "success" and result.values["recovered"] is True
+
+
+@pytest.mark.parametrize("bar", [True, False])
+def test_following_judges_the_recovery_that_found_the_line(bar: bool) -> None:
+    """A line that is followed to an announced end belongs to the track; one that ceases does
+    not."""
+    yard, followed = gap_yard("s", bar=bar)
+    line_end = followed.values["line_end"]
+    result = play(yard, driving.home_on_reflector, line_end=line_end, judged=True).result
+    assert result.status == "success" and result.deferred and result.values["run"]
+    found = play(yard, driving.follow_feed_forward, recovery="task/1/recover#1")
+    assert found.result.values["at_t"] is bar
+    verdict = ("success", "") if bar else ("failure", "not_the_track")
+    assert [told[1:] for told in found.verdicts] == [("task/1/recover#1", *verdict)]
+
+
+def test_a_recovery_that_found_nothing_is_final() -> None:
+    yard, followed = gap_yard("s", reflector=False)
+    line_end = followed.values["line_end"]
+    result = play(yard, driving.home_on_reflector, line_end=line_end, judged=True).result
+    assert (result.status, result.cause, result.deferred) == ("failure", "no_reflector", False)
+    assert result.values["run"] and result.values["recovered"] is False
 
 
 def blindly_on(yard: Yard, end: Odo, ahead: float) -> None:

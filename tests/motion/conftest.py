@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from petrobot.services.action import Cancelled, Result, Wait
+from petrobot.services.action import Cancelled, Result, Status, Wait
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.motion.arm import PERIOD, Arm
 from petrobot.services.motion.model import nominal_arm
@@ -291,6 +291,11 @@ class ArmPlay:
         self.rig = rig
         self.device = FakeRemote(rig)
         self.run = "test"
+        self.verdicts: list[tuple[str, Status, str]] = []
+
+    def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
+        """Keep it."""
+        self.verdicts.append((run, status, cause))
 
     @property
     def now(self) -> float:

@@ -149,6 +149,31 @@ def test_a_ball_that_does_not_come_is_missed(play: Any) -> None:
     assert play.now - ball.begun == pytest.approx(1.0 + FALL + 0.4, abs=0.05)
 
 
+@pytest.mark.parametrize("caught", [True, False])
+def test_the_catch_judges_the_interception(play: Any, caught: bool) -> None:
+    ball = PredictedBall(caught=caught)
+    moved = play.play(actions.intercept_tilted(play, judged=True), ball)
+    assert moved.status is Status.SUCCESS and moved.deferred and moved.values["run"] == "test"
+    play.play(actions.follow_and_wait(play, moved="move#1"), ball)
+    status, cause = (Status.SUCCESS, "") if caught else (Status.FAILURE, "missed")
+    assert play.verdicts == [("move#1", status, cause)]
+
+
+def test_a_catch_that_is_preempted_by_the_ball_judges_too(play: Any) -> None:
+    ball = PredictedBall()
+    moved = play.play(actions.intercept_tilted(play, judged=True), ball)
+    waiting = actions.follow_and_wait(play, moved=moved.values["run"])
+    assert play.play(waiting, ball, cancel=lambda: bool(play.rig.events)) is None
+    assert play.verdicts == [("test", Status.SUCCESS, "")]
+
+
+def test_a_catch_that_vision_broke_off_judges_nothing(play: Any) -> None:
+    ball = PredictedBall(leaves=2.0, until=0.9)
+    play.play(actions.intercept_tilted(play, judged=True), ball)
+    assert play.play(actions.follow_and_wait(play, moved="m"), ball).status is Status.ERROR
+    assert play.verdicts == []
+
+
 def test_waiting_while_vision_dies_is_an_error(play: Any) -> None:
     ball = PredictedBall(leaves=2.0, until=0.9)
     assert play.play(actions.intercept_tilted(play), ball).status is Status.SUCCESS

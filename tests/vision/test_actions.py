@@ -144,6 +144,97 @@ def test_between_images_the_stream_continues_with_fresh_times(context: BenchCont
     assert max(abs(late) for before, late, _, _ in streamed(context) if before < 0.45) < 0.01
 
 
+SPECIFIED: dict[str, Any] = {"place_within": 0.015, "time_within": 0.020}
+
+
+def judged(
+    context: BenchContext,
+    locator: str = "background",
+    predictor: str = "least_squares",
+    **asked: Any,
+) -> tuple[Result, Result]:
+    """Locate and track as `catch_ball` asks for it: the ball itself judges."""
+    located = run_action(
+        context.bench, LOCATORS[locator](context, within=asked.pop("within", 0.005))
+    )
+    assert located.status is Status.SUCCESS and located.deferred, located
+    tracked = PREDICTORS[predictor](context, ball=located.values["ball"], **(SPECIFIED | asked))
+    return located, run_action(context.bench, tracked)
+
+
+@pytest.mark.parametrize("latency", [0.012, 0.2, 0.4])
+@pytest.mark.parametrize("regime", ["A", "B", "C"])
+def test_it_is_measured_where_the_ball_left(
+    context: BenchContext, regime: str, latency: float
+) -> None:
+    """Also from images that come after it has left; the stream ends when it leaves all the same."""
+    bench = context.bench
+    bench.latency = latency
+    bench.ball = draw_ball(np.random.default_rng([7, ord(regime)]), regime)
+    _, tracked = judged(context)
+    after, y = bench.ball.leaves()
+    leaves = after + bench.release
+    assert bench.now - tracked.values["left"]["ago"] == pytest.approx(leaves, abs=0.004)
+    assert tracked.values["left"]["y"] == pytest.approx(y, abs=0.003)
+    assert context.verdicts == [("1", Status.SUCCESS, "")]
+    assert context.published[-1][1] is None and abs(context.published[-1][0] - leaves) < 0.03
+    assert tracked.status is (Status.FAILURE if tracked.cause == "late" else Status.SUCCESS)
+    assert context.device.stopped()
+
+
+@pytest.mark.parametrize("locator", sorted(LOCATORS))
+def test_the_tracker_judges_what_was_located(context: BenchContext, locator: str) -> None:
+    context.bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.2)
+    judged(context, locator)
+    assert context.verdicts == [("1", Status.SUCCESS, "")]
+
+
+def test_a_ball_located_beside_its_path_is_inaccurate(context: BenchContext) -> None:
+    context.bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.2)
+    located = run_action(context.bench, actions.locate_background(context, within=0.005))
+    ball = dict(located.values["ball"])
+    ball["places"] = [[ago, x, y + 0.006] for ago, x, y in ball["places"]]
+    run_action(context.bench, actions.predict_kalman(context, ball=ball, **SPECIFIED))
+    assert context.verdicts == [("1", Status.FAILURE, "inaccurate")]
+
+
+def test_a_ball_that_is_not_seen_again_was_not_there(context: BenchContext) -> None:
+    bench = context.bench
+    bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.2)
+    located = run_action(bench, actions.locate_background(context, within=0.005))
+    bench.gone_after = bench.now - bench.release
+    tracked = actions.predict_kalman(context, ball=located.values["ball"], **SPECIFIED)
+    assert run_action(bench, tracked).cause == "ball_lost"
+    assert context.verdicts == [("1", Status.FAILURE, "not_there")]
+
+
+def test_a_dead_camera_judges_nothing(context: BenchContext) -> None:
+    bench = context.bench
+    bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.2)
+    located = run_action(bench, actions.locate_background(context, within=0.005))
+    bench.dead_from = bench.now
+    tracked = actions.predict_kalman(context, ball=located.values["ball"], **SPECIFIED)
+    assert run_action(bench, tracked).cause == "no_image"
+    assert context.verdicts == []
+
+
+def test_a_tracker_meets_the_specification_as_it_is_written(context: BenchContext) -> None:
+    """A predictor that ignores rolling is late for a slow ball, by more than 20 ms; how much it may
+    be late is what the task says."""
+    context.bench.ball = RolledBall((2.12, 0.1), (0.62, -0.15), 0.9)
+    _, tracked = judged(context, predictor="constant_velocity", lead=0.8)
+    off = tracked.values["time_spread"]
+    assert (tracked.status, tracked.cause) == (Status.FAILURE, "off") and off > 0.020
+    context.bench.release = context.bench.now + 0.5
+    _, tracked = judged(context, predictor="constant_velocity", lead=0.8, time_within=2.0 * off)
+    assert tracked.status is Status.SUCCESS
+
+
+def test_half_a_specification_is_refused(context: BenchContext) -> None:
+    with pytest.raises(ValueError, match="both place_within"):
+        run_action(context.bench, actions.predict_kalman(context, ball={}, place_within=0.01))
+
+
 @pytest.mark.parametrize("locator", sorted(LOCATORS))
 def test_no_ball_is_an_error_at_the_timeout(context: BenchContext, locator: str) -> None:
     located = run_action(context.bench, LOCATORS[locator](context, timeout=1.0))
