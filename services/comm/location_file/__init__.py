@@ -149,6 +149,9 @@ class Directory:
     """Address at which the coordinator listens (in lock step)."""
     parameters: Mapping[str, str]
     """Parameter files that the cell's programs share, by name; paths relative to this file."""
+    installation: str = ""
+    """Name of this cell, if there are several alike: what was learned in one is not pooled with
+    what was learned in another."""
 
     def where(self, name: str) -> str:
         """Return the node of an action, service, device, stream's receiver or timer. Raises
@@ -273,6 +276,7 @@ def parse(text: str, source: Path) -> Directory:
             COORDINATOR, **{"host": "127.0.0.1", "port": COORDINATOR_PORT, **tables[COORDINATOR]}
         ),
         parameters=dict(tables["parameters"]),
+        installation=str(tables["installation"]["name"]),
     )
 
 
