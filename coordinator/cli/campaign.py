@@ -425,8 +425,14 @@ def _in_brackets(result: dict[str, Any], task: str, action: str) -> str:
     """J of an action, or why it has none."""
     j, judged = result["J"].get(task, {}).get(action), result["judged"].get(task, {})
     if j is not None:
-        return f" (J {j:.3f})"
-    if judged and judged["meet_target"] and action not in judged["meet_target"]:
+        ends = result.get("J_interval", {}).get(task, {}).get(action)
+        return f" (J {j:.3f}" + (f" [{ends[0]:.3f}, {ends[1]:.3f}])" if ends else ")")
+    if (
+        judged
+        and judged["target"]
+        and judged["meet_target"]
+        and action not in judged["meet_target"]
+    ):
         return f" (below R {judged['target']:g})"
     return ""
 

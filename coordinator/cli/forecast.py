@@ -46,6 +46,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="a campaign's folder, or an estimates file without its trials",
     )
+    parser.add_argument(
+        "--plant",
+        metavar="NAME",
+        help="of an estimates file with runs of several plants: real, simulated or mock",
+    )
     add_services_argument(parser)
     parser.add_argument(
         "--runs",
@@ -123,7 +128,7 @@ def _forecast(options: argparse.Namespace) -> int:
     from petrobot.coordinator.studies.forecast.tables import forecast_text
 
     task = load_task(options.task)
-    trainings, estimates, about = _trainings(task, options.estimates)
+    trainings, estimates, about = _trainings(task, options.estimates, options.plant)
     names = [name for name in options.regime.split(",") if name] or list(trainings)
     requests = {name: _request(task, trainings, name, options) for name in names}
     if options.services is not None:
@@ -179,9 +184,12 @@ def _refuse_other_cell(
                     )
 
 
-def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, dict[str, Any]]:
+def _trainings(
+    task: Task, path: Path, plant: str | None
+) -> tuple[dict[str, Training], Estimates, dict[str, Any]]:
     """Training trials by regime, the estimates, and what the forecast says about where they come
     from."""
+    from petrobot.coordinator.learning.estimates_file import MOCK, SIMULATED
     from petrobot.coordinator.studies.campaign.observed import estimates_of
     from petrobot.coordinator.studies.campaign.plan import digest, read_manifest
     from petrobot.coordinator.studies.campaign.table import TABLE, read_table
@@ -192,14 +200,21 @@ def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, 
     )
 
     if not path.is_dir():
-        known, physics = read_estimates(path)
+        kept = read_estimates(path, plant)
+        known = kept.estimates
         _refuse_other_names(task, path, {key.primitive_task: [key.action] for key in known.tallies})
         return (
             trainings_of(task, known),
             known,
-            {"estimates": {"file": path.name, "sha256": digest(path)}, **_told(physics)},
+            {
+                "estimates": {"file": path.name, "sha256": digest(path)},
+                **_told(kept.physics, kept.plant),
+            },
         )
     plan = read_manifest(path)
+    own = MOCK if plan.mock else SIMULATED
+    if plant not in (None, own):
+        raise CommandError(2, f"{path}: --plant {plant}: the campaign's runs are {own}")
     _refuse_other_task(task, plan, path)
     rows = list(read_table(path / TABLE))
     _refuse_other_runs(task, rows, path)
@@ -214,14 +229,15 @@ def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, 
             "sha256": digest(path / TABLE),
         },
         "task_sha256": plan.digests["task"],
-        **_told(plan.physics),
+        **_told(plan.physics, own),
     }
     return found, estimates_of(task, rows, path.name), about
 
 
-def _told(physics: str) -> dict[str, str]:
-    """Return what a forecast says of the simulated laboratory's physics, if it has several."""
-    return {"physics": physics} if physics else {}
+def _told(physics: str, plant: str = "") -> dict[str, str]:
+    """Return what a forecast says of the plant that it was trained in, and of the simulated
+    laboratory's physics, if it has several."""
+    return {k: v for k, v in (("plant", plant), ("physics", physics)) if v}
 
 
 def _refuse_other_task(task: Task, plan: CampaignPlan, path: Path) -> None:

@@ -65,12 +65,14 @@ def figures(kept: FileContents, name: str, options: argparse.Namespace) -> dict[
             "C": _known(p.cost.value),
             "C_interval": _interval(p.cost),
             "J": _known(p.j),
+            "J_interval": list(p.j_bounds) if all(map(isfinite, p.j_bounds)) else None,
             "declared_costs": dict(task.primitive_tasks[p.primitive_task].costs),
         }
         for p in found.parts.values()
     ]
     return {
         "task": task.name,
+        "source": kept.plant,
         "context": context,
         "primitive_tasks": parts,
         "scenario": found.scenario,
@@ -120,7 +122,7 @@ def _print(found: dict[str, Any]) -> None:
             _cell(part["R"], part["R_interval"]),
             _cell(part["C"], part["C_interval"]),
             *([_declared(part["declared_costs"])] if declared else []),
-            _cell(part["J"]),
+            _cell(part["J"], part["J_interval"]),
         )
     console.print(table)
     for key, words in (
@@ -139,6 +141,8 @@ def _print(found: dict[str, Any]) -> None:
             f"  The task is judged in the scenario that is hardest for it: {found['scenario']}.",
             highlight=False,
         )
+    if found["source"]:
+        console.print(f"  From {found['source']} runs.", highlight=False)
     for assumption in found["assumptions"]:
         console.print(f"  assumed: {assumption}", highlight=False, style="dim")
 
@@ -185,6 +189,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="show, task: only this context (default: all; show takes them as scenarios)",
     )
     parser.add_argument(
+        "--plant",
+        metavar="NAME",
+        help="show, task: runs of this plant: real, simulated or mock (default: the first of "
+        "these that the file has; they are never pooled)",
+    )
+    parser.add_argument(
         "--cost",
         metavar="MEASURE",
         help="wall, cpu, count or value:NAME (default: the one that they were judged by when "
@@ -221,7 +231,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Do it."""
-    from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
+    from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, said
 
     file = EstimatesFile(options.file)
     try:
@@ -232,7 +242,12 @@ def run(options: argparse.Namespace) -> int:
                 2,
                 f"{options.file}: no such file; `petrobot run ... --learn {options.file}` makes it",
             )
-        kept = file.read()
+        kept = file.read(options.plant)
+        if options.plant is not None and options.plant not in kept.plants:
+            known = ", ".join(sorted(map(said, kept.plants))) or "none"
+            raise CommandError(
+                2, f"{options.file}: --plant {options.plant}: expected one of: {known}"
+            )
         if options.verb == "task":
             refuse_unknown_context(kept, _tasks(kept), options)
             return show_task(kept, options)
@@ -258,14 +273,15 @@ def _merge(file: EstimatesFile, options: argparse.Namespace) -> int:
     for other in options.more:
         file.merge(Path(other))
     kept = file.read()
-    runs = sum(t.runs + t.censored for t in kept.estimates.tallies.values())
+    runs = sum(t.runs + t.censored for e in kept.plants.values() for t in e.tallies.values())
     print(f"{options.file}: {len(options.more)} taken in; {runs} runs known")
     return 0
 
 
 def _tasks(kept: FileContents) -> list[str]:
     return sorted(
-        {k.primitive_task for k in kept.estimates.tallies} | {task for task, _ in kept.selectors}
+        {k.primitive_task for found in kept.plants.values() for k in found.tallies}
+        | {task for task, _ in kept.selectors}
     )
 
 
@@ -280,6 +296,6 @@ def _refuse_unknown(kept: FileContents, options: argparse.Namespace) -> None:
 
 
 def _freeze(file: EstimatesFile, kept: FileContents, options: argparse.Namespace) -> None:
-    for (task, _), state in kept.selectors.items():
+    for (task, name), state in kept.selectors.items():
         if not options.more or task in options.more:
-            file.put_selectors({task: {**state, "frozen": options.verb == "freeze"}})
+            file.put_selectors({(task, name): {**state, "frozen": options.verb == "freeze"}})

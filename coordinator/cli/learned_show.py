@@ -26,14 +26,29 @@ def show(kept: FileContents, tasks: Sequence[str], options: argparse.Namespace) 
     """Print what is known of the primitive tasks' actions, and write it as JSON."""
     from petrobot.coordinator.learning.objective import compare
 
-    known = {task: kept.estimates.of(task, options.context) for task in tasks}
+    plants = [p for p in sorted(kept.plants, key=kept.rank) if options.plant in (None, p)]
+    known = {(task, p): kept.plants[p].of(task, options.context) for task in tasks for p in plants}
     refuse_unknown_context(kept, tasks, options)
     try:
         refuse_unknown_cost(known, options)
         shown = {}
-        for task, tallies in known.items():
-            question = asked_question(kept, task, options)
-            shown[task] = _plain(kept, task, tallies, question, compare(tallies, question), options)
+        for task in tasks:
+            question, of = asked_question(kept, task, options), {p: known[task, p] for p in plants}
+            # A primitive task that ran only in another plant is shown as it is known there.
+            main = kept.plant if of.get(kept.plant) else next((p for p in plants if of[p]), "")
+            tallies = of.pop(main, {})
+            about = _plain(kept, task, tallies, question, compare(tallies, question), options)
+            about["source"] = main
+            for row in about["actions"]:
+                row["source"] = main
+            for plant, others in of.items():
+                about["actions"] += [
+                    {**_row(others[f.action], question, f), "pareto": None, "source": plant}
+                    for f in compare(others, question).figures
+                ]
+            prior = kept.priors.get(main)
+            about["prior"] = None if prior is None else {"source": prior[0], "trials": prior[1]}
+            shown[task] = about
     except ValueError as fault:
         raise CommandError(2, str(fault)) from fault
     if options.json:
@@ -63,7 +78,7 @@ def refuse_unknown_context(
     """Raise CommandError for a context in which no action of these primitive tasks was run."""
     if options.context is None:
         return
-    known = {c for task in tasks for c in kept.estimates.contexts(task)}
+    known = {c for found in kept.plants.values() for task in tasks for c in found.contexts(task)}
     if options.context not in known:
         there = ", ".join(repr(c) for c in sorted(known)) or "none"
         raise CommandError(
@@ -73,7 +88,7 @@ def refuse_unknown_context(
         )
 
 
-def refuse_unknown_cost(known: Mapping[str, Tallies], options: argparse.Namespace) -> None:
+def refuse_unknown_cost(known: Mapping[Any, Tallies], options: argparse.Namespace) -> None:
     """A number that no result has would be a cost of 0 for everything."""
     kind, _, name = (options.cost or "").partition(":")
     tallies = [
@@ -118,6 +133,7 @@ def _plain(
         "target_unmet": judged.unmet and asked.target is not None,
         "rho": judged.rho,
         "best": judged.best,
+        "level_with_best": list(judged.level_with_best),
         "judged_over": list(judged.scenarios),
         "contexts": sorted({c for by_context in tallies.values() for c in by_context}),
         "uncosted": list(judged.uncosted),
@@ -153,6 +169,10 @@ def _row(by_context: Mapping[str, Tally], asked: Question, f: Figures) -> dict[s
         "scenario": f.scenario,
         "scenarios": list(f.scenarios),
         "J": _number(f.j),
+        "J_low": _number(f.j_lower),
+        "J_high": _number(f.j_upper),
+        "runs_needed": f.needed,
+        "runs_there": 0 if f.worst is None else by_context[f.worst].runs,
         "cost_mean": cost.mean if cost.n else None,
         "cost_deviation": cost.deviation,
         **_times(whole),
@@ -198,14 +218,19 @@ def _by_context(tallies: Tallies, asked: Question) -> list[dict[str, Any]]:
                 "A": f.availability,
                 "C": _number(f.cost),
                 "J": _number(f.j),
+                "J_low": _number(f.j_lower),
+                "J_high": _number(f.j_upper),
             }
             out.append(row | _times(tally))
     return out
 
 
 def _selectors(kept: FileContents, task: str) -> dict[str, Any]:
+    """Of the plant that judges by their own names; those of others with the plant."""
+    from petrobot.coordinator.learning.estimates_tables import selector_name
+
     return {
-        name: {
+        name.removesuffix(selector_name("", kept.plant)): {
             "frozen": state["frozen"],
             "contexts": {
                 context: dict(zip(state["actions"], learner["p"], strict=True))
@@ -259,6 +284,9 @@ def _words(asked: Question) -> str:
     return " ".join(parts)
 
 
+WIDTH = 110
+"""Least width of the tables (characters): in fewer, the numbers would be cut."""
+
 # --- for people -------------------------------------------------------------------------------
 
 
@@ -268,6 +296,7 @@ def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> Non
     from rich.table import Table
 
     console = Console()
+    console.width = max(console.width, WIDTH)
     target = "" if about["target"] is None else f", target R {about['target']:g}"
     table = Table(
         title=f"{task} (C: {about['cost']}, rho {about['rho']:.4g}{target})",
@@ -277,13 +306,16 @@ def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> Non
     )
     table.show_edge = table.pad_edge = False
     always_there = all(row["A"] == 1.0 for row in about["actions"])
+    several = any(row["source"] for row in about["actions"])
     columns = [
         "action",
         "runs",
+        *(["source"] if several else []),
         "R",
         "R 95 %",
         "C",
         "J",
+        "J 95 %",
         "s p50/p90",
         "cpu ms",
         *([] if always_there else ["A"]),
@@ -291,23 +323,29 @@ def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> Non
     for column in columns:
         table.add_column(column, justify="left" if column == "action" else "right", no_wrap=True)
     for row in about["actions"]:
-        name = row["action"] + (" *" if row["action"] == about["best"] else "")
-        table.add_row(*_cells(name, row)[: len(columns)])
-        if len(about["contexts"]) > 1:
+        own = row["source"] == about["source"]
+        clear = own and row["action"] == about["best"] and not about["level_with_best"]
+        name = row["action"] + (" *" if clear else "")
+        table.add_row(*_cells(name, row, several)[: len(columns)])
+        if own and len(about["contexts"]) > 1:
             for part in about["by_context"]:
                 if part["action"] == row["action"]:
-                    table.add_row(*_cells(f"  {_named(part['context'])}", part)[: len(columns)])
+                    cells = _cells(f"  {_named(part['context'])}", part, several)
+                    table.add_row(*cells[: len(columns)])
     console.print(table)
     for line in [*_warnings(about), *_remarks(about, options)]:
         console.print(f"  {line}", highlight=False)
 
 
-def _cells(name: str, row: Mapping[str, Any]) -> list[str]:
+def _cells(name: str, row: Mapping[str, Any], several: bool) -> list[str]:
     times = f"{_cell(row['seconds_p50'])}/{_cell(row['seconds_p90'])}"
     cpu = None if row["cpu_mean"] is None else 1e3 * row["cpu_mean"]
     interval = f"{row['R_low']:.2f}-{row['R_high']:.2f}"
-    numbers = [row["R"], interval, row["C"], row["J"], times, cpu, row["A"]]
-    return [name, str(row["runs"]), *map(_cell, numbers)]
+    known = row["J_low"] is not None and row["J_high"] is not None
+    of_j = f"{row['J_low']:.2f}-{row['J_high']:.2f}" if known else None
+    numbers = [row["R"], interval, row["C"], row["J"], of_j, times, cpu, row["A"]]
+    source = [row.get("source", "") or ("-" if "source" in row else "")] if several else []
+    return [name, str(row["runs"]), *source, *map(_cell, numbers)]
 
 
 def _cell(value: Any) -> str:
@@ -322,7 +360,23 @@ def _named(context: str) -> str:
 
 def _warnings(about: Mapping[str, Any]) -> list[str]:
     """What J of this table cannot say."""
-    lines, run = [], [row for row in about["actions"] if row["runs"]]
+    own = [row for row in about["actions"] if row["source"] == about["source"]]
+    lines, run = [], [row for row in own if row["runs"]]
+    if len(own) < len(about["actions"]):
+        lines.append(
+            f"judged by the {about['source'] or 'not said'} runs alone: those of other sources are "
+            "never pooled with them"
+        )
+    if about["prior"] is not None:
+        of, trials = about["prior"]["source"] or "not said", about["prior"]["trials"]
+        lines.append(
+            f"prior: the selectors also count the {of} runs of each action, as {trials:g} trials"
+        )
+    if about["level_with_best"]:
+        lines.append(
+            f"the lowest J is that of {about['best']}, but the difference may be chance: "
+            f"{', '.join(about['level_with_best'])}"
+        )
     if about["target_unmet"] and run:
         lines.append(
             f"no action surely reaches R {about['target']:g} in any context: judged without "
@@ -334,6 +388,8 @@ def _warnings(about: Mapping[str, Any]) -> list[str]:
             f"{action} does not surely reach R {about['target']:g} in any context: no J"
             for action in below
         ]
+    if about["target"] is not None:
+        lines += [_gate(row, about["target"]) for row in run if not row["scenarios"]]
     over = ", ".join(map(_named, about["judged_over"]))
     if not over and len(run) > 1:
         lines.append(
@@ -352,9 +408,22 @@ def _warnings(about: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def _gate(row: Mapping[str, Any], target: float) -> str:
+    """What an action lacks to meet the target in its hardest context."""
+    from petrobot.coordinator.learning.statistics import wilson
+
+    good, runs = round(row["R"] * row["runs_there"]), row["runs_there"]
+    where = f" in {row['worst']}" if row["worst"] else ""
+    bound = wilson(good, runs)[0]
+    known = f"{row['action']}: {good} of {runs}{where}: lower bound {bound:.3f}"
+    if row["runs_needed"] is None:
+        return f"{known}; R itself is not above {target:g}"
+    return f"{known}; {row['runs_needed']} needed for {target:g} with such a share"
+
+
 def _remarks(about: Mapping[str, Any], options: argparse.Namespace) -> list[str]:
     lines = []
-    for row in about["actions"]:
+    for row in (row for row in about["actions"] if row["source"] == about["source"]):
         if options.target is not None or (row["scenarios"] and about["target"] is not None):
             met = ", ".join(map(_named, row["scenarios"])) or "none"
             most = f", where it costs {_cell(row['C_largest'])} at most" if row["scenarios"] else ""

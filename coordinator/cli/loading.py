@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,7 +56,7 @@ def measurements(file: Path | None) -> Callable[[Task, Cell | None], Measured] |
     if file is None:
         return None
     from petrobot.coordinator.analysis.may_run import devices_of
-    from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
+    from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, said
     from petrobot.coordinator.learning.propagation import measured_from
 
     if not file.exists():
@@ -64,6 +65,14 @@ def measurements(file: Path | None) -> Callable[[Task, Cell | None], Measured] |
         kept = EstimatesFile(file).read()
     except EstimatesError as fault:
         raise CommandError(2, str(fault)) from fault
+
+    others = [said(p) for p, found in kept.plants.items() if found.tallies and p != kept.plant]
+    if others:
+        print(
+            f"{file}: the measurements are its {said(kept.plant)} runs, not pooled with: "
+            f"{', '.join(sorted(others))}",
+            file=sys.stderr,
+        )
 
     def of(task: Task, cell: Cell | None) -> Measured:
         devices = devices_of(cell)

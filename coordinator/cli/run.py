@@ -35,7 +35,13 @@ from petrobot.coordinator.cli.recorded_runs import (
     recorded,
     tidy,
 )
-from petrobot.services.host.command_line import LARGEST_SEED, MOST_RUNS, probability, whole
+from petrobot.services.host.command_line import (
+    LARGEST_SEED,
+    MOST_RUNS,
+    number,
+    probability,
+    whole,
+)
 
 if TYPE_CHECKING:
     from petrobot.coordinator.learning.session import LearningSetting
@@ -192,6 +198,15 @@ def add_learning_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME|CONDITION",
         help="learn separately for each value of a parameter or variable, or for a condition "
         "(default: regime, if the task has it)",
+    )
+    parser.add_argument(
+        "--prior",
+        nargs="?",
+        type=number(above=0.0),
+        const=True,
+        metavar="N",
+        help="start from what is known of another plant (the simulated one, for a real cell), as "
+        "from N trials of each action (with --learn; N: 10)",
     )
     parser.add_argument(
         "--frozen",
@@ -438,14 +453,14 @@ def _parameters(task: Task, options: argparse.Namespace) -> Mapping[str, Any]:
 def _learning(options: argparse.Namespace) -> LearningSetting | None:
     """How the run learns. None if it does not learn; then no estimates file is read."""
     if options.learn is None:
-        for name in ("selector", "target", "credit", "context", "frozen"):
+        for name in ("selector", "target", "credit", "context", "prior", "frozen"):
             if getattr(options, name):
                 raise CommandError(
                     2, f"--{name} needs --learn FILE: without it nothing is read or learned"
                 )
         return None
     from petrobot.coordinator.learning.selectors import ACTION, DEFAULT
-    from petrobot.coordinator.learning.session import LearningSetting
+    from petrobot.coordinator.learning.session import PRIOR_TRIALS, LearningSetting
 
     contexts = None if options.context is None else tuple(part for part in options.context if part)
     return LearningSetting(
@@ -455,6 +470,7 @@ def _learning(options: argparse.Namespace) -> LearningSetting | None:
         contexts,
         frozen=options.frozen,
         credit=options.credit or ACTION,
+        prior=PRIOR_TRIALS if options.prior is True else options.prior,
     )
 
 

@@ -14,6 +14,7 @@ from bisect import insort
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from hashlib import blake2b
+from math import sqrt
 from typing import Any, NamedTuple
 
 from petrobot.coordinator.learning.statistics import (
@@ -250,6 +251,31 @@ class Tally:
                 f"{measure!r} is not a cost measure; give wall, cpu, count or value:NAME"
             )
         return self.values.get(name, EMPTY)
+
+    def cost_correlation(self, measure: str = "wall") -> float:
+        """Return the correlation of success and cost over the counted runs: they come from the same
+        runs, so the interval of J needs it. For `cpu` it is that of the sample. Of other numbers
+        only their sums are known: -1, which makes the interval of J widest."""
+        if measure == "wall":
+            good = EMPTY
+            for exit_, moments in self.durations.items():
+                if exit_.partition(":")[0] == Status.SUCCESS:
+                    good = good.merged(moments)
+            whole_ = self.wall
+        elif measure == "cpu":
+            good = whole_ = EMPTY
+            for run in self.sample.kept:
+                if run.cpu_seconds >= 0 and is_counted(run.exit):
+                    whole_ = whole_.adding(run.cpu_seconds)
+                    if run.exit.partition(":")[0] == Status.SUCCESS:
+                        good = good.adding(run.cpu_seconds)
+        else:
+            return -1.0 if self.cost(measure).m2 > 0 else 0.0
+        if not 0 < good.n < whole_.n or whole_.m2 <= 0:
+            return 0.0
+        share = good.n / whole_.n
+        spread = sqrt(share * (1.0 - share) * whole_.m2 / whole_.n)
+        return max(-1.0, min(1.0, share * (good.mean - whole_.mean) / spread))
 
     def quantile(self, q: float, measure: str = "wall") -> float:
         """Return the q-quantile of durations or CPU times (s) over the sampled counted runs; nan

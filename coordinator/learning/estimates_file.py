@@ -7,7 +7,8 @@ associative: no run counts twice, however often and in whatever order files trav
 stays forgotten, because the file remembers the reset origins. A copy of a file gets a new origin as
 soon as something is added to it, so two copies that both grow lose nothing when they are merged.
 The runs of a campaign have a closed origin: it is the same in every file that counts the campaign,
-so nothing else is ever added under it.
+so nothing else is ever added under it. Each origin belongs to one plant (scripted, simulated or
+real): estimates of different plants are in one file, but are never pooled.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ from petrobot.coordinator.learning.estimates_tables import (
     CAMPAIGN,
     CHOICE,
     COUNTED,
+    IN,
+    PLANT,
     SCHEMA,
     TABLES,
     add_flow,
@@ -45,17 +48,21 @@ from petrobot.coordinator.learning.estimates_tables import (
     forget,
     is_empty,
     migrate,
+    plants,
+    put_fact,
     put_question,
     put_selector,
     question_of,
     questions,
     renew_origin,
     schema,
+    selector_name,
     state_of,
     take_later,
     take_selector,
     tally_of,
     tally_row,
+    use_plant,
 )
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
@@ -67,6 +74,9 @@ BUSY = 20.0
 """Seconds that a command waits while another one writes the file."""
 PHYSICS = "physics"
 """Row of the table `about`."""
+MOCK, SIMULATED, REAL = "mock", "simulated", "real"
+"""Plants: scripted actions, a simulated laboratory, a real cell (`real NAME` if the location file
+names its installation). "": a file that is older than this does not say."""
 MACHINE_ID = Path("/etc/machine-id")
 """Distinguishes machines (machine-id(5)). Without it, only the inode of the file tells copies
 apart."""
@@ -78,8 +88,8 @@ class EstimatesError(Exception):
 
 @dataclass
 class FileContents:
-    """Contents of a file: estimates of all origins together, and states of selectors by (primitive
-    task, selector)."""
+    """Contents of a file: estimates of one plant, all origins together, and states of selectors by
+    (primitive task, selector)."""
 
     origin: str = ""
     generation: int = 0
@@ -87,15 +97,27 @@ class FileContents:
     physics: str = ""
     """Name and version of the physics of the simulated laboratory in which all of it was learned;
     empty: not said."""
-    estimates: Estimates = field(default_factory=Estimates)
+    plant: str = ""
+    """Where the runs took place that `estimates`, `kinds` and `states` tell of; empty: not said."""
+    plants: dict[str, Estimates] = field(default_factory=dict)
+    """The estimates of every plant of the file."""
     selectors: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
+    """Of every plant; the selector's name is followed by ` in PLANT`."""
     kinds: dict[tuple[str, str], dict[str, int]] = field(default_factory=dict)
-    """By (primitive task, action): in which kind of runs it was measured, and how often. Campaigns
-    run in simulated laboratories; a file does not record where a mission ran."""
+    """By (primitive task, action): in which kind of runs it was measured, and how often."""
+    priors: dict[str, tuple[str, float]] = field(default_factory=dict)
+    """By plant: the plant whose estimates its learners had as a prior, and for how many trials each
+    action's counted."""
     asked: dict[str, tuple[Question, ...]] = field(default_factory=dict)
     """By primitive task: the questions (cost measure, target, rho) by which its actions were judged
     when they ran. Several if origins differ; the first one is this file's own, otherwise the one of
     the most sessions."""
+
+    def rank(self, plant: str) -> tuple[int, int]:
+        """Sort key of plants: the one that matters most first."""
+        kinds = (REAL, SIMULATED, "", MOCK)
+        runs = sum(t.runs + t.censored for t in self.plants[plant].tallies.values())
+        return kinds.index(plant.partition(" ")[0]), -runs
 
     def question(self, primitive_task: str) -> Question:
         """Return by what the actions of a primitive task are judged unless the user asks
@@ -105,9 +127,15 @@ class FileContents:
         states = (state for (task, _), state in self.selectors.items() if task == primitive_task)
         return Question(next((str(state["cost"]) for state in states if state.get("cost")), "wall"))
 
+    @property
+    def estimates(self) -> Estimates:
+        """The estimates of the plant."""
+        return self.plants.setdefault(self.plant, Estimates())
+
     def states(self, selector: str) -> dict[str, dict[str, Any]]:
-        """Return the states of one kind of selector by primitive task."""
-        return {task: state for (task, name), state in self.selectors.items() if name == selector}
+        """Return the states of one kind of selector in the plant by primitive task."""
+        kept = selector_name(selector, self.plant)
+        return {task: state for (task, name), state in self.selectors.items() if name == kept}
 
 
 class EstimatesFile:
@@ -121,32 +149,42 @@ class EstimatesFile:
 
     # --- reading ------------------------------------------------------------------------------
 
-    def read(self) -> FileContents:
-        """Read the whole file. Raises EstimatesError."""
+    def read(self, plant: str | None = None) -> FileContents:
+        """Read the whole file. `plant`: of which plant `estimates` shall be; None: the one that
+        matters most among those in the file (real, then simulated, not said, mock; of several real
+        ones the one with the most runs). Raises EstimatesError."""
         if not self.path.exists():
-            return FileContents()
+            return FileContents(plant=plant or "")
         with self._open() as db:
-            return self._kept(db)
+            return self._kept(db, plant)
 
-    def _kept(self, db: sqlite3.Connection) -> FileContents:
+    def _kept(self, db: sqlite3.Connection, plant: str | None) -> FileContents:
         if is_empty(db):  # created, but killed before anything was written
-            return FileContents()
+            return FileContents(plant=plant or "")
         about = dict(db.execute("SELECT name, value FROM about"))
         kept = FileContents(about["origin"], int(about["generation"]), about.get(PHYSICS, ""))
+        places = plants(db)
+        kinds: dict[str, dict[tuple[str, str], dict[str, int]]] = {}
         for row in db.execute("SELECT * FROM tally"):
-            key = TallyKey(*row[1:4])
-            tally = tally_of(row)
-            kept.estimates.tallies[key] = merge_tallies(kept.estimates.tally(key), tally)
-            kinds = kept.kinds.setdefault((key.primitive_task, key.action), {})
-            kind = "simulated campaigns" if row[0].startswith(CAMPAIGN) else "missions"
-            kinds[kind] = kinds.get(kind, 0) + tally.runs + tally.censored
+            where, key, tally = places.get(row[0], ""), TallyKey(*row[1:4]), tally_of(row)
+            into = kept.plants.setdefault(where, Estimates())
+            into.tallies[key] = merge_tallies(into.tally(key), tally)
+            by_kind = kinds.setdefault(where, {}).setdefault((key.primitive_task, key.action), {})
+            kind = _kind(where, campaign=row[0].startswith(CAMPAIGN))
+            by_kind[kind] = by_kind.get(kind, 0) + tally.runs + tally.censored
         for row in db.execute("SELECT * FROM flow"):
-            where = FiringsKey(*row[1:4])
-            kept.estimates.flows[where] = merge_firings(
-                kept.estimates.flows.get(where, Firings()), flow_of(row)
-            )
+            into = kept.plants.setdefault(places.get(row[0], ""), Estimates())
+            at = FiringsKey(*row[1:4])
+            into.flows[at] = merge_firings(into.flows.get(at, Firings()), flow_of(row))
         for task, name, state in db.execute("SELECT primitive_task, name, state FROM selector"):
             kept.selectors[task, name] = json.loads(state)
+            kept.plants.setdefault(name.partition(IN)[2], Estimates())
+        kept.plant = min(kept.plants, key=kept.rank, default="") if plant is None else plant
+        kept.kinds = kinds.get(kept.plant, {})
+        for name, value in about.items():
+            if name.startswith(PRIOR):
+                trials, _, of = value.partition(" ")
+                kept.priors[name.removeprefix(PRIOR)] = (of, float(trials))
         for _, task, _, *asked in sorted(
             questions(db), key=lambda row: (row[0] != kept.origin, -row[2], row[0])
         ):
@@ -156,8 +194,9 @@ class EstimatesFile:
         return kept
 
     def refuse_other_physics(self, kept: FileContents, physics: str) -> None:
-        """Raise EstimatesError if the file's contents were learned with another physics."""
-        if kept.estimates.tallies or kept.estimates.flows or kept.selectors:
+        """Raise EstimatesError if the file's simulated runs had another physics, and those of the
+        plant that was read are to have this one."""
+        if has_physics(kept.plant) and any(map(has_physics, kept.plants)):
             _refuse_other_physics(self.path, kept.physics, physics)
 
     def records_of(self, mission: str) -> int:
@@ -181,6 +220,8 @@ class EstimatesFile:
         late: Iterable[Correction] = (),
         asked: Mapping[str, Question] | None = None,
         physics: str = "",
+        plant: str = "",
+        prior: tuple[str, float] | None = None,
     ) -> None:
         """Add what a session gained to this file's own origin, and store the states of its
         selectors (primitive task -> state).
@@ -189,13 +230,17 @@ class EstimatesFile:
         none counts twice when it is resumed; None: the run finished, nothing to remember. `late`:
         verdicts on runs that this file counted before; sums that were reset since then, or came
         from a copied file, stay as they are. `asked`: by what actions were judged (primitive task
-        -> question). `physics`: of the simulated laboratory. Raises EstimatesError, also if the
-        file was learned with another one.
+        -> question). `physics`: of the simulated laboratory. `plant`: where the runs took place.
+        `prior`: the plant whose estimates its learners started from, and how many trials they
+        counted. Raises EstimatesError, also if the file was learned with another physics.
         """
         with self._writing() as db:
-            self._note_physics(db, physics)
+            self._note_physics(db, physics, plant)
             if fact(db, "origin") == fact(db, "closed"):
                 renew_origin(db)
+            use_plant(db, plant)
+            if prior is not None:
+                put_fact(db, PRIOR + plant, f"{prior[1]:g} {prior[0]}")
             origin = fact(db, "origin")
             if fact(db, COUNTED + mission) == origin:
                 for correction in late:
@@ -205,7 +250,7 @@ class EstimatesFile:
             for where, flow in gained.flows.items():
                 add_flow(db, origin, where, flow)
             for task, state in selectors.items():
-                put_selector(db, task, state)
+                put_selector(db, task, state, selector_name(state["selector"], plant))
             for task, question in (asked or {}).items():
                 row = db.execute(
                     "SELECT version FROM question WHERE origin = ? AND primitive_task = ?",
@@ -226,15 +271,18 @@ class EstimatesFile:
         selectors: Mapping[str, Mapping[str, Any]],
         asked: Mapping[str, Question],
         physics: str = "",
+        plant: str = "",
     ) -> None:
         """Write all that was counted under a closed origin, to which nothing is ever added (a
         campaign's).
 
         Writing it a second time changes nothing. What others have added to the file stays, and what
-        was reset stays forgotten. `physics`: as for `add`.
+        was reset stays forgotten. `physics`, `plant`: as for `add`.
         """
         with self._writing() as db:
-            self._note_physics(db, physics)
+            self._note_physics(db, physics, plant)
+            if plant:
+                put_fact(db, PLANT + origin, plant)
             db.execute("INSERT OR IGNORE INTO about VALUES ('closed', ?)", (origin,))
             gone = {
                 task
@@ -256,16 +304,17 @@ class EstimatesFile:
             if db.total_changes > before:
                 count_session(db)
             for task, state in selectors.items():
-                take_selector(db, task, state["selector"], state, origin)
+                take_selector(db, task, selector_name(state["selector"], plant), state, origin)
             for task, question in asked.items():
                 if task not in gone:
                     put_question(db, origin, task, question, 1)
 
-    def put_selectors(self, selectors: Mapping[str, Mapping[str, Any]]) -> None:
-        """Replace states of selectors (freezing, overriding by the user)."""
+    def put_selectors(self, selectors: Mapping[tuple[str, str], Mapping[str, Any]]) -> None:
+        """Replace states of selectors, by (primitive task, name) as `FileContents` has them
+        (freezing, overriding by the user)."""
         with self._writing() as db:
-            for task, state in selectors.items():
-                put_selector(db, task, state)
+            for (task, name), state in selectors.items():
+                put_selector(db, task, state, name)
 
     def reset(self, primitive_task: str | None = None, *, selectors_only: bool = False) -> None:
         """Forget a primitive task (None: everything): states of selectors, and estimates unless
@@ -314,6 +363,7 @@ class EstimatesFile:
             }
             rows["question"] = questions(db)
             gone = db.execute("SELECT * FROM forgotten").fetchall()
+            places, simulated = plants(db), _simulated(db)
             for row in rows["tally"]:
                 tally_of(row)
             for row in rows["flow"]:
@@ -322,8 +372,10 @@ class EstimatesFile:
                 question_of(asked)
             states = [(task, name, state_of(body)) for task, name, _, body in rows["selector"]]
         with self._writing() as mine:
-            if any(rows.values()):
+            if simulated:
                 self._note_physics(mine, physics)
+            for own, place in places.items():
+                put_fact(mine, PLANT + own, place)
             for table in ("tally", "flow", "question"):
                 take_later(mine, table, rows[table])
             for task, name, state in states:
@@ -359,13 +411,15 @@ class EstimatesFile:
                 self.path.unlink()  # created by this attempt, on a disk that is full
             raise
 
-    def _note_physics(self, db: sqlite3.Connection, physics: str) -> None:
-        """Note the physics of what is added, or refuse it if that of the contents is another."""
-        tables = ("tally", "flow", "selector")
-        if any(db.execute(f"SELECT 1 FROM {name} LIMIT 1").fetchone() for name in tables):
+    def _note_physics(self, db: sqlite3.Connection, physics: str, plant: str = "") -> None:
+        """Note the physics of what is added, or refuse it if that of the contents is another. Only
+        simulated runs have one; runs of which nothing is said count as simulated here."""
+        if not has_physics(plant):
+            return
+        if _simulated(db):
             _refuse_other_physics(self.path, fact(db, PHYSICS), physics)
         if physics:
-            db.execute("INSERT OR REPLACE INTO about VALUES (?, ?)", (PHYSICS, physics))
+            put_fact(db, PHYSICS, physics)
 
     def _make(self, db: sqlite3.Connection) -> None:
         for statement in TABLES.split(";"):
@@ -421,6 +475,39 @@ class EstimatesFile:
                 f"{'upgrade petrobot' if version > SCHEMA else 'start a new file'} or give "
                 "another one"
             )
+
+
+PRIOR = "prior of "
+"""Prefix of a plant in the table `about`."""
+
+
+def _kind(plant: str, *, campaign: bool) -> str:
+    """Return the kind of runs, in words."""
+    if campaign:
+        return f"{plant or SIMULATED} campaigns"
+    return f"missions ({plant})" if plant else "missions"
+
+
+def said(plant: str) -> str:
+    """Return a plant in words."""
+    return plant or "not said"
+
+
+def has_physics(plant: str) -> bool:
+    """Return whether runs of a plant depend on the physics of the simulated laboratory."""
+    return plant != MOCK and plant.partition(" ")[0] != REAL
+
+
+def _simulated(db: sqlite3.Connection) -> bool:
+    """Return whether the file contains anything whose physics counts."""
+    places = plants(db)
+    return any(
+        has_physics(places.get(origin, ""))
+        for table in ("tally", "flow")
+        for (origin,) in db.execute(f"SELECT DISTINCT origin FROM {table}")
+    ) or any(
+        has_physics(name.partition(IN)[2]) for (name,) in db.execute("SELECT name FROM selector")
+    )
 
 
 def _refuse_other_physics(path: Path, recorded: str, now: str) -> None:

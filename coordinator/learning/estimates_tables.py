@@ -69,6 +69,11 @@ COUNTED = "counted "
 when it was interrupted."""
 CAMPAIGN = "campaign/"
 """Prefix of the origins of campaigns."""
+PLANT = "plant of "
+"""Prefix of an origin in the table `about`: the plant in which its runs took place. Files that are
+older than this do not say it."""
+ORIGIN_OF = "origin of "
+"""Prefix of a plant in the table `about`: the origin under which this file counts its runs."""
 
 QUESTION = """
 CREATE TABLE question(origin TEXT, primitive_task TEXT, version INTEGER NOT NULL,
@@ -120,12 +125,44 @@ def renew_origin(db: sqlite3.Connection) -> None:
     """Start a new origin: what is added from now on is stored separately from what was added
     before."""
     db.execute("UPDATE about SET value = ? WHERE name = 'origin'", (secrets.token_hex(8),))
+    db.execute("DELETE FROM about WHERE substr(name, 1, ?) = ?", (len(ORIGIN_OF), ORIGIN_OF))
+
+
+def use_plant(db: sqlite3.Connection, plant: str) -> None:
+    """Let what is added now count for a plant: each origin belongs to one, so that no merge can
+    pool two of them."""
+    origin = fact(db, "origin")
+    if plant == fact(db, PLANT + origin):
+        return
+    used = any(
+        db.execute(f"SELECT 1 FROM {table} WHERE origin = ? LIMIT 1", (origin,)).fetchone()
+        for table in ("tally", "flow", "question")
+    )
+    if used or fact(db, PLANT + origin):
+        put_fact(db, ORIGIN_OF + fact(db, PLANT + origin), origin)
+        put_fact(db, "origin", fact(db, ORIGIN_OF + plant) or secrets.token_hex(8))
+    if plant:
+        put_fact(db, PLANT + fact(db, "origin"), plant)
+
+
+def plants(db: sqlite3.Connection) -> dict[str, str]:
+    """Return the plant of each origin that says it."""
+    rows = db.execute(
+        "SELECT substr(name, ?), value FROM about WHERE substr(name, 1, ?) = ?",
+        (len(PLANT) + 1, len(PLANT), PLANT),
+    )
+    return dict(rows.fetchall())
 
 
 def fact(db: sqlite3.Connection, name: str) -> str:
     """Return a value of the table `about`; "" if it is not there."""
     row = db.execute("SELECT value FROM about WHERE name = ?", (name,)).fetchone()
     return str(row[0]) if row else ""
+
+
+def put_fact(db: sqlite3.Connection, name: str, value: str) -> None:
+    """Set a value of the table `about`."""
+    db.execute("INSERT OR REPLACE INTO about VALUES (?, ?)", (name, value))
 
 
 def add_tally(db: sqlite3.Connection, origin: str, key: TallyKey, gained: Tally) -> None:
@@ -202,13 +239,21 @@ def question_of(row: Sequence[Any]) -> Question:
     return Question(cost, target, rho)
 
 
-def put_selector(db: sqlite3.Connection, task: str, state: Mapping[str, Any]) -> None:
-    """Replace the state of a selector."""
+def put_selector(db: sqlite3.Connection, task: str, state: Mapping[str, Any], name: str) -> None:
+    """Replace the state of a selector; `name`: its name in this plant (`selector_name`)."""
     body = json.dumps(state, separators=(",", ":"))
     db.execute(
-        "INSERT OR REPLACE INTO selector VALUES (?, ?, ?, ?)",
-        (task, state["selector"], trials(state), body),
+        "INSERT OR REPLACE INTO selector VALUES (?, ?, ?, ?)", (task, name, trials(state), body)
     )
+
+
+IN = " in "
+"""Between the name of a selector and the plant in which it learned."""
+
+
+def selector_name(selector: str, plant: str) -> str:
+    """Return the name under which a selector's state is kept: a learner never mixes plants."""
+    return f"{selector}{IN}{plant}" if plant else selector
 
 
 def take_selector(
@@ -222,7 +267,7 @@ def take_selector(
     row = db.execute(
         "SELECT state FROM selector WHERE primitive_task = ? AND name = ?", (task, name)
     ).fetchone()
-    put_selector(db, task, state if row is None else joined(state_of(row[0]), state))
+    put_selector(db, task, state if row is None else joined(state_of(row[0]), state), name)
 
 
 def forget(db: sqlite3.Connection) -> None:
@@ -241,7 +286,14 @@ def forget(db: sqlite3.Connection) -> None:
         "DELETE FROM flow WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = flow.origin "
         "AND f.primitive_task = '')"
     )
-    if db.execute("SELECT 1 FROM forgotten WHERE origin = ?", (fact(db, "origin"),)).fetchone():
+    gone = {origin for (origin,) in db.execute("SELECT DISTINCT origin FROM forgotten")}
+    others = db.execute(
+        "SELECT name, value FROM about WHERE substr(name, 1, ?) = ?", (len(ORIGIN_OF), ORIGIN_OF)
+    ).fetchall()
+    for name, origin in others:
+        if origin in gone:
+            db.execute("DELETE FROM about WHERE name = ?", (name,))
+    if fact(db, "origin") in gone:
         renew_origin(db)
 
 

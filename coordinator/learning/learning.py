@@ -216,15 +216,20 @@ class Learning:
 
     # --- state --------------------------------------------------------------------------------
 
-    def prime(self) -> None:
+    def prime(self, prior: Estimates | None = None, trials: float = 0.0) -> None:
         """Let the selectors take their sums from the known estimates, which may contain runs of
-        other machines. Not those that the task judges: estimates hold no verdicts of the task."""
+        other machines, and from those of another plant as from so many trials of each action. Not
+        those that the task judges: estimates hold no verdicts of the task."""
         if self.credit == TASK:
             return
+        other = prior or Estimates()
         for name, selector in self.selectors.items():
-            for context in self.known.contexts(name):
-                by_action = self.known.of(name, context)
-                selector.prime(context, {a: t[context] for a, t in by_action.items()})
+            for context in sorted({*self.known.contexts(name), *other.contexts(name)}):
+                own, before = (
+                    {a: t[context] for a, t in of.of(name, context).items()}
+                    for of in (self.known, other)
+                )
+                selector.prime(context, own, before, trials)
 
     def state(self) -> dict[str, Any]:
         """Return the state of each selector by primitive task, as plain data."""

@@ -7,7 +7,8 @@ of easy and hard scenarios would be put in the wrong order (E. H. Simpson, J. Ro
 Society B 13 (1951) 238). C is its mean cost in the hardest scenario whose reliability is not below
 the target R_d; the lower confidence bound decides which scenarios these are, with hysteresis. rho
 is 1 / max C over the actions of the one primitive task, or declared. All J of a comparison are
-computed from sums with one rho; J values made with different rho are never averaged.
+computed from sums with one rho; J values made with different rho are never averaged. Intervals of J
+hold for that rho.
 """
 
 from __future__ import annotations
@@ -18,6 +19,15 @@ from functools import reduce
 from math import inf, isnan, nan
 
 from petrobot.coordinator.learning.estimate import Tally, merge_tallies
+from petrobot.coordinator.learning.statistics import (
+    joined,
+    lowest_share,
+    mean_interval,
+    objective_interval,
+    runs_needed,
+    wilson,
+)
+from petrobot.coordinator.task import Status
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +59,8 @@ class Figures:
     """R in the scenario that is hardest for the action; nan without any run."""
     lower: float
     upper: float
-    """Bounds of the confidence interval of that R."""
+    """Bounds of the confidence interval of that R. Over several scenarios it is simultaneous: it
+    covers the lowest of all R, whichever that is."""
     worst: str | None
     """The scenario that is hardest for the action; None without any run."""
     availability: float
@@ -68,6 +79,20 @@ class Figures:
     j: float
     """J with the common rho of the comparison; inf for an inadmissible action, nan if nothing is
     known."""
+    j_lower: float = nan
+    j_upper: float = nan
+    """Bounds of the confidence interval of J for that rho, from the joint spread of success and
+    cost over the same runs; nan where the cost of a single run says nothing of its spread."""
+    cost_lower: float = nan
+    cost_upper: float = nan
+    """Bounds of the confidence interval of C."""
+    correlation: float = 0.0
+    """Of success and cost within a run."""
+    available: tuple[float, float] = (1.0, 1.0)
+    """Bounds of the confidence interval of A."""
+    needed: int | None = None
+    """Number of runs in the hardest scenario with which its R, if it stays so, surely reaches the
+    target; None if R is not above the target, or if there is none."""
 
     @property
     def effective(self) -> float:
@@ -104,6 +129,21 @@ class Comparison:
         nothing is known."""
         known = [f for f in self.figures if not isnan(f.j) and f.j < inf]
         return min(known, key=lambda f: f.j).action if known else None
+
+    @property
+    def level_with_best(self) -> tuple[str, ...]:
+        """The other actions whose J cannot be told from the lowest one: the interval of the
+        difference contains 0. The runs of two actions are taken as independent."""
+        if self.best is None:
+            return ()
+        best = self.of(self.best)
+        return tuple(
+            f.action
+            for f in self.figures
+            if f.action != best.action
+            and f.j < inf
+            and not f.j - best.j > joined(f.j - f.j_lower, best.j_upper - best.j)
+        )
 
     def of(self, action: str) -> Figures:
         """Return the figures of one action. Raises KeyError."""
@@ -210,11 +250,17 @@ def _row(
     costs = {s: _mean_cost(known[s], question.measure, declared) for s in among}
     cost = costs[scenario] if scenario is not None else (inf if known else declared)
     largest = max((c for c in costs.values() if not isnan(c)), default=cost)
+    level, counts = question.level, [(t.count(Status.SUCCESS), t.runs) for t in known.values()]
+    # The scenario of C is a choice among several as well, so its interval is as strict.
+    strict = 1.0 - (1.0 - level) / max(1, len(known))
+    spent = known[scenario].cost(question.measure) if scenario is not None else None
+    started = whole.runs + whole.censored + sum(whole.not_executed.values())
+    executed = whole.runs + whole.censored
     return Figures(
         action,
         whole.runs,
         there.reliability,
-        *there.interval(question.level),
+        *(lowest_share(counts, level) if counts else (0.0, 1.0)),
         worst,
         whole.availability,
         cost,
@@ -223,6 +269,15 @@ def _row(
         largest,
         declared,
         nan,
+        nan,
+        nan,
+        *(mean_interval(spent, strict) if spent is not None and spent.n else (cost, cost)),
+        # success and cost of different scenarios are independent
+        there.cost_correlation(question.measure) if scenario == worst else 0.0,
+        wilson(executed, started, level) if executed < started else (1.0, 1.0),
+        None
+        if question.target is None or not known
+        else runs_needed(there.reliability, question.target, level),
     )
 
 
@@ -235,8 +290,20 @@ def _judged(figures: Figures, rho: float) -> Figures:
     if isnan(figures.reliability):
         return figures
     cost = 0.0 if isnan(figures.cost) else figures.cost
-    j = inf if cost == inf else objective(figures.reliability, cost, rho, figures.availability)
-    return replace(figures, j=j)
+    if cost == inf:
+        return replace(figures, j=inf)
+    f = figures
+    low, high = (
+        joined(f.availability * of_r, f.reliability * of_a)
+        for of_r, of_a in (
+            (f.reliability - f.lower, f.availability - f.available[0]),
+            (f.upper - f.reliability, f.available[1] - f.availability),
+        )
+    )
+    effective = (f.effective, f.effective - low, f.effective + high)
+    bounds = objective_interval(effective, (f.cost, f.cost_lower, f.cost_upper), rho, f.correlation)
+    j = objective(f.reliability, cost, rho, f.availability)
+    return replace(f, j=j, j_lower=bounds[0], j_upper=bounds[1])
 
 
 # --- questions --------------------------------------------------------------------------------

@@ -12,7 +12,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from math import inf, isnan, log, nan, prod, sqrt
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -31,11 +30,11 @@ from petrobot.coordinator.learning.estimate import CENSORED, Tally, merge_tallie
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import (
     Comparison,
-    Figures,
     Question,
     compare,
     objective,
 )
+from petrobot.coordinator.learning.statistics import joined, objective_interval
 from petrobot.coordinator.task import Estimate, Kind, Status, Task
 
 # --- competing risks ---
@@ -360,6 +359,7 @@ class PrimitiveFigures:
     reliability: Uncertain
     cost: Uncertain
     j: float
+    j_bounds: tuple[float, float]
     runs: float
     largest_cost: float
     """C of the alternative that costs most; nan if none is known."""
@@ -431,7 +431,8 @@ def propagate(
     where: Sequence[str | None] = scenarios or [None]
     solved = [(_solve(task, measured_from(task, estimates, w, choice), limits), w) for w in where]
     hardest = min(solved, key=lambda one: (one[0].solved.conjunctive_reliability, one[1] or ""))
-    return _figures(task, estimates, *hardest, asked, context, rho, limits)
+    # The lowest of m: intervals at 1 - (1 - level) / m pay for the choice (Bonferroni).
+    return _figures(task, estimates, *hardest, asked, context, rho, limits, len(where))
 
 
 def _scenarios(task: Task, estimates: Estimates) -> list[str]:
@@ -475,6 +476,7 @@ def _figures(
     context: str | None,
     rho: float | None,
     limits: SearchLimits | None,
+    scenarios: int,
 ) -> Propagated:
     parts: dict[str, PrimitiveFigures] = {}
     costs: dict[tuple[str, str], Uncertain] = {}
@@ -483,7 +485,7 @@ def _figures(
         runs = sum(n for (place, _), n in found.visits.items() if place in places)
         judged = compare(estimates.of(name, context), asked[name])
         shares = found.measured.choice.get(name, {})
-        part = _part(name, judged, estimates.of(name, context), shares, asked[name], runs)
+        part = _part(name, judged, shares, asked[name], runs)
         if part is not None:
             parts[name] = part[0]
             costs |= {(place, a): c for place in places for a, c in part[1].items()}
@@ -491,32 +493,51 @@ def _figures(
     alike = len({p.measure for p in needed}) == 1
     largest = sum(p.runs * p.largest_cost for p in needed) if alike else nan
     weight = rho if rho is not None else 1.0 / largest if largest > 0 else 0.0
-    moves = _moves(task, estimates, found, scenario, costs if alike else {}, asked, limits)
+    moves = _moves(
+        task, estimates, found, scenario, costs if alike else {}, asked, limits, scenarios
+    )
     r = found.solved.conjunctive_reliability
     c = _total(found.visits, costs) if alike else nan
-    of_r = [(-min(low, high), max(low, high)) for (low, _), (high, _) in moves]
-    of_c = [(-min(low, high), max(low, high)) for (_, low), (_, high) in moves]
-    of_j = [_span(weight * c1 - r1, weight * c2 - r2) for (r1, c1), (r2, c2) in moves]
-    known = [
-        (n * (cost.value - cost.lower), n * (cost.upper - cost.value))
+    of_r = [(-min(m.low_r, m.high_r), max(m.low_r, m.high_r)) for m in moves.values()]
+    of_c = [(-min(m.low_c, m.high_c), max(m.low_c, m.high_c)) for m in moves.values()]
+    known = {
+        key: (n * (cost.value - cost.lower), n * (cost.upper - cost.value))
         for key, n in found.visits.items()
         if n > 0 and (cost := costs.get(key)) is not None
-    ]
+    }
+    least = 0.0 if all(cost.lower >= 0 for cost in costs.values()) else -inf
     return Propagated(
         parts,
         found.solved,
         scenario,
         Uncertain.combined(r, of_r).within(0.0, 1.0),
-        Uncertain.combined(c, [*of_c, *known]) if c == c else UNKNOWN,
+        Uncertain.combined(c, [*of_c, *known.values()]).within(least, inf) if c == c else UNKNOWN,
         weight,
-        Uncertain.combined(
-            objective(r, c, weight),
-            [*of_j, *((weight * low, weight * high) for low, high in known if weight > 0)],
-        )
+        Uncertain.combined(objective(r, c, weight), _of_j(moves, known, weight))
         if c == c
         else UNKNOWN,
         prod(p.reliability.value for p in needed),
-    )  # fmt: skip
+    )
+
+
+def _of_j(
+    moves: Mapping[tuple[str, str], _Move],
+    costs: Mapping[tuple[str, str], tuple[float, float]],
+    weight: float,
+) -> list[tuple[float, float]]:
+    """Return how far each action moves J of the task down and up: its R and its C together, with
+    their correlation, because both come from the same runs."""
+    out = []
+    for key in sorted({*moves, *costs}):
+        move = moves.get(key, STILL)
+        low, high = costs.get(key, (0.0, 0.0))
+        by_r = [weight * move.low_c - move.low_r, weight * move.high_c - move.high_r]
+        below, above = _span(*by_r)
+        # by_r falls as R grows, as a rule: then R and C that are high together cancel out in J
+        k = move.correlation if by_r[1] > by_r[0] else -move.correlation
+        spent = (weight * low, weight * high) if weight > 0 else (0.0, 0.0)
+        out.append((joined(below, spent[0], k), joined(above, spent[1], k)))
+    return out
 
 
 def _span(one: float, other: float) -> tuple[float, float]:
@@ -531,6 +552,19 @@ def _total(
     return sum(n * costs.get(key, UNKNOWN).value for key, n in visits.items() if n > 0)
 
 
+@dataclass(frozen=True)
+class _Move:
+    """By how much R_conj and C of the task change when R of an action is at the lower and at the
+    upper end of its interval, and the correlation of success and cost over the action's runs."""
+
+    low_r: float = 0.0
+    low_c: float = 0.0
+    high_r: float = 0.0
+    high_c: float = 0.0
+    correlation: float = 0.0
+
+
+STILL = _Move()
 STEP = 0.01
 """Change of a share of SUCCESS by which the derivatives of the task's figures are measured."""
 
@@ -543,13 +577,13 @@ def _moves(
     costs: Mapping[tuple[str, str], Uncertain],
     asked: Mapping[str, Question],
     limits: SearchLimits | None,
-) -> list[tuple[tuple[float, float], tuple[float, float]]]:
-    """Return, for each action, by how much R_conj and C of the task change when its R is at the
-    lower and at the upper end of its confidence interval.
+    scenarios: int,
+) -> dict[tuple[str, str], _Move]:
+    """Return the move of each (place, action), for the hardest of so many scenarios.
 
     To first order: one more solution for each action, with its share of SUCCESS changed by STEP.
     """
-    out = []
+    out = {}
     r, c = found.solved.conjunctive_reliability, _total(found.visits, costs)
     for (place, action), known in found.measured.runs.items():
         primitive = task.primitive_task_of(place).name
@@ -564,8 +598,12 @@ def _moves(
         other = _solve(task, replace(found.measured, runs=runs), limits)
         slope_r = (other.solved.conjunctive_reliability - r) / step
         slope_c = (_total(other.visits, costs) - c) / step if c == c else 0.0
-        low, high = (bound - tally.reliability for bound in tally.interval(asked[primitive].level))
-        out.append(((low * slope_r, low * slope_c), (high * slope_r, high * slope_c)))
+        level = 1.0 - (1.0 - asked[primitive].level) / scenarios
+        low, high = (bound - tally.reliability for bound in tally.interval(level))
+        joint = tally.cost_correlation(asked[primitive].measure)
+        out[place, action] = _Move(
+            low * slope_r, low * slope_c, high * slope_r, high * slope_c, joint
+        )
     return out
 
 
@@ -587,7 +625,6 @@ def _shifted(known: Mapping[Status, Estimate], step: float) -> dict[Status, Esti
 def _part(
     name: str,
     judged: Comparison,
-    tallies: Mapping[str, Mapping[str, Tally]],
     shares: Mapping[str, float],
     question: Question,
     runs: float,
@@ -600,9 +637,9 @@ def _part(
         return None
     weight = {a: shares[a] / sum(shares[b] for b in used) for a in used}
     costs = {
-        a: _cost(figures[a], tallies[a], question)
+        a: Uncertain(f.cost, f.cost_lower, f.cost_upper)
         for a in used
-        if not isnan(figures[a].cost) and figures[a].cost < inf
+        if not isnan((f := figures[a]).cost) and f.cost < inf
     }
     r = Uncertain.combined(
         sum(w * figures[a].effective for a, w in weight.items()),
@@ -629,20 +666,18 @@ def _part(
         (f.cost for f in judged.figures if not isnan(f.cost) and f.cost < inf), default=nan
     )
     j = objective(r.value, c.value, judged.rho)
-    return PrimitiveFigures(name, question.measure, r, c, j, runs, largest), costs
-
-
-def _cost(figures: Figures, tallies: Mapping[str, Tally], question: Question) -> Uncertain:
-    """Return the mean cost of an action with the confidence interval of a mean (normal)."""
-    among = figures.scenario if figures.scenario is not None else figures.worst
-    moments = tallies[among].cost(question.measure) if among is not None else None
-    if not isnan(figures.declared_cost) and (moments is None or not moments.n):
-        return Uncertain(figures.cost, figures.cost, figures.cost)  # declared, taken as exact
-    z = NormalDist().inv_cdf(0.5 + question.level / 2)
-    # One run says nothing of the spread, so the interval is unbounded.
-    several = moments is not None and moments.n > 1
-    error = z * moments.deviation / sqrt(moments.n) if moments is not None and several else inf
-    return Uncertain(figures.cost, figures.cost - error, figures.cost + error)
+    if all(f.j_lower <= f.j <= f.j_upper < inf for f in map(figures.__getitem__, used)):
+        mixed = Uncertain.combined(
+            j,
+            [(w * (f.j - f.j_lower), w * (f.j_upper - f.j))
+             for a, w in weight.items() if (f := figures[a])],
+        )  # fmt: skip
+        bounds = mixed.lower, mixed.upper
+    else:  # an action without a J of its own: the widest interval
+        bounds = objective_interval(
+            (r.value, r.lower, r.upper), (c.value, c.lower, c.upper), judged.rho, -1.0
+        )
+    return PrimitiveFigures(name, question.measure, r, c, j, bounds, runs, largest), costs
 
 
 def _visits(solved: Forecast) -> dict[tuple[str, str], float]:

@@ -221,20 +221,35 @@ class RuleSelector:
             change = self.rule.correcting(batch, i, change, age)
         batch.successes[0, i] = min(max(0.0, batch.successes[0, i] + change), batch.runs[0, i])
 
-    def prime(self, context: str, tallies: Mapping[str, Tally]) -> None:
+    def prime(
+        self,
+        context: str,
+        tallies: Mapping[str, Tally],
+        prior: Mapping[str, Tally] | None = None,
+        trials: float = 0.0,
+    ) -> None:
         """Take the sums from estimates, which may contain runs of other machines; rules that fade
-        their sums keep their own."""
-        if self.frozen or isinstance(self.rule, Tracking):
+        their sums keep their own. `prior`: estimates of another plant, each of which counts as so
+        many `trials` at most; its availability says nothing of this plant."""
+        batch = self.learner(context)
+        if self.frozen or (isinstance(self.rule, Tracking) and (not prior or batch.k[0] > 0)):
             return
         batch = self._kept(context)
         for i, action in enumerate(self.actions):
             tally = tallies.get(action, Tally())
-            cost, missing = tally.cost(self.question.measure), sum(tally.not_executed.values())
-            batch.runs[0, i], batch.successes[0, i] = tally.runs, tally.count(Status.SUCCESS)
-            batch.cost[0, i], batch.costed[0, i] = cost.total, cost.n
-            batch.squares[0, i] = cost.m2 + cost.n * cost.mean**2
+            before = (prior or {}).get(action, Tally())
+            missing = sum(tally.not_executed.values())
+            batch.runs[0, i] = batch.successes[0, i] = 0.0
+            batch.cost[0, i] = batch.costed[0, i] = batch.squares[0, i] = 0.0
+            for seen, share in ((tally, 1.0), (before, min(1.0, trials / max(1, before.runs)))):
+                cost = seen.cost(self.question.measure)
+                batch.runs[0, i] += share * seen.runs
+                batch.successes[0, i] += share * seen.count(Status.SUCCESS)
+                batch.cost[0, i] += share * cost.total
+                batch.costed[0, i] += share * cost.n
+                batch.squares[0, i] += share * (cost.m2 + cost.n * cost.mean**2)
             batch.missing[0, i] = missing
-            batch.tries[0, i] = max(batch.tries[0, i], tally.runs + missing)
+            batch.tries[0, i] = max(batch.tries[0, i], batch.runs[0, i] + missing)
 
     # --- by hand ------------------------------------------------------------------------------
 

@@ -5,17 +5,42 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, FileContents
+from petrobot.coordinator.learning.estimates_file import (
+    MOCK,
+    REAL,
+    SIMULATED,
+    EstimatesError,
+    EstimatesFile,
+    FileContents,
+    said,
+)
 from petrobot.coordinator.learning.learner import Contexts, LearningSelector, usual_contexts
 from petrobot.coordinator.learning.learning import Estimates, Learning
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.records import Correction, RunEnd
 from petrobot.coordinator.learning.selectors import ACTION, DEFAULT, RULES, credited
 from petrobot.coordinator.task import Task
+from petrobot.services.comm.location_file import Directory
+
+PRIOR_TRIALS = 10.0
+"""Trials for which a prior counts unless the user says otherwise. The error of a simulator is not
+known beforehand; one whose R of an action is off by 0.1 (standard deviation) tells of an action
+with R = 0.9 as much as 0.9 * 0.1 / 0.1^2 = 9 real runs do, and 25 of one with R = 0.5."""
+
+
+def plant_of(directory: Directory, *, scripted: bool, lockstep: bool) -> str:
+    """Return where runs take place: in scripted actions (`mock`), in a simulated laboratory (also
+    in lock step, whose time is simulated), or in a real cell, with the name of its installation if
+    the location file gives one."""
+    if scripted:
+        return MOCK
+    if lockstep or directory.laboratory():
+        return SIMULATED
+    return f"{REAL} {directory.installation}".strip()
 
 
 @dataclass(frozen=True)
@@ -40,6 +65,12 @@ class LearningSetting:
     real."""
     credit: str = ACTION
     """What judges a choice: the end of its own run ("action"), or the task's goal ("task")."""
+    plant: str = ""
+    """Where the run takes place (`plant_of`): what it learns is never pooled with another plant's;
+    empty: a run that was recorded before this was."""
+    prior: float | None = None
+    """Learners start from what is known of another plant (for a real one: the simulated one), as
+    from so many trials of each action; None: from nothing."""
 
     def to_plain(self) -> dict[str, Any]:
         """Return plain data for a journal's header."""
@@ -53,6 +84,8 @@ class LearningSetting:
             "declared": None if self.declared is None else dict(self.declared),
             "physics": self.physics,
             "credit": self.credit,
+            "plant": self.plant,
+            "prior": self.prior,
         }
 
     @classmethod
@@ -67,7 +100,12 @@ class LearningSetting:
             data["frozen"],
             data["declared"],
         )
-        more = data.get("physics", ""), data.get("credit", ACTION)
+        more = (
+            data.get("physics", ""),
+            data.get("credit", ACTION),
+            data.get("plant", ""),
+            data.get("prior"),
+        )
         return cls(Path(data["path"]), *given, *more)
 
 
@@ -97,7 +135,7 @@ class LearningSession:
                 f"{setting.path}: no such file: nothing was learned that could be frozen; run with "
                 "--learn and without --frozen first"
             )
-        kept = self.file.read()
+        kept = self.file.read(setting.plant)
         self.file.refuse_other_physics(kept, setting.physics)
         contexts = usual_contexts(task) if setting.contexts is None else Contexts(setting.contexts)
         generation = kept.generation if begun is None else int(begun["generation"])
@@ -106,6 +144,8 @@ class LearningSession:
         self.learning = _learning(
             task, setting, kept, None if begun is None else begun["selectors"], self._token
         )
+        found = _prior(setting, kept)
+        self._prior = None if found is None else (found, setting.prior or 0.0)
         self._begun = self.learning.state()
         self.selector = LearningSelector(
             self.learning,
@@ -141,6 +181,8 @@ class LearningSession:
             late,
             self.learning.asked(),
             self.setting.physics,
+            self.setting.plant,
+            self._prior,
         )
         return sum(t.runs + t.censored for t in gained.tallies.values())
 
@@ -172,19 +214,63 @@ def _learning(
     from those of any other session, including one on a copied file."""
     question = Question(target=setting.target)
     learning = Learning(task, setting.selector, question, kept.estimates, salt, setting.credit)
-    name = credited(setting.selector, setting.credit)
+    source = _prior(setting, kept)
+    known = states if states is not None else _states(setting, kept, source)
     try:
-        learning.restore(kept.states(name) if states is None else states)
+        learning.restore(known)
     except ValueError as fault:
         raise EstimatesError(
             f"{setting.path}: the state of selector {setting.selector} does not fit: {fault}; "
             "reset it with `petrobot learned reset`"
         ) from fault
     if states is None:
-        learning.prime()
+        prior = Estimates() if source is None else kept.plants[source]
+        learning.prime(prior, setting.prior or 0.0)
     if setting.frozen:
         learning.freeze()
     return learning
+
+
+def _prior(setting: LearningSetting, kept: FileContents) -> str | None:
+    """Return the plant whose estimates are the prior; None without one. Raises EstimatesError."""
+    if setting.prior is None:
+        return None
+    if setting.credit != ACTION:
+        raise EstimatesError(
+            "--prior needs --credit action: estimates hold no verdicts of the task; leave one out"
+        )
+    others = [p for p in kept.plants if p not in (setting.plant, MOCK) and kept.plants[p].tallies]
+    if not others and not setting.frozen:
+        raise EstimatesError(
+            f"{setting.path}: --prior needs runs of another plant than {said(setting.plant)} in "
+            "the file; merge the simulated estimates into it with `petrobot learned merge`, or "
+            "leave --prior out"
+        )
+    return min(others, key=kept.rank, default=None)
+
+
+def _states(
+    setting: LearningSetting, kept: FileContents, prior: str | None
+) -> Mapping[str, Mapping[str, Any]]:
+    """Return the states of the selectors in this plant. If nothing was learned in it, a frozen run
+    chooses by those of the prior, or of a file that does not say its plant. Raises EstimatesError
+    where it could only choose by another plant's."""
+    name = credited(setting.selector, setting.credit)
+    states = kept.states(name)
+    if states or not setting.frozen:
+        return states
+    by_plant = {plant: replace(kept, plant=plant).states(name) for plant in kept.plants}
+    learned = [plant for plant, found in by_plant.items() if found]
+    for plant in (prior, ""):
+        if plant in learned:
+            return by_plant[plant]
+    if learned:
+        raise EstimatesError(
+            f"{setting.path}: --frozen: {name} has learned nothing in this plant "
+            f"({said(setting.plant)}), only in: {', '.join(map(said, learned))}; add --prior to "
+            "choose by that"
+        )
+    return {}
 
 
 def session_of(task: Task, header: Mapping[str, Any]) -> LearningSession | None:

@@ -43,6 +43,7 @@ from petrobot.coordinator.learning.session import (
     LearningSession,
     LearningSetting,
     fixed_by_user,
+    plant_of,
     session_of,
 )
 from petrobot.coordinator.operator.commands import Operation
@@ -153,6 +154,7 @@ def prepare(request: RunRequest, task: Task, text: str, directory: Directory) ->
             chosen=request.chosen,
             declared=declared if lockstep else None,
             physics=physics,
+            plant=plant_of(directory, scripted=request.mock is not None, lockstep=lockstep),
         )
         try:
             learning = LearningSession(task, setting, seed)

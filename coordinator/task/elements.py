@@ -131,9 +131,9 @@ class PrimitiveTask:
     deadline: float
     """Longest run (s). The runtime ends a longer one with ERROR, cause `deadline`."""
     specification: str = ""
-    target_reliability: float = 0.9
+    target_reliability: float | None = None
     """R_d (docs/learning.md): the cost is that of the hardest scenario with at least this
-    reliability."""
+    reliability; None: of the hardest one."""
     cost: str = "wall"
     """Measure of the cost of a run: `wall` or `cpu` (s), `count` (the result's value `count`, else
     1), or `value:NAME` (that value of the result)."""

@@ -127,7 +127,7 @@ def _primitive_task(p: PrimitiveTask) -> Iterator[Fault]:
             yield Fault(f"{key}.alternatives", f"{action!r} is listed {n} times", "name it once")
     for name, seconds in (("deadline", p.deadline), ("stop_within", p.stop_within)):
         yield from _time(f"{key}.{name}", seconds)
-    if not 0 < p.target_reliability <= 1:
+    if p.target_reliability is not None and not 0 < p.target_reliability <= 1:
         yield Fault(
             f"{key}.target_reliability",
             f"expected a probability, got {p.target_reliability}",

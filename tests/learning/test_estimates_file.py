@@ -656,3 +656,86 @@ def test_files_agree_after_all_were_merged(
             files[i].merge(files[(i + 1) % 3].path)
     assert {f.read().estimates.tally(KEY).runs for f in files} == {added + 10 * sum(campaigns)}
     assert len({frozenset(f.read().asked.get("pick", ())) for f in files}) == 1
+
+
+# --- plants -----------------------------------------------------------------------------------
+
+
+def runs_by_plant(file: EstimatesFile) -> dict[str, int]:
+    """Return the number of runs of each plant."""
+    plants = file.read().plants
+    return {p: sum(t.runs for t in found.tallies.values()) for p, found in plants.items()}
+
+
+@settings(
+    deadline=None, max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["a", "b"]),
+            st.sampled_from(["", "mock", "simulated", "real", "real cell 2"]),
+            st.integers(1, 3),
+            st.booleans(),
+        ),
+        max_size=10,
+    )
+)
+def test_plants_are_never_pooled_however_files_grow_and_merge(
+    tmp_path: Path, steps: list[tuple[str, str, int, bool]]
+) -> None:
+    """Each run is counted once, in its plant, in both of two files that add and merge at random."""
+    for old in tmp_path.iterdir():
+        old.unlink()
+    files = {name: EstimatesFile(tmp_path / f"{name}.db") for name in "ab"}
+    expected: dict[str, int] = {}
+    for i, (name, plant, count, merge) in enumerate(steps):
+        files[name].add(gained(count, salt=str(i)), {}, plant=plant)
+        expected[plant] = expected.get(plant, 0) + count
+        if merge:
+            files["b" if name == "a" else "a"].merge(files[name].path)
+    if not steps:
+        return
+    for file in files.values():
+        file.add(Estimates(), {}, plant="simulated")
+    files["a"].merge(files["b"].path)
+    files["b"].merge(files["a"].path)
+    for file in files.values():
+        assert runs_by_plant(file) == expected
+
+
+def test_a_learner_of_one_plant_is_not_continued_in_another(tmp_path: Path) -> None:
+    selector = make("nikolic_fu", ("pick_fast", "pick_slow"))
+    selector.chosen("", "pick_fast")
+    selector.update("", "pick_fast", Observation(Status.SUCCESS, 1.0))
+    file = EstimatesFile(tmp_path / "a.db")
+    file.add(gained(1), {"pick": selector.state()}, plant="simulated")
+    file.add(gained(1), {"pick": {**selector.state(), "learners": {}}}, plant="mock")
+    kept = file.read("simulated").states("nikolic_fu")["pick"]
+    assert kept["learners"] and not file.read("mock").states("nikolic_fu")["pick"]["learners"]
+    assert not file.read("real").states("nikolic_fu")
+    assert file.read().plant == "simulated"
+
+
+def test_the_physics_counts_for_simulated_runs_alone(tmp_path: Path) -> None:
+    """A real cell goes on in a file that was learned with any physics; another simulator does
+    not."""
+    file = EstimatesFile(tmp_path / "a.db")
+    file.add(gained(1), {}, physics="portable 1", plant="simulated")
+    file.add(gained(2), {}, plant="real")
+    file.add(gained(1), {}, physics="bullet 3.2.7", plant="mock")
+    with pytest.raises(EstimatesError, match="different physics are not pooled"):
+        file.add(gained(1), {}, physics="bullet 3.2.7", plant="simulated")
+    assert runs_by_plant(file) == {"simulated": 1, "real": 2, "mock": 1}
+    assert file.read().physics == "portable 1" and file.read().plant == "real"
+
+
+def test_what_was_reset_in_one_plant_stays_forgotten_in_a_merge(tmp_path: Path) -> None:
+    file, other = EstimatesFile(tmp_path / "a.db"), EstimatesFile(tmp_path / "b.db")
+    for plant in ("simulated", "mock", "simulated"):
+        file.add(gained(1), {}, plant=plant)
+    other.merge(file.path)
+    file.reset("pick")
+    file.add(gained(3), {}, plant="mock")
+    file.merge(other.path)
+    assert runs_by_plant(file) == {"mock": 3, "simulated": 0}

@@ -13,7 +13,7 @@ from petrobot.coordinator.cli import main
 from petrobot.coordinator.engine import Engine
 from petrobot.coordinator.launch import resumed_mission, with_runs
 from petrobot.coordinator.learning.estimate import Observation, Tally, TallyKey
-from petrobot.coordinator.learning.estimates_file import EstimatesFile
+from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.session import LearningSession, LearningSetting, session_of
@@ -531,3 +531,117 @@ def test_a_resumed_mission_restores_its_selector(tmp_path: Path) -> None:
         again.learning.apply(record)
     assert resumed.learning.state() == again.learning.state()
     assert mission.executor.selector is resumed.selector
+
+
+# --- plants -----------------------------------------------------------------------------------
+
+
+def sampled(good: int, bad: int, salt: str) -> Tally:
+    """Return a tally of runs of one second."""
+    tally = Tally()
+    for i in range(good + bad):
+        status = Status.SUCCESS if i < good else Status.FAILURE
+        tally = tally.adding(Observation(status, 1.0), salt)
+    return tally
+
+
+def learned_in(path: Path, plant: str, **actions: tuple[int, int]) -> None:
+    """Add runs of a plant to an estimates file: successes and failures by action of `pick`."""
+    known = {
+        TallyKey("pick", a, "regime=A"): sampled(*counts, plant) for a, counts in actions.items()
+    }
+    EstimatesFile(path).add(Estimates(known), {}, plant=plant)
+
+
+def test_mock_runs_do_not_move_what_was_learned_in_a_simulation(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both are shown, with their source; the simulated runs judge."""
+    path = cell / "learned.db"
+    learned_in(path, "simulated", pick_fast=(25, 0), pick_slow=(5, 20))
+    assert petrobot("--learn", "learned.db")[0] == 0
+    capsys.readouterr()
+    shown, text = told(path, capsys)
+    rows = {(row["action"], row["source"]): row for row in shown["pick"]["actions"]}
+    fast = rows["pick_fast", "simulated"]
+    assert (fast["R"], fast["runs"]) == (1.0, 25) and shown["pick"]["source"] == "simulated"
+    assert shown["pick"]["best"] == "pick_fast" and shown["pick"]["level_with_best"] == []
+    assert rows["pick_fast", "mock"]["R"] == 0.0 and rows["pick_fast", "mock"]["runs"] > 0
+    assert "never pooled" in text and "pick_fast *" in text
+    assert shown["place"]["source"] == "mock"
+    mock, _ = told(path, capsys, "--plant", "mock")
+    assert {row["source"] for row in mock["pick"]["actions"]} == {"mock"}
+    assert main(["learned", "show", "learned.db", "--plant", "real"]) == 2
+    assert "expected one of: mock, simulated" in capsys.readouterr().err
+    more = ["--estimates", "learned.db", "--runs", "10"]
+    assert main(["forecast", str(TASK_FILE), *more]) == 2
+    assert "several plants, which are never pooled: mock, simulated" in capsys.readouterr().err
+    assert main(["analyse", str(TASK_FILE), "--estimates", "learned.db", "--json", "-"]) in (0, 1)
+    assert "its simulated runs, not pooled with: mock" in capsys.readouterr().err
+
+
+def test_a_file_that_does_not_say_its_plant_is_shown_so(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = cell / "learned.db"
+    learned_in(path, "", pick_fast=(5, 0))
+    assert "source" not in told(path, capsys)[1]
+    learned_in(path, "mock", pick_fast=(0, 5))
+    shown, text = told(path, capsys)
+    assert shown["pick"]["source"] == "" and "judged by the not said runs alone" in text
+
+
+@pytest.mark.parametrize(("trials", "runs", "good"), [(10.0, 14.0, 8.0), (200.0, 54.0, 40.0)])
+def test_a_simulated_estimate_is_a_discounted_prior_of_a_real_one(
+    cell: Path, capsys: pytest.CaptureFixture[str], trials: float, runs: float, good: float
+) -> None:
+    """It counts as so many trials, and never as more than it has; it is not stored as real runs,
+    and never counts twice."""
+    path = cell / "learned.db"
+    learned_in(path, "simulated", pick_fast=(40, 10), pick_slow=(5, 5))
+    learned_in(path, "mock", pick_fast=(0, 90))
+    learned_in(path, "real", pick_fast=(0, 4))
+    for _ in range(2):
+        setting = LearningSetting(path, plant="real", prior=trials)
+        session = LearningSession(sorting(), setting, 1)
+        batch = session.learning.selectors["pick"].learner("regime=A")
+        assert (batch.runs[0, 0], batch.successes[0, 0]) == (runs, good)
+        assert batch.cost[0, 0] == pytest.approx(runs)
+        session.save()
+    shown, text = told(path, capsys)
+    assert shown["pick"]["prior"] == {"source": "simulated", "trials": trials}
+    assert f"count the simulated runs of each action, as {trials:g} trials" in text
+    rows = {(row["action"], row["source"]): row["runs"] for row in shown["pick"]["actions"]}
+    assert rows["pick_fast", "real"] == 4 and rows["pick_fast", "simulated"] == 50
+
+
+def test_a_prior_that_is_not_there_and_a_frozen_choice_of_another_plant_are_refused(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", str(TASK_FILE), "--prior"]) == 2
+    assert "--prior needs --learn" in capsys.readouterr().err
+    path = cell / "learned.db"
+    learned_in(path, "real", pick_fast=(4, 0))
+    with pytest.raises(EstimatesError, match="needs runs of another plant than real"):
+        LearningSession(sorting(), LearningSetting(path, plant="real", prior=5.0), 1)
+    with pytest.raises(EstimatesError, match="--prior needs --credit action"):
+        LearningSession(sorting(), LearningSetting(path, plant="real", prior=5.0, credit="task"), 1)
+    assert petrobot("--learn", "mock.db")[0] == 0
+    with pytest.raises(EstimatesError, match="learned nothing in this plant"):
+        LearningSession(sorting(), LearningSetting(cell / "mock.db", plant="real", frozen=True), 1)
+    assert (
+        LearningSession(sorting(), LearningSetting(cell / "mock.db", plant="mock", frozen=True), 1)
+        .learning.selectors["pick"]
+        .learners
+    )
+
+
+def test_the_gate_says_what_a_target_needs(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = cell / "learned.db"
+    learned_in(path, "real", pick_fast=(38, 0), pick_slow=(90, 10))
+    shown, text = told(path, capsys, "--target", "0.95")
+    assert "pick_fast: 38 of 38 in regime=A: lower bound 0.908; 73 needed for 0.95" in text
+    assert "pick_slow: 90 of 100 in regime=A: lower bound 0.826; R itself is not above 0.95" in text
+    assert shown["pick"]["target_unmet"]
+    for row in shown["pick"]["actions"]:
+        assert row["J_low"] <= row["J"] < row["J_high"]

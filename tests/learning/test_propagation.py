@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import t as student
 
 from petrobot.coordinator.analysis.time.completion import completion
 from petrobot.coordinator.analysis.time.gspn import Chain
@@ -163,7 +164,8 @@ def test_intervals_of_the_task_come_from_those_of_its_actions() -> None:
     )
     c1, c2 = (t.cost("wall") for t in known)
     assert found.cost.value == pytest.approx(c1.mean + r1 * c2.mean)
-    own = 1.959964 * hypot(c1.deviation / 80**0.5, r1 * c2.deviation / 50**0.5)
+    t1, t2 = (float(student.ppf(0.975, n - 1)) for n in (80, 50))
+    own = hypot(t1 * c1.deviation / 80**0.5, t2 * r1 * c2.deviation / 50**0.5)
     more = c2.mean * (u1 - r1)  # The second action runs more often if the first is more reliable.
     assert found.cost.upper == pytest.approx(found.cost.value + hypot(own, more), rel=1e-5)
     assert found.rho == pytest.approx(1 / found.cost.value)

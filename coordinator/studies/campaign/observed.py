@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from petrobot.coordinator.learning.estimate import Firings, FiringsKey, Observation, Tally, TallyKey
-from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
+from petrobot.coordinator.learning.estimates_file import SIMULATED, EstimatesError, EstimatesFile
 from petrobot.coordinator.learning.estimates_tables import CAMPAIGN
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
@@ -85,18 +85,21 @@ def write_estimates(
     campaign: str,
     asked: Mapping[str, Question] | None = None,
     physics: str = "",
+    plant: str = SIMULATED,
 ) -> Path:
     """Write the runs of a campaign to its estimates file, under the campaign's own origin, and
     return its path.
 
     Merging it twice counts nothing twice, and what others have learned into the file stays.
     `asked`: by what the actions of each primitive task are judged; `physics`: that of the
-    simulated laboratory. Raises CampaignError.
+    simulated laboratory; `plant`: SIMULATED, or MOCK for scripted actions. Raises CampaignError.
     """
     path = folder / ESTIMATES
     try:
         origin = CAMPAIGN + campaign
-        EstimatesFile(path, origin).put_closed(origin, estimates, selectors, asked or {}, physics)
+        EstimatesFile(path, origin).put_closed(
+            origin, estimates, selectors, asked or {}, physics, plant
+        )
     except EstimatesError as fault:
         raise CampaignError(
             f"{fault}. If it is removed, the same command makes it again from the table"

@@ -10,12 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import t as student
 
 from petrobot.coordinator.learning.estimate import Tally, TallyKey
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Comparison, Question, compare, objective
-from petrobot.coordinator.learning.statistics import Moments, wilson
+from petrobot.coordinator.learning.statistics import (
+    Moments,
+    lowest_share,
+    mean_interval,
+    objective_interval,
+    wilson,
+)
 from petrobot.coordinator.studies.campaign.observed import ESTIMATES, add_row, context_of, regime_of
 from petrobot.coordinator.studies.campaign.plan import TABLE, CampaignPlan
 from petrobot.coordinator.studies.campaign.rows import TrialRow
@@ -222,6 +227,7 @@ class Summary:
                 f.action: [regime_of(s) for s in f.scenarios] for f in found.figures if f.admissible
             },
             "uncosted": list(found.uncosted),
+            "level_with_best": list(found.level_with_best),
         }
 
     def task_figures(self) -> dict[str, Any]:
@@ -239,10 +245,10 @@ class Summary:
             return {}
         regime = min(begun, key=lambda name: (begun[name].all_success / begun[name].runs, name))
         hardest = begun[regime]
-        # the lowest of m shares: each interval at level 1 - 0.05 / m, so that all hold together
-        level = 1.0 - 0.05 / len(begun)
         n, r = hardest.runs, hardest.all_success / hardest.runs
-        low, high = wilson(hardest.all_success, n, level)
+        low, high = lowest_share([(one.all_success, one.runs) for one in begun.values()])
+        # the cost in the regime that happens to be the hardest of m: at level 1 - 0.05 / m
+        level = 1.0 - 0.05 / len(begun)
         out: dict[str, Any] = {
             "regime": regime,
             "trials": n,
@@ -265,22 +271,17 @@ class Summary:
         )
         given = self.options.get("rho")
         rho = float(given) if given is not None else 1.0 / largest if largest > 0 else 0.0
-        z = float(student.ppf((1.0 + level) / 2.0, n - 1))
-        half = z * cost.deviation / math.sqrt(n)
+        c = (cost.mean, *mean_interval(cost, level))
         # correlation of success and cost within a trial: they come from the same trials
-        spread = math.sqrt(r * (1.0 - r)) * cost.deviation
+        spread = math.sqrt(r * (1.0 - r) * cost.m2 / n)
         joint = r * (hardest.good_cost.mean - cost.mean) / spread if spread > 0 else 0.0
-        j = objective(r, cost.mean, rho)
-        sides = [
-            math.sqrt(max(0.0, side**2 + (rho * half) ** 2 - 2.0 * joint * side * rho * half))
-            for side in (high - r, r - low)
-        ]
+        below, above = objective_interval((r, low, high), c, rho, joint)
         return out | {
             "C": round(cost.mean, 6),
-            "C_interval": [round(cost.mean - half, 6), round(cost.mean + half, 6)],
+            "C_interval": [round(c[1], 6), round(c[2], 6)],
             "rho": round(rho, 9),
-            "J": round(j, 6),
-            "J_interval": [round(j - sides[0], 6), round(j + sides[1], 6)],
+            "J": round(objective(r, cost.mean, rho), 6),
+            "J_interval": [round(below, 6), round(above, 6)],
         }
 
     def to_plain(self) -> dict[str, Any]:
@@ -299,6 +300,10 @@ class Summary:
             },
             "J": {
                 name: {f.action: _finite(f.j) for f in judged.figures}
+                for name, judged in found.items()
+            },
+            "J_interval": {
+                name: {f.action: _bounds(f.j_lower, f.j_upper) for f in judged.figures}
                 for name, judged in found.items()
             },
             "judged": {name: self._judged(name, judged) for name, judged in found.items()},
@@ -339,3 +344,8 @@ def result_of(
 
 def _finite(value: float) -> float | None:
     return round(value, 6) if math.isfinite(value) else None
+
+
+def _bounds(low: float, high: float) -> list[float] | None:
+    known = math.isfinite(low) and math.isfinite(high)
+    return [round(low, 6), round(high, 6)] if known else None

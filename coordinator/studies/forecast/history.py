@@ -4,7 +4,7 @@ its trial."""
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 from petrobot.coordinator.analysis.time.stochastic import is_cause
 from petrobot.coordinator.learning.estimate import CENSORED as CENSORED_CAUSE
 from petrobot.coordinator.learning.estimate import Tally
-from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
+from petrobot.coordinator.learning.estimates_file import (
+    EstimatesError,
+    EstimatesFile,
+    FileContents,
+    said,
+)
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.studies.campaign.observed import context_of, regime_of
 from petrobot.coordinator.studies.campaign.rows import TrialRow
@@ -313,19 +318,30 @@ def reads_variables(t: Transition) -> bool:
 # It holds only sums and samples of runs, so each run stands alone, without what ended before it.
 
 
-def read_estimates(path: Path) -> tuple[Estimates, str]:
-    """Read an estimates file; return what it holds and the physics in which it was learned. Raises
-    ForecastError."""
+def read_estimates(path: Path, plant: str | None = None) -> FileContents:
+    """Read an estimates file. Raises ForecastError, also if it holds runs of several plants and
+    none is named: they are never pooled."""
     try:
-        kept = EstimatesFile(path).read() if path.exists() else None
+        kept = EstimatesFile(path).read(plant) if path.exists() else None
     except EstimatesError as fault:
         raise ForecastError(str(fault)) from fault
-    if kept is None or not kept.estimates.tallies:
+    known = [] if kept is None else [p for p, found in kept.plants.items() if found.tallies]
+    if kept is None or not known:
         raise ForecastError(
             f"{path} holds no estimates; give a campaign's folder or a file that `run "
             "--learn` wrote"
         )
-    return kept.estimates, kept.physics
+    names = ", ".join(said(p) for p in sorted(known))
+    if plant is None and len(known) > 1:
+        raise ForecastError(
+            f"{path} holds runs of several plants, which are never pooled: {names}; choose one "
+            "with --plant"
+        )
+    if plant is None:  # a plant whose runs were reset may have left the state of a selector
+        return replace(kept, plant=known[0])
+    if plant not in known:
+        raise ForecastError(f"{path}: --plant {plant}: expected one of: {names}")
+    return kept
 
 
 def trainings_of(task: Task, estimates: Estimates) -> dict[str, Training]:

@@ -13,6 +13,7 @@ from petrobot.coordinator.learning.estimate import Tally, TallyKey
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.records import Record, RunEnd
 from petrobot.coordinator.learning.selectors import cost_of
+from petrobot.coordinator.learning.statistics import mean_interval
 from petrobot.coordinator.studies.campaign.block import LoadedPlan
 from petrobot.coordinator.studies.campaign.observed import regime_of
 from petrobot.coordinator.studies.campaign.plan import CampaignPlan
@@ -237,8 +238,8 @@ def _reliability(key: TallyKey, tally: Tally) -> IntervalRow:
 
 def _cost(key: TallyKey, tally: Tally, measure: str) -> IntervalRow:
     spent = tally.cost(measure)
-    half = 1.96 * spent.deviation / spent.n**0.5
-    return key.action, regime_of(key.context), spent.mean - half, spent.mean, spent.mean + half
+    low, high = mean_interval(spent) if spent.n > 1 else (spent.mean, spent.mean)
+    return key.action, regime_of(key.context), low, spent.mean, high
 
 
 def _unit(measure: str) -> str:

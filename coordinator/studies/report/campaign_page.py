@@ -6,11 +6,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from math import isfinite, nan
 from typing import Any
 
 import numpy as np
 
 from petrobot.coordinator.learning.objective import Figures, break_even, pareto
+from petrobot.coordinator.learning.statistics import wilson
 from petrobot.coordinator.run.timeline import Bar, Timeline
 from petrobot.coordinator.studies.campaign.observed import regime_of
 from petrobot.coordinator.studies.campaign.plan import CampaignPlan
@@ -29,7 +31,11 @@ from petrobot.coordinator.studies.report.action_pictures import (
     put,
     trial_pictures,
 )
-from petrobot.coordinator.studies.report.comparing import Weighting, objectives
+from petrobot.coordinator.studies.report.comparing import (
+    Weighting,
+    objective_intervals,
+    objectives,
+)
 from petrobot.coordinator.studies.report.page import gallery, html_page, section, table, text
 from petrobot.coordinator.studies.report.plots import declared
 from petrobot.coordinator.studies.report.run_page import gantt_svg
@@ -54,6 +60,10 @@ class CombinationFigures:
     task_objective: float
     time: float
     """Mean duration of the completed trials (s)."""
+    goal_interval: tuple[float, float] = (0.0, 1.0)
+    objective_interval: tuple[float, float] = (nan, nan)
+    task_interval: tuple[float, float] = (nan, nan)
+    """95 % intervals of the three, the last two for the given rho."""
 
     def to_plain(self) -> dict[str, Any]:
         """Return plain data."""
@@ -61,8 +71,11 @@ class CombinationFigures:
             **dict(self.combination),
             "runs": self.trials,
             "R_goal": round(self.goal, 6),
+            "R_goal 95 %": _interval(self.goal_interval),
             "J": round(self.objective, 6),
+            "J 95 %": _interval(self.objective_interval),
             "J of the task": round(self.task_objective, 6),
+            "J of the task 95 %": _interval(self.task_interval),
             "mean time (s)": round(self.time, 6),
         }
 
@@ -108,16 +121,17 @@ def _judged(
 ) -> CombinationFigures:
     found = objectives(task, rows, weighting)
     times = [row.trial.time for row in rows if row.trial is not None and row.trial.time is not None]
-    goal = float(np.mean([row.trial is not None and row.trial.goals > 0 for row in rows]))
+    met = [row.trial is not None and row.trial.goals > 0 for row in rows]
     mean = float(np.mean(times)) if times else float("nan")
-    known = [value for name, value in found.items() if name != "task" and not np.isnan(value)]
     return CombinationFigures(
         combination,
         len(rows),
-        goal,
-        float(np.mean(known)) if known else float("nan"),
+        float(np.mean(met)),
+        found["mean"],
         found["task"],
         mean,
+        wilson(sum(met), len(met)),
+        *objective_intervals(task, rows, weighting),
     )
 
 
@@ -253,7 +267,7 @@ class CampaignReport:
         for primitive, judged in self.summary.comparisons().items():
             front = {f.action for f in pareto(judged.figures)}
             best = next((f for f in judged.figures if f.action == judged.best), None)
-            rows = [_action_row(f, front, best) for f in judged.figures]
+            rows = [_action_row(f, front, best, not judged.level_with_best) for f in judged.figures]
             out.append(
                 f"<h3>{escape(primitive)} <small>rho = {judged.rho:.4g}</small></h3>{table(rows)}"
             )
@@ -313,19 +327,21 @@ class CampaignReport:
         )
 
 
-def _action_row(f: Figures, front: set[str], best: Figures | None) -> dict[str, Any]:
+def _action_row(f: Figures, front: set[str], best: Figures | None, clear: bool) -> dict[str, Any]:
     even = break_even(best, f) if best is not None and best.action != f.action else None
     return {
         "action": f.action
-        + (" (lowest J)" if best is not None and f.action == best.action else ""),
+        + (" (lowest J)" if clear and best is not None and f.action == best.action else ""),
         "runs": f.runs,
         "R in its hardest regime": f.reliability,
         "95 %": f"{f.lower:.3f} to {f.upper:.3f}",
         "availability": f.availability,
         "C": f.cost,
+        "C 95 %": _interval((f.cost_lower, f.cost_upper)),
         "hardest regime": regime_of(f.worst or ""),
         "hardest that meets the target": None if f.scenario is None else regime_of(f.scenario),
         "J": f.j,
+        "J 95 %": _interval((f.j_lower, f.j_upper)),
         "not beaten in both R and C": f.action in front,
         "same J as the best at rho": even,
     }
@@ -409,7 +425,7 @@ def _objective_name(name: str) -> str:
 
 
 def _interval(ends: Sequence[float]) -> str:
-    return f"{text(ends[0])} to {text(ends[1])}"
+    return f"{text(ends[0])} to {text(ends[1])}" if all(map(isfinite, ends)) else "-"
 
 
 def comparison_pictures(

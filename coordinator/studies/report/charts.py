@@ -8,7 +8,7 @@ series also has its own shape or dash, so no chart depends on colour alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from itertools import pairwise
@@ -156,9 +156,9 @@ class Chart:
             f'fill="{colour}" fill-opacity="0.85"><title>{escape(tip)}</title></rect>'
         )
 
-    def names(self, names: Sequence[str], *, dashes: bool = False) -> None:
-        """Add a legend: one name for each number."""
-        for number, name in enumerate(names):
+    def names(self, names: Mapping[str, int] | Sequence[str], *, dashes: bool = False) -> None:
+        """Add a legend: names with their numbers, or one for each number."""
+        for name, number in (names if isinstance(names, Mapping) else _numbered(names)).items():
             colour = PALETTE[number % len(PALETTE)]
             mark = (
                 f'<line x1="-8" x2="10" y1="-4" y2="-4" stroke="{colour}" stroke-width="2" '
@@ -311,19 +311,22 @@ def points(
     x_label: str,
     y_label: str,
     groups: Mapping[str, Sequence[tuple[tuple[float, ...], str]]],
+    numbers: Mapping[str, int] | None = None,
 ) -> str:
-    """Return a chart of points (x, y) or segments (x, y, x2, y2) by group, each with a tooltip."""
+    """Return a chart of points (x, y) or segments (x, y, x2, y2) by group, each with a tooltip.
+    `numbers` gives the colour and shape of each group."""
+    number_of = numbers or _numbered(groups)
     every = [p for group in groups.values() for p, _ in group]
     xs = [v for p in every for v in p[0::2]]
     ys = [v for p in every for v in p[1::2]]
     chart = Chart(title, x_label, y_label, limits(xs), limits(ys), height=420)
-    chart.names(list(groups))
-    for number, group in enumerate(groups.values()):
+    chart.names({name: number_of[name] for name in groups})
+    for name, group in groups.items():
         for place, tip in group:
             if len(place) == 4:
-                chart.segment((place[0], place[1]), (place[2], place[3]), number, tip)
+                chart.segment((place[0], place[1]), (place[2], place[3]), number_of[name], tip)
             else:
-                chart.dot(place[0], place[1], number, tip)
+                chart.dot(place[0], place[1], number_of[name], tip)
     return chart.svg()
 
 
@@ -334,9 +337,13 @@ def histogram(
     bins: int = 30,
     *,
     least: float | None = None,
+    numbers: Mapping[str, int] | None = None,
+    beyond: Mapping[str, str] | None = None,
 ) -> str:
     """Return a histogram with classes of equal width and stacked groups; the first class begins at
-    `least`, if given."""
+    `least`, if given. `numbers` gives the colour of each group, `beyond` what the legend says of
+    the group's values that are not drawn."""
+    number_of = numbers or _numbered(groups)
     every = [v for group in groups.values() for v in group]
     low, high = limits(every if least is None else [least, *every], room=0.0)
     high = high if high > low else low + 1.0
@@ -344,15 +351,27 @@ def histogram(
     counts = {name: _counts(group, low, step, bins) for name, group in groups.items()}
     tallest = max((sum(c[i] for c in counts.values()) for i in range(bins)), default=1)
     chart = Chart(title, x_label, "count", (low, high), (0.0, max(1.0, 1.05 * tallest)))
-    chart.names(list(groups))
+    left_out = beyond or {}
+    chart.names({name + left_out.get(name, ""): number_of[name] for name in groups})
     for i in range(bins):
         base = 0
-        for number, (name, count) in enumerate(counts.items()):
+        for name, count in counts.items():
             if count[i]:
                 tip = f"{name}: {count[i]} from {low + i * step:.4g} to {low + (i + 1) * step:.4g}"
-                chart.bar(low + i * step, low + (i + 1) * step, base, base + count[i], number, tip)
+                chart.bar(
+                    low + i * step,
+                    low + (i + 1) * step,
+                    base,
+                    base + count[i],
+                    number_of[name],
+                    tip,
+                )
                 base += count[i]
     return chart.svg()
+
+
+def _numbered(names: Iterable[str]) -> dict[str, int]:
+    return {name: number for number, name in enumerate(names)}
 
 
 def _counts(values: Sequence[float], low: float, step: float, bins: int) -> list[int]:

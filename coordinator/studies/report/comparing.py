@@ -169,14 +169,59 @@ class Weighting:
 
 
 def objectives(task: Task, rows: Sequence[TrialRow], weighting: Weighting) -> dict[str, float]:
-    """Return J of each primitive task with alternatives and of the task ("task"), with the given
-    rho; nan where nothing ran."""
+    """Return J of each primitive task with alternatives, their mean ("mean") and J of the task
+    ("task"), with the given rho; nan where nothing ran."""
     whole = np.ones((1, len(rows)))
     found = {
         name: float(_objective(_sums(task, name, rows), whole, rho)[0])
         for name, rho in weighting.rho.items()
     }
-    return found | {"task": float(_objective(_task_sums(rows), whole, weighting.task)[0])}
+    known = [value for value in found.values() if not np.isnan(value)]
+    return found | {
+        "mean": float(np.mean(known)) if known else float("nan"),
+        "task": float(_objective(_task_sums(rows), whole, weighting.task)[0]),
+    }
+
+
+def objective_intervals(
+    task: Task, rows: Sequence[TrialRow], weighting: Weighting, seed: int = 1
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the 95 % intervals of the mean J over the primitive tasks with alternatives, and of J
+    of the task: percentiles of a bootstrap over whole trials, so the dependence of R and C counts.
+
+    Four trials at the mean cost are added, two of them successes: without them the interval of a
+    combination that never failed would be empty (A. Agresti and B. A. Coull, The American
+    Statistician 52 (1998) 119-126). nan where nothing ran.
+    """
+    random = np.random.default_rng(seed)
+    weights = random.multinomial(
+        len(rows) + 4, np.full(len(rows) + 4, 1 / (len(rows) + 4)), REPLICATES
+    )
+
+    def spread(sums: Sums, rho: float) -> Values:
+        runs, _, cost, costed = sums
+        per_trial = runs.sum() / max(1, np.count_nonzero(runs))
+        mean = cost.sum() / costed.sum() if costed.sum() else 0.0
+        known = per_trial if costed.sum() else 0.0
+        more = np.array(
+            [[per_trial] * 4, [per_trial] * 2 + [0.0] * 2, [known * mean] * 4, [known] * 4]
+        )
+        grown = [np.append(one, other) for one, other in zip(sums, more, strict=True)]
+        return _objective((grown[0], grown[1], grown[2], grown[3]), weights, rho)
+
+    parts = [(_sums(task, name, rows), rho) for name, rho in weighting.rho.items()]
+    spreads = [spread(sums, rho) for sums, rho in parts if sums[0].sum()]
+    whole = spread(_task_sums(rows), weighting.task) if rows else np.empty(0)
+    mean = np.mean(spreads, axis=0) if spreads else np.empty(0)
+    return _percentiles(mean), _percentiles(whole)
+
+
+def _percentiles(spread: Values) -> tuple[float, float]:
+    known = spread[~np.isnan(spread)]
+    if not len(known):
+        return float("nan"), float("nan")
+    low, high = np.quantile(known, (0.025, 0.975))
+    return float(low), float(high)
 
 
 def objective_difference(

@@ -4,14 +4,16 @@
     "...", y2 = "...",
                             x_label = "... (m)", y_label = "... (m)", colour = "table.column" } }
 
-kind: `points` (x, y), `lines` (to x2, y2) or `histogram` (x; between `least` and `most`, if given).
-`pictures` in a score holds finished SVG texts by title.
+kind: `points` (x, y), `lines` (to x2, y2) or `histogram` (x; between `least` and `most`, if given:
+values above `most` are counted in the legend). `pictures` in a score holds finished SVG texts by
+title.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from hashlib import blake2b
 from typing import Any
 
 from petrobot.coordinator.studies.report import charts
@@ -28,13 +30,30 @@ def declared(plots: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dic
     for name, plot in plots.items():
         if not isinstance(plot, Mapping) or "x" not in plot:
             continue
-        made = _histogram(plot, rows) if plot.get("kind") == "histogram" else _points(plot, rows)
+        numbers = _numbers(plot, rows)
+        make = _histogram if plot.get("kind") == "histogram" else _points
+        made = make(plot, rows, numbers)
         if made is not None:
             out[str(name)] = made
     return out
 
 
-def _points(plot: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str | None:
+def _numbers(plot: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    """Return the number of the colour of each group. It depends on the name, not on how many trials
+    are in which group: the same word has the same colour in every picture and report. If two names
+    of one picture come to the same colour, the later one in the alphabet takes the next free."""
+    out: dict[str, int] = {}
+    for name in sorted({_group(plot, row) for row in rows}):
+        number = blake2b(name.encode()).digest()[0] % len(charts.PALETTE)
+        while number in out.values() and len(out) < len(charts.PALETTE):
+            number = (number + 1) % len(charts.PALETTE)
+        out[name] = number
+    return out
+
+
+def _points(
+    plot: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], numbers: Mapping[str, int]
+) -> str | None:
     names = [
         str(plot[key])
         for key in (("x", "y", "x2", "y2") if plot.get("kind") == "lines" else ("x", "y"))
@@ -57,15 +76,25 @@ def _points(plot: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str |
         str(plot.get("x_label", names[0])),
         str(plot.get("y_label", names[1])),
         _sorted(groups),
+        numbers,
     )
 
 
-def _histogram(plot: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str | None:
+def _histogram(
+    plot: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], numbers: Mapping[str, int]
+) -> str | None:
     groups: dict[str, list[float]] = {}
+    beyond: dict[str, int] = {}
+    most = float(plot.get("most", math.inf))
     for row in rows:
-        value = _number(row.get(str(plot["x"])))
-        if not math.isnan(value) and value <= float(plot.get("most", math.inf)):
-            groups.setdefault(_group(plot, row), []).append(value)
+        value, name = _number(row.get(str(plot["x"]))), _group(plot, row)
+        if math.isnan(value):
+            continue
+        shown = groups.setdefault(name, [])
+        if value <= most:
+            shown.append(value)
+        else:
+            beyond[name] = beyond.get(name, 0) + 1
     if not groups:
         return None
     least = float(plot["least"]) if "least" in plot else None
@@ -74,6 +103,8 @@ def _histogram(plot: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> st
         str(plot.get("x_label", plot["x"])),
         _sorted(groups),
         least=least,
+        numbers=numbers,
+        beyond={name: f" ({n} beyond {most:g})" for name, n in beyond.items()},
     )
 
 

@@ -278,7 +278,7 @@ def _primitive_task(name: str, t: Table) -> PrimitiveTask:
         specification=t.text("specification", ""),
         alternatives=t.texts("alternatives"),
         deadline=t.number("deadline"),
-        target_reliability=t.number("target_reliability", 0.9),
+        target_reliability=t.maybe_number("target_reliability"),
         cost=t.text("cost", "wall"),
         error_causes=_texts(t.table("error_causes")),
         start=t.word("start", Start, Start.WHEN_FREE),

@@ -151,6 +151,9 @@ class Directory:
     """Parameter files that the cell's programs share, by name; paths relative to this file."""
     dry_run: bool = False
     """Whether all drives stay off. Programs of a dry run and others refuse each other."""
+    installation: str = ""
+    """Name of this cell, if there are several alike: what was learned in one is not pooled with
+    what was learned in another."""
 
     @property
     def text(self) -> str:
@@ -290,6 +293,7 @@ def parse(text: str, source: Path) -> Directory:
         ),
         parameters=dict(tables["parameters"]),
         dry_run=digest.startswith(directory_file.DRY),
+        installation=str(tables["installation"]["name"]),
     )
 
 

@@ -148,7 +148,8 @@ CHANNELS = ("call", "can", "serial", "image", "stream", "control")
 KEYS = ("file", "certificates", "also")
 COORDINATOR_PORT = 7299
 """Port of the coordinator unless `[coordinator]` sets another."""
-TOP = ("schema", "dry_run", COORDINATOR, *SHAPES, *FLAT)
+INSTALLATION = "installation"
+TOP = ("schema", "dry_run", INSTALLATION, COORDINATOR, *SHAPES, *FLAT)
 DRY = "dry run of "
 """How the hash of a file with `dry_run = true` begins: in its messages one sees why hashes
 differ."""
@@ -200,6 +201,7 @@ def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
     _check_top(data, faults)
     tables: Tables = {name: data.get(name, {}) for name in (*SHAPES, *FLAT)}
     tables[COORDINATOR] = _coordinator(data, faults)
+    tables[INSTALLATION] = {"name": data.get(INSTALLATION, "")}
     for name in (*SHAPES, *FLAT):
         if not isinstance(tables[name], dict):
             faults.add(name, f"is not a table; write [{name}]")
@@ -263,6 +265,10 @@ def _check_top(data: Mapping[str, Any], faults: Faults) -> None:
     for name in data:
         if name not in TOP:
             faults.add(name, f"unknown table{nearest(name, TOP)}")
+    if not isinstance(data.get(INSTALLATION, ""), str):
+        faults.add(
+            INSTALLATION, f'is {data[INSTALLATION]!r}; write the cell\'s name, such as "cell 2"'
+        )
     schema = data.get("schema")
     if schema != SCHEMA:
         known = "is missing" if schema is None else f"is {schema!r}"

@@ -356,12 +356,15 @@ def test_an_action_that_cannot_be_loaded_is_bad_input(conduct: Conduct, tmp_path
 
 def test_j_uses_the_given_target_and_rho(conduct: Conduct) -> None:
     """Without them it uses the target of the task file: the cost is that of the hardest regime that
-    still reaches it."""
+    still reaches it. A target that nobody declared rules nothing."""
     campaign = conduct("a", selector="round_robin", runs=240)
-    task, plan = campaign.bench.task, campaign.plan
-    assert (
-        campaign.result()["judged"]["look"]["target"] == 0.9
-    )  # A declared target, even if only by default.
+    undeclared, plan = campaign.bench.task, campaign.plan
+    result = campaign.result()
+    assert result["judged"]["look"]["target"] is None
+    assert all(j is not None for j in result["J"]["look"].values())
+    assert all(low < high for low, high in result["J_interval"]["look"].values())
+    look = replace(undeclared.primitive_tasks["look"], target_reliability=0.9)
+    task = replace(undeclared, primitive_tasks={**undeclared.primitive_tasks, "look": look})
     sets = []
     for options in ({}, {"target": 0.3}, {"target": 0.6}, {"target": 0.99}, {"rho": 0.25}):
         summary = Summary.of(task, campaign.table.rows(), options=options)
@@ -455,7 +458,7 @@ def test_a_count_is_a_cost_in_campaigns_and_runs_alike(
     assert main([*told, "--runs", "6", "--learn", "run.db", "--selector", "round_robin"]) == 0
     for path in (Path("run.db"), Path(result["estimates"])):
         kept = EstimatesFile(path).read()
-        assert kept.question("look") == Question("count", 0.9)
+        assert kept.question("look") == Question("count")
         for action, by_context in kept.estimates.of("look").items():
             assert {tally.cost("count").mean for tally in by_context.values()} == {counted[action]}
     learner = (
