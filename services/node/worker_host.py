@@ -1,10 +1,11 @@
-"""Where the runs of one device (or runs of none) take place in real time: in processes of their
-own, watched by the node.
+"""The host of runs in real time: the processes of one device, or one process for actions without a
+device, watched by the node.
 
-A device without cyclic duty has one process, which owns its driver and runs its actions. A cyclic
-device has two: its driver's, and its actions'. A run that hangs is ended at its deadline (stop
-routine first, then its process is killed), one whose process died ends ERROR with executed =
-unknown; a dead process is started again, at once and then with a growing pause.
+A device whose driver is not cyclic has one process, with its driver and its actions. A cyclic
+device has two: one for its driver and one for its actions. A run that hangs is ended at its
+deadline: first the stop routine, then its process is killed. A run whose process died ends in ERROR
+with executed = unknown. A process that died is started again, at first at once, then after growing
+pauses.
 """
 
 from __future__ import annotations
@@ -53,37 +54,37 @@ from petrobot.services.worker.runner import GRACE, STOP_LIMIT, Order
 _log = logging.getLogger(__name__)
 
 SILENT = 0.1
-"""Seconds without an answer after which a worker counts as hanging, so that its device is stopped
-without it."""
+"""Time without an answer after which a worker counts as blocked, and its device is stopped without
+it (s)."""
 MARGIN = 0.5
-"""Seconds beyond grace and stop limit after which a worker that answers but does not end a run is
-killed all the same."""
+"""Time beyond grace and stop limit after which a worker is killed that answers but does not end a
+run (s)."""
 PAUSES = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-"""Seconds before a dead process is started again, by how often it died soon after its start without
-ending a run."""
+"""Pause before a process that died is started again (s), by how often it died soon after its start
+without ending a run."""
 STABLE = 10.0
-"""Seconds after which a process counts as well started."""
+"""Time after which a process counts as started (s): if it dies later, the pauses begin again."""
 START_LIMIT = 30.0
-"""Seconds that a process has to become ready; then it is killed and started again."""
+"""Time in which a process must become ready (s); after that it is killed and started again."""
 NOT_READY = 10.0
-"""Seconds that a call waits for a process that could not be started; for one that is being started
-it waits `START_LIMIT`."""
+"""How long a call waits for a process that could not be started (s). For one that is starting it
+waits `START_LIMIT`."""
 DRIVER_GONE = 0.25
-"""Seconds before actions that have lost the link to their driver are started again: it has most
-likely died itself."""
+"""Pause before actions that lost the link to their driver are started again (s): most likely the
+driver has died, too."""
 PATIENCE = 0.005
-"""Seconds without the end of a run after which the calls that wait behind it in its process are
-taken back: it may take long. Also the longest that a call is expected to wait there."""
+"""Duration of a run after which the calls behind it in its process are taken back (s), because it
+may take long. Also the longest expected wait of a call that is put behind others."""
 HAND_OVER = 0.0001
-"""Seconds that a worker needs for a run beside the action itself, about."""
+"""What a worker needs for a run beside the action itself, roughly (s)."""
 DONE = {"hold": "held", "release": "released", CLEAR_EMERGENCY: "cleared", PICTURE: PICTURE}
-"""What actions without a device answer to a command when no process of theirs has anything to do;
-`stopped` to all others."""
+"""Answers to a command for actions without a device while none of them runs; to any other command
+the answer is `stopped`."""
 DRIVER_DIED = "the process of its device's driver died"
 
 
 class HostStage(Enum):
-    """Which processes of a place there are, and what they wait for."""
+    """Which processes of a host there are, and what they wait for."""
 
     DOWN = "none runs; the first is started when its pause is over"
     DRIVER_STARTS = "the process with the device's driver was started and is not ready"
@@ -96,7 +97,7 @@ class HostStage(Enum):
 
 
 class Happening(Enum):
-    """What moves a place from one stage to the next."""
+    """What moves a host from one stage to the next."""
 
     START_DRIVER = "a process for the device's driver was started"
     START_ACTIONS = "a process for actions alone was started"
@@ -122,24 +123,23 @@ NEXT: Mapping[tuple[HostStage, Happening], HostStage] = {
     (HostStage.READY, Happening.ALL_ENDED): HostStage.DOWN,
     **{(stage, Happening.CLOSE): HostStage.CLOSED for stage in HostStage},
 }
-"""Every move. What is not in the table happens only out of turn (a second READY) and moves
-nothing."""
+"""All transitions between stages. Anything else (a second READY) is ignored."""
 
 STARTING = (HostStage.DRIVER_STARTS, HostStage.ACTIONS_START)
 
 
 @dataclass(slots=True)
-class _Given:
-    """A call in the hands of a worker. Its deadline is watched by the node's `Callee`."""
+class _HostedCall:
+    """A call that the host has. The node's `Callee` watches its deadline."""
 
     call: Call
     taken: float
     posted: float | None = None
     """When it was written to the worker's pipe (s); None while it waits for a worker."""
     number: int = 0
-    """Number of the call among those that this worker was given, from 1."""
+    """Number of the call among those that were sent to this worker, from 1."""
     cause: str = ""
-    """Why it was stopped, and a text; empty if it was not."""
+    """Cause and text of its stop; empty if it was not stopped."""
     text: str = ""
     stopped_at: float = math.inf
     pong: bool = False
@@ -152,18 +152,18 @@ Spawn = Callable[[Setup, Callable[[Child, list[Item]], None], Callable[[Child], 
 
 @dataclass(frozen=True, slots=True)
 class Hosting:
-    """What a node gives to a host of runs: a `WorkerHost`, or a `WorkerPool` of them."""
+    """What a node gives to a `WorkerHost` or to a `WorkerPool` of them."""
 
     setup: Setup
     clock: Callable[[], float]
     """The node's monotonic clock (s)."""
     changed: Callable[[bool], None]
-    """Called when a process has sent something or has ended. True: only results of its runs came,
-    so nothing else about it has changed."""
+    """Called when a process sent something or ended. The argument is True if only results of runs
+    arrived, so that nothing else can have changed."""
     wanted: Callable[[str], None]
-    """Called with the name of a stream whose receiver's address an action wants."""
+    """Called with the name of a stream if an action needs its receiver's address."""
     spawn: Spawn = Child
-    """Starts a process; tests start none."""
+    """Starts a process; replaced in tests."""
 
 
 class WorkerHost:
@@ -182,42 +182,41 @@ class WorkerHost:
         self._worker: Child | None = None
         """Process of the actions: the owner itself, unless the driver is cyclic."""
         self.streams: Mapping[str, int] = {}
-        """Port at which each stream is received."""
+        """TCP port of each stream that is received here."""
         self.failed = ""
         """Why a process could not be started, empty if it could."""
         self._died = ""
-        """How the last process ended; empty once the place is ready again."""
-        self._runs: dict[str, _Given] = {}
+        """How the last process ended; empty when the host is ready again."""
+        self._runs: dict[str, _HostedCall] = {}
         self._lost: list[Outcome] = []
-        """Ends that are told when the device is known to stand still."""
+        """Outcomes that are reported when the device is known to stand still."""
         self._halt_due: float | None = None
         self._halts = 0
         self._pings = 0
         self._given = 0
-        """How many runs the worker was given, without those that were taken back."""
+        """How many calls were sent to the worker, without those that were taken back."""
         self._withdrawn: set[str] = set()
-        """Runs that were taken back, until the worker says that it has seen that: before, it could
-        take the permit of another call for one of them."""
+        """Calls that were taken back and that the worker has not yet dropped: until then it might
+        begin one of them with the permit of another call."""
         self._withdrawn_at = -math.inf
         self._behind = False
-        """Whether calls may wait in its process behind another one."""
+        """Whether calls may wait in its process behind another call."""
         self._progress = -math.inf
-        """When its worker has last got something to do, or ended a run (s)."""
+        """When its worker last became busy or ended a run (s)."""
         self._pace = HAND_OVER
-        """Seconds that a run keeps its worker, on average of the last ones."""
+        """How long a run occupies its worker: moving average (s)."""
         self._commands: dict[str, str] = {}
         """Verb of each command that a process has not answered."""
         self._frozen = False
-        """Whether the operator holds its runs."""
+        """Whether its runs are held by the operator."""
         self._reports: list[Report] = []
         self._deaths = 0
         self._started = -math.inf
         self._restart_at: float | None = None
         self._retiring: Child | None = None
-        """A process that was told to leave for lack of memory."""
+        """A process that was ordered to exit because it ran out of memory."""
         self._emergency = False
-        """Whether the device obeys nobody until that is cleared: its next process, too, is told at
-        once."""
+        """Whether the device is in emergency stop; its next process is told so at its start."""
 
     # --- processes ----------------------------------------------------------------------------
 
@@ -228,7 +227,7 @@ class WorkerHost:
 
     @property
     def ready(self) -> bool:
-        """Whether a run would be taken at once: its processes are up, and none of them is known to
+        """Whether a run would start at once: its processes are up, and none of them is about to
         end."""
         return (
             self._stage is HostStage.READY
@@ -246,8 +245,8 @@ class WorkerHost:
 
     @property
     def condition(self) -> tuple[str, str]:
-        """`up` if a run would be taken, else `starting`, `restarting` or `failed`; and why, empty
-        for the first two."""
+        """`up` if a run would start at once, otherwise `starting`, `restarting` or `failed`; and
+        the reason, empty for the first two."""
         if self.ready:
             return "up", ""
         if self.failed:
@@ -258,23 +257,23 @@ class WorkerHost:
 
     @property
     def runs(self) -> tuple[str, ...]:
-        """Ids of the runs that it has taken and that have not ended."""
+        """Ids of the runs that have not ended."""
         return (*self._runs, *(end.id for end in self._lost))
 
     @property
     def busy(self) -> bool:
-        """Whether it has taken a run that has not ended."""
+        """Whether it has a run that has not ended."""
         return bool(self._runs or self._lost)
 
     def wait_of_next(self, now: float) -> float:
-        """For how long a call that it was given now would wait there for others, as far as its last
-        runs tell (s); infinite if it should not be given any."""
+        """Return how long a call would wait here for others, estimated from the last runs (s);
+        infinite if it should not be given a call."""
         if not self.ready or (self._runs and now >= self._progress + PATIENCE):
             return math.inf
         return len(self._runs) * self._pace
 
     def pids(self) -> dict[str, int]:
-        """Process ids: `actions`, and `driver` when that has a process of its own."""
+        """Return the process ids: `actions`, and `driver` if that has a process of its own."""
         found = {}
         if self._worker is not None:
             found["actions"] = self._worker.pid
@@ -288,7 +287,7 @@ class WorkerHost:
             self._start_due()
 
     def _start_due(self) -> None:
-        """Start the process that is missing in this stage."""
+        """Start the process that this stage lacks."""
         self._started, self._restart_at = self._clock(), None
         try:
             if self._setup.device and self._stage is HostStage.DOWN:
@@ -309,7 +308,7 @@ class WorkerHost:
         self._worker = self._spawn(self._setup, self._heard, self._ended, link)
 
     def _move(self, happening: Happening) -> bool:
-        """Go to the next stage. False if this comes out of turn, and moves nothing."""
+        """Go to the next stage. Return False if there is no such transition."""
         stage = NEXT.get((self._stage, happening))
         if stage is None:
             return False
@@ -317,7 +316,7 @@ class WorkerHost:
         return True
 
     def _heard(self, child: Child, received: list[Item]) -> None:
-        """Take what a process has sent; the last words of a former process do not count."""
+        """Handle what a process sent. Items of a former process are ignored."""
         plain_ends = True
         for item in received:
             if type(item) is not Outcome or item.cause == OUT_OF_MEMORY:
@@ -340,7 +339,7 @@ class WorkerHost:
         if items[0] == READY:
             self._take_ready(child, items[1])
         elif items[0] == FAILED:
-            # It is about to end: what is ordered now waits for its successor.
+            # It is about to end: new orders wait for the next process.
             self.failed = str(items[1])
         elif items[0] == WANTED:
             self._wanted(items[1])
@@ -387,7 +386,7 @@ class WorkerHost:
                 self._post_call(now, run)
 
     def _ended(self, child: Child) -> None:
-        """A process has ended. That of a former one is no news."""
+        """Handle the end of a process, unless it is a former one."""
         if child is self._owner:
             self._all_ended(child)
         elif child is self._worker:
@@ -398,8 +397,8 @@ class WorkerHost:
         self._changed(False)
 
     def _actions_ended(self, child: Child) -> None:
-        """The actions of a cyclic device: its driver is stopped, and what was lost is told when it
-        stands."""
+        """Handle the end of a cyclic device's actions: stop its driver, and report the lost runs
+        when the device stands still."""
         assert self._owner is not None
         self._worker = None
         self._died = f"the process of its actions died: {child.describe()}"
@@ -413,7 +412,7 @@ class WorkerHost:
             self._tell_lost("")
 
     def _all_ended(self, child: Child) -> None:
-        """The process with the driver, or the only one: nothing of this place runs any more."""
+        """Handle the end of the driver's process, or of the only one: nothing of this host runs."""
         why, worker, was_ready = (
             self.failed or child.describe(),
             self._worker,
@@ -438,14 +437,14 @@ class WorkerHost:
             self._plan_restart(child)
 
     def _plan_restart(self, child: Child | None = None) -> None:
-        """Start again what has ended, or could not be started: the later, the more often that has
-        happened of late."""
+        """Plan the restart of what ended or could not be started. The pause grows with the number
+        of recent deaths."""
         now = self._clock()
         if child is not None and child is self._retiring:
             self._retiring = None
         elif (
             child is None or child.code != LINK_LOST
-        ):  # one that has lost its driver dies of that one's death
+        ):  # a process that lost its driver does not count: the driver died
             self._deaths = 0 if now - self._started > STABLE else self._deaths + 1
         pause = PAUSES[min(self._deaths, len(PAUSES)) - 1] if self._deaths else 0.0
         if child is not None and child.code == LINK_LOST:
@@ -459,7 +458,7 @@ class WorkerHost:
     def _take_end(self, end: Outcome) -> None:
         if self._runs.pop(end.id, None) is None:
             return
-        self._deaths = 0  # the process has done what it is there for
+        self._deaths = 0  # the process works
         self._reports.append(end)
         self._progress = self._clock()
         self._pace += (end.seconds + HAND_OVER - self._pace) / 4
@@ -467,19 +466,19 @@ class WorkerHost:
             self.withdraw()
         alone = all(run.posted is None for run in self._runs.values())
         if end.cause == OUT_OF_MEMORY and alone and self._worker is not None:
-            # What the run has kept would fail the next one, which may need little.
+            # The memory that the run still holds would fail the next run, which may need little.
             self._retiring = self._worker
             self._worker.leave()
         self._release_if_over()
 
     def _end(self, id_: str, cause: str, text: str) -> None:
-        """A run that no process was told of ends."""
+        """End a run that was not sent to a process."""
         del self._runs[id_]
         self._reports.append(Outcome(id_, Status.ERROR, {}, cause, text, Executed.NO))
         self._release_if_over()
 
     def withdraw(self) -> None:
-        """Take back the calls that its process has not begun: they wait again."""
+        """Take back the calls that its process has not begun; they wait again."""
         self._behind = False
         if self._worker is None or not (count := self._worker.take_back()):
             return
@@ -490,16 +489,16 @@ class WorkerHost:
                 self._withdrawn.add(id_)
                 self._wait_again(id_, run)
 
-    def _wait_again(self, id_: str, run: _Given) -> None:
-        """Its process will not begin this run: let it wait, or end as it was stopped."""
+    def _wait_again(self, id_: str, run: _HostedCall) -> None:
+        """Let a run wait that its process will not begin, or end it if it was stopped."""
         run.posted = None
         if run.cause:
             text = f"{run.text}; its process had not begun it".lstrip("; ")
             self._end(id_, run.cause, text)
 
     def _take_dropped(self, ids: Iterable[str]) -> None:
-        """Its process will not begin these runs: they were taken back, or would have to wait for
-        another run."""
+        """Handle runs that its process will not begin: they were taken back, or would have to wait
+        there for another run."""
         for id_ in ids:
             if id_ in self._withdrawn:
                 self._withdrawn.discard(id_)
@@ -512,7 +511,7 @@ class WorkerHost:
                     self._post_call(self._clock(), run)
 
     def hand_over(self) -> list[Call]:
-        """Return the calls that a process here was given and did not begin: another host may take
+        """Remove and return the calls that a process here did not begin: another host may take
         them."""
         calls = [run.call for run in self._runs.values() if run.number and run.posted is None]
         for call in calls:
@@ -520,9 +519,8 @@ class WorkerHost:
         return calls
 
     def _lose_runs(self, cause: str, text: str, worker: Child | None) -> None:
-        """The process of the runs is gone: each that it had begun ends, with what is known of it.
-        What it had not begun by then nobody has executed: it waits for the next process, or ends as
-        it was stopped."""
+        """End the runs that a process had begun when it ended. Those that it had not begun were
+        never executed: they wait for the next process, or end if they were stopped."""
         begun = self._given - (worker.take_back() if worker is not None else 0)
         self._withdrawn.clear()
         for id_, run in list(self._runs.items()):
@@ -535,7 +533,7 @@ class WorkerHost:
             took = self._clock() - run.posted
             if run.killed:
                 how = (
-                    "it did not let go"
+                    "it ignored the order to stop"
                     if run.pong
                     else "it blocked its process, which answered nothing"
                 )
@@ -559,7 +557,7 @@ class WorkerHost:
     def take(self, now: float, order: Order) -> None:
         """Take an order about a run."""
         if isinstance(order, Call):
-            self._runs[order.id] = run = _Given(order, now)
+            self._runs[order.id] = run = _HostedCall(order, now)
             if self.ready:
                 self._post_call(now, run)
         elif isinstance(order, Cancel):
@@ -568,7 +566,7 @@ class WorkerHost:
         elif self._worker is not None:
             self._worker.post(order)
 
-    def _post_call(self, now: float, run: _Given) -> None:
+    def _post_call(self, now: float, run: _HostedCall) -> None:
         assert self._worker is not None
         self._given += 1
         run.posted, run.number = now, self._given
@@ -578,7 +576,7 @@ class WorkerHost:
             self._behind = not self._setup.device
         self._worker.give(run.call)
 
-    def _stop(self, now: float, run: _Given, cancel: Cancel) -> None:
+    def _stop(self, now: float, run: _HostedCall, cancel: Cancel) -> None:
         if run.cause:
             return
         if not self._setup.device:
@@ -599,10 +597,10 @@ class WorkerHost:
         return bool(self._reports)
 
     idle = False
-    """Its processes may say something at any time."""
+    """Its processes may send something at any time."""
 
     def advance(self, now: float) -> None:
-        """Start again what died, and kill what hangs."""
+        """Restart what died, and kill what hangs."""
         if self._restart_at is not None and now >= self._restart_at:
             self._start_due()
         if self._stage in STARTING and now >= self._started + START_LIMIT:
@@ -612,7 +610,7 @@ class WorkerHost:
         if now >= self._patience_ends():
             self.withdraw()
         if now >= self._unseen_limit() and self._worker is not None:
-            self._withdrawn_at = now  # once more, should even the kill come to nothing
+            self._withdrawn_at = now  # try again later if the kill has no effect
             self._worker.kill("it did not read its calls, and was killed")
         for id_, run in list(self._runs.items()):
             if run.posted is None and now >= self._wait_limit(run):
@@ -622,29 +620,29 @@ class WorkerHost:
                 self._chase(now, run)
 
     def _patience_ends(self) -> float:
-        """When calls that wait in its process are taken back (s)."""
+        """Return when the calls that wait in its process are taken back (s)."""
         return self._progress + PATIENCE if self._behind else math.inf
 
     def _unseen_limit(self) -> float:
-        """When a worker without a run must have seen that calls were taken back: it is frozen if it
-        has not (s)."""
+        """Return when a worker without a run must have dropped the calls that were taken back (s);
+        after that it counts as frozen."""
         if not self._withdrawn or any(run.posted is not None for run in self._runs.values()):
             return math.inf
         return max(self._withdrawn_at, self._progress) + GRACE + MARGIN
 
-    def _wait_limit(self, run: _Given) -> float:
-        """Until when a run waits for its process."""
+    def _wait_limit(self, run: _HostedCall) -> float:
+        """Return until when a run waits for its process (s)."""
         return run.taken + (NOT_READY if self.failed else START_LIMIT)
 
     def _give_start_up(self, now: float) -> None:
         child = self._owner if self._stage is HostStage.DRIVER_STARTS else self._worker
-        self._started = now  # once more, should even the kill come to nothing
+        self._started = now  # try again later if the kill has no effect
         if child is not None:
             _log.warning("%s: not ready after %g s: killed", self._name(), START_LIMIT)
             child.kill(f"it was not ready after {START_LIMIT:g} s, and was killed")
 
-    def _chase(self, now: float, run: _Given) -> None:
-        """A stopped run that does not end: stop its device without it, then kill its process."""
+    def _chase(self, now: float, run: _HostedCall) -> None:
+        """Enforce the end of a stopped run: stop its device without it, then kill its process."""
         since = now - run.stopped_at
         if since >= SILENT and not run.pong and not run.halted:
             run.halted = True
@@ -675,7 +673,7 @@ class WorkerHost:
                 soonest = due
         return soonest if soonest < math.inf else None
 
-    def _due_of(self, run: _Given) -> float:
+    def _due_of(self, run: _HostedCall) -> float:
         if run.posted is None:
             return self._wait_limit(run)
         if not run.cause or run.killed:
@@ -696,7 +694,7 @@ class WorkerHost:
             self._refuse(command.id, verb)
         else:
             self._commands[command.id] = verb
-            target.post(command)  # first: the device waits for nobody
+            target.post(command)  # before anything else: the device must not wait
         if verb in ("stop", EMERGENCY_STOP):
             for run_id, run in list(self._runs.items()):
                 self._stop(now, run, Cancel(run_id, stopped_by(verb)))
@@ -706,14 +704,15 @@ class WorkerHost:
             self._freeze(True)  # it holds as soon as it is ready, before its runs begin
 
     def _commanded(self) -> Child | None:
-        """The process that carries out commands: the ready driver's, else the worker's."""
+        """Return the process that carries out commands: that of the driver if it is ready,
+        otherwise the worker."""
         if self._stage in (HostStage.DOWN, HostStage.DRIVER_STARTS, HostStage.CLOSED):
             return None
         found = self._owner or (self._worker if self._stage is HostStage.READY else None)
         return found if found is not None and not found.closed else None
 
     def _refuse(self, id_: str, verb: str) -> None:
-        """No process can answer a command."""
+        """Answer a command that no process can answer."""
         word, why = self.condition
         done = "not ready" if self._setup.device else DONE.get(verb, "stopped")
         answer = word if verb == "status" else done
@@ -721,7 +720,7 @@ class WorkerHost:
         self._reports.append(answer_of(id_, answer, data))
 
     def _answer_commands(self) -> None:
-        """The process that was to answer them has ended."""
+        """Answer the commands of a process that has ended."""
         commands, self._commands = self._commands, {}
         for id_, verb in commands.items():
             self._refuse(id_, verb)
@@ -733,8 +732,8 @@ class WorkerHost:
             self._worker.post(HOLD if frozen else RELEASE)
 
     def _release_if_over(self) -> None:
-        """The last of the held runs has ended, its device was stopped: the next one must not find
-        it held."""
+        """Release the device when the last held run has ended: the next run must not find it
+        held."""
         if self._runs or not self._frozen:
             return
         self._freeze(False)
@@ -742,7 +741,7 @@ class WorkerHost:
             self._owner.post(RELEASE)
 
     def _answered(self, answer: Answer) -> None:
-        """A process has answered a command."""
+        """Handle a process's answer to a command."""
         word, data = str(answer.data["answer"]), dict(answer.data)
         if answer.id.startswith(HALT):
             # Not the answer to an earlier order.
@@ -763,17 +762,17 @@ class WorkerHost:
         self._reports.append(answer_of(answer.id, word, {**data, "answer": word}))
 
     def stream_at(self, stream: str, host: str, port: int, ticket: str) -> None:
-        """Tell the actions where a stream is received."""
+        """Tell the actions the address of a stream's receiver."""
         if self._worker is not None:
             self._worker.post([STREAM_AT, stream, host, port, ticket])
 
     def reports(self) -> list[Report]:
-        """What happened since the last call, in order."""
+        """Return what happened since the last call, in order."""
         reports, self._reports = self._reports, []
         return reports
 
     def close(self, now: float) -> None:
-        """Let the processes end in good order."""
+        """Let the processes end by themselves."""
         self._move(Happening.CLOSE)
         self.withdraw()
         self._restart_at = None
@@ -781,13 +780,13 @@ class WorkerHost:
             child.leave()
 
     def children(self) -> list[Child]:
-        """Its processes."""
+        """Return its processes."""
         found = [self._owner, self._worker if self._worker is not self._owner else None]
         return [child for child in found if child is not None]
 
 
 def _cause_of(child: Child) -> tuple[str, str]:
-    """Cause and text of the runs of a process that has ended by itself."""
+    """Return cause and text for the runs of a process that ended by itself."""
     if child.code == LINK_LOST:
         return "device_died", DRIVER_DIED
     if child.code == NO_MEMORY:

@@ -1,9 +1,9 @@
-"""The runs of a node's actions that use no device: each has a worker process of its own while it
-runs.
+"""The host of a node's actions that use no device: a pool of worker processes, in which each run
+has a process to itself.
 
-So an action that blocks, crashes or takes all its memory ends no other run. Workers are started as
-they are needed, with one more that waits for the next run, since a process takes its time to start.
-Those that nobody has needed for a while retire.
+So an action that blocks, crashes or uses up its memory ends no other run. Workers are started on
+demand, and one more waits for the next run, because a process takes time to start. Workers that are
+idle for long exit.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from petrobot.services.worker.remote import EMERGENCY_STOP
 from petrobot.services.worker.runner import Order
 
 KEPT = 2
-"""Idle workers that stay however long nothing is to be done."""
+"""Number of idle workers that always stay."""
 BUSY_AFTER = 0.5
-"""Seconds for which a call waits when there are as many workers as there may be, and all are busy:
-most runs end sooner."""
+"""How long a call waits when all workers are busy and no more may be started (s): most runs end
+sooner."""
 STARTS = max(KEPT, os.cpu_count() or KEPT)
-"""Workers that are started at once. More would only take each other's time, and that of the runs
-that are active."""
+"""Most workers that start at the same time. More would only slow down each other and the active
+runs."""
 IDLE_LIMIT = 30.0
-"""Seconds after which an idle worker beyond these retires."""
+"""Time after which any further idle worker exits (s)."""
 
 
 @dataclass
@@ -55,7 +55,7 @@ class WorkerPool:
     """Implements `inline_host.Host` for actions without a device, with one `WorkerHost` for each
     worker.
 
-    `most` is how many workers there may be; a run that finds none of them free within
+    `most` is the largest number of workers. A run that finds none of them free within
     `BUSY_AFTER` is refused: `busy`, executed = no.
     """
 
@@ -63,23 +63,23 @@ class WorkerPool:
         self._hosting = hosting
         self._most = most
         self._workers: dict[int, WorkerHost] = {}
-        """By number from 1, the lowest first: a node that has little to do uses the same ones again
-        and again."""
+        """By number from 1. The lowest are used first, so a node with little to do always uses the
+        same ones."""
         self._leaving: list[WorkerHost] = []
         self._idle_since: dict[int, float] = {}
         self._touched: set[int] = set()
-        """Those to which something has happened since the last step. The others need no look before
-        they are due: a step must not take longer the more workers there are."""
+        """Workers that changed since the last step. The others are left alone until they are due,
+        so that a step does not take longer the more workers there are."""
         self._due: dict[int, float] = {}
         self._soonest = math.inf
         self._streams: dict[str, set[int]] = {}
-        """Those that want to know where a stream is received."""
+        """By stream: workers that need its receiver's address."""
         self._commands: dict[str, _Gathered] = {}
         self._waiting: dict[str, tuple[float, Call]] = {}
-        """Calls that no worker could take, and until when they wait for one (s)."""
+        """Calls that wait for a worker, and until when (s)."""
         self._held = False
         self._queued = False
-        """Whether a call was put behind another one since `due` was last asked for."""
+        """Whether a call was put behind another one since the last call of `due`."""
         self._reports: list[Report] = []
         self.streams: Mapping[str, int] = {}
         """Actions without a device receive no stream."""
@@ -93,15 +93,15 @@ class WorkerPool:
 
     @property
     def failed(self) -> str:
-        """Why a worker could not be started, empty if one is up or none has failed."""
+        """Why a worker could not be started; empty if one is up or none failed."""
         return (
             "" if self.ready else next((w.failed for w in self._workers.values() if w.failed), "")
         )
 
     @property
     def condition(self) -> tuple[str, str]:
-        """`up` if a run would be taken, else `busy`, `starting`, `restarting` or `failed`; and
-        why."""
+        """`up` if a run would start at once, otherwise `busy`, `starting`, `restarting` or
+        `failed`; and the reason."""
         if self._idle() or len(self._workers) < self._most:
             return (
                 ("up", "")
@@ -114,7 +114,7 @@ class WorkerPool:
         return f"all {self._most} workers run an action; see `workers` of the node in services.toml"
 
     def pids(self) -> dict[str, int]:
-        """Process ids: `actions` of the first worker, `actions 2` of the second, ..."""
+        """Return the process ids: `actions` of the first worker, `actions 2` of the second, ..."""
         found = {}
         for number, worker in sorted(self._workers.items()):
             for name, process in worker.pids().items():
@@ -145,8 +145,8 @@ class WorkerPool:
         self._hosting.changed(plain_ends and not self._waiting)
 
     def _idle(self) -> list[int]:
-        """Workers without a run, the best first: ready ones, then those that start, then those that
-        wait to be started again."""
+        """Return the workers without a run: first the ready ones, then those that are starting,
+        then those that wait for a restart."""
         idle = [number for number, worker in self._workers.items() if not worker.busy]
         return sorted(idle, key=lambda number: (self._rank(number), number))
 
@@ -155,7 +155,7 @@ class WorkerPool:
         return 0 if worker.ready else 1 if worker.stage is HostStage.ACTIONS_START else 2
 
     def children(self) -> list[Child]:
-        """Its processes, those included that were told to leave."""
+        """Return its processes, including those that were ordered to exit."""
         return [
             child
             for worker in (*self._workers.values(), *self._leaving)
@@ -179,7 +179,7 @@ class WorkerPool:
                     worker.take(now, order)
 
     def _starting(self) -> int:
-        """How many workers are being started: the calls that wait may have them."""
+        """Return how many workers are starting: waiting calls may use them."""
         return sum(w.stage is HostStage.ACTIONS_START for w in self._workers.values())
 
     def _may_add(self) -> bool:
@@ -205,15 +205,16 @@ class WorkerPool:
 
     @property
     def runs(self) -> list[str]:
-        """Ids of the runs that it has taken and that have not ended."""
+        """Ids of the runs that have not ended."""
         return [*self._waiting, *(run for one in self._workers.values() for run in one.runs)]
 
     def _choose(self, now: float) -> int | None:
-        """Number of the worker for the next run, started if need be; None at the limit.
+        """Return the number of the worker for the next run, which is started if necessary; None at
+        the limit.
 
         While runs are short, a call waits a moment behind others in one of the first workers: a
-        process that is awake takes many calls with one read, and its caches are warm. As soon as a
-        run takes longer, the calls behind it are taken back, and others run them.
+        process that is awake reads many calls at once, and its caches are warm. As soon as a run
+        takes longer, the calls behind it are taken back and given to other workers.
         """
         best, shortest, found = 0, math.inf, 0
         for number, worker in self._workers.items():
@@ -227,22 +228,22 @@ class WorkerPool:
             self._queued |= shortest > 0.0
             return best
         idle = self._idle()
-        # One that waits to be started again is the last choice: it may have to wait long.
+        # A worker that waits for a restart is the last choice: that may take long.
         if (not idle or self._rank(idle[0]) == 2) and self._may_add():
             return self._add()
         return idle[0] if idle else None
 
     @property
     def news(self) -> bool:
-        """Whether it needs a step before a process says anything: a run is refused, or calls wait
+        """Whether it needs a step before a process sends anything: a run was refused, or calls wait
         behind others."""
         return bool(self._reports) or self._queued
 
     idle = False
-    """Its processes may say something at any time."""
+    """Its processes may send something at any time."""
 
     def advance(self, now: float) -> None:
-        """Do all that is due, and let those go that are needed no more."""
+        """Do all that is due, and close workers that are not needed any more."""
         if now >= self._soonest:
             self._touched.update(number for number, due in self._due.items() if now >= due)
         for number in tuple(self._touched):
@@ -262,8 +263,7 @@ class WorkerPool:
             self._retire(now)
 
     def _retire(self, now: float) -> None:
-        """Of idle workers only the lowest numbers stay; the others leave when they have been idle
-        for long."""
+        """Close workers that have been idle for long; the `KEPT` lowest idle ones stay."""
         before = self._idle_since
         spare = sorted(number for number, worker in self._workers.items() if not worker.busy)[KEPT:]
         self._idle_since = {number: before.get(number, now) for number in spare}
@@ -299,7 +299,7 @@ class WorkerPool:
         self._due[number] = min(retires, math.inf if due is None else due)
 
     def reports(self) -> list[Report]:
-        """What happened since the last call, in order."""
+        """Return what happened since the last call, in order."""
         if self._touched:
             self._gather_reports()
         reports, self._reports = self._reports, []
@@ -326,8 +326,8 @@ class WorkerPool:
         self._hosting.wanted(stream)
 
     def stream_at(self, stream: str, host: str, port: int, ticket: str) -> None:
-        """Tell the workers that have asked where a stream is received: another one would take the
-        stream over."""
+        """Tell the address of a stream's receiver to the workers that asked: any other would take
+        the stream over."""
         for number in self._streams.pop(stream, ()):
             if number in self._workers:
                 self._workers[number].stream_at(stream, host, port, ticket)
@@ -335,9 +335,8 @@ class WorkerPool:
     # --- operator -----------------------------------------------------------------------------
 
     def command(self, now: float, command: Command) -> None:
-        """Carry out an operator's command in every worker that has a run. What only the node knows
-        needs none of them: `status` is answered although all of them may be blocked by their
-        actions."""
+        """Carry out an operator's command in every worker that has a run. `status` is answered
+        here, because all workers may be blocked by their actions."""
         verb = command.verb
         if verb in ("hold", "release"):
             self._held = verb == "hold"
@@ -376,6 +375,6 @@ class WorkerPool:
         self._reports.append(answer_of(id_, word, data))
 
     def close(self, now: float) -> None:
-        """Let the processes end in good order."""
+        """Let the processes end by themselves."""
         for worker in self._workers.values():
             worker.close(now)

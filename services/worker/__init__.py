@@ -1,1 +1,1 @@
-"""Processes of a node that run the code of users: actions and cyclic drivers."""
+"""Processes of a node that run user code: actions and cyclic drivers."""

@@ -1,5 +1,5 @@
-"""Code of users as Python callables: arguments checked against their signature, what they raise
-described in one line."""
+"""User code as Python callables: check arguments against signatures, and describe exceptions in one
+line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SERVICES = Path(__file__).parents[1]
 _OURS = (f"{_SERVICES}/worker/", f"{_SERVICES}/node/", f"{_SERVICES}/device.py")
 """Files whose frames are left out of the traceback that users see."""
 LONGEST = 2_000
-"""Characters of a description: what an exception says may be as long as what it is about."""
+"""Longest description (characters): an exception may quote all of the data that it is about."""
 FRAMES, CHAIN = 50, 8
 """Most frames of one traceback in the log, and most exceptions that led to one another."""
 _RAISE = dis.opmap["RAISE_VARARGS"]
@@ -26,8 +26,8 @@ _RAISE = dis.opmap["RAISE_VARARGS"]
 
 @lru_cache(maxsize=4096)
 def _parameters(function: Callable[..., Any]) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
-    """Names of a callable's parameters after the context, those without default, and whether it
-    takes any name."""
+    """Return the names of a callable's parameters after the context, those without a default, and
+    whether it accepts any name."""
     parameters = list(inspect.signature(function).parameters.values())[1:]
     named = [p for p in parameters if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
     needed = tuple(p.name for p in named if p.default is p.empty)
@@ -39,7 +39,7 @@ def _parameters(function: Callable[..., Any]) -> tuple[tuple[str, ...], tuple[st
 
 
 def check_arguments(function: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
-    """Raise TypeError that names the argument which does not fit and what would; the first
+    """Raise a TypeError that names the argument which does not fit and what would fit. The first
     parameter is the context."""
     names, needed, takes_any = _parameters(function)
     for name in arguments:
@@ -53,8 +53,8 @@ def check_arguments(function: Callable[..., Any], arguments: Mapping[str, Any]) 
 
 
 def words_of(fault: BaseException) -> str:
-    """The message of an exception as a text that can always be sent: cut at `LONGEST` characters,
-    and what is not Unicode escaped."""
+    """Return the message of an exception as text that can always be sent: cut at `LONGEST`
+    characters, with anything that is not Unicode escaped."""
     try:
         said = str(fault)
     except Exception as worse:
@@ -65,7 +65,7 @@ def words_of(fault: BaseException) -> str:
 
 
 def describe(fault: BaseException) -> str:
-    """Type and message of an exception and the last three places of the user's own code that it
+    """Return the type and message of an exception, and the last three lines of user code that it
     came through."""
     frames = [
         f for f in traceback.extract_tb(fault.__traceback__) if not f.filename.startswith(_OURS)
@@ -75,8 +75,8 @@ def describe(fault: BaseException) -> str:
 
 
 def log_fault(log: logging.Logger, fault: BaseException, text: str, *arguments: Any) -> None:
-    """Log an error of the user's code with its traceback. Raise nothing: the exception comes from
-    code that may have used up the memory, or made its exceptions unreadable."""
+    """Log an error of user code with its traceback. This raises nothing, although the user code may
+    have used up the memory or made its exceptions unreadable."""
     try:
         trace = _traceback(fault)
     except Exception as worse:
@@ -85,8 +85,8 @@ def log_fault(log: logging.Logger, fault: BaseException, text: str, *arguments: 
 
 
 def _traceback(fault: BaseException) -> str:
-    """The traceback of an exception after those of the exceptions that led to it, as Python prints
-    them, but with each message cut by `words_of`."""
+    """Return the traceback of an exception after those of the exceptions that led to it, as Python
+    prints them, but with each message cut by `words_of`."""
     parts: list[str] = []
     found: BaseException | None = fault
     while found is not None and len(parts) < CHAIN:
@@ -98,8 +98,8 @@ def _traceback(fault: BaseException) -> str:
 
 
 def from_outside(fault: BaseException) -> bool:
-    """Whether the exception is the Ctrl-C of a person at a terminal, and no doing of the code that
-    it hit.
+    """Return whether the exception is a Ctrl-C at a terminal and was not raised by the code that it
+    interrupted.
 
     Python raises KeyboardInterrupt for it wherever the main thread is; code that raises one itself
     does it by a `raise`.

@@ -1,4 +1,4 @@
-"""The context of one run: the only way in which an action touches the world."""
+"""The context of one run: everything outside that an action can use."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def never() -> bool:
 
 
 def checked(message: Message) -> None:
-    """Refuse what no peer would take, where the value is made: later it could only cost the
+    """Refuse a message that no peer would accept, where it is made: later it could only cost the
     connection. Raises ValueError."""
     try:
         encode(message)
@@ -50,8 +50,8 @@ def checked(message: Message) -> None:
 
 
 def checked_result(identity: str, returned: Any, where: str = "result") -> Result:
-    """What an action or a service returned as a result in plain data that can be sent. Raises
-    ValueError for any other, naming its values as `where` says."""
+    """Return what an action or a service returned, as plain data that can be sent. Raises
+    ValueError if that is impossible; `where` names the values in its text."""
     if not isinstance(returned, Result):
         name = type(returned).__name__
         raise ValueError(f"returned a {name}; return success(), failure() or error()")
@@ -85,7 +85,8 @@ class Draws:
         self._generators: dict[str, np.random.Generator] = {}
 
     def reseed(self, seed: int) -> None:
-        """Draw anew if the seed is another one: that of the mission run whose action begins."""
+        """Start new generators if this is another seed: that of the mission run whose action
+        begins."""
         if seed != self._seed:
             self._seed = seed
             self._generators.clear()
@@ -121,7 +122,7 @@ class RunContext:
         report: Callable[[Report], None],
     ) -> None:
         self.held = 0.0
-        """Seconds for which the operator has held the run."""
+        """How long the operator has held the run (s)."""
         self._call = call
         self._device = device
         self._clock = clock
@@ -152,20 +153,20 @@ class RunContext:
         return Wait(ready, None if timeout is None else self._clock() + timeout)
 
     def sleep(self, seconds: float) -> Wait:
-        """Awaitable: goes on after so many seconds of the cell's clock."""
+        """Awaitable: returns after so many seconds of the cell's clock."""
         return Wait(never, self._clock() + seconds)
 
     def publish(self, stream: str, values: Sequence[float]) -> None:
-        """Make `values` the newest set point of a stream; repeated while the run goes on and stands
-        by it."""
+        """Make `values` the newest set point of a stream. It is sent repeatedly until the run ends
+        or withdraws it."""
         self._outlets.publish(self._clock(), self.run, stream, values)
 
     def withdraw(self, stream: str) -> None:
-        """Stop standing by the last set point of a stream."""
+        """Withdraw the last set point of a stream."""
         self._outlets.withdraw(stream, self.run)
 
     def raise_event(self, name: str, **data: Any) -> None:
-        """Raise a named internal event while the run goes on."""
+        """Raise a named internal event during the run."""
         event = Event(
             plain(name, "name"), self._call.service, 0, plain(data, "data"), self._call.id
         )
@@ -173,8 +174,8 @@ class RunContext:
         self._report(event)
 
     def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
-        """Judge an earlier run that had ended provisionally. Raises ValueError for what is no run's
-        id or no status."""
+        """Give the verdict on an earlier run that ended provisionally. Raises ValueError if the id
+        or the status is not one."""
         said = RunVerdict(run, Status(status).value, str(cause), str(text))
         name = verdict_event(mission_of(run))
         checked(Outcome(run, said.status, cause=said.cause, text=said.text))
@@ -183,7 +184,7 @@ class RunContext:
         self._report(event)
 
     def progress(self, fraction: float, **data: Any) -> None:
-        """Tell how far the run is, 0 to 1 (clipped)."""
+        """Report the progress of the run, 0 to 1 (clipped)."""
         if not math.isfinite(fraction):
             raise ValueError(f"progress is {fraction}; give a number from 0 to 1")
         feedback = Feedback(self.run, min(1.0, max(0.0, float(fraction))), plain(data, "data"))
@@ -193,8 +194,8 @@ class RunContext:
     async def call(
         self, service: str, /, deadline: float | None = None, **arguments: Any
     ) -> Result:
-        """Call any network service by its name; a call still open when the run is cancelled is
-        cancelled with it. Raises ValueError or TypeError for what cannot be sent."""
+        """Call any network service by its name. A call that is open when the run is cancelled is
+        cancelled, too. Raises ValueError or TypeError for arguments that cannot be sent."""
         self._children += 1
         child = f"{self.run}/{self._children}"
         limit = None if deadline is None else float(deadline)
@@ -220,7 +221,7 @@ class RunContext:
         return self._answers.pop(child)
 
     async def command(self, body: Mapping[str, Any], timeout: float = 1.0) -> None:
-        """Send a command to the device's driver, and wait until the driver has taken it. Raises
+        """Send a command to the device's driver, and wait until the driver has accepted it. Raises
         CommandRefused."""
         device = self._device
         if not hasattr(device, "send"):
@@ -244,7 +245,7 @@ class RunContext:
         return (values.get("value"), int(version)) if version else (default, 0)
 
     async def put(self, name: str, value: Any) -> int:
-        """Write a global-memory variable; gives its new version. Raises CallFailed."""
+        """Write a global-memory variable, and return its new version. Raises CallFailed."""
         return int((await self._memory("memory.put", name=name, value=value)).values["version"])
 
     async def compare_and_set(self, name: str, version: int, value: Any) -> bool:
@@ -267,7 +268,8 @@ class RunContext:
         return self._draws.random(purpose)
 
     def answer(self, outcome: Outcome) -> bool:
-        """Accept the result of a call that this run has made; False if it does not wait for it."""
+        """Accept the result of a call that this run made. Return False if the run does not wait for
+        it."""
         if outcome.id not in self._waiting:
             return False
         self._answers[outcome.id] = Result(

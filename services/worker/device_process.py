@@ -1,9 +1,9 @@
-"""The process of a cyclic driver: paced by absolute deadline, no user code of actions in it.
+"""The process of a cyclic driver. It steps the driver at absolute times and runs no action.
 
-Commands of actions come and states go over a `NewestLink` to the device's worker; the node's orders
-come over its pipe. When the worker is gone the stop routine is called; when the node is gone the
-device is stopped and the process ends. When the node is silent, or its latch says that somebody has
-stopped the device in an emergency, the device is stopped and stays so.
+Commands of actions and the driver's states travel over a `NewestLink` to the device's worker,
+orders of the node over its pipe. If the worker ends, the stop routine is called. If the node ends,
+the device is stopped and the process ends. If the node is silent, or its latch shows an emergency
+stop, the device is stopped and stays so.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ from petrobot.services.worker.remote import (
 from petrobot.services.worker.runner import STOP_LIMIT
 
 LINKED = "linked"
-"""What the node says when it has passed the link of a new worker."""
+"""Message of the node after it has passed the link of a new worker."""
 HALT = "halt"
 """Verb of the node's own stop order, answered when the device stands still."""
 _log = logging.getLogger(__name__)
 TELL_OVERRUN = 1.0
-"""Seconds that a driver must have stood still for the log to say so."""
+"""Delay after which an overdue driver is reported in the log (s)."""
 PRIORITY = 50
 """SCHED_FIFO priority, where the system permits it."""
 
 
 def take_priority() -> bool:
-    """Ask for real-time scheduling; False where it is not permitted (needs CAP_SYS_NICE or an
-    rtprio limit)."""
+    """Request real-time scheduling. Return False if it is not permitted (it needs CAP_SYS_NICE or
+    an rtprio limit)."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except (PermissionError, OSError):
@@ -56,8 +56,8 @@ def take_priority() -> bool:
 
 
 def post_report(node: Pipe, report: Message) -> None:
-    """Send a report to the node. An answer that no message can carry says so instead: what a
-    driver tells of its device must not end its process."""
+    """Send a report to the node. An answer that cannot be sent is replaced by the reason: the state
+    that a driver returns must not end its process."""
     try:
         node.post(report)
     except ProtocolError as fault:
@@ -69,12 +69,12 @@ def post_report(node: Pipe, report: Message) -> None:
 
 
 class DeviceError(Exception):
-    """A driver has raised what it must not; the text says what and where. Its device was stopped as
-    far as it still could be."""
+    """A driver raised an exception; the text says which and where. Its device was stopped if that
+    was possible."""
 
 
 class DeviceLoop:
-    """Steps one driver for as long as its node lives."""
+    """Steps one driver until its node ends."""
 
     def __init__(
         self,
@@ -100,8 +100,8 @@ class DeviceLoop:
         self._tell_due = 0.0
 
     def run(self) -> None:
-        """Step until the node is gone and the device stands still (or the stop routine's time is
-        over). Raises DeviceError."""
+        """Step until the node has ended and the device stands still, or the time of the stop
+        routine is over. Raises DeviceError."""
         gc.collect()
         gc.freeze()
         try:
@@ -114,13 +114,13 @@ class DeviceLoop:
             try:
                 self._driver.close()
             except Exception:
-                _log.exception("a driver failed while it was let go")
+                _log.exception("a driver failed while it was being closed")
             if self._worker is not None:
                 self._worker.close()
 
     def _stop_broken(self) -> None:
-        """Stop a device whose driver has failed: as long as it still can be stepped, until it
-        stands or time is over."""
+        """Stop a device whose driver failed: step it, while that works, until the device stands
+        still or time is over."""
         end = time.monotonic() + STOP_LIMIT
         try:
             stop_at_once(self._driver, time.monotonic())
@@ -151,8 +151,8 @@ class DeviceLoop:
         return now
 
     def _next(self, due: float, now: float) -> float:
-        """The next point of the grid. Missed cycles are left out: made up for in a burst, they
-        would make a drive jump."""
+        """Return the time of the next cycle. Missed cycles are left out: a burst of cycles would
+        make a drive jump."""
         missed = max(0, math.floor((now - due) / self._period))
         if missed:
             self._overruns += missed
@@ -203,7 +203,8 @@ class DeviceLoop:
             self._node.post(Event(name, "", 0, data))
 
     def _watch(self, now: float, guard: Guard) -> None:
-        """Stop the device without an order where nobody may be able to give one."""
+        """Stop the device without an order of the node if the node is silent or the latch is
+        set."""
         cause, before = guard.look(now), self._cyclic.barred
         if cause == EMERGENCY_STOP:
             if before != EMERGENCY_STOP:
@@ -259,7 +260,7 @@ class DeviceLoop:
             self._tell(id_, "up")
 
     def _attach(self) -> None:
-        """A new worker: take the end of its link."""
+        """Accept the link of a new worker."""
         _, found, _, _ = socket.recv_fds(self._descriptors, 1, 1)
         end = socket.socket(fileno=found[0])
         if self._worker is not None:

@@ -1,5 +1,5 @@
-"""The process between a node and one of its workers: whatever the worker's user code leaves behind
-ends with the worker.
+"""The process between a node and one of its workers: whatever user code leaves running ends with
+the worker.
 
 An action or a driver may fork, start daemons or leave programs running. A worker that dies cannot
 clean up after itself, and its node is not the parent of what it started. So each worker has a
@@ -26,21 +26,21 @@ from pathlib import Path
 from petrobot.services.host.parent_death import adopt_orphans, die_with, notify_of_end
 
 KILL_ORDER = signal.SIGUSR2
-"""From the node: kill the worker and all that it has started."""
+"""Order of the node: kill the worker and everything that it started."""
 NODE_ENDED = signal.SIGUSR1
-"""From the kernel."""
+"""Signal of the kernel: the node has ended."""
 _WATCHED = (signal.SIGCHLD, KILL_ORDER, NODE_ENDED)
 _IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """The node decides when its children end."""
 CLEAN_UP = 1.0
-"""Seconds for what the worker has left to die: one that hangs in the kernel must not hide that the
-worker has ended."""
+"""Time in which the processes that the worker left must die (s): one that hangs in the kernel must
+not hide that the worker has ended."""
 LOOK_AGAIN = 0.01
 
 
 def keep(worker: int, patience: float) -> int:
-    """Wait for the worker's end; return its wait status. `patience` is how long it may outlive its
-    node (s)."""
+    """Wait until the worker has ended, and return its wait status. `patience` is how long it may
+    outlive its node (s)."""
     limit: float | None = None
     while True:
         if limit is not None and time.monotonic() >= limit:
@@ -64,8 +64,8 @@ def keep(worker: int, patience: float) -> int:
 
 
 def clean_up() -> None:
-    """Kill all descendants of this process: a killed one's children become its own, until there are
-    none."""
+    """Kill all descendants of this process. The children of a killed one become children of this
+    process, so it is repeated until there are none."""
     until = time.monotonic() + CLEAN_UP
     while time.monotonic() < until:
         try:
@@ -80,8 +80,8 @@ def clean_up() -> None:
 
 
 def _children(parent: int) -> list[int]:
-    """Processes whose parent this is, from /proc (`children` there needs a kernel option; `stat` is
-    always there)."""
+    """Return the children of a process, from /proc (its `children` file needs a kernel option;
+    `stat` always exists)."""
     found = []
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit():
@@ -93,8 +93,7 @@ def _children(parent: int) -> list[int]:
 
 
 def end_as(status: int) -> None:
-    """End this process as a wait status says that the worker has: by the same signal, or with the
-    same exit code."""
+    """End this process as the worker ended: by the same signal or with the same exit code."""
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

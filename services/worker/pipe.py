@@ -115,8 +115,8 @@ class Pipe:
                     self._unsent.clear()
 
     def read(self) -> list[Item]:
-        """Return all items that have come. Raises ValueError for what is not msgpack: user code has
-        written into the pipe."""
+        """Return all items that arrived. Raises ValueError for data that is not msgpack: user code
+        has written into the pipe."""
         if _Copy.made:
             os._exit(0)
         items: list[Item] = []
@@ -137,7 +137,7 @@ class Pipe:
                 if (item := _item(unpacked)) is not None:
                     items.append(item)
             if count < CHUNK and not self.closed:
-                break  # all that has come; the end of the pipe wakes its reader once more
+                break  # all that arrived; the end of the pipe wakes its reader again
         return items
 
     def _feed(self, data: memoryview) -> None:
@@ -147,14 +147,14 @@ class Pipe:
             raise ValueError(f"an item of more than {LARGEST} bytes") from fault
 
     def close(self) -> None:
-        """Let it go."""
+        """Close this end."""
         self.closed = self.ended = True
         self.socket.close()
 
 
 def _item(unpacked: Any) -> Item | None:
-    """Return a message, or a list that begins with a word. Anything but a list is dropped; a list
-    that is neither becomes the word MALFORMED, so that what came before it still counts."""
+    """Return a message, or a list that begins with a word. Anything but a list is dropped; any
+    other list becomes the word MALFORMED, so that the items before it still count."""
     if not isinstance(unpacked, list) or not unpacked:
         return None
     if isinstance(unpacked[0], str):
@@ -168,10 +168,10 @@ def _item(unpacked: Any) -> Item | None:
 class Permits:
     """Permits to begin a call, shared by a node and one of its workers.
 
-    The node gives one with each call, and the worker takes one before it begins a call. The node
-    may take back what is left: the calls that were given last. The kernel counts the permits (an
-    eventfd), so each is taken once, by the worker or by the node, whatever either is doing; and
-    they can be read after the worker's death.
+    The node gives one permit with each call, and the worker takes one before it begins a call. The
+    node may take back the permits that are left: those of the calls that were given last. The
+    kernel counts the permits (an eventfd), so each is taken exactly once, by the worker or by the
+    node, and they can still be read after the worker's end.
     """
 
     def __init__(self, descriptor: int) -> None:
@@ -191,18 +191,18 @@ class Permits:
         return True
 
     def close(self) -> None:
-        """Let the counter go."""
+        """Close the counter."""
         os.close(self._descriptor)
 
 
 def permit_counter() -> int:
-    """A descriptor of the counter of `Permits`. Raises OSError."""
+    """Return a descriptor of a counter for `Permits`. Raises OSError."""
     return os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK | os.EFD_SEMAPHORE)
 
 
 class NewestLink:
-    """Commands one way, states the other, as whole datagrams of a SOCK_SEQPACKET pair: of the
-    states only the newest counts."""
+    """One end of the link between actions and their driver: commands one way, states the other, as
+    datagrams of a SOCK_SEQPACKET pair. Only the newest state counts."""
 
     def __init__(self, end: socket.socket) -> None:
         end.setblocking(False)
@@ -215,8 +215,8 @@ class NewestLink:
         return self.socket.fileno()
 
     def send(self, items: list[Any]) -> bool:
-        """Send one datagram. False when the other end does not read or is gone; ValueError for more
-        than fits into one."""
+        """Send one datagram. Return False if the other end does not read or is closed. Raises
+        ValueError for more than fits into one."""
         data = msgpack.packb(items)
         try:
             self.socket.send(data)
@@ -232,11 +232,11 @@ class NewestLink:
         return True
 
     def read(self) -> list[list[Any]]:
-        """All datagrams that have come."""
+        """Return all datagrams that arrived."""
         return [msgpack.unpackb(data) for data in self._datagrams()]
 
     def newest(self) -> list[Any] | None:
-        """The last datagram that has come, None if there is none."""
+        """Return the last datagram that arrived, None if there is none."""
         datagrams = self._datagrams()
         return msgpack.unpackb(datagrams[-1]) if datagrams else None
 
@@ -261,11 +261,11 @@ class NewestLink:
 
 
 def pipe_pair() -> tuple[Pipe, socket.socket]:
-    """A pipe for this process and the socket that its child makes one of."""
+    """Return a pipe for this process, and the socket of its other end for a child."""
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
     return Pipe(here), there
 
 
 def link_pair() -> tuple[socket.socket, socket.socket]:
-    """Both ends of a `NewestLink` between two children."""
+    """Return the sockets of a `NewestLink` between two children."""
     return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -1,10 +1,10 @@
 """A process of a node: the warm worker that runs the actions of a device (or of none), or the
 process of a cyclic driver.
 
-Forked by its keeper (`services/worker/keeper.py`) with the numbers of the inherited sockets PIPE
-DESCRIPTORS LINK (-1: none) and of the counter PERMITS, from which it takes the permit of each call
-before it begins it. The node says over the pipe which it is to be. A process that
-makes its device's driver and finds it cyclic serves the driver alone.
+Its keeper (`services/worker/keeper.py`) forks it with the numbers of the inherited sockets PIPE,
+DESCRIPTORS and LINK (-1: none) and of the counter PERMITS, from which it takes the permit of each
+call before it begins it. The node sends over the pipe what the process is for. A process that makes
+its device's driver and finds it cyclic serves only the driver.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ from petrobot.services.worker.pipe import Item, NewestLink, Permits, Pipe, keep_
 from petrobot.services.worker.remote import DeviceCommand, DeviceState, RemoteDriver
 
 POLL = 0.002
-"""Seconds between looks at what a run waits for, when it is more than time."""
+"""Time between checks of a condition for which a run waits (s)."""
 SETUP, BORN, READY, FAILED = "setup", "born", "ready", "failed"
 WANTED, STREAM_AT, DROPPED = "wanted", "stream_at", "dropped"
 OUT_OF_MEMORY = "out_of_memory"
-"""Cause of the end of a run that has used up the memory of its process."""
+"""Cause of a run that used up the memory of its process."""
 LINK_LOST, NO_MEMORY = 90, 91
-"""Exit codes: the driver's process is gone; not even the report of a run fits into the memory that
-is left."""
+"""Exit codes: the driver's process has ended; not even the report of a run fits into the remaining
+memory."""
 
 
 _IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -69,10 +69,10 @@ _IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What the node tells its new process."""
+    """First message of the node to a new process."""
 
     source: str
-    """Path of services.toml, and its text as the node read it."""
+    """Path of services.toml; `text` is its text as the node read it."""
     text: str
     node: str
     device: str
@@ -81,9 +81,9 @@ class Setup:
     memory: int = 0
     """Limit of the address space (bytes), 0 for none."""
     tickets: Mapping[str, str] = field(default_factory=dict)
-    """What opens each stream that this node receives."""
+    """The ticket of each stream that this node receives."""
     log_level: int = logging.INFO
-    """Least level of what is logged."""
+    """Lowest level that is logged."""
 
     def items(self) -> Mapping[str, Any]:
         """As plain data."""
@@ -91,8 +91,8 @@ class Setup:
 
 
 class Worker:
-    """Runs actions: orders come and reports go over the node's pipe, device commands and states
-    over the link."""
+    """Runs actions. Orders and reports travel over the node's pipe, device commands and states over
+    the link."""
 
     def __init__(
         self,
@@ -133,16 +133,16 @@ class Worker:
         )
         self._place.warm()
         self._one_by_one = not setup.device
-        """Actions without a device run one at a time: what blocks or crashes the process then ends
-        no other run. The calls behind it have not begun, and the node gives them to another
-        worker."""
+        """Whether runs take turns. Actions without a device do: one that blocks or crashes the
+        process then ends no other run. The calls behind it have not begun, and the node gives them
+        to another worker."""
         self._calls: deque[Call] = deque()
         self._spent = False
-        """Whether a run has used up the memory: the next one needs a fresh process."""
+        """Whether a run used up the memory, so that the next one needs a new process."""
         self._outlets = StreamOutlets(directory, f"{setup.node} {setup.device or 'actions'}")
         self._connecting = False
-        # Faster than a selector; and an end that the user's code has closed is reported, and found
-        # closed when it is read, where epoll would forget it.
+        # Faster than a selector. It also reports an end that user code has closed, which epoll
+        # would forget.
         self._ends = select.poll()
         self._ends.register(node, select.POLLIN)
         if link is not None:
@@ -156,7 +156,7 @@ class Worker:
                 self._read_link(self._link)
 
     def run(self) -> None:
-        """Serve until the node is gone. Exits when the driver fails."""
+        """Serve until the node has ended. Exits if the driver fails."""
         while not self._node.closed:
             pause = self._pause()
             self._ends.poll(None if pause is None else 1e3 * pause)
@@ -183,7 +183,7 @@ class Worker:
             self._begin(now, self._calls.popleft())
         self._place.advance(now)
         if self._place.failed:
-            # Before the ends of its runs: no other run is to come here.
+            # Sent before the ends of its runs, so that no other run is sent here.
             self._node.post([FAILED, self._place.failed])
             self._report(now)
             sys.exit(1)
@@ -200,24 +200,25 @@ class Worker:
             self._node.post([DROPPED, [call.id]])
 
     def _give_back(self) -> None:
-        """Let others run the calls that would have to wait here. Those without a permit were taken
-        back already."""
+        """Give back the calls that would have to wait here. Those without a permit were already
+        taken back."""
         for _ in self._calls:
             self._permits.take()
         self._node.post([DROPPED, [call.id for call in self._calls]])
         self._calls.clear()
 
     def _watch(self, now: float, guard: Guard) -> None:
-        """Stop device and runs without an order where nobody may be able to give one."""
+        """Stop device and runs without an order of the node if the node is silent or the latch is
+        set."""
         cause, before = guard.look(now), self._barred
         self._barred = cause
-        # With a run again and again: it may have begun between a clearing and the next stop, both
-        # since the last look.
+        # Repeated while there is a run: it may have begun between a clearing and another stop, both
+        # since the last check.
         if cause and (cause != before or self._place.runs):
             self._place.bar(now, cause)
 
     def _pause(self) -> float | None:
-        """How long nothing can be due (s), None for as long as nothing comes in."""
+        """Return for how long nothing is due (s), None until something arrives."""
         if self._node.unsent:
             return POLL
         due = self._place.due()
@@ -269,7 +270,7 @@ class Worker:
         if items is not None and self._remote is not None:
             self._remote.take(DeviceState(*items))
         if link.closed:
-            # Without its driver nothing here can be done; the node starts both again.
+            # Without its driver this process is of no use; the node starts both again.
             os._exit(LINK_LOST)
 
     def _post_command(self, command: DeviceCommand) -> None:
@@ -291,7 +292,8 @@ def _first(node: Pipe) -> Setup:
 def serve(
     node: Pipe, descriptors: socket.socket | None, link: NewestLink | None, permits: Permits
 ) -> None:
-    """Be what the node says. Faults of the driver go back to it as text."""
+    """Serve what the node's first message asks for. Errors of the driver are reported to it as
+    text."""
     node.post([BORN, os.getpid()])
     setup = _first(node)
     logging.getLogger().setLevel(setup.log_level)
@@ -336,10 +338,10 @@ def serve(
 
 
 def main(arguments: list[str]) -> None:
-    """What the process does, once it is forked."""
+    """Run the process, after the fork."""
     for number in _IGNORED:
-        # The node decides when its children end. A handler, unlike SIG_IGN, is not passed on to
-        # programs that user code starts.
+        # The node decides when its children end. Programs that user code starts do not inherit a
+        # handler, as they would inherit SIG_IGN.
         signal.signal(number, lambda *_: None)
     os.register_at_fork(after_in_child=_take_signals)
     log_to_stderr()

@@ -1,5 +1,5 @@
-"""A cyclic driver and the actions that use it, one command line apart: both ends as machines,
-inline and across processes."""
+"""A cyclic driver and the actions that use it: both ends of the exchange of commands and states, as
+sans-I/O machines, inline and across processes."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ _log = logging.getLogger(__name__)
 
 COMMAND, STOP, SEED = "command", "stop", "seed"
 EMERGENCY_STOP, CLEAR_EMERGENCY = "emergency_stop", "clear_emergency"
-"""An operator's verbs: stop at once and obey no action any more; obey actions again (nothing moves
-by that alone)."""
+"""Verbs of the operator: stop at once and refuse all commands; accept commands again (which moves
+nothing by itself)."""
 IN_EMERGENCY = "emergency stop: clear it with `petrobot estop --clear` when the cell is safe"
 NODE_SILENT = "node_silent"
 NODE_IS_SILENT = (
     "the device's node was silent, so the device was stopped: look why the node stood still"
 )
 BARRED: Mapping[str, str] = {EMERGENCY_STOP: IN_EMERGENCY, NODE_SILENT: NODE_IS_SILENT}
-"""Why a device accepts no commands, in words: by the cause that its runs end with."""
+"""By cause of the end of its runs: why a device accepts no commands, in words."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceCommand:
-    """From the actions' end: a command of an action, or the stop routine."""
+    """A command of an action, or the stop routine."""
 
     number: int
     """Counts up from 1."""
@@ -40,7 +40,7 @@ class DeviceCommand:
 
 @dataclass(frozen=True, slots=True)
 class DeviceState:
-    """From the driver's end, each cycle; only the newest counts."""
+    """What the driver's end publishes at each cycle; only the newest one counts."""
 
     handled: int = 0
     refused: str = ""
@@ -48,8 +48,8 @@ class DeviceState:
     stopped: bool = False
     state: Mapping[str, Any] = field(default_factory=dict)
     refusal: tuple[int, str] = (0, "")
-    """Number of the last command that was refused (0: none), and why: a later command does not hide
-    it."""
+    """Number of the last command that was refused (0: none); the reason is kept beside it, so that
+    a later command does not hide it."""
     barred: str = ""
     """Cause for which the device was stopped and accepts no commands (a key of `BARRED`); empty if
     it accepts them."""
@@ -68,16 +68,16 @@ class Refusing(Protocol):
         """Seconds since the driver last published its state."""
 
     def refusal(self, since: int) -> str | None:
-        """Why a command after number `since` was refused that no action has looked at; empty if
-        none was, None as long as the driver still has commands to take."""
+        """Return why a command after number `since` was refused whose refusal no action has read;
+        empty if there is none, None while the driver still has commands to handle."""
 
 
 class RemoteDriver:
     """The actions' end: implements `services.device.Remote` for them and
     `services.worker.runner.DeviceControl` for the runner.
 
-    `post` sends a command; `take` is given each newer state. Where the driver lives in the same
-    process, `expect` is told instead where to get it: nothing is put together that nobody looks at.
+    `post` sends a command; `take` receives each newer state. If the driver is in the same process,
+    `expect` receives a function instead, so that a state is only made when it is read.
     """
 
     def __init__(self, post: Callable[[DeviceCommand], None], clock: Callable[[], float]) -> None:
@@ -86,7 +86,7 @@ class RemoteDriver:
         self._sent = 0
         self._seed: int | None = None
         self._seen = 0
-        """Number of the last refused command whose refusal an action has looked at."""
+        """Number of the last refused command whose refusal an action has read."""
         self._taken = DeviceState()
         self._source: Callable[[], DeviceState] | None = None
         self._arrived = -float("inf")
@@ -103,13 +103,13 @@ class RemoteDriver:
         return self
 
     def send(self, body: Mapping[str, Any]) -> int:
-        """Send a command; gives its number. Raises ConnectionError when the driver's process is
-        gone."""
+        """Send a command, and return its number. Raises ConnectionError if the driver's process has
+        ended."""
         return self._number(COMMAND, plain(body, "command"))
 
     @property
     def handled(self) -> int:
-        """Number of the last command that the driver has taken."""
+        """Number of the last command that the driver has handled."""
         return self._newest.handled
 
     @property
@@ -152,7 +152,7 @@ class RemoteDriver:
     def reseed(self, seed: int) -> None:
         """Tell the driver the seed of the mission run whose action begins."""
         if seed != self._seed:
-            # A driver that takes nothing now is told at the next action.
+            # A driver that accepts nothing now gets it with the next action.
             with contextlib.suppress(ConnectionError):
                 self._post(DeviceCommand(self._sent, SEED, {"seed": seed}))
                 self._seed = seed
@@ -162,15 +162,15 @@ class RemoteDriver:
         self._number(STOP, {})
 
     def stopped(self) -> bool:
-        """Whether the device stands still after all that was sent to it."""
+        """Return whether the device stands still after all that was sent to it."""
         return self._newest.handled >= self._sent and self._newest.stopped
 
     def take(self, state: DeviceState) -> None:
-        """A newer state came in."""
+        """Accept a newer state."""
         self._taken, self._source, self._arrived = state, None, self._clock()
 
     def expect(self, source: Callable[[], DeviceState]) -> None:
-        """A newer state is there; `source` gives it when it is wanted."""
+        """Note that there is a newer state; `source` returns it."""
         self._source, self._arrived = source, self._clock()
 
     def _number(self, verb: str, body: Mapping[str, Any]) -> int:
@@ -180,12 +180,12 @@ class RemoteDriver:
 
 
 class CyclicDriver:
-    """The driver's end: gives it the commands in order, steps it, and tells its state."""
+    """The driver's end: passes it the commands in order, steps it, and publishes its state."""
 
     def __init__(self, driver: Driver) -> None:
         self.driver = driver
         self.refused = 0
-        """How many commands were refused."""
+        """Number of refused commands."""
         self._handled = 0
         self._refusal = (0, "")
         self._emergency = self._silent = False
@@ -196,26 +196,26 @@ class CyclicDriver:
         stop_at_once(self.driver, now)
 
     def clear_emergency(self) -> None:
-        """Take commands again; the device stays as it is until one comes."""
+        """Accept commands again; nothing moves until one arrives."""
         self._emergency = False
 
     def node_silent(self, now: float) -> None:
-        """Stop, and refuse every command until `node_speaks`: nobody could stop what the device
-        does."""
+        """Stop, and refuse every command until `node_speaks`: with a silent node, nothing could
+        stop the device."""
         self._silent = True
         self.driver.stop(now)
 
     def node_speaks(self) -> None:
-        """Take commands again."""
+        """Accept commands again."""
         self._silent = False
 
     @property
     def barred(self) -> str:
-        """Cause for which it takes no commands, empty if it takes them."""
+        """Cause for which it refuses all commands; empty if it accepts them."""
         return EMERGENCY_STOP if self._emergency else NODE_SILENT if self._silent else ""
 
     def take(self, now: float, command: DeviceCommand) -> None:
-        """Carry out a command; what the driver refuses is told in the next state."""
+        """Carry out a command; a refusal is published with the next state."""
         self._handled = command.number
         if command.verb == STOP:
             self.driver.stop(now)
@@ -238,7 +238,7 @@ class CyclicDriver:
         self._refusal = (command.number, why)
 
     def step(self, now: float) -> DeviceState:
-        """One cycle, and the state after it."""
+        """Do one cycle, and return the state after it."""
         self.driver.step(now)
         return self.state()
 
@@ -253,7 +253,7 @@ class CyclicDriver:
         )
 
     def forget(self) -> None:
-        """The actions' end is another one now: its numbers begin anew."""
+        """Start again with the numbers of a new actions' end."""
         self._handled, self._refusal = 0, (0, "")
 
 

@@ -1,5 +1,5 @@
-"""Runs actions: a machine that polls their coroutines, cancels them, holds them to their deadlines
-and guards their device."""
+"""Runs actions: a sans-I/O machine that polls their coroutines, cancels them, and guards their
+device."""
 
 from __future__ import annotations
 
@@ -31,46 +31,46 @@ from petrobot.services.worker.remote import Refusing
 _log = logging.getLogger(__name__)
 
 GRACE = 0.5
-"""Seconds that a cancelled action has to clean up and its device to stand still before the stop
-routine is called."""
+"""Time in which a cancelled action must clean up and its device must stand still (s); after that
+the stop routine is called."""
 STOP_LIMIT = 2.0
-"""Seconds after the stop routine when the run ends although its device is not known to stand still;
-the device stays fenced."""
+"""Time after the stop routine at which the run ends even if its device is not known to stand still
+(s); the device then stays fenced."""
 TAKEN_WITHIN = 1.0
-"""Seconds that a driver has to take the commands of a run that has returned: until then nobody
-knows whether it refuses one."""
+"""Time in which a driver must handle the last commands of a run that has returned (s): only then is
+it known whether it refuses one."""
 Order = Call | Cancel | Outcome | Command
-"""What a runner is told. Call: begin this run. Cancel: stop it, for the cause and with the text
-that `stop_reason` has put together. Outcome: the result of a call that a run has made. Command:
-`hold` or `release` all runs."""
+"""Orders to a runner. Call: begin this run. Cancel: stop it, with a reason made by `stop_reason`.
+Outcome: the result of a call that a run made. Command: `hold` or `release` all runs."""
 
 
 def stop_reason(cause: str, text: str) -> str:
-    """Return the reason of a CANCEL inside a node: the cause that the run ends with, and a text."""
+    """Return the reason of a CANCEL inside a node: the cause with which the run ends, and a
+    text."""
     return f"{cause}: {text}"
 
 
 STEPS = 10_000
-"""How often a coroutine may go on without time passing before it is taken for an endless loop."""
+"""How often a coroutine may continue without time passing before it counts as an endless loop."""
 
 
 class ActionPhase(Enum):
-    """Where a run is between its begin and its end."""
+    """Stage of a run between its begin and its end."""
 
     NEW = auto()
     RUNNING = auto()
     COMPUTED = auto()
     """Its result waits for the declared computing time."""
     TAKING = auto()
-    """Its result waits until the driver has taken all commands: one of them may be refused."""
+    """Its result waits until the driver has handled all commands: it may refuse one."""
     STOPPING = auto()
     """Its coroutine cleans up after a cancel."""
     SETTLING = auto()
-    """Its coroutine is over; its device must come to a standstill."""
+    """Its coroutine has ended; its device must come to a standstill."""
 
 
 class Hung(BaseException):
-    """Raised by the watchdog of lock step into code that has not come back for too long."""
+    """Raised by the watchdog of lock step in code that has not returned for too long."""
 
     def __str__(self) -> str:
         return (
@@ -80,7 +80,7 @@ class Hung(BaseException):
 
 
 class Returned(Exception):  # noqa: N818 - not an error
-    """The action is over; `value` is what it returned."""
+    """The action has ended; `value` is what it returned."""
 
     def __init__(self, value: Any) -> None:
         super().__init__()
@@ -99,18 +99,19 @@ class Execution:
     wait: Wait | None = None
     started: float = 0.0
     limit: float | None = None
-    """When the phase is over at the latest."""
+    """When the phase ends at the latest."""
     ready_at: float = 0.0
-    """When its computed result is out, or is given up because the driver takes no commands."""
+    """When its computed result is reported, or is given up because the driver handles no
+    commands."""
     sent_before: int = 0
-    """Number of the last command that its device was sent before it began."""
+    """Number of the last command that was sent to its device before it began."""
     cpu: float = 0.0
     result: Result | None = None
     cause: str = ""
     text: str = ""
     abandoned: bool = False
-    """The action could not bring its device to a safe state itself: standing still is not
-    enough."""
+    """Whether the action could not bring its device to a safe state: standing still is not enough
+    then."""
     stop_called: bool = False
 
     @property
@@ -125,7 +126,7 @@ class Execution:
         return waits or self.phase in (ActionPhase.SETTLING, ActionPhase.TAKING)
 
     def due(self) -> float | None:
-        """When it is worth a look without anything coming in (s)."""
+        """When it must be looked at although nothing arrives (s)."""
         if self.phase is ActionPhase.NEW:
             return -math.inf
         times = [self.limit, self.wait.due if self.wait else None]
@@ -134,8 +135,8 @@ class Execution:
         return min((t for t in times if t is not None), default=None)
 
     def begin(self, function: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
-        """Call the action up to its first wait. Raises Returned when it is over, else whatever it
-        raised."""
+        """Call the action up to its first wait. Raises Returned if it ends, otherwise whatever it
+        raises."""
         returned = self._timed(lambda: function(self.context, **arguments))
         if not inspect.iscoroutine(returned):
             raise Returned(returned)
@@ -143,7 +144,7 @@ class Execution:
         self.go_on(None)
 
     def look(self, now: float) -> None:
-        """Continue if what it waits for is there or its time is over. Raises as `begin` does."""
+        """Continue if its wait is fulfilled or has timed out. Raises as `begin` does."""
         if self.wait is None:
             return
         try:
@@ -187,7 +188,7 @@ class Execution:
         raise RuntimeError("awaits only what its context did not give it")
 
     def close(self) -> str:
-        """End the coroutine for good; what it raised instead of ending, empty if it did not."""
+        """End the coroutine. Return what it raised instead of ending; empty if it ended."""
         coroutine, self.coroutine, self.wait = self.coroutine, None, None
         try:
             if coroutine is not None:
@@ -203,7 +204,7 @@ class Execution:
         self.text = f"{self.text}; {text}" if self.text else text
 
     def postpone(self, pause: float) -> None:
-        """Move all its times by an operator's pause."""
+        """Shift all its times by an operator's pause."""
         self.started += pause
         self.ready_at += pause
         self.limit = None if self.limit is None else self.limit + pause
@@ -234,7 +235,7 @@ class DeviceControl(Protocol):
         """Call the stop routine."""
 
     def stopped(self) -> bool:
-        """Whether the device is known to stand still and has taken all commands."""
+        """Return whether the device is known to stand still and has handled all commands."""
 
 
 class Runner:
@@ -282,7 +283,7 @@ class Runner:
 
     @property
     def idle(self) -> bool:
-        """Whether there is no run, nothing to report and no fence to look at."""
+        """Whether it has no run, nothing to report and no fence to check."""
         return not (self._runs or self._reports or self._fenced)
 
     @property
@@ -296,7 +297,7 @@ class Runner:
         return self._fenced
 
     def load(self, action: str) -> Callable[..., Any]:
-        """The callable of an action, imported once. Raises ImportError."""
+        """Return the callable of an action, imported once. Raises ImportError."""
         if action not in self._callables:
             self._callables[action] = resolve(self._actions[action].run)
         return self._callables[action]
@@ -315,7 +316,7 @@ class Runner:
             self._hold(now, order.verb == "hold")
 
     def reports(self) -> list[Report]:
-        """What happened since the last call, in order."""
+        """Return what happened since the last call, in order."""
         if not self._reports:
             return []
         reports, self._reports = self._reports, []
@@ -335,7 +336,7 @@ class Runner:
         return min((t for t in times if t is not None), default=None)
 
     def advance(self, now: float) -> None:
-        """Do all that is due: begin, go on, stop, end."""
+        """Do all that is due: begin, continue, stop and end runs."""
         if self._fenced:
             self._look_at_fence()
         if not self._runs:  # nor is a stream open: a run closes its own when it ends
@@ -352,13 +353,13 @@ class Runner:
             self._reports += self._outlets.advance(now)
 
     def commands_taken(self, now: float) -> None:
-        """The driver has just been stepped: end the runs that only waited for it to take their last
-        commands."""
+        """End the runs that only waited for the driver, which was just stepped, to handle their
+        last commands."""
         for run in [run for run in self._runs.values() if run.phase is ActionPhase.TAKING]:
             self._await_taking(now, run)
 
     def give_up_all(self, now: float, cause: str, text: str) -> list[Report]:
-        """The device is no more: how all runs end, without its stop routine."""
+        """Return how all runs end when their device has failed; its stop routine is not called."""
         ends: list[Report] = []
         for identity, run in self._runs.items():
             if fault := run.close():
@@ -421,7 +422,7 @@ class Runner:
         run.sent_before = self._refusing.sent if self._refusing is not None else 0
         self._in_action(now, run, lambda: run.begin(function, arguments))
 
-    # --- go on --------------------------------------------------------------------------------
+    # --- continue -----------------------------------------------------------------------------
 
     def _look_at_fence(self) -> None:
         if self._fenced and (self._device is None or self._device.stopped()):
@@ -438,7 +439,7 @@ class Runner:
             self._finish(now, run, run.result)
 
     def _in_action(self, now: float, run: Execution, step: Callable[[], None]) -> None:
-        """Let the action's own code go on, and take what comes of it."""
+        """Let the action's code continue, and handle its result."""
         try:
             step()
         except Returned as returned:
@@ -487,7 +488,7 @@ class Runner:
             self._finish(now, run, result)
 
     def _finish(self, now: float, run: Execution, result: Result) -> None:
-        """End the run as its action said, as soon as it is known that the driver has refused none
+        """End the run with its action's result, as soon as it is known that the driver refused none
         of its commands."""
         if result.status is Status.ERROR:
             text = self._with_refusal(run, result.text)
@@ -512,8 +513,8 @@ class Runner:
             self._end(now, run, run.result)
 
     def _with_refusal(self, run: Execution, text: str) -> str:
-        """The text of an ERROR, and what the driver refused without the action's looking, or that
-        it is silent: that is often the reason."""
+        """Return the text of an ERROR with a refusal of the driver that the action did not read, or
+        the driver's silence: that is often the reason."""
         if self._refusing is None:
             return text
         if refusal := self._refusing.refusal(run.sent_before):
@@ -526,7 +527,8 @@ class Runner:
 
     @staticmethod
     def _give_up(now: float, run: Execution, cause: str, text: str) -> None:
-        """The action broke: nobody leads its device any more, so the stop routine comes at once."""
+        """Handle an action that raised: its device is not controlled any more, so the stop routine
+        is called at once."""
         run.phase, run.cause, run.text, run.abandoned, run.limit = (
             ActionPhase.SETTLING,
             cause,
@@ -589,7 +591,7 @@ class Runner:
         self._reports.append(Outcome(identity, *said, took, run.cpu, result.deferred))
 
     def _hold(self, now: float, frozen: bool) -> None:
-        """Freeze the runs, or let them go on with all their times moved by the pause."""
+        """Freeze the runs, or let them continue with all their times shifted by the pause."""
         if frozen:
             self._held_since = now if self._held_since is None else self._held_since
         elif self._held_since is not None:

@@ -24,32 +24,32 @@ class SetpointReceiver:
 
     @property
     def values(self) -> tuple[float, ...] | None:
-        """The newest set point, None before the first or when it is stale (older than three of its
+        """The newest set point; None before the first one, and if it is stale (older than three
         periods)."""
         return self._values if self.age <= self._limit else None
 
     @property
     def age(self) -> float:
-        """Seconds since the newest one arrived (inf before the first)."""
+        """Time since the newest one arrived (s; inf before the first)."""
         return self._clock() - self._arrived
 
     @property
     def held(self) -> float:
-        """Seconds since the sender first sent these values, but for their way here: a repeat makes
-        them no younger."""
+        """Time since the sender first sent these values, without their transport (s). A repetition
+        does not make them younger."""
         return self._clock() - self._published
 
     @property
     def count(self) -> int:
-        """How many have arrived."""
+        """Number of set points that arrived."""
         return self._count
 
     def take(self, values: Sequence[float], held: float = 0.0) -> None:
-        """A set point arrived, `held` seconds after its sender first sent these values."""
+        """Accept a set point whose values its sender first sent `held` seconds ago."""
         now = self._clock()
         self._values, self._arrived, self._published = tuple(values), now, now - held
         self._count += 1
 
     def withdraw(self) -> None:
-        """The sender stands by it no more, or is gone: it is stale at once."""
+        """Note that the sender withdrew it or has ended: it is stale at once."""
         self._values = None
