@@ -12,6 +12,7 @@ import argparse
 import asyncio
 import contextlib
 import json
+import logging
 import os
 import signal
 import sys
@@ -24,6 +25,7 @@ import aiohttp
 from petrobot.services.adapters.ros2 import definitions
 from petrobot.services.adapters.ros2.link import WebSocketLink
 
+_log = logging.getLogger(__name__)
 LOOK = 0.2
 """Seconds between two looks at the run."""
 LATE = 10
@@ -92,6 +94,7 @@ class Offer:
                     print(f"{self._options.action} is offered", flush=True)
                 elif kind == "down":
                     self._epoch, self._why = 0, "lost"
+                    print(f"no connection to rosbridge: {item}", file=sys.stderr, flush=True)
                 elif kind == "message" and item.get("action") == self._options.action:
                     self._take(item)
             with contextlib.suppress(TimeoutError):
@@ -119,6 +122,9 @@ class Offer:
             await self._follow(goal, await self._start(args))
         except (OSError, ValueError) as fault:
             self._result(goal, ABORTED, "refused", str(fault))
+        except Exception as fault:  # its client must not wait for ever
+            _log.exception("goal %s", goal)
+            self._result(goal, ABORTED, "refused", f"{type(fault).__name__}: {fault}")
         finally:
             self._goal = ""
             with contextlib.suppress(OSError):
@@ -218,7 +224,7 @@ async def main(arguments: list[str]) -> int:
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     timeout = aiohttp.ClientTimeout(10.0)
     async with aiohttp.ClientSession(trust_env=False, timeout=timeout) as http:
-        link = WebSocketLink(options.url, 5.0)
+        link = WebSocketLink(options.url, 10.0)
         try:
             await Offer(link, Page(options.page, http), options).serve(stop)
         except (OSError, ValueError) as fault:

@@ -29,7 +29,9 @@ class Bridge(Driver):
 
     period = 0.02
     url: str = key("ws://127.0.0.1:9090", "ws://, wss://, or module:Class of a simulation")
-    heartbeat: float = key(5.0, "s without a message until the server must answer a ping; 0: never")
+    heartbeat: float = key(
+        10.0, "s without a message until the server must answer a ping; 0: never"
+    )
     patience: float = key(5.0, "s without a word after a cancel until a goal is given up")
     definitions: dict[str, str] = key({}, "file of each type's .msg, .srv or .action, by type")
     subscribe: dict[str, Any] = key({}, "by name: topic, type, optional event, when, throttle")

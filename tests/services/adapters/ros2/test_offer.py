@@ -10,6 +10,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -351,11 +352,13 @@ def test_petrobot_starts_petrobot(offered: FakeProcess) -> None:
     assert one.values["state"] == "success" and json.loads(one.values["result"])["task"] == "rest"
     assert one.feedback["places"]
     request = {"op": "send_action_goal", "action": "/rest", "action_type": offering.TYPE}
-    bridge.command(0.0, {"goal": {**request, "args": {"seconds": 50.0}}, "run": "second"})
+    bridge.command(
+        time.monotonic(), {"goal": {**request, "args": {"seconds": 50.0}}, "run": "second"}
+    )
     bridge.until_phase(Phase.ACTIVE, "second")
-    bridge.command(0.0, {"cancel": "second"})
+    bridge.command(time.monotonic(), {"cancel": "second"})
     bridge.until_phase(Phase.CANCELLED, "second")
-    bridge.command(0.0, {"goal": {**request, "args": {"hours": 50.0}}, "run": "third"})
+    bridge.command(time.monotonic(), {"goal": {**request, "args": {"hours": 50.0}}, "run": "third"})
     bridge.until_phase(Phase.ABORTED, "third")
     assert "hours" in bridge.exchanges.open["third"].values["reason"]
     bridge.close()
