@@ -289,7 +289,7 @@ class Exchanges:
         if message["op"] == "service_response" or status is None:
             word = Word.SUCCEEDED
         else:
-            word = _STATUS.get(status if isinstance(status, int) else 0, Word.ABORTED)
+            word = _STATUS.get(status if isinstance(status, int | float) else 0, Word.ABORTED)
             one.text = "" if word is not Word.ABORTED else f"the goal ended with status {status}"
         if isinstance(said, str):
             one.text, said = said[:500], {}
