@@ -14,6 +14,8 @@ from petrobot import Context, Remote, Result, error, failure, success
 from petrobot.services.adapters.so101.kinematics import forward, inverse
 
 State = Mapping[str, Any]
+STARTING = 1.0
+"""s that the driver may need to find the servos and to switch them on."""
 
 
 async def move_joints(
@@ -47,14 +49,16 @@ async def move_to(
     return result if result.cause else success(off=math.dist(tip[:3], (x, y, z)))
 
 
-async def grasp(ctx: Context[Remote], *, squeeze: float = 0.25, timeout: float = 4.0) -> Result:
+async def grasp(
+    ctx: Context[Remote], *, squeeze: float = 0.25, thinnest: float = 0.02, timeout: float = 4.0
+) -> Result:
     """Close the gripper until it holds something with this share of its stall torque; `angle`
-    (rad) is how far it is open then. FAILURE `empty` if it closed on nothing."""
+    (rad) is how far it is open then. FAILURE `empty` if it closed to less than `thinnest` rad."""
     ends = ("holding", "closed")
     command = {"do": "close", "squeeze": squeeze}
     fault = await _do(ctx, command, lambda state: any(state["gripper"][e] for e in ends), timeout)
     gripper = ctx.device.state["gripper"]
-    if fault is None and not gripper["holding"]:
+    if fault is None and (gripper["angle"] < thinnest or not gripper["holding"]):
         return failure("empty", "the gripper closed on nothing", angle=gripper["angle"])
     return fault or success(angle=gripper["angle"])
 
@@ -69,8 +73,9 @@ async def _do(
     ctx: Context[Remote], command: State, done: Callable[[State], bool], timeout: float
 ) -> Result | None:
     """Send a command and wait until it is done; None if it was."""
-    await ctx.command(command)
     device = ctx.device
+    await ctx.wait(lambda: bool(device.state["ready"] or device.state["faults"]), STARTING)
+    await ctx.command(command)
     await ctx.wait(lambda: done(device.state) or bool(device.state["faults"]), timeout)
     if device.state["faults"]:
         return error("arm_fault", "; ".join(device.state["faults"].values()))

@@ -22,8 +22,8 @@ from petrobot import Driver, Ports, SerialLine, key
 from petrobot.services.adapters.so101 import bus
 from petrobot.services.adapters.so101.kinematics import JOINTS
 
-LOST: Final = 5
-"""Periods without an answer after which a servo is missing."""
+LOST: Final = 0.3
+"""s without an answer after which a servo is missing."""
 STILL, CREEP = 5, 5
 """Readings without a change after which a servo stands, unless it is faster (steps/s)."""
 RETRY: Final = (0.2, 3.2)
@@ -176,6 +176,7 @@ class Arm(Driver):
         them, so that none hides another."""
         self._split = bus.Splitter()
         self._lost, self._retry, self._pause = "", 0.0, RETRY[0]
+        self._begun = ports.now
         self._line: SerialLine | None = ports.serial(self.port, self.baud)
 
     def _check_keys(self) -> None:
@@ -357,7 +358,7 @@ class Arm(Driver):
             self.stop(self.ports.now)
 
     def _missing(self, now: float) -> str:
-        late = now - LOST * self.period
+        late = now - LOST
         names = ", ".join(joint.name for joint in self.joints if joint.heard < late)
         return f"no answer from {names} {self._lost}".rstrip() if names else ""
 
@@ -467,9 +468,10 @@ class Arm(Driver):
         """Return angles (rad), speeds (rad/s), loads (share of the stall torque), temperatures
         (deg C) and what is wrong."""
         arm, gripper = self.arm, self.gripper
-        missing = self._missing(self.ports.now)
+        now = self.ports.now
+        missing = self._missing(now)
         faults = dict(self.faults)
-        if missing:
+        if missing and now > self._begun + LOST:
             faults["missing"] = missing
         if not self._calibrated:
             faults["uncalibrated"] = f"{self.calibration} is not there yet"
@@ -491,6 +493,7 @@ class Arm(Driver):
                 "open": self._hand == "open" and abs(gripper.q - gripper.goal) <= 2 * REACHED,
             },
             "torque": self._on,
+            "ready": not missing and all(joint.ready for joint in self.joints),
             "faults": faults,
         }
 
