@@ -301,7 +301,7 @@ def local_programs(
     )
     options = ["--services", str(directory.source), *(["--lockstep"] if lockstep else [])]
     options += ["--await-coordinator", str(awaited)] if lockstep and awaited else []
-    options += ["--log-level", log_level]
+    options += ["--log-level", log_level, *(["--dry-run"] if directory.dry_run else [])]
     own = ["--mock", str(mock)] if mock else []
     return [
         Program(node.name, [sys.executable, "-m", "petrobot.sim", *options], first=True)

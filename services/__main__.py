@@ -13,8 +13,7 @@ from pathlib import Path
 from petrobot.services.comm.location_file import (
     Directory,
     DirectoryError,
-    parse,
-    read_text,
+    load,
     verify_imports,
 )
 from petrobot.services.comm.location_file.reading import nearest
@@ -55,20 +54,21 @@ def parser() -> argparse.ArgumentParser:
     commands.add_argument(
         "--mock", metavar="FILE", default="", help="replace the actions that this file scripts"
     )
+    commands.add_argument("--dry-run", action="store_true", help="keep all drives off")
     add_log_level(commands)
     return commands
 
 
-def read(path: Path, name: str) -> tuple[Directory, str]:
+def read(path: Path, name: str, dry_run: bool = False) -> tuple[Directory, str]:
     """The location file and its text. Raises DirectoryError when it is bad or this node cannot run
     here."""
     try:
-        text = read_text(path)
+        directory = load(path, dry_run)
+        text = directory.text
     except OSError as fault:
         raise DirectoryError(
             (f"{path}: {fault.strerror}; name the file with --services",)
         ) from fault
-    directory = parse(text, path)
     if name not in directory.nodes:
         raise DirectoryError(
             (f"{path}: no node is named {name!r}{nearest(name, directory.nodes)}",)
@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     log_to_stderr(LOG_LEVELS[options.log_level])
     try:
-        directory, text = read(options.services, options.name)
+        directory, text = read(options.services, options.name, options.dry_run)
         if options.mock:
             load_script(options.mock)
         if options.lockstep:

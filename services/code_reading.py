@@ -25,7 +25,7 @@ from typing import Any, get_type_hints
 
 from petrobot.services import action as actions
 from petrobot.services.comm.location_file import resolve
-from petrobot.services.device import Driver, faults_of_keys
+from petrobot.services.device import Driver, faults_of_keys, faults_of_limits
 from petrobot.services.host.json_text import json_text
 
 AWAITED = frozenset(
@@ -258,11 +258,13 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
     }
 
 
-def _driver(thing: Any, config: Mapping[str, Any]) -> dict[str, Any]:
-    """What is known of a driver's class, and what is wrong with the keys of its table."""
+def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """What is known of a driver's class, and what is wrong with the keys of its devices' tables, by
+    device."""
     seen = _Seen()
     if not inspect.isclass(thing):
-        return {"keys": [["driver", "is not a class; a driver is a class derived from `Driver`"]]}
+        text = "is not a class; a driver is a class derived from `Driver`"
+        return {"keys": {device: [["driver", text]] for device in tables}}
     for code in _reachable(thing):
         _look(code, seen, in_action=False)
     keys: list[tuple[str, str]] = []
@@ -277,9 +279,9 @@ def _driver(thing: Any, config: Mapping[str, Any]) -> dict[str, Any]:
     if moves and not (is_number and 0.0 < period < float("inf")):
         text = f"{thing.__name__}.period: expected seconds above 0 or None, found {period!r:.40}"
         keys.append(("driver", text))
-    if issubclass(thing, Driver):
-        keys += faults_of_keys(thing, config)
-    return {"keys": keys, **_plain(seen)}
+    check = faults_of_keys if issubclass(thing, Driver) else faults_of_limits
+    found = {device: [*keys, *check(thing, table)] for device, table in tables.items()}
+    return {"keys": found, **_plain(seen)}
 
 
 def _plain(seen: _Seen) -> dict[str, Any]:
@@ -295,13 +297,13 @@ def _plain(seen: _Seen) -> dict[str, Any]:
     }
 
 
-def _read(path: str, config: Mapping[str, Any] | None) -> dict[str, Any]:
+def _read(path: str, tables: Mapping[str, Any] | None) -> dict[str, Any]:
     """Import one path and say what is known of it."""
     try:
         thing = resolve(path)
     except ImportError as fault:
         return {"import": str(fault)}
-    return _function(thing) if config is None else _driver(thing, config)
+    return _function(thing) if tables is None else _driver(thing, tables)
 
 
 def main() -> None:
@@ -312,8 +314,8 @@ def main() -> None:
     os.dup2(silent, 1)
     os.dup2(silent, 2)
     sys.path[:] = asked["sys_path"]
-    for path, config in asked["paths"]:
-        answers.write(json_text({"path": path, **_read(path, config)}) + "\n")
+    for path, tables in asked["paths"]:
+        answers.write(json_text({"path": path, **_read(path, tables)}) + "\n")
         answers.flush()
     answers.close()
     os._exit(0)  # threads of imported modules, and what they do at exit, have no say

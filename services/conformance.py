@@ -3,30 +3,45 @@
 
 The driver is run beside its device, or beside a simulation of it: it gets your commands, is stopped
 and held in the middle of a movement, closed and made again. Positions are found by themselves: they
-are the numbers of `state` that change during a movement and not at rest.
+are the numbers of `state` that end a movement elsewhere than they began it, and stay there at rest
+(but for the noise of a measurement).
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+from inspect import signature
 from itertools import pairwise
 from typing import Any
 
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.plain import plain
-from petrobot.services.device import Driver
+from petrobot.services.device import LIMITS, Driver, keys_of
 
 Command = Mapping[str, Any]
 REST, PART = 20, 0.25
 """Steps at rest that show which numbers change then, too; the part of a movement after which it is
 stopped or held."""
+PLAY = 0.01
+"""Share of its way by which a position may differ at rest: noise, and what is left of settling."""
+SLOWEST, NOISE = 0.05, 3.0
+"""A position counts as moving while it changes by more than this share of its fastest step, and by
+more than so many times of what it changes at rest."""
 LATE_SHARE = 0.02
 """Share of steps that may take longer than the period: a busy computer delays some."""
 STARTING = 2
 """Steps of a movement in which `stopped` may still be True."""
 UNKNOWN: Command = {"no driver knows this command": True}
+SLOW, SLOWED = 0.25, 0.5
+"""The share of its speed that a driver is given, and the greatest part of its usual quickness that
+it may have then: on its way it speeds up and slows down as usual."""
+ELSEWHERE: Command = dict.fromkeys("xyz", (1e6, 2e6))
+"""A workspace in which no command ends."""
 
 
 @dataclass
@@ -39,22 +54,25 @@ class DriverCheck:
 
 
 def check_driver(
-    make: Callable[[], Driver],
+    make: Callable[..., Driver],
     commands: Sequence[Command] = (),
     *,
+    first: Sequence[Command] = (),
     seconds: float = 5.0,
     within: float = 1.0,
     cable: Callable[[bool], None] | None = None,
     simulated: bool = False,
 ) -> DriverCheck:
-    """Check a driver that `make()` makes anew each time.
+    """Check a driver that `make()` makes anew each time; `make(speed=0.25)` makes it with this key
+    added to the device's table, as `lambda **keys: Axis(keys, ports)` does.
 
     `commands` are two or more that lead to different places, each in at most `seconds`, better in
-    more than `within`; the device must stand still `within` s after `stop`. `cable(False)` pulls
+    more than `within`; `first` are those that a new driver needs before them, to switch its drives
+    on. The device must stand still `within` s after `stop`. `cable(False)` pulls
     the device's cable, `cable(True)` puts it back. `simulated`: time passes only between two steps,
     for a driver whose device is simulated by its steps; the check then takes milliseconds.
     """
-    check = _Check(make, _Clock() if simulated else time, within)
+    check = _Check(make, _Clock() if simulated else time, within, first)
     try:
         check.rules(commands, seconds, cable)
     except Exception as fault:
@@ -69,6 +87,7 @@ def check_device(
     name: str,
     commands: Sequence[Command] = (),
     *,
+    first: Sequence[Command] = (),
     seconds: float = 5.0,
     within: float = 1.0,
 ) -> DriverCheck:
@@ -82,13 +101,14 @@ def check_device(
         known = ", ".join(sorted(d.name for d in directory.devices.values() if d.driver))
         raise ValueError(f"no device with a driver of this name; there are: {known or 'none'}")
 
-    def make() -> Driver:
+    def make(**keys: Any) -> Driver:
         ports = ProcessPorts(directory, entry, time.monotonic, {})
-        driver = make_driver(directory, entry, ports)
+        asked = replace(entry, config={**entry.config, **keys})
+        driver = make_driver(directory, asked, ports)
         ports.draws.reseed(0)
         return driver
 
-    return check_driver(make, commands, seconds=seconds, within=within)
+    return check_driver(make, commands, first=first, seconds=seconds, within=within)
 
 
 class _Clock:
@@ -109,11 +129,12 @@ class _Check:
 
     def __init__(
         self,
-        make: Callable[[], Driver],
+        make: Callable[..., Driver],
         clock: Any,
         within: float,
+        first: Sequence[Command],
     ) -> None:
-        self.make, self.within = make, within
+        self.make, self.within, self.first = make, within, first
         self.now: Callable[[], float] = clock.monotonic
         self.sleep: Callable[[float], None] = clock.sleep
         self.found = DriverCheck()
@@ -121,8 +142,12 @@ class _Check:
         self.longest = 0.0
         self.driver = make()
         self.period = self.driver.period or 0.01
-        self.always = set[str]()
-        """Numbers of the state that change at rest, too."""
+        self.idle: dict[str, float] = {}
+        """By how much each number of the state usually changes in a step at rest."""
+        self.fresh = True
+        """Whether the driver was made and has not been given a command that moves it."""
+        self.refusing = ""
+        """Why it refused the last command."""
 
     def fault(self, text: str) -> None:
         if text not in self.found.faults:
@@ -152,14 +177,17 @@ class _Check:
         self.sleep(max(0.0, self.period - took))
         return numbers
 
-    def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> set[str]:
-        """Step for so long; gives the names of the numbers that changed."""
-        before, changed, end = self.numbers(), set[str](), self.now() + seconds
+    def run(
+        self,
+        seconds: float,
+        until: Callable[[], bool] = lambda: False,
+        positions: Mapping[str, float] | None = None,
+    ) -> set[str]:
+        """Step for so long; gives the positions that changed by more than their play."""
+        begin, drifted, end = self.numbers(), set[str](), self.now() + seconds
         while self.now() < end and not until():
-            after = self.step()
-            changed |= {name for name in after if after[name] != before.get(name)}
-            before = after
-        return changed
+            drifted |= _differ(begin, self.step(), positions or {}, PLAY)
+        return drifted
 
     def rules(
         self, commands: Sequence[Command], seconds: float, cable: Callable[[bool], None] | None
@@ -171,27 +199,44 @@ class _Check:
         else:
             self.refusal()
             for there, back in pairwise([*commands, *commands[:1]] if len(commands) > 1 else ()):
+                self.move(back, seconds)
+                self.rest()  # with its drives on, unlike before
                 self.movements(there, back, seconds)
             if len(commands) < 2:
                 self.note("stop and hold during a movement: give two commands, there and back")
+            else:
+                self.limits(commands, seconds)
         if cable is None:
             self.note("a pulled cable: give `cable`")
         else:
-            self.cable(cable, seconds)
+            self.cable(cable, commands, seconds)
 
     def life(self) -> None:
         """Made, closed, made again; stopped at rest, twice."""
         if self.driver.period is not None and not self.driver.period > 0.0:
             self.fault(f"period: expected seconds above 0 or None, got {self.driver.period!r}")
-        self.always = self.run(REST * self.period)
+        self.rest()
         self.again("close and a second driver of the same configuration")
         self.stop("stop at rest")
 
-    def again(self, what: str) -> None:
-        """Close the driver and make another one."""
+    def rest(self) -> None:
+        """Find out what changes at rest, too: counters, ages, noise."""
+        before, changes = self.numbers(), dict[str, list[float]]()
+        for _ in range(REST):
+            after = self.step()
+            for name, value in after.items():
+                changes.setdefault(name, []).append(abs(value - before.get(name, value)))
+            before = after
+        for name, far in changes.items():
+            # without the largest: a first answer of the device is a jump
+            usual = (sum(far) - max(far)) / len(far)
+            self.idle[name] = max(usual, self.idle.get(name, 0.0))
+
+    def again(self, what: str, **keys: Any) -> None:
+        """Close the driver and make another one, with further keys."""
         try:
             self.driver.close()
-            self.driver = self.make()
+            self.driver, self.fresh = self.make(**keys), True
             self.run(REST * self.period)
         except Exception as fault:
             self.fault(f"{what}: {type(fault).__name__}: {fault}")
@@ -205,10 +250,7 @@ class _Check:
 
     def movements(self, there: Command, back: Command, seconds: float) -> None:
         """One to its end, one stopped on its way, one held on its way and released."""
-        self.move(back, seconds)
-        begin = self.now()
-        positions = self.move(there, seconds)
-        took = self.now() - begin - REST * self.period
+        positions, took = self.way(there, back, seconds)
         if not positions:
             self.fault(f"{dict(there)}: no number of state changes: give a command that moves it")
             return
@@ -222,34 +264,116 @@ class _Check:
             self.fault(f'hold: expected "held", "cannot hold" or "stopped", got {answer!r}')
         if answer in ("held", "stopped"):
             self.run(self.within)
-            if drift := self.run(REST * self.period) & positions:
+            if drift := self.run(REST * self.period, positions=positions):
                 self.fault(f"hold: answered {answer!r}, and {_names(drift)} still changes")
         self.driver.release(self.now())
-        if answer == "held" and not self.run(seconds) & positions:
+        if answer == "held" and not self.run(seconds, positions=positions):
             self.fault("release: the movement that was held does not continue")
         self.stop("stop", positions)
 
-    def move(self, command: Command, seconds: float) -> set[str]:
-        """Give a command and step for so long, or until it stands again; gives the positions that
-        changed."""
-        try:
-            self.driver.command(self.now(), command)
-        except Exception as fault:
-            self.fault(f"{dict(command)}: refused: {type(fault).__name__}: {fault}")
-        before, positions, resting, untrue = self.numbers(), set[str](), 0, 0
+    def limits(self, commands: Sequence[Command], seconds: float) -> None:
+        """It obeys those of `speed`, `workspace` and `dry_run` that it says it obeys."""
+        own = keys_of(type(self.driver))
+        obeys = [name for name in LIMITS if name in self.driver.obeys and name not in own]
+        takes = signature(self.make).parameters.values()
+        if not any(one.kind is one.VAR_KEYWORD for one in takes):
+            if obeys:
+                self.note(f"{', '.join(obeys)}: let `make` take keys of the device's table")
+            return
+        there, back = commands[0], commands[-1]
+        positions, took = self.way(there, back, seconds)
+        self.move(back, seconds)
+        if "speed" in obeys:
+            self.again(f"speed = {SLOW}", speed=SLOW)
+            most = max(positions, key=positions.__getitem__, default="")
+            slow, slowly = self.way(there, back, seconds / SLOW)
+            share = slow.get(most, 0.0) / slowly / (positions.get(most, 0.0) / took or 1.0)
+            if share > SLOWED:
+                self.fault(
+                    f"speed = {SLOW}: {dict(there)} moves it at {share:.2f} of its usual speed; if "
+                    "it does not reach that on so short a way, give commands farther apart"
+                )
+            self.move(back, seconds / SLOW)
+        if "workspace" in obeys:
+            self.again("a workspace far away", workspace=ELSEWHERE)
+            self.run(seconds)
+            for command in (there, back):
+                before = self.numbers()
+                with suppress(ValueError):
+                    self.driver.command(self.now(), command)
+                self.run(took)
+                if moved := _differ(before, self.numbers(), positions, PART):
+                    self.fault(f"workspace: {dict(command)} moves it far outside: {_names(moved)}")
+            self.stop("stop")
+        if "dry_run" in obeys:
+            self.again("made again")
+            before = self.numbers()
+            self.again("dry_run = true", dry_run=True)
+            self.move(there, seconds)
+            self.again("made again")
+            if moved := _differ(before, self.numbers(), positions, PART):
+                self.fault(f"dry_run: {dict(there)} moves the device: {_names(moved)} changed")
+        self.again("made again")
+
+    def way(
+        self, there: Command, back: Command, seconds: float
+    ) -> tuple[Mapping[str, float], float]:
+        """Move back and there; return how far each position came, and how long it took (s)."""
+        self.move(back, seconds, judged=False)  # it may be there already, and only settle
+        begin = self.now()
+        positions = self.move(there, seconds)
+        return positions, max(self.period, self.now() - begin - REST * self.period)
+
+    def move(self, command: Command, seconds: float, judged: bool = True) -> Mapping[str, float]:
+        """Give a command and step for so long, or until it stands again; gives how far each
+        position came."""
+        self.refusing = ""
+        for needed in (*self.first, command) if self.fresh else ():
+            self.run(seconds, partial(self.accepts, needed))  # a new driver may need time
+        if not self.accepts(command):
+            self.fault(f"{dict(command)}: refused: {self.refusing}")
+        judged, self.fresh = judged and not self.fresh, False
+        begin = before = low = high = self.numbers()
+        fastest, resting, untrue = dict[str, float](), 0, 0
+        moved, lied = set[str](), set[str]()
+        ways, away = dict[str, float](), set[str]()
         end = self.now() + seconds
         while self.now() < end and resting < REST:
             still = self.driver.stopped()
             after = self.step()
-            changed = {name for name in after if after[name] != before.get(name)} - self.always
-            before, positions = after, positions | changed
+            low = {name: min(value, low.get(name, value)) for name, value in after.items()}
+            high = {name: max(value, high.get(name, value)) for name, value in after.items()}
+            ways = {n: abs(v - begin[n]) for n, v in after.items() if n in begin and n in before}
+            away = {n for n, far in ways.items() if far > 0.5 * (high[n] - low[n])}
+            steps = {name: abs(after[name] - before[name]) for name in away}
+            fastest |= {n: max(far, fastest.get(n, 0.0)) for n, far in steps.items()}
+            changed = {
+                name
+                for name, far in steps.items()
+                if far > max(SLOWEST * fastest[name], NOISE * self.idle.get(name, 0.0))
+            }
+            before, moved = after, moved | changed
             resting = 0 if changed else resting + 1
-            untrue += bool(still and changed)
-        if untrue > STARTING:
-            self.fault(f"stopped: True during {dict(command)}, while {_names(positions)} changed")
-        return positions
+            if still and changed:
+                untrue, lied = untrue + 1, lied | changed
+        found = {name: far for name, far in ways.items() if name in moved and name in away}
+        least = SLOWEST * max(found.values(), default=0.0)  # what hardly moves only settles
+        found = {name: far for name, far in found.items() if far >= least}
+        if judged and untrue > STARTING and lied & found.keys():
+            names = _names(lied & found.keys())
+            self.fault(f"stopped: True during {dict(command)}, while {names} changed")
+        return found
 
-    def stop(self, what: str, positions: set[str] | None = None) -> None:
+    def accepts(self, command: Command) -> bool:
+        """Give a command; return whether it was accepted."""
+        try:
+            self.driver.command(self.now(), command)
+        except Exception as fault:
+            self.refusing = f"{type(fault).__name__}: {fault}"
+            return False
+        return True
+
+    def stop(self, what: str, positions: Mapping[str, float] | None = None) -> None:
         """Stop it, twice."""
         self.driver.stop(self.now())
         try:
@@ -258,17 +382,21 @@ class _Check:
             self.fault(f"stop, a second time: {type(fault).__name__}: {fault}")
         self.stands(what, positions)
 
-    def stands(self, what: str, positions: set[str] | None = None) -> None:
+    def stands(self, what: str, positions: Mapping[str, float] | None = None) -> None:
         """It says that it stands still within the limit, and does."""
         self.run(self.within, self.driver.stopped)
         if not self.driver.stopped():
             self.fault(f"{what}: stopped() is still False after {self.within:g} s")
-        elif drift := self.run(REST * self.period) & (positions or set()):
+        elif drift := self.run(REST * self.period, positions=positions):
             self.fault(f"{what}: stopped() is True, and {_names(drift)} still changes")
 
-    def cable(self, cable: Callable[[bool], None], seconds: float) -> None:
+    def cable(
+        self, cable: Callable[[bool], None], commands: Sequence[Command], seconds: float
+    ) -> None:
         """Without its cable a driver raises, or no longer says that it stands; with it, a new one
         works."""
+        for command in commands[-1:]:
+            self.move(command, seconds)
         cable(False)
         try:
             self.driver.stop(self.now())
@@ -279,6 +407,8 @@ class _Check:
             pass
         cable(True)
         self.again("cable put back")
+        for command in commands[:1]:
+            self.move(command, seconds)
 
     def end(self) -> None:
         """Stop and close the driver, whatever happened."""
@@ -302,8 +432,16 @@ def _leaves(value: Any, path: str) -> Iterator[tuple[str, float]]:
     elif isinstance(value, list | tuple):
         for number, part in enumerate(value):
             yield from _leaves(part, f"{path}[{number}]")
-    elif isinstance(value, int | float) and not isinstance(value, bool):
+    elif isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
         yield path, float(value)
+
+
+def _differ(
+    before: Mapping[str, float], after: Mapping[str, float], ways: Mapping[str, float], share: float
+) -> set[str]:
+    """Return the positions that differ by more than a share of their way."""
+    known = (name for name in ways if name in before and name in after)
+    return {name for name in known if abs(after[name] - before[name]) > share * ways[name]}
 
 
 def _names(found: set[str]) -> str:

@@ -10,7 +10,8 @@ inline."""
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping
+import math
+from collections.abc import Collection, Mapping, Sequence
 from copy import copy
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -99,14 +100,18 @@ CAMERA_KEYS = (
 )
 PORT_KEYS = ("interface", "channel", "bitrate", "can", *CAMERA_KEYS)
 """Keys of a device's table that its ports read: what bus and which images it has."""
+LIMITS = ("speed", "workspace", "dry_run")
+"""Keys of a device's table for its first motions: any device may have them whose driver obeys
+them (`Driver.obeys`)."""
+COMMON_KEYS = (*PORT_KEYS, *LIMITS)
 
 
 def refuse_unknown_keys(config: Mapping[str, Any], own: Collection[str]) -> None:
     """Raise ValueError if a device's table has a key that is neither its driver's `own` nor its
     ports': a mistyped one would silently be no setting at all. For a driver's constructor."""
     for name in config:
-        if name not in own and name not in PORT_KEYS:
-            raise ValueError(f"unknown key {name!r}{nearest(name, [*own, *PORT_KEYS])}")
+        if name not in own and name not in COMMON_KEYS:
+            raise ValueError(f"unknown key {name!r}{nearest(name, [*own, *COMMON_KEYS])}")
 
 
 class _Required:
@@ -168,6 +173,31 @@ def key(default: Any = _Required, text: str = "") -> Any:
     return Key(default, text)
 
 
+class Workspace:
+    """The box in which a device may move: bounds (m) by axis, in the frame that its driver's
+    documentation names. An axis without bounds is free; the box without any is all of space."""
+
+    def __init__(self, bounds: Mapping[str, Sequence[float]] | None = None) -> None:
+        """Raises ValueError for a table that is not a box."""
+        self.bounds = dict(bounds or {}) if isinstance(bounds, Mapping | None) else {"": ()}
+        for axis, ends in self.bounds.items():
+            fits = axis in ("x", "y", "z") and isinstance(ends, list | tuple) and len(ends) == 2
+            if not fits or not all(map(_is_number, ends)) or not ends[0] < ends[1]:
+                raise ValueError(
+                    "workspace: expected a table such as { x = [-0.5, 0.5], z = [0.1, 0.9] } with "
+                    f"the least and the greatest value (m) of x, y or z, found {bounds!r:.80}"
+                )
+
+    def outside(self, point: Sequence[float]) -> str:
+        """Return in words that a point (x, y, z in m) lies outside; empty if it lies inside."""
+        at = dict(zip("xyz", point, strict=False))
+        if all(low <= at[axis] <= high for axis, (low, high) in self.bounds.items()):
+            return ""
+        box = ", ".join(f"{axis} = [{low:g}, {top:g}]" for axis, (low, top) in self.bounds.items())
+        there = ", ".join(f"{axis} = {value:.3f}" for axis, value in at.items())
+        return f"the point {there} m lies outside the workspace {box} m"
+
+
 class Driver:
     """One device: the base class of drivers. Override what the device can do.
 
@@ -179,12 +209,35 @@ class Driver:
 
     period: float | None = None
     """Seconds between calls of `step`; None for a driver without cyclic work."""
+    obeys: Collection[str] = ()
+    """Which of `speed`, `workspace` and `dry_run` this driver obeys. A table that asks for another
+    one is refused."""
+    speed: float = 1.0
+    """Share of its normal speed at which the device may move: above 0, at most 1."""
+    workspace = Workspace()
+    """Where the device may move: refuse commands and set points outside, and stop a motion that
+    leaves it."""
+    dry_run: bool = False
+    """Drives off: obey all as usual and report the motion that would have come of it, but enable
+    no drive and send no motion."""
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         """Read the keys of the device's table. Raises ValueError with every wrong key."""
         self.ports = ports
         for name, value in read_keys(type(self), config).items():
             setattr(self, name, value)
+        self.limit(config)
+
+    def limit(self, config: Mapping[str, Any]) -> None:
+        """Read `speed`, `workspace` and `dry_run` of the device's table: for a constructor that
+        does not call that of `Driver`. Raises ValueError."""
+        if faults := faults_of_limits(type(self), config):
+            raise ValueError("; ".join(text for _, text in faults))
+        if "speed" in config and "speed" not in keys_of(type(self)):
+            self.speed = float(config["speed"])
+        if "workspace" in config and "workspace" not in keys_of(type(self)):
+            self.workspace = Workspace(config["workspace"])
+        self.dry_run = config.get("dry_run", False)
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
         """Take a command from an action (cyclic drivers). Raise ValueError to refuse it: that ends
@@ -238,9 +291,48 @@ def read_keys(driver: type, config: Mapping[str, Any]) -> dict[str, Any]:
 
 def faults_of_keys(driver: type, config: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return each wrong key of a device's table, and what is wrong with it, without making the
-    driver; empty for a driver that declares no keys and reads them itself."""
+    driver; of a driver that declares no keys and reads them itself only `faults_of_limits`."""
     reads_itself = driver.__init__ is not Driver.__init__ and not keys_of(driver)  # type: ignore[misc]
-    return [] if reads_itself else _faults_of_keys(driver, config)
+    own = [] if reads_itself else _faults_of_keys(driver, config)
+    return own + faults_of_limits(driver, config)
+
+
+def faults_of_limits(driver: type, config: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return what is wrong with `speed`, `workspace` and `dry_run` in a device's table, by key: a
+    driver that does not obey one would run as if it were not there. A key of this name that the
+    driver declares itself is its own."""
+    faults = list[tuple[str, str]]()
+    obeys = getattr(driver, "obeys", ())
+    for name in LIMITS:
+        still = name == "dry_run" and not can_move(driver)  # as in every dry run
+        if name not in config or name in keys_of(driver) or still:
+            continue
+        if name not in obeys:
+            text = f'{name}: {driver.__name__} does not obey it; do without it, or write obeys = ("'
+            faults.append((name, f'{text}{name}",) in the driver and obey it there'))
+            continue
+        value = config[name]
+        if name == "dry_run" and not isinstance(value, bool):
+            faults.append((name, f"dry_run: expected true or false, found {value!r:.60}"))
+        if name == "speed" and not (_is_number(value) and 0.0 < value <= 1.0):
+            text = "expected a number above 0 and at most 1, the share of the normal speed"
+            faults.append((name, f"speed: {text}, found {value!r:.60}"))
+        if name == "workspace":
+            try:
+                Workspace(value)
+            except ValueError as fault:
+                faults.append((name, str(fault)))
+    return faults
+
+
+def can_move(driver: type) -> bool:
+    """Return whether the class is that of a cyclic driver: any other device does not move."""
+    steps = getattr(driver, "step", Driver.step) is not Driver.step
+    return steps or getattr(driver, "period", None) is not None
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _faults_of_keys(driver: type, config: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -251,8 +343,8 @@ def _faults_of_keys(driver: type, config: Mapping[str, Any]) -> list[tuple[str, 
         except ValueError as fault:
             faults.append((name, str(fault)))
     for name in config:
-        if name not in own and name not in PORT_KEYS:
-            faults.append((name, f"unknown key {name!r}{nearest(name, [*own, *PORT_KEYS])}"))
+        if name not in own and name not in COMMON_KEYS:
+            faults.append((name, f"unknown key {name!r}{nearest(name, [*own, *COMMON_KEYS])}"))
     return faults
 
 

@@ -39,14 +39,15 @@ def parser() -> argparse.ArgumentParser:
         metavar="S",
         help="lock step: wait so long for a coordinator that died and is resumed (s of wall time)",
     )
+    commands.add_argument("--dry-run", action="store_true", help="serve nodes of a dry run")
     add_log_level(commands)
     return commands
 
 
-def read(path: Path) -> tuple[Directory, str]:
+def read(path: Path, dry_run: bool = False) -> tuple[Directory, str]:
     """Return the location file and the name of its simulated node. Raises DirectoryError."""
     try:
-        directory = load(path)
+        directory = load(path, dry_run)
     except OSError as fault:
         raise DirectoryError(
             (f"{path}: {fault.strerror}; name the file with --services",)
@@ -66,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     log_to_stderr(LOG_LEVELS[options.log_level])
     try:
-        directory, name = read(options.services)
+        directory, name = read(options.services, options.dry_run)
         if options.lockstep:
             laboratory = resolve(directory.nodes[name].sim)(directory, name)
             run_member(directory, name, laboratory, options.await_coordinator)

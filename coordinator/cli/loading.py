@@ -189,13 +189,14 @@ def file_line(path: Path, key: str) -> str:
     return f"{path}:{line_of(key, key_lines(path.read_text(encoding='utf-8')))}"
 
 
-def load_directory(given: Path | None) -> Directory:
-    """Read services.toml."""
+def load_directory(given: Path | None, dry_run: bool = False) -> Directory:
+    """Read services.toml; with `dry_run` all drives of this host are to stay off, and a driver that
+    cannot do without them is refused."""
     from petrobot.services.comm.location_file import DirectoryError, load
 
     path = services_path(given)
     try:
-        return load(path)
+        directory = load(path, dry_run)
     except OSError as fault:
         text = (
             f"{path}: {fault.strerror or fault}; give --services a location file that can be read"
@@ -203,6 +204,22 @@ def load_directory(given: Path | None) -> Directory:
         raise CommandError(2, text) from fault
     except DirectoryError as fault:
         raise CommandError(2, str(fault)) from fault
+    if dry_run:
+        from petrobot.services.comm.location_file import read_text
+        from petrobot.services.comm.location_file.code import code_faults, read_code
+
+        if faults := code_faults(directory, read_code(directory), read_text(path)):
+            raise CommandError(2, "\n".join(faults))
+    return directory
+
+
+def add_dry_run_argument(parser: argparse.ArgumentParser) -> None:
+    """Add `--dry-run`."""
+    parser.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="keep all drives off: drivers obey as usual, and nothing moves",
+    )
 
 
 def refuse_misplaced(

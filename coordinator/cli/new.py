@@ -178,12 +178,13 @@ class {Class}(Driver):
     write to its motor in `step`."""
 
     period = 0.01  # s between two steps; without it the driver has no `step`, and nothing moves
-    speed: float = key(0.5, "m/s")
+    obeys = ("speed", "workspace", "dry_run")  # keys of its table for its first motions
+    top_speed: float = key(0.5, "m/s")
     length: float = key(1.0, "m, from end to end")
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         super().__init__(config, ports)
-        self.at = self.goal = 0.0  # m
+        self.at = self.goal = 0.0  # m along x
         self.paused = False
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
@@ -191,12 +192,16 @@ class {Class}(Driver):
         to = body.get("to")
         if not isinstance(to, int | float) or not 0.0 <= to <= self.length:
             raise ValueError(f"to: expected 0 to {self.length} m, found {to!r}")
+        if outside := self.workspace.outside((to, 0.0, 0.0)):
+            raise ValueError(f"to: {outside}")
         self.goal = float(to)
 
     def step(self, now: float) -> None:
         if not self.paused:
-            most = self.speed * self.period
+            most = self.speed * self.top_speed * self.period
             self.at += max(-most, min(most, self.goal - self.at))
+            # A real one would write to its motor here, unless `self.dry_run`, and call `stop` where
+            # its axis leaves the workspace.
 
     def state(self) -> Mapping[str, Any]:
         return {"at": self.at, "arrived": self.stopped()}
@@ -224,7 +229,8 @@ from petrobot import Context, Remote, Result, check_driver, rehearse, success
 
 def test_it_keeps_the_rules_of_drivers():
     there_and_back = [{"to": 0.9}, {"to": 0.1}]
-    assert check_driver(lambda: {Class}({}, None), there_and_back, simulated=True).faults == []
+    found = check_driver(lambda **keys: {Class}(keys, None), there_and_back, simulated=True)
+    assert found.faults == []
 
 
 async def drive(ctx: Context[Remote], *, to: float) -> Result:
@@ -234,7 +240,7 @@ async def drive(ctx: Context[Remote], *, to: float) -> Result:
 
 
 def test_it_arrives():
-    device = {Class}({"speed": 0.5}, None)
+    device = {Class}({"top_speed": 0.5}, None)
     assert 0.9 < rehearse(drive, device=device, to=0.5).seconds < 1.1 and device.at == 0.5
 
 
@@ -313,7 +319,7 @@ port = 7501
 [devices.axis]
 node = "pc"
 driver = "{name}:Axis"
-speed = 0.5                  # keys of the driver
+top_speed = 0.5              # keys of the driver
 
 [actions.move]
 run = "{name}:move"
@@ -344,14 +350,15 @@ def petrobot(*arguments):
 
 
 def test_it_moves():
-    axis = Axis({"speed": 0.5}, None)
+    axis = Axis({"top_speed": 0.5}, None)
     played = rehearse(move, device=axis, to=0.5)
     assert played.result.status == "success" and 0.9 < played.seconds < 1.1
 
 
 def test_the_driver_keeps_the_rules_of_drivers():
     there_and_back = [{"to": 0.9}, {"to": 0.1}]
-    assert check_driver(lambda: Axis({}, None), there_and_back, simulated=True).faults == []
+    found = check_driver(lambda **keys: Axis(keys, None), there_and_back, simulated=True)
+    assert found.faults == []
 
 
 def test_what_is_out_of_reach_is_refused():

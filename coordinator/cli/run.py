@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
+    add_dry_run_argument,
     add_services_argument,
     cell_of,
     cell_path,
@@ -69,6 +70,7 @@ REFUSED = {
     "services": "the cell is that of the recorded run",
     "join": "it simulates its own cell",
     "up": "it simulates its own cell",
+    "dry_run": "it simulates its own cell",
 }
 """Options that cannot be combined with --from, and why."""
 
@@ -128,6 +130,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="start the nodes of this host for this run, and stop them after it",
     )
+    add_dry_run_argument(parser)
     parser.add_argument(
         "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
     )
@@ -229,7 +232,7 @@ def run(options: argparse.Namespace) -> int:
     options.seed = SEED if options.seed is None else options.seed
     lockstep = options.mode == "lockstep"
     task = load_task(options.task)
-    directory = load_directory(cell_path(options.services, options.task, task))
+    directory = load_directory(cell_path(options.services, options.task, task), options.dry_run)
     if options.join and (not lockstep or options.processes != 0):
         raise CommandError(
             2,
@@ -461,9 +464,10 @@ def _learning(options: argparse.Namespace) -> LearningSetting | None:
 def _from_record(options: argparse.Namespace) -> Callable[[], RunSession]:
     """Return a function that prepares a simulated run from a point of a recorded one."""
     for name, why in REFUSED.items():
+        said = f"--{name.replace('_', '-')}"
         if getattr(options, name):
             raise CommandError(
-                2, f"--from cannot have {'--' if name != 'task' else 'a '}{name}: {why}"
+                2, f"--from cannot have {'a task' if name == 'task' else said}: {why}"
             )
     if options.mode == "realtime" or options.processes != 1:
         raise CommandError(

@@ -32,6 +32,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a command that moves the device; give two or more, there and back",
     )
     parser.add_argument(
+        "--first",
+        type=_command,
+        action="append",
+        default=[],
+        metavar="JSON",
+        help="a command that a new driver needs before those, to switch its drives on",
+    )
+    parser.add_argument(
         "--seconds",
         type=number(least=0.1),
         default=5.0,
@@ -68,6 +76,7 @@ def run(options: argparse.Namespace) -> int:
             directory,
             options.device,
             options.commands,
+            first=options.first,
             seconds=options.seconds,
             within=options.within,
         )

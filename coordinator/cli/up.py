@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
+    add_dry_run_argument,
     add_services_argument,
     load_directory,
     refuse_misplaced,
@@ -54,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
     )
+    add_dry_run_argument(parser)
     parser.add_argument("--no-respawn", action="store_true", help="do not restart a node that died")
     parser.add_argument(
         "--print-unit",
@@ -65,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Start the nodes and watch them."""
-    directory = load_directory(options.services)
+    directory = load_directory(options.services, options.dry_run)
     refuse_misplaced(directory, scripted=options.mock is not None)
     refuse_script(options.mock, directory)
     if options.print_unit:
@@ -83,7 +85,7 @@ After=network-online.target
 [Service]
 User={user}
 WorkingDirectory={folder}
-ExecStart="{petrobot}" up --services "{services}" --logs "{logs}"
+ExecStart="{petrobot}" up --services "{services}" --logs "{logs}"{dry_run}
 Restart=on-failure
 RestartSec=1
 # petrobot stops its nodes itself, devices first; what is left is killed.
@@ -109,6 +111,7 @@ def unit(directory: Directory, logs: Path) -> str:
     }
     # In a unit, "%" begins a specifier.
     texts = {name: str(path).replace("%", "%%") for name, path in paths.items()}
+    texts["dry_run"] = " --dry-run" if directory.dry_run else ""
     return UNIT.format(user=getpass.getuser(), **texts)
 
 

@@ -164,7 +164,7 @@ def prepare(request: RunRequest, task: Task, text: str, directory: Directory) ->
         request,
         directory,
         Setting(task, request.parameters, request.runs, seed, selector),
-        (text, directory.source.read_text(encoding="utf-8")),
+        (text, directory.text),
         {"chosen": dict(request.chosen), **more},
         learning,
     )

@@ -109,3 +109,8 @@ class SpeedProfile:
         """Return the next set speed (m/s) between the present and the wanted one."""
         up, down = self.raising * dt, 1.6 * self.braking * dt
         return min(max(wanted, present - down), present + up)
+
+    def distance(self, speed: float) -> float:
+        """Return how far (m) the rover drives on from `speed` (m/s) until `towards` has it
+        stand."""
+        return speed * speed / (3.2 * self.braking)

@@ -13,10 +13,10 @@ Commands: {"do": "follow", "law", "speed"} (repeat it within `LEASE` s), {"do": 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from petrobot.services.device import Driver, Ports, Setpoint
+from petrobot.services.device import LIMITS, Driver, Ports, Setpoint
 from petrobot.services.mobile.following import LAWS, PurePursuit, SpeedProfile, capped
 from petrobot.services.mobile.model import RoverModel as Numbers
 from petrobot.services.mobile.model import nominal_rover, read_rover
@@ -50,6 +50,8 @@ REGAINED_ASIDE: Final = 0.25
 """m to the side at most."""
 REGAINED_TURN: Final = 0.6
 """rad askew at most."""
+EDGE: Final = 0.02
+"""m from the edge of its workspace at which the rover stands."""
 DRIVES_SHARE: Final = 0.95
 """Share of the wheels' top speed that set points use; the rest is for the lead over their lag."""
 
@@ -58,10 +60,14 @@ class Rover(Driver):
     """Driver of the rover (see `services.device.Driver`). Its keys in services.toml, all optional
     except those of its bus:
 
-    `rover`: file of numbers beside services.toml (default: the shipped one).
+    `rover`: file of numbers beside services.toml (default: the shipped one). Its workspace bounds
+    the middle of its axle in the odometry frame: where that stood when the driver was made.
     """
 
+    obeys = LIMITS
+
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        self.limit(config)
         name = str(config.get("rover", ""))
         self.numbers: Numbers = (
             read_rover(ports.file(name).decode(), name) if name else nominal_rover()
@@ -72,7 +78,12 @@ class Rover(Driver):
         self._bus = ports.can()
         self._setpoint: Setpoint = ports.stream(STREAM)
         self._master = WheelMaster(
-            round(bus.left), round(bus.right), round(bus.sensor), bus.period, wheels.quick_stop
+            round(bus.left),
+            round(bus.right),
+            round(bus.sensor),
+            bus.period,
+            wheels.quick_stop,
+            self.dry_run,
         )
         self._odometry = Odometry(wheels.track_width)
         self._map = TrackMap()
@@ -168,7 +179,8 @@ class Rover(Driver):
 
     def stopped(self) -> bool:
         """Return whether the rover stands, held by its drives or by its brakes."""
-        return self._standing() and self._mode in ("off", "rest")
+        still = self._standing() and not self._master.blind
+        return still and self._mode in ("off", "rest")
 
     def hold(self, now: float) -> str:
         """Pause for the operator: brake, and resume the same motion after `release`."""
@@ -191,7 +203,9 @@ class Rover(Driver):
         law = str(body.get("law", self._law))
         if law not in LAWS:
             raise ValueError(f"unknown law {law!r}: know {', '.join(LAWS)}")
-        self._law, self._asked = law, _positive(body, "speed")
+        if outside := self._leaves():
+            raise ValueError(f"follow: {outside}")
+        self._law, self._asked = law, self.speed * _positive(body, "speed")
         self._lease(now, "follow")
 
     def _turn(self, now: float, body: Mapping[str, Any]) -> None:
@@ -201,7 +215,7 @@ class Rover(Driver):
             raise ValueError(
                 f"turn: to: expected a finite heading (rad, odometry frame), got {to!r}"
             )
-        self._heading, self._rate = float(to), _positive(body, "rate", 1.0)
+        self._heading, self._rate = float(to), self.speed * _positive(body, "rate", 1.0)
         self._lease(now, "turn")
 
     def _plan(self, body: Mapping[str, Any]) -> None:
@@ -210,6 +224,7 @@ class Rover(Driver):
             raise ValueError(
                 "plan: points: expected pairs of finite numbers (m, odometry frame), got others"
             )
+        self._refuse_outside("plan", points)
         self._map.plan(points)
 
     def _stretch(self, body: Mapping[str, Any]) -> None:
@@ -219,6 +234,7 @@ class Rover(Driver):
                 "stretch: gates: expected poses of three finite numbers (m, m, rad, odometry "
                 "frame), got others"
             )
+        self._refuse_outside("stretch", gates)
         self._map.begin(
             [Pose(*map(float, gate)) for gate in gates], look=bool(body.get("look", True))
         )
@@ -240,6 +256,22 @@ class Rover(Driver):
                 or self._master.phase.value
             )
             raise ValueError(f"cannot {what}: the drives are not enabled ({troubles})")
+
+    def _refuse_outside(self, what: str, places: Sequence[Sequence[float]]) -> None:
+        for x, y, *_ in places:
+            if outside := self.workspace.outside((x, y, 0.0)):
+                raise ValueError(f"{what}: {outside}")
+
+    def _leaves(self) -> str:
+        """Return in words that the rover would leave its workspace if it braked now; empty if it
+        would not."""
+        if not self.workspace.bounds:
+            return ""
+        pose, speed = self._odometry.pose, self._speed
+        ahead = EDGE + speed * self.numbers.bus.period + self._profile.distance(speed)
+        x = pose.x + ahead * math.cos(pose.heading)
+        y = pose.y + ahead * math.sin(pose.heading)
+        return self.workspace.outside((x, y, 0.0))
 
     def _lease(self, now: float, mode: str) -> None:
         self._leased_until = now + LEASE
@@ -264,6 +296,8 @@ class Rover(Driver):
         """Update odometry and reflectors."""
         radius = self.numbers.wheels.wheel_radius
         left, right = (wheel.turned() * radius for wheel in self._master.drives)
+        if self.dry_run:
+            left, right = (speed * radius * self.numbers.bus.period for speed in self._set)
         self._odometry.add(now, left, right)
         self._measured = 0.5 * (left + right) / self.numbers.bus.period
         self._turning = (right - left) / self.numbers.wheels.track_width / self.numbers.bus.period
@@ -295,6 +329,8 @@ class Rover(Driver):
             self._mode, self._reason = "rest", "enabled"
         if self._mode in ("follow", "turn") and now > self._leased_until and not self._paused:
             self._rest("silent_action")
+        if self._mode == "follow" and (outside := self._leaves()):
+            self._rest(outside)
         if self._paused or self._mode == "rest":
             return self._brake()
         return self._turn_on() if self._mode == "turn" else self._follow_on()

@@ -8,6 +8,7 @@ reported, but does not stop the rover.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 from petrobot.services.comm.canopen import cia301 as canopen
@@ -129,7 +130,15 @@ class WheelLink:
 class WheelMaster(CanopenMaster[WheelLink]):
     """Master of the wheels `left` and `right` (node ids) and of the reflector sensor `sensor`."""
 
-    def __init__(self, left: int, right: int, sensor: int, cycle: float, quick_stop: float) -> None:
+    def __init__(
+        self,
+        left: int,
+        right: int,
+        sensor: int,
+        cycle: float,
+        quick_stop: float,
+        dry_run: bool = False,
+    ) -> None:
         """`cycle` s, `quick_stop` rad/s^2."""
         self.sensor = sensor
         self.echoes: list[bytes] = []
@@ -145,7 +154,12 @@ class WheelMaster(CanopenMaster[WheelLink]):
             (companion,),
             cycle,
             Supervision(SILENT_CYCLES, HEARTBEAT_PATIENCE, old_emergencies=True),
+            dry_run=dry_run,
         )
+
+    def advance(self, now: float, targets: Sequence[float]) -> list[Frame]:
+        """Return the frames of one cycle; in a dry run with speeds of zero."""
+        return super().advance(now, (0.0, 0.0) if self._dry_run else targets)
 
     @property
     def sensor_alive(self) -> bool:

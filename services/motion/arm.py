@@ -28,7 +28,7 @@ from typing import Any, Final
 import numpy as np
 
 from petrobot.services.comm.canopen.master import MasterPhase
-from petrobot.services.device import Driver, Ports, Setpoint, refuse_unknown_keys
+from petrobot.services.device import LIMITS, Driver, Ports, Setpoint, refuse_unknown_keys
 from petrobot.services.motion.drive_master import DriveMaster, DriveSettings
 from petrobot.services.motion.following import Follower
 from petrobot.services.motion.interception import STRATEGIES, Interceptor, Strategy
@@ -52,14 +52,13 @@ from petrobot.services.motion.steering import Steering
 class Settings:
     """Configuration of the driver in services.toml.
 
-    `stream` and `stream_period` (s) name the stream of catch points; `speed` is the share of the
-    joints' greatest speeds to use; `enable` says whether to enable the drives at the start; `model`
-    and `cell` name files to read instead of the package's own.
+    `stream` and `stream_period` (s) name the stream of catch points; `enable` says whether to
+    enable the drives at the start; `model` and `cell` name files to read instead of the package's
+    own.
     """
 
     stream: str = "catch_point"
     stream_period: float = 0.02
-    speed: float = 1.0
     enable: bool = True
     model: str = ""
     cell: str = ""
@@ -82,11 +81,6 @@ class Settings:
                     f"services.toml: arm: {name}: expected a {kind.__name__}, got {value!r}"
                 )
         settings = cls(**fields)
-        if not 0.0 < settings.speed <= 1.0:
-            raise ValueError(
-                "services.toml: arm: speed: expected a number above 0 and at most 1, got "
-                f"{settings.speed}"
-            )
         if not settings.stream_period > 0.0:
             raise ValueError(
                 "services.toml: arm: stream_period: expected seconds above 0, got "
@@ -183,27 +177,32 @@ POWER: Final = 0x02
 
 
 class Arm(Driver):
-    """Driver of the PUMA (see `services.device.Driver`)."""
+    """Driver of the PUMA (see `services.device.Driver`). Its workspace bounds the centre of the
+    cup's mouth in the arm's base frame."""
 
     period: float | None = PERIOD
+    obeys = LIMITS
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         settings = Settings.parse(config)
+        self.limit(config)
         self._ports = ports
         self.model, cell = numbers(settings, ports)
         self._puma = Puma.of(self.model)
-        self._guard = CollisionGuard(self._puma, self.model, cell)
+        self._guard = CollisionGuard(self._puma, self.model, cell, workspace=self.workspace)
         home = self.model.poses["home"]
         self._interceptor = Interceptor(
             self._puma, cell, self._guard, home, branch_of(self._puma, np.asarray(home))
         )
-        self._full_speed = (self.model.speed * (settings.speed * SPEED_SHARE)).tolist()
+        self._full_speed = (self.model.speed * (self.speed * SPEED_SHARE)).tolist()
         self._full_acceleration = self.model.acceleration.tolist()
         self._steering = Steering(
             self._guard, self._interceptor.retreat, home, PERIOD, self.model.acceleration
         )
         self._trajectory = self._steering.trajectory
-        self._master = DriveMaster(drive_settings(self.model), PERIOD, enable=settings.enable)
+        self._master = DriveMaster(
+            drive_settings(self.model), PERIOD, enable=settings.enable, dry_run=self.dry_run
+        )
         self._setpoint: Setpoint = ports.stream(settings.stream)
         self._bus = ports.can()
         self._follower = Follower(settings.stream_period)
@@ -306,6 +305,8 @@ class Arm(Driver):
 
     def stopped(self) -> bool:
         """Return whether the arm stands still, held by its drives or its brakes."""
+        if self._master.blind:
+            return False
         if self._mode == "off":
             return (
                 self._master.phase is not MasterPhase.RUNNING
@@ -384,7 +385,9 @@ class Arm(Driver):
         return [min(mine, theirs) for mine, theirs in zip(self._full_speed, drives, strict=True)]
 
     def _measure(self) -> None:
-        before, self._measured = self._measured, self._master.positions
+        pretends = self.dry_run and self._mode != "off"
+        commanded = list(self._trajectory.q) if pretends else self._master.positions
+        before, self._measured = self._measured, commanded
         self._measured_speed = [
             (new - old) / PERIOD for new, old in zip(self._measured, before, strict=True)
         ]

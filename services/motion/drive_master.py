@@ -201,7 +201,12 @@ class DriveMaster(CanopenMaster[JointDriveLink]):
     """Master of nodes 1 to 6 (drives, base to flange) and of the node `inputs` (digital inputs)."""
 
     def __init__(
-        self, settings: Sequence[DriveSettings], cycle: float, inputs: int = 7, enable: bool = True
+        self,
+        settings: Sequence[DriveSettings],
+        cycle: float,
+        inputs: int = 7,
+        enable: bool = True,
+        dry_run: bool = False,
     ) -> None:
         """`cycle` in seconds; with `enable` the drives are enabled as soon as all of them are
         present for the first time."""
@@ -217,6 +222,7 @@ class DriveMaster(CanopenMaster[JointDriveLink]):
             cycle,
             Supervision(SILENT_CYCLES, HEARTBEAT_PATIENCE),
             enable=enable,
+            dry_run=dry_run,
         )
 
     @property
@@ -240,6 +246,7 @@ class DriveMaster(CanopenMaster[JointDriveLink]):
         """Return the frames of one cycle: configuration, or set points (rad) and SYNC, and now and
         then a read of a drive's greatest speed."""
         configuring = self.phase is MasterPhase.CONFIGURING
+        targets = self.positions if self._dry_run else targets
         frames = super().advance(now, targets)
         if not configuring:
             hurry = self.limited

@@ -18,6 +18,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from petrobot.services.device import Workspace
 from petrobot.services.host.numba_kernels import kernel
 from petrobot.services.motion.kinematics import Puma
 from petrobot.services.motion.model import JOINTS, ArmModel, CatchingCell
@@ -254,9 +255,11 @@ class CollisionGuard:
         cell: CatchingCell,
         cup_margin: float = CUP_MARGIN,
         arm_margin: float = ARM_MARGIN,
+        workspace: Workspace | None = None,
     ) -> None:
         """Margins (m) are between cup and table, and of everything else. They cover what happens
-        between the checked poses."""
+        between the checked poses. `workspace` bounds the centre of the cup's mouth (base frame)."""
+        self._workspace = workspace or Workspace()
         self._cup_margin, self._arm_margin = cup_margin, arm_margin
         self._puma = puma
         self._model = model
@@ -307,9 +310,8 @@ class CollisionGuard:
 
     def closer(self, share: float) -> CollisionGuard:
         """Return a guard with only a share of the margins."""
-        return CollisionGuard(
-            self._puma, self._model, self._cell, share * self._cup_margin, share * self._arm_margin
-        )
+        margins = share * self._cup_margin, share * self._arm_margin
+        return CollisionGuard(self._puma, self._model, self._cell, *margins, self._workspace)
 
     def place(self, q: Sequence[float]) -> Placement:
         """Return where forearm and cup are in a joint pose."""
@@ -340,7 +342,7 @@ class CollisionGuard:
     def violation(self, q: Sequence[float]) -> str:
         """Return in words what a joint pose would touch; empty if it is clear."""
         if clear(six(q), *self._geometry):
-            return ""
+            return self._workspace.outside(self.place(q).mouth) if self._workspace.bounds else ""
         for angle, (low, high) in zip(q, self._limits, strict=True):
             if not low <= angle <= high:
                 return f"joint {self._beyond(q)} beyond its limit"
@@ -436,7 +438,8 @@ class CollisionGuard:
                 trajectory.brakes,
                 *self._geometry,
             )
-            refused = "" if is_clear else self._refusal(trajectory, q, qd)
+            sure = is_clear and not self._workspace.bounds
+            refused = "" if sure else self._refusal(trajectory, q, qd)
         if refused:
             q, qd = trajectory.braking()
         else:

@@ -3,11 +3,12 @@ names the device."""
 
 from __future__ import annotations
 
+import inspect
 import logging
 import math
 
 from petrobot.services.comm.location_file import DeviceEntry, Directory, DirectoryError, resolve
-from petrobot.services.device import Driver, Ports
+from petrobot.services.device import Driver, Ports, can_move, faults_of_limits
 from petrobot.services.worker.callables import describe
 
 _log = logging.getLogger(__name__)
@@ -17,8 +18,17 @@ def make_driver(directory: Directory, device: DeviceEntry, ports: Ports) -> Driv
     """The device's driver, `Class(config, ports)`. Raises DirectoryError naming the device, its
     driver and what was wrong."""
     here = f"{directory.source}: devices.{device.name}"
+    config = dict(device.config)
+    if directory.dry_run:
+        config["dry_run"] = True
     try:
-        driver: Driver = resolve(device.driver)(device.config, ports)
+        kind = resolve(device.driver)
+        if inspect.isclass(kind):
+            if faults := faults_of_limits(kind, config):
+                raise ValueError("; ".join(text for _, text in faults))
+            if not can_move(kind):
+                config.pop("dry_run", None)
+        driver: Driver = kind(config, ports)
     except ImportError as fault:
         raise DirectoryError((f"{here}.driver: {fault}",)) from fault
     except OSError as fault:

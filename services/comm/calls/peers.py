@@ -103,9 +103,10 @@ class Peers:
                 f"the caller's services.toml ({its[:12]}) differs from that of {self._node} "
                 f"({mine[:12]})"
             )
-            return Refuse(
-                "directory", f"{text}: copy the same file to each host and start its node again"
-            )
+            remedy = "copy the same file to each host and start its node again"
+            if mine.split()[-1] == its.split()[-1]:
+                remedy = "one of them is in a dry run: give --dry-run to both, or to none"
+            return Refuse("directory", f"{text}: {remedy}")
         return None
 
     def come(self, name: str, hello: Hello, local: bool) -> str:

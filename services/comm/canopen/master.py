@@ -41,6 +41,9 @@ HEARTBEAT_MS: Final = 50
 """Period of every node's heartbeat (ms)."""
 RETRY: Final = 1.0
 """Pause before a failed configuration is tried again (s)."""
+BY_THEMSELVES: Final = 1.2
+"""Time in which enabled drives that have lost their master stand still: they notice it by its
+heartbeat (0.25 s at most here) and stop quickly (0.8 s at most), then their brakes hold (s)."""
 SETTLE: Final = 0.05
 """Time that nodes get after a reset of their communication (s)."""
 
@@ -235,9 +238,10 @@ class CanopenMaster(Generic[Link]):
         manner: Supervision,
         *,
         enable: bool = False,
+        dry_run: bool = False,
     ) -> None:
         """`cycle` in s. With `enable` the drives are enabled as soon as they are configured for the
-        first time."""
+        first time. In a dry run `enabled` says what would be: no drive is ever enabled."""
         self.cycle = cycle
         self.drives: Sequence[Link] = tuple(drives.values())
         self.names = tuple(drives)
@@ -248,6 +252,7 @@ class CanopenMaster(Generic[Link]):
         self.limited = False
         """Whether a drive clips its set points because they exceed its speed."""
         self._manner = manner
+        self._dry_run = dry_run
         self._companions = {each.node: each for each in companions}
         self._sdos = {each.node: SdoClient(each.node) for each in companions}
         self._by_tpdo = {canopen.TPDO1_BASE + drive.node: drive for drive in self.drives}
@@ -255,6 +260,8 @@ class CanopenMaster(Generic[Link]):
         self._axis = {drive.node: axis for axis, drive in enumerate(self.drives)}
         self._heard = dict.fromkeys([*self._axis, *self._companions], 0.0)
         self._now = 0.0
+        self._seen = -BY_THEMSELVES
+        """When all drives answered last (s)."""
         self._begin_at: float | None = 0.0
         self._settled_at = 0.0
         self._beat_due = 0.0
@@ -265,7 +272,15 @@ class CanopenMaster(Generic[Link]):
     @property
     def enabled(self) -> bool:
         """Return whether all drives follow set points."""
-        return self._all_enabled and self.phase is MasterPhase.RUNNING
+        follow = self.wanted if self._dry_run else self._all_enabled
+        return follow and self.phase is MasterPhase.RUNNING
+
+    @property
+    def blind(self) -> bool:
+        """Return whether drives may still be moving unseen: they were enabled and are silent."""
+        silence = self._now - self._seen
+        least = (self._manner.silent_cycles + 1) * self.cycle
+        return self._all_enabled and least < silence < BY_THEMSELVES
 
     def alive(self, node: int) -> bool:
         """Return whether a node's heartbeat arrived recently."""
@@ -361,7 +376,7 @@ class CanopenMaster(Generic[Link]):
         if self.phase is MasterPhase.CONFIGURING:
             return frames + self._configure(now)
         self._supervise(now)
-        wanted, resetting = self.wanted, self._resetting
+        wanted, resetting = self.wanted and not self._dry_run, self._resetting
         frames += [
             drive.frame(target, wanted, resetting)
             for drive, target in zip(self.drives, targets, strict=True)
@@ -432,6 +447,8 @@ class CanopenMaster(Generic[Link]):
                 and drive.silent <= 1
             ):
                 self._fault(axis, drive.error_code)
+        if all(drive.spoken and drive.silent <= 1 for drive in self.drives):
+            self._seen = now
         patience = self._manner.patience
         for node, heard in self._heard.items():
             if now - heard > patience and self._needed(node):

@@ -149,6 +149,15 @@ class Directory:
     """Address at which the coordinator listens (in lock step)."""
     parameters: Mapping[str, str]
     """Parameter files that the cell's programs share, by name; paths relative to this file."""
+    dry_run: bool = False
+    """Whether all drives stay off. Programs of a dry run and others refuse each other."""
+
+    @property
+    def text(self) -> str:
+        """The text of the file, as its other programs shall read it. Raises DirectoryError,
+        OSError."""
+        text = read_text(self.source)
+        return dry(text) if self.dry_run and not parse(text, self.source).dry_run else text
 
     def where(self, name: str) -> str:
         """Return the node of an action, service, device, stream's receiver or timer. Raises
@@ -224,11 +233,18 @@ class Directory:
         }
 
 
-def load(path: str | Path) -> Directory:
-    """Read services.toml. Raises DirectoryError with every fault in it, OSError when it cannot be
-    read."""
+def load(path: str | Path, dry_run: bool = False) -> Directory:
+    """Read services.toml; with `dry_run` as if it said `dry_run = true`. Raises DirectoryError with
+    every fault in it, OSError when it cannot be read."""
     source = Path(path)
-    return parse(read_text(source), source)
+    text = read_text(source)
+    found = parse(text, source)
+    return parse(dry(text), source) if dry_run and not found.dry_run else found
+
+
+def dry(text: str) -> str:
+    """Return the text of a location file with all drives off."""
+    return "dry_run = true\n" + text.removeprefix("\ufeff")
 
 
 def read_text(source: Path) -> str:
@@ -273,6 +289,7 @@ def parse(text: str, source: Path) -> Directory:
             COORDINATOR, **{"host": "127.0.0.1", "port": COORDINATOR_PORT, **tables[COORDINATOR]}
         ),
         parameters=dict(tables["parameters"]),
+        dry_run=digest.startswith(directory_file.DRY),
     )
 
 

@@ -41,7 +41,11 @@ def read_code(directory: Directory, seconds: float = SECONDS) -> dict[str, Facts
     actions, services = directory.actions.values(), directory.services.values()
     functions = [(a.node, a.run) for a in actions] + [(s.node, s.run) for s in services]
     asked: dict[str, Any] = {run: None for node, run in functions if node in here and run}
-    asked |= {d.driver: d.config for d in directory.devices.values() if d.node in here and d.driver}
+    for device in directory.devices.values():
+        if device.node in here and device.driver:
+            more = {"dry_run": True} if directory.dry_run else {}
+            tables = asked.setdefault(device.driver, {})
+            tables[device.name] = {**device.config, **more}
     known: dict[str, Facts] = {}
     while left := [[path, config] for path, config in asked.items() if path not in known]:
         told, why = _ask(left, seconds)
@@ -99,7 +103,7 @@ def code_faults(directory: Directory, code: Mapping[str, Facts], text: str) -> t
         facts = code.get(device.driver, {})
         if why := facts.get("import"):
             faults.add(f"devices.{device.name}.driver", why)
-        for key, said in facts.get("keys", ()):
+        for key, said in facts.get("keys", {}).get(device.name, ()):
             faults.add(f"devices.{device.name}.{key}", said)
     return (*faults.lines, *_streams(directory, code))
 

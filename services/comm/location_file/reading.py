@@ -148,7 +148,10 @@ CHANNELS = ("call", "can", "serial", "image", "stream", "control")
 KEYS = ("file", "certificates", "also")
 COORDINATOR_PORT = 7299
 """Port of the coordinator unless `[coordinator]` sets another."""
-TOP = ("schema", COORDINATOR, *SHAPES, *FLAT)
+TOP = ("schema", "dry_run", COORDINATOR, *SHAPES, *FLAT)
+DRY = "dry run of "
+"""How the hash of a file with `dry_run = true` begins: in its messages one sees why hashes
+differ."""
 
 
 class Faults:
@@ -239,8 +242,9 @@ def _digest(data: Mapping[str, Any]) -> str:
     While keys are being replaced, hosts name different ones; a wrong key is refused in the
     handshake anyway.
     """
-    told = {name: table for name, table in data.items() if name != "keys"}
-    return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
+    told = {name: table for name, table in data.items() if name not in ("keys", "dry_run")}
+    digest = hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
+    return (DRY if data.get("dry_run") else "") + digest
 
 
 def _syntax_fault(source: str, text: str) -> str:
@@ -265,6 +269,8 @@ def _check_top(data: Mapping[str, Any], faults: Faults) -> None:
         faults.add(
             "schema", f"{known}; write schema = {SCHEMA}, the layout that this version reads"
         )
+    if not isinstance(data.get("dry_run", False), bool):
+        faults.add("dry_run", f"is {data['dry_run']!r}; write true or false")
     if not data.get("nodes"):
         faults.add("nodes", "no node here; write at least one [nodes.NAME] with host and port")
 
