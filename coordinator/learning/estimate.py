@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 from petrobot.coordinator.learning.statistics import (
     EMPTY,
     Moments,
+    added,
     clopper_pearson,
     merged,
     whole,
@@ -203,7 +204,7 @@ class Tally:
     @property
     def exposure(self) -> float:
         """Total seconds of all executed runs, including censored ones."""
-        return sum(m.total for m in self.durations.values())
+        return added(m.total for m in self.durations.values())
 
     @property
     def reliability(self) -> float:

@@ -34,7 +34,7 @@ from petrobot.coordinator.learning.objective import (
     compare,
     objective,
 )
-from petrobot.coordinator.learning.statistics import joined, objective_interval
+from petrobot.coordinator.learning.statistics import added, joined, objective_interval
 from petrobot.coordinator.task import Estimate, Kind, Status, Task
 
 # --- competing risks ---
@@ -92,7 +92,7 @@ def incidences(times: Sequence[float], causes: Sequence[str | None]) -> dict[str
     hazard: Array = np.add.reduce([np.zeros(len(moments)), *ended.values()]) / active
     before = np.concatenate([[1.0], np.cumprod(1.0 - hazard)[:-1]]) if len(moments) else np.zeros(0)
     curves = {c: np.cumsum(before * d / active) for c, d in ended.items()}
-    whole = sum(float(curve[-1]) for curve in curves.values())
+    whole = added(float(curve[-1]) for curve in curves.values())
     return {c: Incidence(moments, curve / whole) for c, curve in curves.items()}
 
 
@@ -334,7 +334,7 @@ class Uncertain:
         one side (shares near 0 or 1) stay so.
         """
         moves = list(parts)
-        below, above = (sqrt(sum(move[side] ** 2 for move in moves)) for side in (0, 1))
+        below, above = (sqrt(added(move[side] ** 2 for move in moves)) for side in (0, 1))
         return cls(value, value - below, value + above)
 
     def within(self, low: float, high: float) -> Uncertain:
@@ -491,7 +491,7 @@ def _figures(
             costs |= {(place, a): c for place in places for a, c in part[1].items()}
     needed = [p for p in parts.values() if p.runs > 0]
     alike = len({p.measure for p in needed}) == 1
-    largest = sum(p.runs * p.largest_cost for p in needed) if alike else nan
+    largest = added(p.runs * p.largest_cost for p in needed) if alike else nan
     weight = rho if rho is not None else 1.0 / largest if largest > 0 else 0.0
     moves = _moves(
         task, estimates, found, scenario, costs if alike else {}, asked, limits, scenarios
@@ -549,7 +549,7 @@ def _total(
     visits: Mapping[tuple[str, str], float], costs: Mapping[tuple[str, str], Uncertain]
 ) -> float:
     """Return the expected cost of a mission run; nan if an action that it runs has none."""
-    return sum(n * costs.get(key, UNKNOWN).value for key, n in visits.items() if n > 0)
+    return added(n * costs.get(key, UNKNOWN).value for key, n in visits.items() if n > 0)
 
 
 @dataclass(frozen=True)
@@ -613,7 +613,7 @@ def _shifted(known: Mapping[Status, Estimate], step: float) -> dict[Status, Esti
     example = next(iter(known.values()))
     success = known.get(Status.SUCCESS, replace(example, share=0.0))
     others = {s: e for s, e in known.items() if s is not Status.SUCCESS}
-    rest = sum(e.share for e in others.values())
+    rest = added(e.share for e in others.values())
     left: dict[Status, Estimate] = {
         s: replace(e, share=e.share * (rest - step) / rest) for s, e in others.items() if rest
     }
@@ -635,24 +635,24 @@ def _part(
     used = [a for a, share in shares.items() if share > 0 and a in figures]
     if not used:
         return None
-    weight = {a: shares[a] / sum(shares[b] for b in used) for a in used}
+    weight = {a: shares[a] / added(shares[b] for b in used) for a in used}
     costs = {
         a: Uncertain(f.cost, f.cost_lower, f.cost_upper)
         for a in used
         if not isnan((f := figures[a]).cost) and f.cost < inf
     }
     r = Uncertain.combined(
-        sum(w * figures[a].effective for a, w in weight.items()),
+        added(w * figures[a].effective for a, w in weight.items()),
         [
             (w * f.availability * (f.reliability - f.lower),
              w * f.availability * (f.upper - f.reliability))
             for a, w in weight.items() if (f := figures[a])
         ],
     )  # fmt: skip
-    costed = sum(weight[a] for a in costs)
+    costed = added(weight[a] for a in costs)
     c = (
         Uncertain.combined(
-            sum(weight[a] * cost.value for a, cost in costs.items()) / costed,
+            added(weight[a] * cost.value for a, cost in costs.items()) / costed,
             [
                 (weight[a] / costed * (cost.value - cost.lower),
                  weight[a] / costed * (cost.upper - cost.value))

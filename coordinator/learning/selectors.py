@@ -28,6 +28,7 @@ from petrobot.coordinator.learning.rules import (
     Thompson,
     Tracking,
 )
+from petrobot.coordinator.learning.statistics import added
 from petrobot.coordinator.task import Executed, Status
 
 
@@ -291,7 +292,7 @@ class RuleSelector:
         batch, old = self._kept(context), self._fresh(actions)
         old.take_plain(data)
         pairs = [(i, actions.index(a)) for i, a in enumerate(self.actions) if a in actions]
-        kept = sum(old.p[0, j] for _, j in pairs)
+        kept = added(old.p[0, j] for _, j in pairs)
         for i, j in pairs:
             for name in SUMS:
                 getattr(batch, name)[0, i] = getattr(old, name)[0, j]
@@ -332,7 +333,7 @@ def verdicts_of_task(
         asked = measure(primitive_task)
         costs = [cost_of(end, asked) for *_, end in runs if end.executed is not Executed.NO]
         known = [cost for cost in costs if cost == cost]  # nan: not measured
-        whole = sum(known) if known else float("nan")
+        whole = added(known) if known else float("nan")
         status = Status.SUCCESS if met else Status.FAILURE
         yield Credit(
             *key,

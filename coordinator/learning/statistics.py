@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import reduce
 from math import ceil, inf, nan, sqrt
+from operator import add
 from typing import Any
 
 
@@ -87,6 +89,12 @@ class Moments:
 
 
 EMPTY = Moments()
+
+
+def added(values: Iterable[float]) -> float:
+    """Return the sum, added one by one. From Python 3.12 on the builtin `sum` corrects rounding, so
+    that its last digits, and choices that hang on them, would depend on the interpreter."""
+    return reduce(add, values, 0.0)
 
 
 def whole(n: Any, what: str, most: float = inf) -> int:

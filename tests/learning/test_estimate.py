@@ -23,7 +23,7 @@ from petrobot.coordinator.learning.estimate import (
     quantile,
 )
 from petrobot.coordinator.learning.selectors import cost_of
-from petrobot.coordinator.learning.statistics import Moments, clopper_pearson, wilson
+from petrobot.coordinator.learning.statistics import Moments, added, clopper_pearson, wilson
 from petrobot.coordinator.task import Executed, Status
 from tests.learning.conftest import COUNTED, OBSERVATIONS, tally_of
 
@@ -317,3 +317,8 @@ def test_every_tally_of_real_runs_is_accepted(
         tally_of(others, "other"),
     )
     assert Tally.of_plain(json.loads(json.dumps(tally.to_plain()))) == tally
+
+
+def test_sums_have_the_same_bits_on_every_interpreter() -> None:
+    """As Python 3.11 adds; the builtin of 3.12 and later gives 1.0 here."""
+    assert added([0.1] * 10) == 0.9999999999999999 and added(()) == 0.0
