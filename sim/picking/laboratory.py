@@ -1,0 +1,160 @@
+"""The pick-and-place laboratory as one party: table, parts, trays, camera, and the arm that the
+location file names, which answers as its hardware would."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.lockstep.party import TICK
+from petrobot.sim.catching.truth import LaboratoryError
+from petrobot.sim.faults import FaultKinds, FaultPlan
+from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
+from petrobot.sim.picking.camera import Picture, TableCamera
+from petrobot.sim.picking.controllers import controller
+from petrobot.sim.picking.referee import Referee
+from petrobot.sim.picking.truth import PickingSite, picking_site_of
+from petrobot.sim.picking.world import World
+
+PICKING_FAULTS: Final = FaultKinds(
+    keys={
+        "drop_images": ("share", "duration"),
+        "dead_camera": ("duration",),
+        "clear": (),
+    },
+    drives=1,
+)
+REGIME: Final = "plain"
+"""The default regime."""
+_PARTS, _IMAGE, _WORLD, _FAULTS = 0x7061, 0x696D, 0x776F, 0x6661
+"""Keep draws of the same seed separate."""
+
+
+class PickingLaboratory(LaboratoryParty):
+    """The party of the simulated node `name`. `where` returns the party of an endpoint
+    (`Directory.party`)."""
+
+    def __init__(
+        self,
+        name: str,
+        site: PickingSite,
+        where: Callable[[str], str],
+        *,
+        boot: str = "laboratory",
+        directory: str = "",
+    ) -> None:
+        """`boot`, `directory`: as in services.comm.calls.callee."""
+        super().__init__(name, where, boot, directory)
+        cv2.setNumThreads(1)  # Other nodes share the cores.
+        self._site = site
+        self.arm = site.arm()
+        self.controller = controller(site.numbers)
+        self._camera = TableCamera(site.camera(), site.settings["table"]["grey"], site.trays)
+        self._radius = float(site.settings["arm"]["radius"])
+        self._prepare(0, REGIME, None)
+
+    def _prepare(self, seed: int, regime: str, parts: int | None) -> None:
+        """Begin a new experiment: new parts on the table, an empty score. The arm stays where it
+        is."""
+        self.truth = self._site.truth(regime)
+        drawn = self._site.parts(
+            self.truth, np.random.default_rng((seed, _PARTS)), parts
+        )
+        self.world = World(
+            self._site.table, self._site.fingers, drawn, np.random.default_rng((seed, _WORLD))
+        )
+        self._image_draws = np.random.default_rng((seed, _IMAGE))
+        direction = float(np.random.default_rng((seed, _PARTS, 1)).uniform(-math.pi, math.pi))
+        self.light = self.truth.light(direction)
+        self._faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
+        self.referee = Referee(self.world, self._site.trays, self._site.belongs, self.now)
+        self.controller.block(None)
+
+    # The world, as lock step and real time drive it
+
+    def tick(self, now: float) -> None:
+        """Expose the world as it is at `now`, then advance it to `now` + TICK."""
+        if not self._faults.none:
+            self._faults.begin(now)
+        if self.exposures.due(now) and not self._faults.image_lost():
+            self.exposures.put(now, now + self._site.readout, self.picture())
+        controller = self.controller
+        controller.advance(now, TICK)
+        tool = self.arm.tool(controller.joints())
+        force = self.truth.force * controller.force()
+        self.world.move(tool, controller.gap(), force, TICK)
+        controller.block(None if self.world.held is None else self.world.gap)
+        self.referee.watch(now, tool)
+        self.now = now + TICK
+
+    def picture(self) -> Picture:
+        """Return what the camera sees: (height, width) grey levels."""
+        links = self.arm.links(self.controller.joints())
+        return self._camera.take(
+            self.world.parts, links, self._radius, self.light, self._image_draws
+        )
+
+    def take_on_serial(self, now: float, device: str, data: bytes) -> bytes:
+        """Process bytes that the arm's driver sent; return the answer."""
+        return self.controller.receive(now, data)
+
+    def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
+        """Ignore frames: nothing here is on a CAN bus."""
+
+    def take_frames(self) -> Sequence[Frame]:
+        """Return no frames."""
+        return ()
+
+    # Services
+
+    def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Answer one of `services`. Raises ValueError (LaboratoryError among them) for bad
+        arguments.
+
+        laboratory_prepare(seed=0, regime="plain", parts=None): lay out new parts;
+        laboratory_score(cycles=[]): see `Referee.score`; laboratory_fault(kind, after=0, ...): see
+        PICKING_FAULTS.
+        """
+        if service == SCORE:
+            return self.referee.score(self.now, arguments.get("cycles") or [])
+        if service == FAULT:
+            rest = {key: value for key, value in arguments.items() if key != "kind"}
+            kind = str(arguments.get("kind", ""))
+            self._faults.add(PICKING_FAULTS.read(self.now, kind, rest))
+            return {}
+        self._prepare(
+            whole_number(arguments, "seed", 0) or 0,
+            str(arguments.get("regime", REGIME)),
+            whole_number(arguments, "parts", None),
+        )
+        return {}
+
+    def make_ready(self, arguments: Mapping[str, Any]) -> None:
+        """Check the regime. Raises LaboratoryError."""
+        self._site.truth(str(arguments.get("regime", REGIME)))
+
+    def close(self) -> None:
+        """Release the controller."""
+        self.controller.close()
+
+
+def make_laboratory(directory: Directory, name: str) -> PickingLaboratory:
+    """Return the laboratory of the simulated node `name` of the location file. Raises
+    LaboratoryError."""
+    boot = f"{name} in lock step"
+    site = picking_site_of(directory)
+    try:
+        return PickingLaboratory(
+            name, site, directory.party, boot=boot, directory=directory.hash
+        )
+    except KeyError as fault:
+        raise LaboratoryError(
+            f"{directory.source}: key {fault} is missing in the files of [parameters]; the shipped "
+            "files show it"
+        ) from fault
