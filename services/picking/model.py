@@ -92,11 +92,12 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Gripper:
-    """Two parallel fingers (m)."""
+    """Two parallel fingers (m). `numbers`: what else the arm's driver needs to know."""
 
     opening: float
     thickness: float
     width: float
+    numbers: Mapping[str, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +118,8 @@ class Arm:
     limits: Vector
     """(n, 2) rad."""
     gripper: Gripper
+    controller: str
+    """What its driver is told: a key of `petrobot.services.picking.commands.ARMS`."""
     poses: Mapping[str, tuple[float, ...]]
 
     def tool(self, joints: Sequence[float]) -> tuple[Vector, Vector, Vector, Vector]:
@@ -262,7 +265,11 @@ def read_arm(text: str, source: str) -> Arm:
             turn @ np.asarray(tool["approach"], float),
             turn @ np.asarray(tool["closing"], float),
             np.array([_pair(j["limits"]) for j in joints]),
-            Gripper(*(float(gripper[key]) for key in ("opening", "thickness", "width"))),
+            Gripper(
+                *(float(gripper[key]) for key in ("opening", "thickness", "width")),
+                {key: float(value) for key, value in gripper.items()},
+            ),
+            str(table["controller"]),
             {name: tuple(map(float, pose)) for name, pose in table["poses"].items()},
         )
     except (KeyError, TypeError, ValueError) as fault:

@@ -1,0 +1,226 @@
+"""Find parts in an image: by their contours, or by templates of the kinds that are handled. Pure.
+
+Both return the parts that lie where parts are looked for, best first. The camera looks straight
+down; a part's top is nearer to it than the table, so a pixel is projected to the height of the top
+of its kind.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from petrobot.services.picking.model import Cell, Kind
+
+Grey = NDArray[np.uint8]
+
+
+class Found(NamedTuple):
+    """A part that was seen: its kind, the middle of its top (m) and the direction of its long side
+    (rad, table's frame), and how sure it is (0 to 1)."""
+
+    kind: str
+    x: float
+    y: float
+    turn: float
+    score: float
+
+    def plain(self) -> dict[str, Any]:
+        """As data of a task's variable."""
+        return dict(self._asdict())
+
+
+Finder = Callable[[Grey, Cell], list[Found]]
+
+CONTRAST: Final = 26.0
+"""Grey levels from the table's from which a pixel belongs to something."""
+_UNLIKE: Final = 0.35
+"""Relative error of an area from which a contour is no kind of part."""
+MATCH: Final = 0.62
+"""Correlation from which a template is a part."""
+SCALE: Final = 1250.0
+"""Pixels per metre of the rectified image in which templates are compared."""
+TURNS: Final = 12
+"""Orientations in which a box's template is compared, over half a turn."""
+_RIM: Final = 0.006
+"""m of table around a part that belongs to its template."""
+
+
+def find_by_contours(image: Grey, cell: Cell) -> list[Found]:
+    """Find what differs from the table's grey level, and take the smallest rectangle around it.
+
+    Cheap. A shadow that is as dark as CONTRAST is taken for a piece of the part; a part that differs
+    less is not seen.
+    """
+    (x0, x1), (y0, y1) = cell.area
+    eye = cell.eye
+    margin = 0.02
+    u0, v0 = eye.pixel(x1 + margin, y1 + margin, 0.0)
+    u1, v1 = eye.pixel(x0 - margin, y0 - margin, 0.0)
+    top, left = max(0, round(v0)), max(0, round(u0))
+    region = cv2.GaussianBlur(image[top : round(v1), left : round(u1)], (5, 5), 0)
+    table = float(np.median(region))
+    mask = (np.abs(region.astype(np.float32) - table) > CONTRAST).astype(np.uint8)
+    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))  # type: ignore[assignment]
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    found = []
+    for contour in contours:
+        area = cv2.contourArea(contour)
+        if area < 40.0:
+            continue
+        (u, v), (wide, high), _ = rectangle = cv2.minAreaRect(contour)
+        match = _kind_of(cell, area, max(wide, high), min(wide, high))
+        if match is None:
+            continue
+        kind, unlike = match
+        x, y = eye.point(u + left, v + top, kind.height)
+        if not (x0 - 0.01 <= x <= x1 + 0.01 and y0 - 0.01 <= y <= y1 + 0.01):
+            continue
+        corners = cv2.boxPoints(rectangle)
+        side = max(
+            (corners[1] - corners[0], corners[2] - corners[1]), key=lambda s: math.hypot(*s)
+        )
+        # u runs along -y and v along -x.
+        turn = math.atan2(-side[0], -side[1]) if not kind.round else 0.0
+        found.append(Found(kind.name, x, y, turn % math.pi, 1.0 - unlike))
+    return sorted(found, key=lambda f: -f.score)
+
+
+def _kind_of(cell: Cell, area: float, long: float, short: float) -> tuple[Kind, float] | None:
+    """Return the kind whose size is nearest to a contour's (px), and how unlike it is."""
+    best: tuple[float, Kind] | None = None
+    for kind in cell.kinds.values():
+        scale = cell.eye.focal / (cell.eye.position[2] - kind.height)
+        length, width = (side * scale for side in kind.size)
+        full = length * width * (math.pi / 4 if kind.round else 1.0)
+        fill = area / max(long * short, 1.0)
+        shape = abs(fill - (math.pi / 4 if kind.round else 1.0))
+        unlike = (
+            abs(math.log(area / full)) / 2
+            + abs(math.log(max(long, 1.0) / length)) / 2
+            + abs(math.log(max(short, 1.0) / width)) / 2
+            + shape
+        )
+        if best is None or unlike < best[0]:
+            best = unlike, kind
+    if best is None or best[0] > _UNLIKE:
+        return None
+    return best[1], best[0]
+
+
+def find_by_templates(image: Grey, cell: Cell) -> list[Found]:
+    """Compare the image with every kind of part in every orientation.
+
+    Dear. It compares shapes whatever the light is, so neither dim light nor the shadow at one side
+    of a part matters much; two parts that touch are still two.
+    """
+    found: list[Found] = []
+    for kind in cell.kinds.values():
+        seen = _rectified(image, cell, kind.height)
+        best = np.zeros(seen.shape, np.float32)
+        which = np.zeros(seen.shape, np.int16)
+        templates = _templates(kind)
+        for number, (_, template) in enumerate(templates):
+            high, wide = template.shape
+            scores = np.abs(cv2.matchTemplate(seen, template, cv2.TM_CCOEFF_NORMED))
+            window = best[
+                high // 2 : high // 2 + scores.shape[0], wide // 2 : wide // 2 + scores.shape[1]
+            ]
+            chosen = which[
+                high // 2 : high // 2 + scores.shape[0], wide // 2 : wide // 2 + scores.shape[1]
+            ]
+            better = scores > window
+            window[better] = scores[better]
+            chosen[better] = number
+        peaks = (best == cv2.dilate(best, np.ones((9, 9), np.uint8))) & (best > MATCH)
+        for row, column in np.argwhere(peaks):
+            x, y = _place(cell, float(row), float(column))
+            turn = templates[int(which[row, column])][0]
+            found.append(Found(kind.name, x, y, turn, min(1.0, float(best[row, column]))))
+    return _distinct(found, cell)
+
+
+def _distinct(found: Sequence[Found], cell: Cell) -> list[Found]:
+    """Of those that overlap, keep the best."""
+    kept: list[Found] = []
+    (x0, x1), (y0, y1) = cell.area
+    for one in sorted(found, key=lambda f: -f.score):
+        inside = x0 - 0.01 <= one.x <= x1 + 0.01 and y0 - 0.01 <= one.y <= y1 + 0.01
+        apart = all(
+            math.hypot(one.x - k.x, one.y - k.y)
+            > 0.4 * (min(cell.kinds[one.kind].size) + min(cell.kinds[k.kind].size))
+            for k in kept
+        )
+        if inside and apart:
+            kept.append(one)
+    return kept
+
+
+_BORDER: Final = 0.03
+"""m by which the rectified image is larger than the area."""
+
+
+def _rectified(image: Grey, cell: Cell, height: float) -> Grey:
+    """The area as seen at a height: row along x, column along y."""
+    (x0, x1), (y0, y1) = cell.area
+    rows = round((x1 - x0 + 2 * _BORDER) * SCALE)
+    columns = round((y1 - y0 + 2 * _BORDER) * SCALE)
+    u0, v0 = cell.eye.pixel(x0 - _BORDER, y0 - _BORDER, height)
+    per = cell.eye.focal / (cell.eye.position[2] - height) / SCALE
+    # column (y) leads along -u, row (x) along -v
+    warp = np.array(((-per, 0.0, u0), (0.0, -per, v0)), np.float32)
+    seen = cv2.warpAffine(
+        image,
+        warp,
+        (columns, rows),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return cv2.GaussianBlur(seen, (3, 3), 0)  # type: ignore[return-value]
+
+
+def _place(cell: Cell, row: float, column: float) -> tuple[float, float]:
+    return cell.area[0][0] - _BORDER + row / SCALE, cell.area[1][0] - _BORDER + column / SCALE
+
+
+@lru_cache(maxsize=32)
+def _templates(kind: Kind) -> tuple[tuple[float, Grey], ...]:
+    """Return each orientation (rad) of a kind with its picture: bright top, dark table."""
+    square = kind.size[0] == kind.size[1]
+    half_turn = math.pi / 2 if square else math.pi
+    count = 1 if kind.round else TURNS // 2 if square else TURNS
+    size = 2 * math.ceil((math.hypot(*kind.size) / 2 * (0.72 if kind.round else 1.0) + _RIM) * SCALE)
+    made = []
+    for k in range(count):
+        turn = k * half_turn / count
+        picture = np.full((size + 1, size + 1), 60, np.uint8)
+        middle = size / 2
+        if kind.round:
+            radius = round(kind.size[0] / 2 * SCALE * 16)
+            cv2.circle(
+                picture, (round(middle * 16), round(middle * 16)), radius, 200, -1, cv2.LINE_AA, 4
+            )
+        else:
+            a, b = (side / 2 * SCALE for side in kind.size)
+            c, s = math.cos(turn), math.sin(turn)
+            corners = [
+                # row is x, column is y
+                (middle + s * px + c * py, middle + c * px - s * py)
+                for px, py in ((-a, -b), (a, -b), (a, b), (-a, b))
+            ]
+            points = np.rint(np.array(corners) * 16).astype(np.int32)
+            cv2.fillConvexPoly(picture, points, 200, cv2.LINE_AA, 4)
+        made.append((turn, cv2.GaussianBlur(picture, (3, 3), 0)))
+    return tuple(made)  # type: ignore[arg-type]
+
+
+FINDERS: Final[Mapping[str, Finder]] = {
+    "contours": find_by_contours,
+    "templates": find_by_templates,
+}

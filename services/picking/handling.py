@@ -1,0 +1,356 @@
+"""Primitive actions of the arm: make ready, grasp, verify, place.
+
+They use any arm whose driver `petrobot.services.picking.commands` knows. Which arm it is says
+their argument `arm`: the file of its numbers (`petrobot.services.picking.model.arm_named`); `cell`
+is the cell's file.
+
+Error causes: `unreachable`, `arm_timeout`, `arm_fault`, `bad_part`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, Final, NamedTuple
+
+from petrobot.services.action import (
+    CommandRefused,
+    Context,
+    Result,
+    Status,
+    error,
+    failure,
+    provisional,
+    success,
+)
+from petrobot.services.picking.commands import ARMS, ArmState
+from petrobot.services.picking.model import (
+    Arm,
+    Cell,
+    Kind,
+    NumbersError,
+    UnreachableError,
+    arm_named,
+    cell_named,
+)
+
+ABOVE: Final = 0.065
+"""m over the table at which the finger tips travel."""
+SEAT: Final = 0.012
+"""m of a part's height that the fingers reach around."""
+FLOOR: Final = 0.004
+"""m over the table below which the finger tips never go."""
+GAP: Final = 0.012
+"""m that the fingers are opened beyond a part's side when they know its direction."""
+SQUEEZE: Final = 0.006
+"""m that the fingers are told to close beyond a part's size."""
+ALONG: Final = 0.0
+"""rad, the direction in which fingers close over a tray."""
+TAKEN: Final = 0.06
+"""s until a driver's state shows what a command has changed."""
+CLOSING: Final = 2.0
+"""s within which fingers stop."""
+THIN: Final = 0.005
+"""m below a part's narrow side at which the fingers have closed on something else, or nothing."""
+SETTLE: Final = 0.25
+"""s that fingers have to take hold before they are lifted."""
+
+
+class Grasp(NamedTuple):
+    """How to grasp: where the finger tips go (m), along which direction they close (rad), how far
+    they open before and are to close (m)."""
+
+    x: float
+    y: float
+    z: float
+    turn: float
+    opening: float
+    closing: float
+
+
+class ArmError(Exception):
+    """The arm did not do what it was told: cause and text."""
+
+    def __init__(self, cause: str, text: str) -> None:
+        super().__init__(text)
+        self.cause, self.text = cause, text
+
+
+# Where to grasp
+
+
+def across(kind: Kind, part: Mapping[str, Any], arm: Arm) -> Grasp:
+    """Return a grasp across a part's narrow side; a round part has none, so the fingers keep the
+    direction in which the arm comes."""
+    narrow, turn = min(kind.size), float(part["turn"]) + math.pi / 2
+    if kind.round:
+        turn = _arriving(part, arm)
+    return Grasp(
+        float(part["x"]),
+        float(part["y"]),
+        _depth(kind),
+        turn,
+        min(arm.gripper.opening, narrow + 2 * GAP),
+        max(0.0, narrow - SQUEEZE),
+    )
+
+
+def at_centre(kind: Kind, part: Mapping[str, Any], arm: Arm) -> Grasp:
+    """Return a grasp at a part's middle, with the fingers wide open and across the direction in
+    which the arm comes: they turn the part by closing."""
+    return Grasp(
+        float(part["x"]),
+        float(part["y"]),
+        _depth(kind),
+        _arriving(part, arm),
+        arm.gripper.opening,
+        max(0.0, min(kind.size) - SQUEEZE),
+    )
+
+
+def _depth(kind: Kind) -> float:
+    return max(FLOOR, kind.height - SEAT)
+
+
+def _arriving(part: Mapping[str, Any], arm: Arm) -> float:
+    """The direction across the line from the arm's foot to the part."""
+    foot = arm.points[0]
+    return math.atan2(float(part["y"]) - foot[1], float(part["x"]) - foot[0]) + math.pi / 2
+
+
+# Actions
+
+
+async def make_ready(ctx: Context, *, arm: str = "so101", timeout: float = 20.0) -> Result:
+    """Switch the arm on, open the fingers and fold it back out of the camera's view, whatever
+    happened before.
+
+    SUCCESS when it stands there; ERROR `arm_fault` or `arm_timeout`.
+    """
+    try:
+        hand = Hand(ctx, arm, timeout)
+        await hand.enable()
+        await hand.open(hand.arm.gripper.opening)
+        await hand.move(hand.arm.poses["rest"])
+    except (ArmError, CommandRefused, NumbersError) as fault:
+        return _error(fault)
+    return success()
+
+
+async def grasp_narrow(
+    ctx: Context,
+    *,
+    part: Mapping[str, Any],
+    arm: str = "so101",
+    cell: str = "cell",
+    timeout: float = 10.0,
+) -> Result:
+    """Grasp a part across its narrow side and lift it, out of the camera's view.
+
+    SUCCESS, provisionally: `picked` is the id of this run; the action that verifies the grasp gives
+    the verdict. ERROR `unreachable` if the arm cannot get there.
+    """
+    return await _grasp(ctx, across, part, arm, cell, timeout)
+
+
+async def grasp_centre(
+    ctx: Context,
+    *,
+    part: Mapping[str, Any],
+    arm: str = "so101",
+    cell: str = "cell",
+    timeout: float = 10.0,
+) -> Result:
+    """Grasp a part at its middle, whatever its direction: quicker, and enough for round parts.
+    Otherwise as `grasp_narrow`."""
+    return await _grasp(ctx, at_centre, part, arm, cell, timeout)
+
+
+async def _grasp(
+    ctx: Context,
+    planned: Callable[[Kind, Mapping[str, Any], Arm], Grasp],
+    part: Mapping[str, Any],
+    arm: str,
+    cell: str,
+    timeout: float,
+) -> Result:
+    try:
+        hand = Hand(ctx, arm, timeout)
+        grasp = planned(_kind(cell_named(cell), part), part, hand.arm)
+        place = partial(hand.arm.over, grasp.x, grasp.y)
+        above = place(ABOVE, grasp.turn, hand.state.q)
+        middle = place((ABOVE + grasp.z) / 2, grasp.turn, above)
+        down = place(grasp.z, grasp.turn, middle)
+        await hand.open(grasp.opening)
+        await hand.move(above, middle, down)
+        await hand.close(grasp.closing)
+        await ctx.sleep(SETTLE)
+        await hand.move(middle, above, hand.arm.poses["rest"])
+    except (ArmError, CommandRefused, NumbersError, UnreachableError) as fault:
+        return _error(fault)
+    return provisional(success(picked=ctx.run, grip=hand.state.grip))
+
+
+async def verify_width(
+    ctx: Context,
+    *,
+    part: Mapping[str, Any],
+    picked: str = "",
+    found: str = "",
+    arm: str = "so101",
+    cell: str = "cell",
+) -> Result:
+    """Verify by the gap between the fingers that the part is held, and give the verdicts on the
+    runs that found and picked it.
+
+    SUCCESS or FAILURE, both with `held`: fingers that closed on nothing are the fault of both runs,
+    fingers that closed on something of another size that of the grasp.
+    """
+    try:
+        kind = _kind(cell_named(cell), part)
+        state = Hand(ctx, arm, 1.0).state
+    except (ArmError, NumbersError) as fault:
+        return _error(fault)
+    grip, empty = state.grip, not state.held
+    held = not empty and grip > min(kind.size) - THIN
+    if held:
+        _judge(ctx, (picked, found), Status.SUCCESS, "", "")
+        return success(held=True, grip=grip)
+    cause = "missed" if empty else "bad_hold"
+    text = f"the fingers closed to {1e3 * grip:.1f} mm, the {kind.name} is {1e3 * min(kind.size):.0f}"
+    _judge(ctx, (picked, found) if empty else (picked,), Status.FAILURE, cause, text)
+    if not empty:
+        _judge(ctx, (found,), Status.SUCCESS, "", "")
+    return failure(cause, text, held=False, grip=grip)
+
+
+def _judge(ctx: Context, runs: Sequence[str], status: Status, cause: str, text: str) -> None:
+    for run in filter(None, runs):
+        ctx.verdict(run, status, cause, text)
+
+
+async def place_in_tray(
+    ctx: Context,
+    *,
+    part: Mapping[str, Any],
+    slots: Mapping[str, int] | None = None,
+    arm: str = "so101",
+    cell: str = "cell",
+    timeout: float = 10.0,
+) -> Result:
+    """Put the part that is held into the next slot of the tray of its kind.
+
+    SUCCESS, provisionally, if it was held until there: `slots` counts what lies in each tray, `tray`
+    is the one; the referee gives the verdict. FAILURE `lost_on_the_way` if not. Raises the event
+    `tray_full` with the last slot.
+    """
+    try:
+        hand, known = Hand(ctx, arm, timeout), cell_named(cell)
+        kind = _kind(known, part)
+        tray, used = known.trays[kind.tray], dict(slots or {})
+        place = partial(
+            hand.arm.over, *tray.slots[used.get(kind.tray, 0) % len(tray.slots)], turn=ALONG
+        )
+        above = place(z=ABOVE, near=hand.state.q)
+        middle = place(z=(ABOVE + _depth(kind)) / 2, near=above)
+        down = place(z=_depth(kind) + 0.001, near=middle)
+        await hand.move(above, middle, down)
+        held = hand.state.held
+        await hand.open(min(hand.arm.gripper.opening, max(kind.size) + GAP))
+        await hand.move(middle, above, hand.arm.poses["rest"])
+    except (ArmError, CommandRefused, NumbersError, UnreachableError) as fault:
+        return _error(fault)
+    if not held:
+        return failure(
+            "lost_on_the_way", "the fingers are empty over the tray", slots=used, tray=kind.tray
+        )
+    used[kind.tray] = used.get(kind.tray, 0) + 1
+    if used[kind.tray] == len(tray.slots):
+        ctx.raise_event("tray_full", tray=kind.tray)
+    return provisional(success(slots=used, tray=kind.tray))
+
+
+# What they share
+
+
+def _kind(cell: Cell, part: Mapping[str, Any]) -> Kind:
+    try:
+        float(part["x"]), float(part["y"]), float(part["turn"])
+        return cell.kinds[str(part["kind"])]
+    except (KeyError, TypeError, ValueError) as fault:
+        raise ArmError(
+            "bad_part",
+            f"part: expected a table with x, y, turn and a kind of {', '.join(cell.kinds)}, found "
+            f"{part!r:.80}",
+        ) from fault
+
+
+def _error(fault: Exception) -> Result:
+    if isinstance(fault, ArmError):
+        return error(fault.cause, fault.text)
+    cause = {UnreachableError: "unreachable", NumbersError: "bad_numbers"}.get(
+        type(fault), "arm_fault"
+    )
+    return error(cause, str(fault))
+
+
+class Hand:
+    """An arm of known numbers, as the actions use it."""
+
+    def __init__(self, ctx: Context, arm: str, timeout: float) -> None:
+        """Raises ArmError, NumbersError."""
+        self.ctx, self.arm, self._timeout = ctx, arm_named(arm), timeout
+        if self.arm.controller not in ARMS:
+            raise ArmError(
+                "bad_numbers",
+                f"{arm}: controller: expected {' or '.join(ARMS)}, found {self.arm.controller!r}",
+            )
+        self._commands = ARMS[self.arm.controller]
+
+    @property
+    def state(self) -> ArmState:
+        """The newest state of the arm."""
+        return self._commands.state(self.arm.gripper, self.ctx.device.state)
+
+    async def enable(self) -> None:
+        """Switch the arm on, whatever happened before; a controller that is just starting refuses
+        that for a while. Raises CommandRefused."""
+        due = self.ctx.now + self._timeout / 2
+        while True:
+            try:
+                await self.ctx.command(self._commands.enable())
+                break
+            except CommandRefused:
+                if self.ctx.now >= due:
+                    raise
+            await self.ctx.sleep(SETTLE)
+        await self.ctx.sleep(SETTLE)
+
+    async def open(self, gap: float) -> None:
+        """Open the fingers to a gap (m), and wait until they are."""
+        await self._fingers(self._commands.open(self.arm.gripper, gap))
+
+    async def close(self, gap: float) -> None:
+        """Close the fingers on what is between them, and wait until they have stopped."""
+        await self._fingers(self._commands.close(self.arm.gripper, gap))
+
+    async def _fingers(self, command: Mapping[str, Any]) -> None:
+        await self.ctx.command(command)
+        await self.ctx.sleep(TAKEN)
+        await self.ctx.wait(lambda: self.state.gripped or bool(self.state.fault), CLOSING)
+
+    async def move(self, *ways: Sequence[float]) -> None:
+        """Move through joint angles (rad). Raises ArmError."""
+        for joints in ways:
+            await self.ctx.command(self._commands.move(joints))
+            await self.ctx.sleep(TAKEN)
+            there = await self.ctx.wait(
+                lambda: self.state.at_goal or bool(self.state.fault), self._timeout
+            )
+            if fault := self.state.fault:
+                raise ArmError("arm_fault", fault)
+            if not there:
+                raise ArmError(
+                    "arm_timeout", f"the arm did not get there within {self._timeout:g} s"
+                )
