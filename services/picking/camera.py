@@ -38,11 +38,10 @@ class TableCamera(Driver):
         self._on, self._newest = True, None
         try:
             while len(taken) < count and await ctx.wait(self._arrived, timeout):
-                image, self._newest = self._newest, None
-                if image is None or image.shape != (eye.height, eye.width):
-                    shape = None if image is None else image.shape
+                image = self._pop()
+                if image.shape != (eye.height, eye.width):
                     raise ValueError(
-                        f"the camera's images have shape {shape}, its numbers say "
+                        f"the camera's images have shape {image.shape}, its numbers say "
                         f"{(eye.height, eye.width)}: change [camera] of the cell's file or the "
                         "camera's settings"
                     )
@@ -57,6 +56,11 @@ class TableCamera(Driver):
         if image is not None:
             self._newest = image.pixels
         return self._newest is not None
+
+    def _pop(self) -> NDArray[np.uint8]:
+        image, self._newest = self._newest, None
+        assert image is not None  # `_arrived` said so
+        return image
 
     def state(self) -> Mapping[str, Any]:
         """Return plain data for operator and report."""

@@ -55,8 +55,8 @@ _RIM: Final = 0.006
 def find_by_contours(image: Grey, cell: Cell) -> list[Found]:
     """Find what differs from the table's grey level, and take the smallest rectangle around it.
 
-    Cheap. A shadow that is as dark as CONTRAST is taken for a piece of the part; a part that differs
-    less is not seen.
+    Cheap. A shadow that is as dark as CONTRAST is taken for a piece of a dark part; a part that
+    differs less is not seen.
     """
     (x0, x1), (y0, y1) = cell.area
     eye = cell.eye
@@ -66,9 +66,12 @@ def find_by_contours(image: Grey, cell: Cell) -> list[Found]:
     top, left = max(0, round(v0)), max(0, round(u0))
     region = cv2.GaussianBlur(image[top : round(v1), left : round(u1)], (5, 5), 0)
     table = float(np.median(region))
-    mask = (np.abs(region.astype(np.float32) - table) > CONTRAST).astype(np.uint8)
-    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))  # type: ignore[assignment]
-    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    away = region.astype(np.float32) - table
+    contours: list[Grey] = []
+    for side in (away, -away):  # apart: the shadow of a bright part is dark
+        mask = (side > CONTRAST).astype(np.uint8)
+        mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))  # type: ignore[assignment]
+        contours += cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]  # type: ignore[arg-type]
     found = []
     for contour in contours:
         area = cv2.contourArea(contour)
@@ -83,9 +86,7 @@ def find_by_contours(image: Grey, cell: Cell) -> list[Found]:
         if not (x0 - 0.01 <= x <= x1 + 0.01 and y0 - 0.01 <= y <= y1 + 0.01):
             continue
         corners = cv2.boxPoints(rectangle)
-        side = max(
-            (corners[1] - corners[0], corners[2] - corners[1]), key=lambda s: math.hypot(*s)
-        )
+        side = max((corners[1] - corners[0], corners[2] - corners[1]), key=lambda s: math.hypot(*s))
         # u runs along -y and v along -x.
         turn = math.atan2(-side[0], -side[1]) if not kind.round else 0.0
         found.append(Found(kind.name, x, y, turn % math.pi, 1.0 - unlike))
@@ -195,7 +196,9 @@ def _templates(kind: Kind) -> tuple[tuple[float, Grey], ...]:
     square = kind.size[0] == kind.size[1]
     half_turn = math.pi / 2 if square else math.pi
     count = 1 if kind.round else TURNS // 2 if square else TURNS
-    size = 2 * math.ceil((math.hypot(*kind.size) / 2 * (0.72 if kind.round else 1.0) + _RIM) * SCALE)
+    size = 2 * math.ceil(
+        (math.hypot(*kind.size) / 2 * (0.72 if kind.round else 1.0) + _RIM) * SCALE
+    )
     made = []
     for k in range(count):
         turn = k * half_turn / count

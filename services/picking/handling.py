@@ -37,6 +37,8 @@ from petrobot.services.picking.model import (
 
 ABOVE: Final = 0.065
 """m over the table at which the finger tips travel."""
+LOW: Final = 0.03
+"""m over the table at which fingers let something go that is not to be placed."""
 SEAT: Final = 0.012
 """m of a part's height that the fingers reach around."""
 FLOOR: Final = 0.004
@@ -51,8 +53,8 @@ TAKEN: Final = 0.06
 """s until a driver's state shows what a command has changed."""
 CLOSING: Final = 2.0
 """s within which fingers stop."""
-THIN: Final = 0.005
-"""m below a part's narrow side at which the fingers have closed on something else, or nothing."""
+FIT: Final = 0.004
+"""m by which the gap between the fingers may differ from the side that they hold."""
 SETTLE: Final = 0.25
 """s that fingers have to take hold before they are lifted."""
 
@@ -122,18 +124,23 @@ def _arriving(part: Mapping[str, Any], arm: Arm) -> float:
 # Actions
 
 
-async def make_ready(ctx: Context, *, arm: str = "so101", timeout: float = 20.0) -> Result:
+async def make_ready(
+    ctx: Context, *, arm: str = "so101", cell: str = "cell", timeout: float = 20.0
+) -> Result:
     """Switch the arm on, open the fingers and fold it back out of the camera's view, whatever
-    happened before.
+    happened before. What the fingers still hold is put down where parts are looked for.
 
     SUCCESS when it stands there; ERROR `arm_fault` or `arm_timeout`.
     """
     try:
-        hand = Hand(ctx, arm, timeout)
+        hand, known = Hand(ctx, arm, timeout), cell_named(cell)
         await hand.enable()
+        if hand.state.held:
+            (x0, x1), (y0, y1) = known.area
+            await hand.move(hand.arm.over((x0 + x1) / 2, (y0 + y1) / 2, LOW, ALONG, hand.state.q))
         await hand.open(hand.arm.gripper.opening)
         await hand.move(hand.arm.poses["rest"])
-    except (ArmError, CommandRefused, NumbersError) as fault:
+    except (ArmError, CommandRefused, NumbersError, UnreachableError) as fault:
         return _error(fault)
     return success()
 
@@ -204,30 +211,30 @@ async def verify_width(
     """Verify by the gap between the fingers that the part is held, and give the verdicts on the
     runs that found and picked it.
 
-    SUCCESS or FAILURE, both with `held`: fingers that closed on nothing are the fault of both runs,
-    fingers that closed on something of another size that of the grasp.
+    SUCCESS or FAILURE, both with `held`. FAILURE `missed`: the fingers closed on nothing, which is
+    held against both runs; `wrong_kind`: on something smaller, against the run that found it;
+    `askew`: on something wider, against the run that grasped it.
     """
     try:
         kind = _kind(cell_named(cell), part)
         state = Hand(ctx, arm, 1.0).state
     except (ArmError, NumbersError) as fault:
         return _error(fault)
-    grip, empty = state.grip, not state.held
-    held = not empty and grip > min(kind.size) - THIN
-    if held:
-        _judge(ctx, (picked, found), Status.SUCCESS, "", "")
-        return success(held=True, grip=grip)
-    cause = "missed" if empty else "bad_hold"
-    text = f"the fingers closed to {1e3 * grip:.1f} mm, the {kind.name} is {1e3 * min(kind.size):.0f}"
-    _judge(ctx, (picked, found) if empty else (picked,), Status.FAILURE, cause, text)
-    if not empty:
-        _judge(ctx, (found,), Status.SUCCESS, "", "")
-    return failure(cause, text, held=False, grip=grip)
-
-
-def _judge(ctx: Context, runs: Sequence[str], status: Status, cause: str, text: str) -> None:
-    for run in filter(None, runs):
-        ctx.verdict(run, status, cause, text)
+    narrow, grip = min(kind.size), state.grip
+    text = f"the fingers closed to {1e3 * grip:.1f} mm, the {kind.name} has {1e3 * narrow:.0f}"
+    cause = ""
+    if not state.held:
+        cause = "missed"
+    elif abs(grip - narrow) > FIT:
+        cause = "askew" if grip > narrow else "wrong_kind"
+    for run, blamed in ((found, ("missed", "wrong_kind")), (picked, ("missed", "askew"))):
+        if run and cause in blamed:
+            ctx.verdict(run, Status.FAILURE, cause, text)
+        elif run:
+            ctx.verdict(run, Status.SUCCESS)
+    if cause:
+        return failure(cause, text, held=False, grip=grip)
+    return success(held=True, grip=grip)
 
 
 async def place_in_tray(
@@ -241,9 +248,9 @@ async def place_in_tray(
 ) -> Result:
     """Put the part that is held into the next slot of the tray of its kind.
 
-    SUCCESS, provisionally, if it was held until there: `slots` counts what lies in each tray, `tray`
-    is the one; the referee gives the verdict. FAILURE `lost_on_the_way` if not. Raises the event
-    `tray_full` with the last slot.
+    SUCCESS, provisionally, if it was held until there: `slots` counts what lies in each tray,
+    `tray` is the one; the referee gives the verdict. FAILURE `lost_on_the_way` if not. Raises the
+    event `tray_full` with the last slot.
     """
     try:
         hand, known = Hand(ctx, arm, timeout), cell_named(cell)
@@ -289,9 +296,8 @@ def _kind(cell: Cell, part: Mapping[str, Any]) -> Kind:
 def _error(fault: Exception) -> Result:
     if isinstance(fault, ArmError):
         return error(fault.cause, fault.text)
-    cause = {UnreachableError: "unreachable", NumbersError: "bad_numbers"}.get(
-        type(fault), "arm_fault"
-    )
+    known = (UnreachableError, "unreachable"), (NumbersError, "bad_numbers")
+    cause = next((cause for kind, cause in known if isinstance(fault, kind)), "arm_fault")
     return error(cause, str(fault))
 
 

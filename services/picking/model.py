@@ -134,9 +134,7 @@ class Arm:
             moved = moved + rotation @ (point - turned @ point)
             rotation = rotation @ turned
         tip = rotation @ self.tip + moved
-        jacobian = np.vstack(
-            (np.cross(axes, tip - np.array(points)).T, np.array(axes).T)
-        )
+        jacobian = np.vstack((np.cross(axes, tip - np.array(points)).T, np.array(axes).T))
         return tip, rotation @ self.approach, rotation @ self.closing, jacobian
 
     def over(
@@ -175,7 +173,7 @@ class Arm:
         wanted = np.array((math.cos(turn), math.sin(turn), 0.0))
         down = np.array((0.0, 0.0, -1.0))
         for _ in range(60):
-            tip, approach, closing, jacobian = self.tool(joints)
+            tip, approach, closing, jacobian = self.tool(joints.tolist())
             away = np.array(place) - tip
             aside = 0.5 * (np.cross(approach, down) + np.cross(closing, wanted))
             if approach @ down < 0.0 or closing @ wanted < 0.0:
@@ -266,7 +264,9 @@ def read_arm(text: str, source: str) -> Arm:
             turn @ np.asarray(tool["closing"], float),
             np.array([_pair(j["limits"]) for j in joints]),
             Gripper(
-                *(float(gripper[key]) for key in ("opening", "thickness", "width")),
+                float(gripper["opening"]),
+                float(gripper["thickness"]),
+                float(gripper["width"]),
                 {key: float(value) for key, value in gripper.items()},
             ),
             str(table["controller"]),

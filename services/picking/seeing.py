@@ -46,9 +46,7 @@ async def locate_templates(
     return await _locate(ctx, FINDERS["templates"], images, timeout)
 
 
-async def _locate(
-    ctx: Context[TableCamera], find: Finder, images: int, timeout: float
-) -> Result:
+async def _locate(ctx: Context[TableCamera], find: Finder, images: int, timeout: float) -> Result:
     cell = ctx.device.known
     taken = await ctx.device.take(ctx, images, timeout)
     if len(taken) < images:
@@ -117,4 +115,3 @@ def is_empty(image: NDArray[np.uint8], cell: Cell, tray: str) -> bool:
     u1, v1 = cell.eye.pixel(x - along / 2, y - across / 2, 0.0)
     inside = cv2.blur(image[round(v0) : round(v1), round(u0) : round(u1)], (5, 5))
     return bool(inside.std() < EMPTY)
-

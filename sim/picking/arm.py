@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,36 +24,47 @@ class ToolPose(NamedTuple):
     tilt: float
 
 
-@dataclass(frozen=True, slots=True)
 class TrueArm:
-    """The axes of an arm as it is bolted down, all in the table's frame at joint angles of zero."""
+    """An arm as it is bolted down, all in the table's frame at joint angles of zero."""
 
-    points: Vector
-    """(n, 3) a point on each axis, m."""
-    axes: Vector
-    """(n, 3) unit vectors."""
-    tip: Vector
-    approach: Vector
-    closing: Vector
-    offsets: Vector
-    """(n,) rad by which each joint stands beside what its encoder says."""
+    def __init__(
+        self,
+        points: Vector,
+        axes: Vector,
+        tool: tuple[Vector, Vector, Vector],
+        offsets: Sequence[float],
+    ) -> None:
+        """`points`, `axes` (n, 3): a point on each axis, and its unit vector; `tool`: tip, approach
+        and closing direction; `offsets`: rad by which each joint stands beside what its encoder
+        says."""
+        self._tip, self._approach, self._closing = tool
+        self._offsets = list(offsets)
+        self._points = list(points)
+        self._turns = [(k, k @ k) for k in map(_skew, axes)]
+        self._last: tuple[list[float], list[Vector], Vector] | None = None
 
-    def frames(self, joints: Sequence[float]) -> tuple[Vector, Vector]:
-        """Return rotation and translation of the last link (product of exponentials)."""
-        rotation, moved = np.eye(3), np.zeros(3)
-        for angle, point, axis in zip(
-            np.asarray(joints) + self.offsets, self.points, self.axes, strict=True
-        ):
-            turned = rotate(axis, float(angle))
-            moved = moved + rotation @ (point - turned @ point)
-            rotation = rotation @ turned
-        return rotation, moved
+    def _chain(self, joints: Sequence[float]) -> tuple[list[Vector], Vector]:
+        """Return where the joints and the tip are, and the rotation of the last link (product of
+        exponentials)."""
+        angles = [a + b for a, b in zip(joints, self._offsets, strict=True)]
+        if self._last is not None and self._last[0] == angles:
+            return self._last[1:]
+        rotation, moved = _UNIT, np.zeros(3)
+        places = []
+        for angle, point, (k, kk) in zip(angles, self._points, self._turns, strict=True):
+            place = rotation @ point + moved
+            places.append(place)
+            rotation = rotation @ (_UNIT + math.sin(angle) * k + (1.0 - math.cos(angle)) * kk)
+            moved = place - rotation @ point
+        places.append(rotation @ self._tip + moved)
+        self._last = angles, places, rotation
+        return places, rotation
 
     def tool(self, joints: Sequence[float]) -> ToolPose:
         """Return where the fingers are."""
-        rotation, moved = self.frames(joints)
-        x, y, z = (rotation @ self.tip + moved).tolist()
-        closing, approach = rotation @ self.closing, rotation @ self.approach
+        places, rotation = self._chain(joints)
+        x, y, z = places[-1].tolist()
+        closing, approach = rotation @ self._closing, rotation @ self._approach
         return ToolPose(
             x,
             y,
@@ -63,27 +73,17 @@ class TrueArm:
             math.acos(max(-1.0, min(1.0, -float(approach[2])))),
         )
 
-    def links(self, joints: Sequence[float]) -> list[tuple[float, float, float]]:
+    def links(self, joints: Sequence[float]) -> list[list[float]]:
         """Return the points of the joints and of the finger tips, for the camera."""
-        rotation, moved = np.eye(3), np.zeros(3)
-        found = []
-        for angle, point, axis in zip(
-            np.asarray(joints) + self.offsets, self.points, self.axes, strict=True
-        ):
-            found.append(tuple((rotation @ point + moved).tolist()))
-            turned = rotate(axis, float(angle))
-            moved = moved + rotation @ (point - turned @ point)
-            rotation = rotation @ turned
-        found.append(tuple((rotation @ self.tip + moved).tolist()))
-        return found
+        return [place.tolist() for place in self._chain(joints)[0]]
 
 
-def rotate(axis: Vector, angle: float) -> Vector:
-    """Return the rotation by `angle` rad about a unit vector (Rodrigues)."""
+_UNIT = np.eye(3)
+
+
+def _skew(axis: Vector) -> Vector:
     x, y, z = axis
-    k = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
-    turned: Vector = np.eye(3) + math.sin(angle) * k + (1.0 - math.cos(angle)) * (k @ k)
-    return turned
+    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
 
 
 def true_arm(
@@ -94,14 +94,18 @@ def true_arm(
     base = np.asarray(numbers["base"]["position"], float)
     yaw = float(numbers["base"]["yaw"]) + float(rng.normal(0.0, errors["base_yaw"]))
     base = base + np.append(rng.normal(0.0, errors["base"], 2), rng.normal(0.0, errors["base_z"]))
-    turn = rotate(np.array((0.0, 0.0, 1.0)), yaw)
+    c, s = math.cos(yaw), math.sin(yaw)
+    turn = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
     joints = numbers["joints"]
+    zero = float(errors["joint_zero"]) * float(numbers.get("zero_error", 1.0))
     tool = numbers["tool"]
     return TrueArm(
         np.array([turn @ np.asarray(j["point"], float) + base for j in joints]),
         np.array([turn @ np.asarray(j["axis"], float) for j in joints]),
-        turn @ np.asarray(tool["tip"], float) + base,
-        turn @ np.asarray(tool["approach"], float),
-        turn @ np.asarray(tool["closing"], float),
-        rng.normal(0.0, errors["joint_zero"] * float(numbers.get("zero_error", 1.0)), len(joints)),
+        (
+            turn @ np.asarray(tool["tip"], float) + base,
+            turn @ np.asarray(tool["approach"], float),
+            turn @ np.asarray(tool["closing"], float),
+        ),
+        rng.normal(0.0, zero, len(joints)).tolist(),
     )

@@ -6,13 +6,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.sim.picking.parts import Part, rectangle
+from petrobot.sim.picking.parts import Part, Point, rectangle
 
 Picture = NDArray[np.uint8]
 Vector = NDArray[np.float64]
@@ -51,9 +52,7 @@ class Mounted:
         """Return the pixels (n, 2) of points of the table's frame (n, 3)."""
         seen = (np.asarray(points, float) - self.position) @ self.rotation.T
         depth = np.maximum(seen[:, 2:], 0.02)
-        return (  # type: ignore[no-any-return]
-            self.focal * seen[:, :2] / depth + (self.width / 2 - 0.5, self.height / 2 - 0.5)
-        )
+        return self.focal * seen[:, :2] / depth + (self.width / 2 - 0.5, self.height / 2 - 0.5)
 
 
 def mounted(
@@ -83,9 +82,9 @@ class TableCamera:
         size = mount.height, mount.width
         self._ground = np.full(size, table, np.uint8)
         for tray in trays.values():
-            corners = rectangle(*tray["position"], 0.0, *tray["size"])
+            corners = _tray(tray, 0.0)
             self._fill(self._ground, [(x, y, 0.0) for x, y in corners], 0.82 * table)
-            inner = rectangle(*tray["position"], 0.0, *(s - 0.006 for s in tray["size"]))
+            inner = _tray(tray, 0.006)
             self._fill(self._ground, [(x, y, 0.0) for x, y in inner], 1.08 * table)
         v, u = np.mgrid[0 : size[0], 0 : size[1]]
         r2 = ((u / size[1] - 0.5) ** 2 + (v / size[0] - 0.5) ** 2) / 0.5
@@ -122,9 +121,7 @@ class TableCamera:
             seen *= self._band(light)
         seen *= light.level
         dv, du = rng.integers(0, self.mount.height), rng.integers(0, self.mount.width)
-        seen += light.noise * self._noise[
-            dv : dv + self.mount.height, du : du + self.mount.width
-        ]
+        seen += light.noise * self._noise[dv : dv + self.mount.height, du : du + self.mount.width]
         return np.clip(seen, 0.0, 255.0).astype(np.uint8)
 
     def _shade(self, image: Picture, parts: Sequence[Part], light: Light) -> None:
@@ -138,9 +135,8 @@ class TableCamera:
             far = [(x + dx * part.top, y + dy * part.top, 0.0) for x, y in part.outline()]
             self._hull(mask, foot + far, 255.0)
         mask = cv2.GaussianBlur(mask, (5, 5), 1.2)  # type: ignore[assignment]
-        np.copyto(
-            image, (image * (1.0 - light.darkness / 255.0 * mask.astype(np.float32))).astype(np.uint8)
-        )
+        factor = 1.0 - light.darkness / 255.0 * mask.astype(np.float32)
+        np.copyto(image, (image * factor).astype(np.uint8))
 
     def _band(self, light: Light) -> NDArray[np.float32]:
         """A soft shadow across the table, such as a person's: a factor per image column."""
@@ -151,19 +147,16 @@ class TableCamera:
         edge = 1.0 / (1.0 + np.exp((np.abs(u - float(at[0, 0])) - half) / 6.0))
         return (1.0 - light.darkness * edge)[None, :].astype(np.float32)  # type: ignore[no-any-return]
 
-    def _draw_arm(
-        self, image: Picture, arm: Sequence[Sequence[float]], radius: float
-    ) -> None:
+    def _draw_arm(self, image: Picture, arm: Sequence[Sequence[float]], radius: float) -> None:
         eye = self.mount.position[2]
-        for k, (a, b) in enumerate(zip(arm, arm[1:], strict=False)):
+        for k, (a, b) in enumerate(pairwise(arm)):
             if max(a[2], b[2]) > eye - 0.08 or math.dist(a, b) < 1e-6:
                 continue
             thick = radius * (0.5 if k == len(arm) - 2 else 1.0)
             ends = self.mount.pixels([a, b])
             width = 2.0 * thick * self.mount.focal / (eye - (a[2] + b[2]) / 2)
-            cv2.line(
-                image, *(tuple(map(int, np.rint(end))) for end in ends), 45, max(1, round(width))
-            )
+            (u0, v0), (u1, v1) = np.rint(ends).astype(int).tolist()
+            cv2.line(image, (u0, v0), (u1, v1), 45, max(1, round(width)))
 
     def _fill(self, image: Picture, points: Sequence[Sequence[float]], grey: float) -> None:
         corners = np.rint(self.mount.pixels(points) * (1 << _SHIFT)).astype(np.int32)
@@ -173,3 +166,8 @@ class TableCamera:
         corners = (self.mount.pixels(points) * (1 << _SHIFT)).astype(np.float32)
         hull = np.rint(cv2.convexHull(corners)).astype(np.int32)
         cv2.fillConvexPoly(image, hull, float(grey), cv2.LINE_AA, _SHIFT)
+
+
+def _tray(tray: Mapping[str, Any], rim: float) -> list[Point]:
+    (x, y), (along, across) = tray["position"], tray["size"]
+    return rectangle(x, y, 0.0, along - rim, across - rim)

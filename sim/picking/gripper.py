@@ -125,9 +125,7 @@ def close_on(part: Part, frame: tuple[float, float, float], gap: float, f: Finge
             continue
         lever = held.at_high - held.at_low
         if abs(math.atan2(lever, held.size)) > math.atan(part.friction):
-            part.turn += math.copysign(
-                min(excess / abs(lever) + 1e-4, _LARGEST_TURN), lever
-            )
+            part.turn += math.copysign(min(excess / abs(lever) + 1e-4, _LARGEST_TURN), lever)
             continue
         _shift_along(part, frame, -(held.low + held.high) / 2)
         width = FULL_WIDTH if part.round else held.contact

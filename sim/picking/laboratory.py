@@ -63,9 +63,7 @@ class PickingLaboratory(LaboratoryParty):
         """Begin a new experiment: new parts on the table, an empty score. The arm stays where it
         is."""
         self.truth = self._site.truth(regime)
-        drawn = self._site.parts(
-            self.truth, np.random.default_rng((seed, _PARTS)), parts
-        )
+        drawn = self._site.parts(self.truth, np.random.default_rng((seed, _PARTS)), parts)
         self.world = World(
             self._site.table, self._site.fingers, drawn, np.random.default_rng((seed, _WORLD))
         )
@@ -150,9 +148,7 @@ def make_laboratory(directory: Directory, name: str) -> PickingLaboratory:
     boot = f"{name} in lock step"
     site = picking_site_of(directory)
     try:
-        return PickingLaboratory(
-            name, site, directory.party, boot=boot, directory=directory.hash
-        )
+        return PickingLaboratory(name, site, directory.party, boot=boot, directory=directory.hash)
     except KeyError as fault:
         raise LaboratoryError(
             f"{directory.source}: key {fault} is missing in the files of [parameters]; the shipped "

@@ -99,9 +99,8 @@ def rectangle(x: float, y: float, turn: float, along: float, across: float) -> l
     """Return the corners of a rectangle around (x, y) whose side `along` points to `turn`."""
     c, s = math.cos(turn), math.sin(turn)
     a, b = along / 2, across / 2
-    return [
-        (x + c * px - s * py, y + s * px + c * py) for px, py in ((-a, -b), (a, -b), (a, b), (-a, b))
-    ]
+    corners = (-a, -b), (a, -b), (a, b), (-a, b)
+    return [(x + c * px - s * py, y + s * px + c * py) for px, py in corners]
 
 
 def contact(first: Sequence[Point], second: Sequence[Point]) -> Contact | None:

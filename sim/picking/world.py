@@ -73,7 +73,7 @@ class World:
         self.counts = {"grips": 0, "slips": 0, "drops": 0, "struck": 0, "table_hits": 0}
         """What has happened, for the referee."""
         self._tool: ToolPose | None = None
-        self._smooth = [np.zeros(3), np.zeros(3)]
+        self._smooth, self._speed = [0.0] * 3, [0.0] * 3
         self._sliding = 0.0
 
     def move(self, tool: ToolPose, wanted: float, force: float, dt: float) -> None:
@@ -99,18 +99,16 @@ class World:
 
     def _accelerate(self, tool: ToolPose, dt: float) -> float:
         """Return the force per mass (m/s^2) that a held part needs: gravity and acceleration."""
-        place = np.array(tool[:3])
         if self._tool is None:
-            self._smooth = [place, np.zeros(3)]
-        share = dt / (_LAG + dt)
-        near, speed = self._smooth
-        moved = near + share * (place - near)
-        new = (moved - near) / dt
-        change = share * (new - speed)
-        self._smooth = [moved, speed + change]
-        needed = change / dt
-        needed[2] += GRAVITY
-        return float(np.linalg.norm(needed))
+            self._smooth = list(tool[:3])
+        share, total = dt / (_LAG + dt), 0.0
+        for k in range(3):
+            step = share * (tool[k] - self._smooth[k])
+            change = share * (step / dt - self._speed[k])
+            self._smooth[k] += step
+            self._speed[k] += change
+            total += (change / dt + (GRAVITY if k == 2 else 0.0)) ** 2
+        return math.sqrt(total)
 
     # Free fingers
 
@@ -175,9 +173,12 @@ class World:
             body = rectangle(x, y, frame[2], fingers.thickness, fingers.width)
             found = contact(body, part.outline())
             # What lies before the finger's inner side is the business of `close_on`.
-            inner = found is not None and (
-                found.normal[0] * math.cos(frame[2]) + found.normal[1] * math.sin(frame[2])
-            ) * side < -0.7
+            inner = (
+                found is not None
+                and (found.normal[0] * math.cos(frame[2]) + found.normal[1] * math.sin(frame[2]))
+                * side
+                < -0.7
+            )
             if found is not None and not inner:
                 part.push(found.normal, found.depth, found.point)
                 struck = True
