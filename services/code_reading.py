@@ -25,7 +25,7 @@ from typing import Any, get_type_hints
 
 from petrobot.services import action as actions
 from petrobot.services.comm.location_file import resolve
-from petrobot.services.device import Driver, faults_of_keys
+from petrobot.services.device import Driver, Key, faults_of_keys
 from petrobot.services.host.json_text import json_text
 
 AWAITED = frozenset(
@@ -267,6 +267,8 @@ def _driver(thing: Any, config: Mapping[str, Any]) -> dict[str, Any]:
         _look(code, seen, in_action=False)
     keys: list[tuple[str, str]] = []
     period: Any = getattr(thing, "period", None)
+    if isinstance(period, Key):
+        period = config.get("period", period.default)
     declared = not hasattr(period, "__get__")  # a property is known only when the driver is made
     moves = declared and period is not None
     wanted = [*METHODS, *(CYCLIC if moves else ())]
