@@ -267,10 +267,16 @@ def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, An
         return {"keys": {device: [["driver", text]] for device in tables}}
     for code in _reachable(thing):
         _look(code, seen, in_action=False)
+    found = {device: _faults_of_driver(thing, table) for device, table in tables.items()}
+    return {"keys": found, **_plain(seen)}
+
+
+def _faults_of_driver(thing: type, table: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What is wrong with a driver's class and the keys of a device's table."""
     keys: list[tuple[str, str]] = []
     period: Any = getattr(thing, "period", None)
-    if isinstance(period, Key):  # declared by `key`: the table may say another
-        period = period.default
+    if isinstance(period, Key):
+        period = table.get("period", period.default)
     declared = not hasattr(period, "__get__")  # a property is known only when the driver is made
     moves = declared and period is not None
     wanted = [*METHODS, *(CYCLIC if moves else ())]
@@ -282,8 +288,7 @@ def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, An
         text = f"{thing.__name__}.period: expected seconds above 0 or None, found {period!r:.40}"
         keys.append(("driver", text))
     check = faults_of_keys if issubclass(thing, Driver) else faults_of_limits
-    found = {device: [*keys, *check(thing, table)] for device, table in tables.items()}
-    return {"keys": found, **_plain(seen)}
+    return [*keys, *check(thing, table)]
 
 
 def _plain(seen: _Seen) -> dict[str, Any]:

@@ -76,6 +76,37 @@ class So101:
         )
 
 
+class Lines:
+    """`petrobot.services.picking.line_arm`: the gripper knows its gap."""
+
+    def enable(self) -> Mapping[str, Any]:
+        """See `Commands`."""
+        return {"enable": True}
+
+    def move(self, joints: Sequence[float]) -> Mapping[str, Any]:
+        """See `Commands`."""
+        return {"q": list(joints)}
+
+    def open(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
+        """See `Commands`."""
+        return {"grip": gap}
+
+    def close(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
+        """See `Commands`."""
+        return {"grip": gap}
+
+    def state(self, gripper: Gripper, state: Mapping[str, Any]) -> ArmState:
+        """See `Commands`."""
+        return ArmState(
+            tuple(state["q"]),
+            state["at_goal"],
+            state["grip"],
+            state["held"],
+            not state["closing"],
+            state["fault"],
+        )
+
+
 CLOSED: Final = 0.003
 """m up to which fingers that are stopped have met each other."""
-ARMS: Final[Mapping[str, Commands]] = {"feetech": So101()}
+ARMS: Final[Mapping[str, Commands]] = {"feetech": So101(), "lines": Lines()}

@@ -53,7 +53,7 @@ TAKEN: Final = 0.06
 """s until a driver's state shows what a command has changed."""
 CLOSING: Final = 2.0
 """s within which fingers stop."""
-FIT: Final = 0.004
+FIT: Final = 0.003
 """m by which the gap between the fingers may differ from the side that they hold."""
 SETTLE: Final = 0.25
 """s that fingers have to take hold before they are lifted."""
@@ -155,8 +155,9 @@ async def grasp_narrow(
 ) -> Result:
     """Grasp a part across its narrow side and lift it, out of the camera's view.
 
-    SUCCESS, provisionally: `picked` is the id of this run; the action that verifies the grasp gives
-    the verdict. ERROR `unreachable` if the arm cannot get there.
+    SUCCESS, provisionally: `picked` is the id of this run, `took` says whether the fingers closed
+    on something; the action that verifies the grasp gives the verdict. ERROR `unreachable` if the
+    arm cannot get there.
     """
     return await _grasp(ctx, across, part, arm, cell, timeout)
 
@@ -193,10 +194,11 @@ async def _grasp(
         await hand.move(above, middle, down)
         await hand.close(grasp.closing)
         await ctx.sleep(SETTLE)
+        took = hand.state.held
         await hand.move(middle, above, hand.arm.poses["rest"])
     except (ArmError, CommandRefused, NumbersError, UnreachableError) as fault:
         return _error(fault)
-    return provisional(success(picked=ctx.run, grip=hand.state.grip))
+    return provisional(success(picked=ctx.run, took=took))
 
 
 async def verify_width(
@@ -205,15 +207,17 @@ async def verify_width(
     part: Mapping[str, Any],
     picked: str = "",
     found: str = "",
+    took: bool = False,
     arm: str = "so101",
     cell: str = "cell",
 ) -> Result:
     """Verify by the gap between the fingers that the part is held, and give the verdicts on the
     runs that found and picked it.
 
-    SUCCESS or FAILURE, both with `held`. FAILURE `missed`: the fingers closed on nothing, which is
-    held against both runs; `wrong_kind`: on something smaller, against the run that found it;
-    `askew`: on something wider, against the run that grasped it.
+    SUCCESS if it is held at the right gap. FAILURE `missed`: the fingers closed on nothing, for
+    which both runs are blamed; `wrong_kind`: on something smaller, for which the run that found it
+    is; `askew`: on something wider, and `slipped`: it was lost while it was lifted (`took`), for
+    which the run that grasped it is.
     """
     try:
         kind = _kind(cell_named(cell), part)
@@ -224,17 +228,20 @@ async def verify_width(
     text = f"the fingers closed to {1e3 * grip:.1f} mm, the {kind.name} has {1e3 * narrow:.0f}"
     cause = ""
     if not state.held:
-        cause = "missed"
+        cause = "slipped" if took else "missed"
     elif abs(grip - narrow) > FIT:
         cause = "askew" if grip > narrow else "wrong_kind"
-    for run, blamed in ((found, ("missed", "wrong_kind")), (picked, ("missed", "askew"))):
+    for run, blamed in (
+        (found, ("missed", "wrong_kind")),
+        (picked, ("missed", "askew", "slipped")),
+    ):
         if run and cause in blamed:
             ctx.verdict(run, Status.FAILURE, cause, text)
         elif run:
             ctx.verdict(run, Status.SUCCESS)
     if cause:
-        return failure(cause, text, held=False, grip=grip)
-    return success(held=True, grip=grip)
+        return failure(cause, text, grip=grip)
+    return success(grip=grip)
 
 
 async def place_in_tray(

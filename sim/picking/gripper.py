@@ -107,8 +107,8 @@ def close_on(part: Part, frame: tuple[float, float, float], gap: float, f: Finge
     for _ in range(_TURNS):
         shape = _local(part, frame)
         held = span(shape, f.width / 2)
-        if held is None:
-            return None
+        if held is None or abs(held.low + held.high) > gap:
+            return None  # nothing of it, or less than half, is between the fingers
         left, right = -gap / 2 - held.low, held.high - gap / 2
         if left <= 1e-9 and right <= 1e-9:
             return None

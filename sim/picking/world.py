@@ -170,6 +170,8 @@ class World:
             away = side * (self.gap + fingers.thickness) / 2
             x = frame[0] + math.cos(frame[2]) * away
             y = frame[1] + math.sin(frame[2]) * away
+            if math.hypot(part.x - x, part.y - y) > part.reach + fingers.thickness + fingers.width:
+                continue
             body = rectangle(x, y, frame[2], fingers.thickness, fingers.width)
             found = contact(body, part.outline())
             # What lies before the finger's inner side is the business of `close_on`.
