@@ -35,7 +35,7 @@ demo: $(VENV)/.ready
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy -p petrobot -p tests -p tools
+	$(BIN)/mypy -p petrobot -p tests -p tools -p experiments
 
 test: lint
 	$(BIN)/pytest -n 4 --dist worksteal -rs -m "not proof"

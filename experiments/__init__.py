@@ -1,0 +1,1 @@
+"""Experiments with petrobot that are no part of the package."""

@@ -1,0 +1,400 @@
+"""Part (b): forecasts of twenty structural changes from 300 trials, against what then happens.
+
+The training chooses every alternative at random. Forecast are the share of balls caught, the mean
+and the 90 % quantile of the time of a trial, each with a 95 % interval for the new trials where the
+method has one.
+
+- petrobot: `register` (as `petrobot forecast`) for other choices and for other nets; for slower
+  and more faulty actions the stochastic view with the changes of `petrobot analyse --what-if`,
+  which has no intervals.
+- product: what one computes by hand. Steps succeed and last independently of each other: the
+  product of their shares, the sum of their means, a normal quantile; intervals by a bootstrap.
+- bootstrap: the training trials that made the new choices, resampled; other changes are not seen.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.against_trees.faults import Edit, Edits, apply
+from experiments.against_trees.results import PLANT, TASK, Line, Results, Size
+from experiments.against_trees.verified import petrobot
+from petrobot.coordinator.analysis.time.completion import completion_time
+from petrobot.coordinator.analysis.time.stochastic import stochastic_view
+from petrobot.coordinator.analysis.time.task_forecast import forecast
+from petrobot.coordinator.analysis.time.whatif import Change, change_task
+from petrobot.coordinator.learning.propagation import measured_from
+from petrobot.coordinator.studies.campaign.block import LoadedPlan, run_block
+from petrobot.coordinator.studies.campaign.observed import estimates_of
+from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest
+from petrobot.coordinator.studies.campaign.table import TABLE, read_table
+from petrobot.coordinator.studies.campaign.trials import Trial
+from petrobot.coordinator.studies.forecast.choices import choices_of
+from petrobot.coordinator.studies.forecast.history import by_regime, trainings_of
+from petrobot.coordinator.studies.forecast.predict import Request
+from petrobot.coordinator.studies.forecast.registered import register
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.task.file import loads
+
+REGIME = "A"
+"""The plant knows no regimes; the task has one."""
+TRAINING_SEED, NEW_SEED = 300, 400
+BLOCK = 20
+RESAMPLED = 400
+NORMAL_90 = 1.2816
+FIGURES = ("R_goal", "mean", "q90")
+METHODS = ("petrobot", "product", "bootstrap")
+ALTERNATIVES = {
+    "locate_ball": ("locate_background", "locate_mog2", "locate_hough", "locate_threshold",
+                    "locate_compensated"),
+    "track_ball": ("predict_least_squares", "predict_kalman", "predict_constant_velocity"),
+    "move_to_point": ("intercept_tilted", "intercept_upright"),
+}  # fmt: skip
+CAMERA = (*ALTERNATIVES["locate_ball"], *ALTERNATIVES["track_ball"])
+ARM = (*ALTERNATIVES["move_to_point"], "follow_and_wait", "empty_and_home", "reset_and_home")
+
+Samples = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StructuralChange:
+    """One change. `choices` by primitive task; `slow` and `faults` by action; `net` edits the task
+    file."""
+
+    name: str
+    choices: Mapping[str, str] = field(default_factory=dict)
+    slow: Mapping[str, float] = field(default_factory=dict)
+    faults: Mapping[str, float] = field(default_factory=dict)
+    net: Edits = ()
+    looks: int = 1
+    """How often a ball is looked for before it counts as not thrown."""
+
+    @property
+    def by_view(self) -> bool:
+        """Whether petrobot forecasts it by the stochastic view."""
+        return bool(self.slow or self.faults)
+
+
+def _choice(name: str, **choices: str) -> StructuralChange:
+    return StructuralChange(name, choices)
+
+
+_LOOK_AGAIN: Edits = (
+    Edit('out = ["arm_free", "camera_free"]', 'out = ["look_again"]', "transitions.not_located"),
+    Edit("[places.track_ball]", """[places.look_again]
+kind = "action"
+task = "locate_ball"
+out = { ball = "ball" }
+
+[transitions.located_late]
+in = ["look_again:normal"]
+out = ["track_ball", "move_to_point"]
+
+[transitions.not_located_again]
+in = ["look_again:error"]
+out = ["arm_free", "camera_free"]
+
+[places.track_ball]"""),
+)  # fmt: skip
+
+CHANGES: tuple[StructuralChange, ...] = (
+    _choice("locate by mog2", locate_ball="locate_mog2"),
+    _choice("locate by hough", locate_ball="locate_hough"),
+    _choice("locate by threshold", locate_ball="locate_threshold"),
+    _choice("locate compensated", locate_ball="locate_compensated"),
+    _choice("predict by Kalman", track_ball="predict_kalman"),
+    _choice("predict by constant velocity", track_ball="predict_constant_velocity"),
+    _choice("intercept upright", move_to_point="intercept_upright"),
+    _choice(
+        "threshold, constant velocity, upright", locate_ball="locate_threshold",
+        track_ball="predict_constant_velocity", move_to_point="intercept_upright",
+    ),
+    _choice(
+        "mog2, Kalman, tilted", locate_ball="locate_mog2", track_ball="predict_kalman",
+        move_to_point="intercept_tilted",
+    ),
+    StructuralChange("arm 1.5 times slower", slow=dict.fromkeys(ARM, 1.5)),
+    StructuralChange("arm 2 times slower", slow=dict.fromkeys(ARM, 2.0)),
+    StructuralChange("arm 2 times faster", slow=dict.fromkeys(ARM, 0.5)),
+    StructuralChange("camera 1.5 times slower", slow=dict.fromkeys(CAMERA, 1.5)),
+    StructuralChange("faults of locating x 10",
+                     faults=dict.fromkeys(ALTERNATIVES["locate_ball"], 10.0)),
+    StructuralChange("faults of moving x 10",
+                     faults=dict.fromkeys(ALTERNATIVES["move_to_point"], 10.0)),
+    StructuralChange("faults of catching x 10", faults={"follow_and_wait": 10.0}),
+    StructuralChange("faults of going home x 10", faults={"empty_and_home": 10.0}),
+    StructuralChange("look a second time", net=_LOOK_AGAIN, looks=2),
+    StructuralChange("no second attempt to recover", net=(
+        Edit("tokens = 3\ncapacity = 3", "tokens = 0\ncapacity = 3", "places.attempts"),
+    )),
+    StructuralChange("reset the arm after each miss", net=(
+        Edit('out = ["return_home"]', 'out = ["recover_arm"]', "transitions.missed"),
+    )),
+)  # fmt: skip
+
+
+def world(change: StructuralChange, folder: Path) -> tuple[Path, Path]:
+    """Write task and location file of the changed world. Return their paths."""
+    task = apply(TASK.read_text(encoding="utf-8"), change.net)
+    edits = []
+    for action in {**change.slow, **change.faults}:
+        slow, faults = change.slow.get(action, 1.0), change.faults.get(action, 1.0)
+        old = f'action = "{action}" }}'
+        new = f'action = "{action}", slow = {slow}, faults = {faults} }}'
+        edits.append(Edit(old, new, f"actions.{action}"))
+    services = apply(PLANT.read_text(encoding="utf-8"), tuple(edits))
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = folder / "catch_ball.toml", folder / "plant.toml"
+    for path, text in zip(paths, (task, services), strict=True):
+        path.write_text(text, encoding="utf-8")
+    return paths
+
+
+def trials_of(change: StructuralChange, folder: Path, runs: int) -> list[Trial]:
+    """Run new trials in the changed world with petrobot: choices at random, but for those of the
+    change."""
+    task, services = world(change, folder)
+    files = {"task": str(task), "services": str(services)}
+    plan = CampaignPlan(
+        files["task"], files["services"], runs, (REGIME,), NEW_SEED, "random", block=BLOCK,
+        batch=0, digests={key: digest(Path(path)) for key, path in files.items()},
+    )  # fmt: skip
+    bench = LoadedPlan.of(plan)
+    weights = {
+        name: {action: 1.0 for action in offered if change.choices.get(name, action) == action}
+        for name, offered in ALTERNATIVES.items()
+    }
+    found = []
+    for block in plan.blocks:
+        done = run_block(bench, block, [weights] * block.count)
+        found += [Trial.from_plain(plain) for plain in done["trials"]]
+    return found
+
+
+# --- petrobot's forecasts -------------------------------------------------------------------------
+
+
+def by_petrobot(change: StructuralChange, train: Path, runs: int) -> dict[str, Any]:
+    """Forecast a change from the folder of the training campaign: value and interval by figure."""
+    task = loads(apply(TASK.read_text(encoding="utf-8"), change.net))
+    rows = list(read_table(train / TABLE))
+    estimates = estimates_of(task, rows, train.name)
+    if change.by_view:
+        return _by_view(change, task, estimates)
+    choices = {name: {action: 1.0} for name, action in change.choices.items()}
+    trainings = trainings_of(task, estimates) if change.net else by_regime(task, rows)
+    usual = choices_of(trainings[REGIME])  # as often as the training chose
+    request = Request(runs, {**usual, **choices})
+    made = register(task, trainings, {REGIME: request}, {"estimates": train.name}, estimates)
+    said = made["regimes"][REGIME]
+    figures = {name: said["figures"][name] for name in FIGURES}
+    return {
+        **{name: [one["value"], one["interval"]] for name, one in figures.items()},
+        "from": said["from"], "doubts": said["doubts"], "sha256": made["sha256"],
+    }  # fmt: skip
+
+
+def _by_view(change: StructuralChange, task: Task, estimates: Any) -> dict[str, Any]:
+    measured = measured_from(task, estimates)
+    changes = []
+    for place in task.flat.places.values():
+        for (subject, action), known in measured.runs.items():
+            if subject != place.name:
+                continue
+            for status, estimate in known.items():
+                name = (place.task, action, status.value)
+                if action in change.slow and estimate.mean > 0:
+                    changes.append(Change((*name, "mean"), estimate.mean * change.slow[action]))
+                if action in change.faults and status.value == "error" and estimate.share > 0:
+                    share = min(1.0, estimate.share * change.faults[action])
+                    changes.append(Change((*name, "share"), share))
+    task, measured = change_task(task, measured, changes)
+    view = stochastic_view(task, measured)
+    view = replace(view, gspn=view.gspn.marked({str(task.runs_place): 1}))
+    found = forecast(view)
+    q90 = completion_time(found.chain, found.done.goal).quantile(0.9)
+    return {
+        "R_goal": [found.goal_reliability, None],
+        "mean": [found.done.mean, None],
+        "q90": [q90, None],
+        "from": "view", "doubts": [], "sha256": "",
+    }  # fmt: skip
+
+
+# --- by hand --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Steps:
+    """What the training says of each trial, one row each; nan where a step did not run."""
+
+    goal: Samples
+    time: Samples
+    """s from the trial's begin to its end."""
+    seconds: Mapping[str, Samples]
+    well: Mapping[str, Samples]
+    """1 where a step ended as it should: no error, and for catching the ball in the cup."""
+    chosen: Mapping[str, NDArray[Any]]
+
+
+STEPS = ("locate_ball", "move_to_point", "catch_ball", "return_home")
+
+
+def steps_of(trials: Sequence[Trial]) -> Steps:
+    """Tabulate the first run of each step of each trial."""
+    names = (*STEPS, "track_ball")
+    first = [{run.place: run for run in reversed(trial.runs)} for trial in trials]
+
+    def column(name: str, value: Any) -> Samples:
+        return np.array([value(one[name]) if name in one else np.nan for one in first])
+
+    def well(name: str) -> Samples:
+        if name == "catch_ball":
+            return column(name, lambda run: float(run.taken == "caught"))
+        return column(name, lambda run: float(run.status != "error"))
+
+    times = [np.nan if trial.time is None else trial.time for trial in trials]
+    return Steps(
+        np.array([float(trial.goals > 0) for trial in trials]),
+        np.array(times, dtype=float),
+        {name: column(name, lambda run: run.took) for name in names},
+        {name: well(name) for name in names},
+        {
+            name: np.array([one[name].action if name in one else "" for one in first])
+            for name in ALTERNATIVES
+        },
+    )
+
+
+def chosen_rows(change: StructuralChange, steps: Steps) -> NDArray[np.bool_]:
+    """Return which training trials made the choices of the change (a step that did not run made
+    every choice)."""
+    kept = np.ones(len(steps.goal), dtype=bool)
+    for name, action in change.choices.items():
+        kept &= (steps.chosen[name] == action) | (steps.chosen[name] == "")
+    return kept
+
+
+def by_product(change: StructuralChange, steps: Steps, runs: int) -> dict[str, Any]:
+    """Forecast by independent steps: each figure with an interval for so many new trials."""
+    rng = np.random.default_rng(1)
+    n = len(steps.goal)
+    point = _product(change, steps, np.arange(n))
+    drawn = []
+    for _ in range(RESAMPLED):
+        share, mean, q90, spread = _product(change, steps, rng.integers(0, n, n))
+        noise = rng.normal(size=2) * spread / np.sqrt(runs)
+        # a normal sample's 90 % quantile scatters 1.71 times as much as its mean
+        drawn.append((rng.binomial(runs, share) / runs, mean + noise[0], q90 + 1.71 * noise[1]))
+    return _with_intervals(point[:3], np.array(drawn))
+
+
+def _product(
+    change: StructuralChange, steps: Steps, rows: NDArray[Any]
+) -> tuple[float, float, float, float]:
+    share, mean, variance = 1.0, 0.0, 0.0
+    for name in STEPS:
+        wanted, kept = change.choices.get(name), rows
+        if wanted is not None:
+            kept = rows[steps.chosen[name][rows] == wanted]
+        ran = kept[~np.isnan(steps.seconds[name][kept])]
+        seconds, well = steps.seconds[name][ran], steps.well[name][ran]
+        action = wanted or ALTERNATIVES.get(name, ARM_STEPS.get(name, ("",)))[0]
+        slow, faults = change.slow.get(action, 1.0), change.faults.get(action, 1.0)
+        right = float(well.mean()) if len(well) else 1.0
+        if name != "catch_ball":  # a miss is no fault
+            right = max(0.0, 1.0 - (1.0 - right) * faults)
+        looks = change.looks if name == "locate_ball" else 1
+        lasts = float(seconds.mean()) * slow if len(seconds) else 0.0
+        mean += share * lasts * (1.0 + (looks - 1) * (1.0 - right))
+        variance += float(seconds.var()) * slow * slow if len(seconds) else 0.0
+        if name != "return_home":
+            share *= 1.0 - (1.0 - right) ** looks
+    spread = float(np.sqrt(variance))
+    return share, mean, mean + NORMAL_90 * spread, spread
+
+
+ARM_STEPS = {"catch_ball": ("follow_and_wait",), "return_home": ("empty_and_home",)}
+
+
+def by_bootstrap(change: StructuralChange, steps: Steps, runs: int) -> dict[str, Any]:
+    """Forecast by resampling the training trials that made the new choices."""
+    rng = np.random.default_rng(2)
+    rows = np.flatnonzero(chosen_rows(change, steps))
+    point = figures(steps.goal[rows], steps.time[rows])
+    drawn = []
+    for _ in range(RESAMPLED):
+        own = rng.choice(rows, len(rows))
+        new = rng.choice(own, runs)
+        drawn.append(figures(steps.goal[new], steps.time[new]))
+    return _with_intervals(point, np.array(drawn))
+
+
+def figures(goal: Samples, times: Samples) -> tuple[float, float, float]:
+    """Return share of goals, mean and 90 % quantile of the time."""
+    times = times[~np.isnan(times)]
+    return float(goal.mean()), float(times.mean()), float(np.quantile(times, 0.9))
+
+
+def _with_intervals(point: Sequence[float], drawn: Samples) -> dict[str, Any]:
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+    return {name: [point[k], [float(low[k]), float(high[k])]] for k, name in enumerate(FIGURES)}
+
+
+# --- the part -------------------------------------------------------------------------------------
+
+
+def forecast_one(number: int, train: str, runs: int) -> Line:
+    """Forecast a change by all methods."""
+    change = CHANGES[number]
+    rows = [row.trial for row in read_table(Path(train) / TABLE)]
+    steps = steps_of([trial for trial in rows if trial is not None])
+    return {
+        "change": number,
+        "name": change.name,
+        "at": time.time(),
+        "runs": runs,
+        "petrobot": by_petrobot(change, Path(train), runs),
+        "product": by_product(change, steps, runs),
+        "bootstrap": by_bootstrap(change, steps, runs),
+    }
+
+
+def measure_one(number: int, folder: str, runs: int) -> Line:
+    """Run the new trials of a change."""
+    begun = time.time()
+    steps = steps_of(trials_of(CHANGES[number], Path(folder), runs))
+    kept = ~np.isnan(steps.time)
+    found = figures(steps.goal, steps.time)
+    return {
+        "change": number, "name": CHANGES[number].name, "begun": begun, "runs": len(kept),
+        "ended": int(kept.sum()), **dict(zip(FIGURES, found, strict=True)),
+    }  # fmt: skip
+
+
+def measure(results: Results, size: Size, workers: int) -> None:
+    """Train, register every forecast, then measure."""
+    train = results.folder / "train"
+    if not (train / "result.json").exists():
+        petrobot(
+            "campaign", str(TASK), "--services", str(PLANT), "--runs", str(size.training),
+            "--regime", REGIME, "--selector", "random", "--seed", str(TRAINING_SEED),
+            "--block", str(BLOCK), "--workers", "1", "--out", str(train),
+        )  # fmt: skip
+    keys = [f"{n:02}" for n in range(len(CHANGES))]
+    results.measure(
+        "registered", forecast_one,
+        [(key, (n, str(train), size.trials)) for n, key in enumerate(keys)], workers,
+    )  # fmt: skip
+    worlds = results.folder / "worlds"
+    results.measure(
+        "measured", measure_one,
+        [(key, (n, str(worlds / key), size.trials)) for n, key in enumerate(keys)], workers,
+    )  # fmt: skip

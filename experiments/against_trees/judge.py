@@ -1,0 +1,148 @@
+"""The referee: what a mission in the scripted plant must look like, whoever led it.
+
+It reads only the plant's log and the program's own report, so it is the same for a net, a tree and
+a state machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from experiments.against_trees.plant import Entry
+
+STEPS = {
+    "locate": "locate",
+    "predict": "track",
+    "intercept": "move",
+    "follow": "follow",
+    "empty": "home",
+    "reset": "recover",
+}
+"""By the first word of an action's name: the step that it does."""
+DEADLINES = {
+    "locate": 8.0,
+    "track": 6.0,
+    "move": 6.0,
+    "follow": 4.0,
+    "home": 10.0,
+    "recover": 30.0,
+}
+"""s that a run of a step may last."""
+ATTEMPTS = 4
+SLACK = 0.1
+"""s between what should follow and what does: links, ticks and a program's own turn."""
+
+
+class Report(NamedTuple):
+    """What a program says at its end. `crash` is what it raised, or that it never ended."""
+
+    caught: int
+    gave_up: bool
+    crash: str = ""
+
+
+class Past(NamedTuple):
+    """A run as the log tells it."""
+
+    step: str
+    ball: int
+    begun: float
+    ended: float
+    what: str
+    caught: float
+    """When the ball came into the cup during this run; 0 if it did not."""
+
+
+def step_of(action: str) -> str:
+    """Return the step that an action does."""
+    return STEPS[action.partition("_")[0]]
+
+
+def runs_of(entries: Sequence[Entry]) -> tuple[dict[str, list[Past]], list[str]]:
+    """Return the runs of each device in order, and what is wrong with them one by one."""
+    runs: dict[str, list[Past]] = {"camera": [], "arm": []}
+    open_: dict[str, Entry] = {}
+    caught: dict[str, float] = {}
+    wrong: list[str] = []
+    for entry in entries:
+        if entry.what == "begin":
+            if any(other.device == entry.device for other in open_.values()):
+                wrong.append(f"{entry.action} begins while the {entry.device} is busy")
+            open_[entry.run] = entry
+        elif entry.what == "caught":
+            caught[entry.run] = entry.t
+        elif (begin := open_.pop(entry.run, None)) is not None:
+            step = step_of(entry.action)
+            runs[entry.device].append(
+                Past(step, entry.ball, begin.t, entry.t, entry.what, caught.get(entry.run, 0.0))
+            )
+    wrong += [f"{begin.action} still runs at the end" for begin in open_.values()]
+    return runs, wrong
+
+
+def violations(entries: Sequence[Entry], report: Report, balls: int) -> list[str]:
+    """Return what was wrong with a mission of so many balls; empty if nothing was."""
+    runs, wrong = runs_of(entries)
+    if report.crash:
+        wrong.append(report.crash)
+    both = [*runs["camera"], *runs["arm"]]
+    for run in both:
+        lasted = run.ended - run.begun
+        if lasted > DEADLINES[run.step] + 1.0:
+            wrong.append(f"{run.step} lasted {lasted:.1f} s")
+        if run.what == "cut" and not run.caught and lasted < DEADLINES[run.step] - SLACK:
+            wrong.append(f"{run.step} was cut short")
+    located = [run for run in runs["camera"] if run.step == "locate"]
+    if len(located) > balls or (len(located) < balls and not report.gave_up):
+        wrong.append("another number of balls was located")
+    wrong += _camera(runs["camera"], runs["arm"])
+    wrong += _arm(runs["arm"])
+    wrong += _end(runs["arm"], report)
+    return wrong
+
+
+def _camera(camera: Sequence[Past], arm: Sequence[Past]) -> Iterator[str]:
+    """A ball that was located is tracked and met at once, and only then."""
+    for n, run in enumerate(camera):
+        after = camera[n + 1] if n + 1 < len(camera) else None
+        tracked = after is not None and after.step == "track" and after.ball == run.ball
+        if run.step == "locate" and run.what == "success":
+            if after is None or not tracked or after.begun > run.ended + SLACK:
+                yield "a located ball was not tracked at once"
+            if not any(run.ended <= r.begun <= run.ended + SLACK and r.step == "move" for r in arm):
+                yield "the arm did not move to a located ball at once"
+        elif run.step == "locate" and tracked:
+            yield "a ball that was not located was tracked"
+
+
+def _arm(arm: Sequence[Past]) -> Iterator[str]:
+    """Each run of the arm is followed by what its end asks for."""
+    failed = 0
+    for n, run in enumerate(arm):
+        after = arm[n + 1] if n + 1 < len(arm) else None
+        failed = failed + 1 if run.step == "recover" and run.what in ("error", "cut") else 0
+        wanted = _next(run, failed)
+        step = "nothing" if after is None else after.step
+        if step not in wanted:
+            cause = "the catch" if run.caught else run.what
+            yield f"after {run.step} ({cause}) the arm did {step}, not {' or '.join(wanted)}"
+        elif run.caught and after is not None and after.begun > run.caught + SLACK:
+            yield "the ball was in the cup, and the arm did not go home"
+
+
+def _next(run: Past, failed: int) -> tuple[str, ...]:
+    if run.caught:
+        return ("home",)
+    if run.what in ("error", "cut"):
+        return ("recover",) if failed < ATTEMPTS else ("nothing",)
+    return {"move": ("follow",), "follow": ("home",)}.get(run.step, ("move", "nothing"))
+
+
+def _end(arm: Sequence[Past], report: Report) -> Iterator[str]:
+    caught = sum(1 for run in arm if run.caught)
+    if not report.crash and report.caught != caught:
+        yield f"reports {report.caught} caught of {caught}"
+    lost = bool(arm) and arm[-1].step == "recover" and arm[-1].what != "success"
+    if not report.crash and report.gave_up != lost:
+        yield "reports that the arm is lost, and it is not" if report.gave_up else "hides that"
