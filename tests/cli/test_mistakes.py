@@ -154,13 +154,13 @@ IN_THE_CELL: list[Mistake] = [
         CELL,
         "speed = 0.5",
         'speed = "fast"',
-        r":LINE: devices.axis.speed: .*a number \(m/s\), found 'fast'",
+        r":LINE: devices.axis.top_speed: .*a number \(m/s\), found 'fast'",
     ),
     (
         CELL,
         "speed = 0.5",
         "sped = 0.5",
-        r":LINE: devices.axis.sped: unknown key 'sped'; did you mean 'sp",
+        r":LINE: devices.axis.top_sped: unknown key 'top_sped'; did you mean 'top_speed'",
     ),
     (
         CELL,

@@ -278,9 +278,8 @@ class Exchanges:
     def _end(self, one: Exchange, message: Message) -> None:
         said, status = message.get("values"), message.get("status")
         nested = isinstance(said, dict) and set(said) == {"status", "result"}
-        if (
-            nested and status is None and isinstance(said, dict)
-        ):  # rosbridge before it told a status
+        # An older rosbridge sends the status inside the result.
+        if nested and status is None and isinstance(said, dict):
             said, status = said["result"], said["status"]
         if message.get("result") is False and status not in (5, 6):
             one.text = str(said or "rosbridge gives no reason")[:500]
@@ -289,7 +288,7 @@ class Exchanges:
         if message["op"] == "service_response" or status is None:
             word = Word.SUCCEEDED
         else:
-            word = _STATUS.get(status if isinstance(status, int | float) else 0, Word.ABORTED)
+            word = _STATUS.get(int(status) if isinstance(status, int | float) else 0, Word.ABORTED)
             one.text = "" if word is not Word.ABORTED else f"the goal ended with status {status}"
         if isinstance(said, str):
             one.text, said = said[:500], {}

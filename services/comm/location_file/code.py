@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import os
 import resource
 import signal
@@ -24,7 +25,9 @@ from petrobot.services.host.json_text import json_text
 
 PROGRAM = "petrobot.services.code_reading"
 SECONDS = 20.0
-"""How long all imports together may take."""
+"""Processor time that the imports may take (s)."""
+BUSY = 3.0
+"""How many times as long they may take altogether: on a busy host, or when they sleep."""
 MEMORY = 4 << 30
 """Bytes of address space that they may have."""
 
@@ -35,7 +38,8 @@ Facts = Mapping[str, Any]
 def read_code(directory: Directory, seconds: float = SECONDS) -> dict[str, Facts]:
     """Return what is known of each action, service and driver of this host's nodes, by import path.
 
-    What cannot be imported, or not within `seconds` altogether, has the key `import`: why.
+    What cannot be imported, or not within `seconds` of processor time altogether, has the key
+    `import`: why.
     """
     here = {node.name for node in directory.nodes.values() if is_loopback(node.host)}
     actions, services = directory.actions.values(), directory.services.values()
@@ -44,8 +48,9 @@ def read_code(directory: Directory, seconds: float = SECONDS) -> dict[str, Facts
     for device in directory.devices.values():
         if device.node in here and device.driver:
             more = {"dry_run": True} if directory.dry_run else {}
-            tables = asked.setdefault(device.driver, {})
-            tables[device.name] = {**device.config, **more}
+            if asked.get(device.driver) is None:
+                asked[device.driver] = {}  # also where an action has the same path
+            asked[device.driver][device.name] = {**device.config, **more}
     known: dict[str, Facts] = {}
     while left := [[path, config] for path, config in asked.items() if path not in known]:
         told, why = _ask(left, seconds)
@@ -76,9 +81,14 @@ def _ask_process(question: str, seconds: float) -> tuple[list[Facts], str]:
         start_new_session=True,
     )  # fmt: skip
     resource.prlimit(process.pid, resource.RLIMIT_AS, (MEMORY, MEMORY))
+    # What counts is processor time: on a busy host an import may take several times as long.
+    most = math.ceil(seconds)
+    resource.prlimit(process.pid, resource.RLIMIT_CPU, (most, most + 1))
     try:
-        text, _ = process.communicate(question, timeout=seconds)
+        text, _ = process.communicate(question, timeout=BUSY * seconds)
         why = f"importing it ended the process (exit code {process.returncode})"
+        if process.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+            why = f"importing it took longer than {seconds:g} s"
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         text, _ = process.communicate()
