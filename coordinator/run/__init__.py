@@ -1,1 +1,1 @@
-"""One mission run: the engine meets the network, in real time and in lock step."""
+"""One mission run: connects the engine to the nodes, in real time and in lock step."""

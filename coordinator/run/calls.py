@@ -1,9 +1,8 @@
-"""Runs in the hands of nodes: the engine's orders become calls, and what nodes say of them becomes
-stimuli.
+"""Translates the engine's orders into calls of nodes, and the nodes' replies into stimuli.
 
-A machine without clock or sockets; its calls are in its callers. It keeps every device fenced whose
-last run is not known to be over, and after a resume it asks the nodes for the runs that an earlier
-process gave them (docs/semantics.md, section 12).
+A sans-I/O machine; the calls are in its callers. It keeps every device fenced whose last run is not
+known to have stopped. After a resume it asks the nodes for the runs that an earlier process gave
+them (docs/semantics.md, section 12).
 """
 
 from __future__ import annotations
@@ -44,23 +43,23 @@ from petrobot.services.comm.protocol.plain import NotPlainError
 # Fences: devices that may still move although no run here leads them.
 
 STOP_MARGIN: Final = 2.0
-"""Seconds that a node's stop routine may take after a run's orphan time (docs/semantics.md,
+"""Time that a node's stop routine may take after a run's orphan time (s; docs/semantics.md,
 cancel)."""
 REBOOTED: Final = "rebooted"
 FORGOTTEN: Final = "forgotten"
 UNSURE: Final = frozenset({"lost", "no_answer", "not_accepted", "refused", REBOOTED, FORGOTTEN})
 """Causes after which a device may still be moving if executed = unknown.
 
-The node has not said that the run is over, or cannot say how it ended. Or it is another process,
-and the devices of the former one may be in the middle of their stop routines.
+The node has not reported that the run has stopped, or does not know how it ended. Or it is another
+process, and the devices of the former one may still be in their stop routines.
 """
 FOR_GOOD: Final = math.inf
 
 
 @dataclass(frozen=True, slots=True)
 class Fence:
-    """A device is kept free because of a run, until a time (s) or until its node says that the run
-    is over."""
+    """A device is kept free because of a run, until a time (s) or until its node reports that the
+    run has stopped."""
 
     run: str
     node: str
@@ -87,39 +86,39 @@ class Fences:
         self._fences[device] = Fence(run, node, until)
 
     def after(self, cause: str, now: float, orphan_time: float | None) -> float:
-        """Until when a device is fenced whose run ended for this cause.
+        """Return until when a device is fenced whose run ended for this cause.
 
-        A node that was lost stops the run itself once it has missed its coordinator for the orphan
-        time. One that was started again, or has forgotten the run, does not execute it any more.
-        One that is there and does not say that the run has stopped can be waited for only.
+        A node that was lost stops the run by itself after the orphan time. A node that was started
+        again, or has forgotten the run, does not execute it any more. A node that is connected and
+        does not report that the run has stopped: there is no limit.
         """
         if cause == "no_answer":
             return FOR_GOOD
         return now + STOP_MARGIN + (0.0 if cause in (REBOOTED, FORGOTTEN) else orphan_time or 0.0)
 
     def lift(self, run: str) -> list[str]:
-        """The run is known to be over: gives the devices that are free by that."""
+        """Note that the run has stopped, and return the devices that are free now."""
         devices = [device for device, fence in self._fences.items() if fence.run == run]
         for device in devices:
             del self._fences[device]
         return devices
 
     def rebooted(self, now: float, node: str) -> None:
-        """The node is another process: the runs of the former one ended with it, at the latest by
-        its devices' stop routines."""
+        """Note that the node is another process: the runs of the former one ended with it, at the
+        latest by the stop routines of its devices."""
         for device, fence in self._fences.items():
             if fence.node == node:
                 self._fences[device] = Fence(fence.run, node, min(fence.until, now + STOP_MARGIN))
 
     def over(self, now: float) -> list[tuple[str, Fence]]:
-        """Take out the fences whose time is over."""
+        """Remove the fences whose time is over."""
         found = [(device, fence) for device, fence in self._fences.items() if fence.until <= now]
         for device, _ in found:
             del self._fences[device]
         return found
 
     def due(self) -> float | None:
-        """When the next one is over, None if only a node can lift one."""
+        """Return when the next fence ends, None if only a node can lift one."""
         soonest = min((fence.until for fence in self._fences.values()), default=FOR_GOOD)
         return soonest if soonest < FOR_GOOD else None
 
@@ -135,7 +134,7 @@ class _Timer:
 
 
 class AfterTimers:
-    """By key; times in seconds on the clock of whoever calls."""
+    """By key; times in seconds on the caller's clock."""
 
     def __init__(self) -> None:
         self._timers: dict[str, _Timer] = {}
@@ -147,25 +146,25 @@ class AfterTimers:
         return len(self._timers)
 
     def arm(self, now: float, key: str, seconds: float) -> None:
-        """Be over in so many seconds."""
+        """Arm a timer that elapses after so many seconds."""
         self._timers[key] = _Timer(now + seconds)
 
     def disarm(self, key: str) -> None:
-        """It is not wanted any more."""
+        """Cancel a timer."""
         self._timers.pop(key, None)
 
     def hold(self, now: float, key: str) -> None:
-        """Stop it; what is left is kept."""
+        """Stop a timer and keep its remaining time."""
         if (timer := self._timers.get(key)) and timer.held is None:
             timer.held = max(0.0, timer.due - now)
 
     def release(self, now: float, key: str) -> None:
-        """Go on with what is left."""
+        """Let a timer continue with its remaining time."""
         if (timer := self._timers.get(key)) and timer.held is not None:
             timer.due, timer.held = now + timer.held, None
 
     def over(self, now: float) -> list[str]:
-        """Take out those that are over, the earliest first."""
+        """Remove and return the timers that have elapsed, the earliest first."""
         keys = sorted(
             (t.due, k) for k, t in self._timers.items() if t.held is None and t.due <= now
         )
@@ -174,18 +173,18 @@ class AfterTimers:
         return [key for _, key in keys]
 
     def due(self) -> float | None:
-        """When the next one is over."""
+        """Return when the next timer elapses."""
         return min((t.due for t in self._timers.values() if t.held is None), default=None)
 
 
 ESCALATION: Final = 3.0
-"""Seconds after a run's own time to stop that its node needs at most for the stop routine and the
-kill of its worker."""
+"""Longest time that a node needs for the stop routine and the kill of a worker, after the run's own
+time to stop (s)."""
 RESUMED: Final = "resumed"
 NO_BOOT: Final = "unknown"
-"""Names no boot of a node: boots are drawn as hexadecimal numbers."""
+"""Never the boot of a node: boots are hexadecimal numbers."""
 _GIVEN_UP: Final = UNSURE | {RESUMED, "unreachable"}
-"""Causes by which this side ended a run without word of its node."""
+"""Causes with which this side ends a run without a report of its node."""
 _TIMERS: Final = (ArmTimer, DisarmTimer, HoldTimer, ReleaseTimer)
 
 
@@ -205,7 +204,7 @@ class Flight:
     """The boot of its node that an earlier process may have called already; empty: no process
     has."""
     abandon: bool = False
-    """If its node says that it still goes on, it is ended here: its action's `on_resume` is
+    """If its node reports that it is still active, it is ended here: its action's `on_resume` is
     `error`."""
 
     @property
@@ -228,20 +227,21 @@ class Dispatch:
         self._seed = seed
         self._fences = Fences()
         self._parting: dict[str, Flight] = {}
-        """Runs that this side is done with, or is stopping, and that their node has not said to be
-        over."""
+        """Runs that this side has finished or is stopping, and whose node has not reported that
+        they stopped."""
         self._timers = AfterTimers()
         self._commands: dict[str, str] = {}
         self._command_count = 0
         self._boots: dict[str, str] = {}
         self._kept: dict[str, Sequence[str]] = {}
-        """By node: ids that it still knew when it welcomed us and nobody has settled yet."""
+        """By node: runs that it still knew when it welcomed us and that have not been handled
+        yet."""
         self._earlier: dict[str, tuple[StartRun, str]] = {}
         """Runs that an earlier process started, with the boot of their node as it was then."""
         self._accepted: set[str] = set()
         """Runs that their node had accepted in an earlier process."""
         self._settled: dict[str, bool] = {}
-        """Runs that ended in an earlier process, and whether their node said so."""
+        """Runs that ended in an earlier process, and whether their node reported that."""
         self._orders: Mapping[type, Callable[[float, Any], list[Stimulus]]] = {
             StartRun: self._start,
             CancelRun: self._cancel,
@@ -255,11 +255,11 @@ class Dispatch:
         return type(instruction) in self._orders
 
     def carry_out(self, now: float, order: Instruction) -> list[Stimulus]:
-        """Carry out an order; gives what is known of it at once."""
+        """Carry out an order, and return the stimuli that follow at once."""
         return self._orders[type(order)](now, order)
 
     def moves_hardware(self, order: Instruction) -> bool:
-        """Whether the order reaches a device."""
+        """Return whether the order reaches a device."""
         if isinstance(order, StartRun):
             entry = self.directory.actions.get(order.action)
             return entry is not None and bool(entry.device)
@@ -269,18 +269,17 @@ class Dispatch:
         return False
 
     def call_id(self, run: str) -> str:
-        """The id of a run's call, unique for ever."""
+        """Return the id of a run's call, which is never used again."""
         return f"{self._mission}/{run}"
 
     def run_of(self, call: str) -> str | None:
-        """The run that a call of this mission run was made for, None if it was made for none that
-        is under way."""
+        """Return the active run of a call; None if there is none."""
         run = call.removeprefix(self._mission + "/")
         return run if run in self.flights else None
 
     @property
     def asked(self) -> bool:
-        """Whether a node still has to say whether it holds."""
+        """Return whether a node's answer to a hold is missing."""
         return bool(self._commands)
 
     # --- orders -------------------------------------------------------------------------------
@@ -297,8 +296,7 @@ class Dispatch:
         return self._call(now, flight)
 
     def _call(self, now: float, flight: Flight) -> list[Stimulus]:
-        """Call the flight's action; gives its end where its arguments are what no message
-        carries."""
+        """Call the action of a run. Return its end if its arguments cannot be sent."""
         flight.waits = False
         start, boot = flight.start, flight.boot
         arguments = {**self.directory.actions[start.action].args, **start.arguments}
@@ -365,14 +363,14 @@ class Dispatch:
     # --- what nodes say -----------------------------------------------------------------------
 
     def accepted(self, now: float, call: str) -> list[Stimulus]:
-        """The node took a call, or says that it goes on."""
+        """Note that the node accepted a call, or reports that its run is active."""
         run = self.run_of(call)
         if run is None:
             return []
         return self._abandon(now, run) if self.flights[run].abandon else [RunStarted(run)]
 
     def ended(self, now: float, outcome: Outcome) -> list[Stimulus]:
-        """A call has ended, by word of its node or by this side's decision."""
+        """Handle the end of a call, reported by its node or decided by this side."""
         run = self.run_of(outcome.id)
         if run is None:
             return self.late(now, outcome) if self._parted(outcome) else []
@@ -395,16 +393,16 @@ class Dispatch:
         return [] if flight.device else [_run_ended(run, outcome)]
 
     def _parted(self, outcome: Outcome) -> bool:
-        """Whether a node says (not this side decides) that a run is over which was given up
-        here."""
+        """Return whether this is a node's report, not a decision of this side, that a run which was
+        given up here has ended."""
         return (
             outcome.id.removeprefix(self._mission + "/") in self._parting
             and outcome.cause not in _GIVEN_UP
         )
 
     def late(self, now: float, outcome: Outcome) -> list[Stimulus]:
-        """A node's own word on a run that had ended here: it is recorded, moves nothing, and frees
-        the device."""
+        """Handle a node's report on a run that has already ended here: it is recorded, moves no
+        token, and frees the device."""
         run = outcome.id.removeprefix(self._mission + "/")
         if run == outcome.id or "#" not in run:
             return []
@@ -415,7 +413,7 @@ class Dispatch:
         return stimuli
 
     def answered(self, now: float, answer: Answer) -> list[Stimulus]:
-        """The answer to a hold."""
+        """Handle the answer to a hold."""
         run = self._commands.pop(answer.id, None)
         flight = self.flights.get(run) if run is not None else None
         if run is None or flight is None:
@@ -430,7 +428,7 @@ class Dispatch:
         return [RunHeld(run, held)]
 
     def back(self, now: float, node: str, boot: str, runs: Sequence[str]) -> None:
-        """A node has welcomed us; `runs` are the ids that it still knows."""
+        """Handle a node's WELCOME; `runs` are the ids that it still knows."""
         if self._boots.get(node, boot) != boot:
             self._fences.rebooted(now, node)
         self._boots[node] = boot
@@ -439,7 +437,7 @@ class Dispatch:
     # --- time ---------------------------------------------------------------------------------
 
     def advance(self, now: float) -> list[Stimulus]:
-        """What is over: timers, fences, and the patience of runs that wait for one."""
+        """Handle what has elapsed: timers, fences, and the patience of runs that wait for one."""
         stimuli: list[Stimulus] = [TimerFired(key) for key in self._timers.over(now)]
         for device, fence in self._fences.over(now):
             flight = self._parting.pop(fence.run, None)
@@ -458,18 +456,18 @@ class Dispatch:
         return stimuli
 
     def _go_on(self, now: float, device: str) -> list[Stimulus]:
-        """The device is free: start what waited for it."""
+        """Start the run that waited for a device which is free now."""
         waiting = [f for f in self.flights.values() if f.waits and f.device == device]
         return [stimulus for flight in waiting for stimulus in self._call(now, flight)]
 
     @property
     def idle(self) -> bool:
-        """Whether time alone can change nothing: no timer, no fence (and so no run that waits for
+        """Whether time alone changes nothing: there is no timer and no fence (so no run waits for
         one)."""
         return not self._timers and not self._fences
 
     def due(self) -> float | None:
-        """When `advance` has something to do next."""
+        """Return when `advance` is needed next."""
         times = [self._timers.due(), self._fences.due()]
         times += [
             flight.begun + flight.start.deadline for flight in self.flights.values() if flight.waits
@@ -485,7 +483,8 @@ class Dispatch:
         instructions: Iterable[Instruction],
         boots: Mapping[str, str],
     ) -> None:
-        """A step that an earlier process took at `now`: its timers and fences still count."""
+        """Replay a step that an earlier process took at `now`: its timers and fences still
+        count."""
         self._boots.update(boots)
         if isinstance(stimulus, TimerFired):
             self._timers.disarm(stimulus.key)
@@ -526,7 +525,7 @@ class Dispatch:
             )
 
     def adopt(self, now: float, orders: Iterable[Instruction], state: State) -> list[Stimulus]:
-        """Carry out again the orders that an earlier process left open, and settle what the nodes
+        """Carry out again the orders that an earlier process left open, and handle what the nodes
         still keep of its runs."""
         stimuli = self.advance(now)
         for order in orders:
@@ -543,8 +542,8 @@ class Dispatch:
         return stimuli
 
     def settle(self, now: float, node: str) -> None:
-        """Of the runs that a node keeps for this mission run: stop those that are of no use, let it
-        forget the others."""
+        """Of the runs that a node keeps for this mission run, stop those that are not needed, and
+        let it forget the others."""
         caller = self.callers[node]
         for id_ in self._kept.pop(node, ()):
             run = id_.removeprefix(self._mission + "/")
@@ -556,7 +555,7 @@ class Dispatch:
                 caller.disown(now, id_)
 
     def _rejoin(self, now: float, start: StartRun) -> list[Stimulus]:
-        """Ask for a run under its old id: the node goes on with it or gives its stored result;
+        """Ask for a run under its old id: the node continues it or returns its stored result;
         another boot answers unknown."""
         entry = self.directory.actions.get(start.action)
         if entry is None:
@@ -571,8 +570,8 @@ class Dispatch:
         return stimuli
 
     def _ask_again(self, now: float, start: StartRun, stopping: bool = False) -> list[Stimulus]:
-        """Call a run again that an earlier process may have called. One that its node had accepted
-        and neither executes nor keeps any more was forgotten there: it ends without a call."""
+        """Call a run again that an earlier process may have called. A run that its node had
+        accepted and neither executes nor keeps was forgotten there: it ends without a call."""
         entry = self.directory.actions[start.action]
         present, id_ = self.callers[entry.node].boot, self.call_id(start.run)
         known = id_ in self._kept.get(entry.node, ())

@@ -1,9 +1,8 @@
-"""The executor: where net and network meet. It feeds the engine, and has its instructions carried
-out.
+"""The executor: passes stimuli to the engine and carries out its instructions.
 
-A machine without clock or sockets: `take` what a caller noticed, `advance` to a time, and the calls
-it makes are in its callers. Every stimulus is handed to the store before its effects leave, and
-effects leave after the store's `sync`.
+A sans-I/O machine: `take` receives what a caller noticed, `advance` moves it to a time, and its
+calls are in its callers. Every stimulus is stored before its effects leave, and effects leave after
+the store's `sync`.
 """
 
 from __future__ import annotations
@@ -59,8 +58,8 @@ from petrobot.services.comm.protocol.messages import (
 
 MEMORY_EVENTS: Final = "memory:"
 SYNC_WITHIN: Final = 0.5
-"""Seconds after which what waits for a sync is synced although no effect calls for it, so that
-nodes may forget results."""
+"""Time after which records are synced even if no effect needs that (s), so that nodes may forget
+results."""
 _LEAVES_THE_PROCESS: Final = (StartRun, CancelRun, HoldRun, ReleaseRun)
 
 
@@ -79,7 +78,7 @@ class Executor:
     observers: list[Observer] = field(default_factory=list)
     finished: Finished | None = None
     on_status: Callable[[Mapping[str, Any]], None] | None = None
-    """Gets what nodes answer to the operator's questions."""
+    """Receives the nodes' answers to the operator's questions."""
 
     def __post_init__(self) -> None:
         """Start with the engine's initial state."""
@@ -96,15 +95,15 @@ class Executor:
     # --- in -----------------------------------------------------------------------------------
 
     def subscribe(self, now: float) -> None:
-        """Have the events and variables that the task knows, and verdicts on its runs, sent by
-        every node."""
+        """Subscribe at every node to the events and variables of the task and to verdicts on its
+        runs."""
         known = self._external | {MEMORY_EVENTS + name for name in self.task.flat.variables}
         names = sorted(known | {verdict_event(self.mission)})
         for caller in self.callers.values():
             caller.subscribe(now, names)
 
     def relive(self, now: float, step: RecordedStep) -> None:
-        """Take in a step that an earlier process recorded at `now`; observers see it, nothing is
+        """Replay a step that an earlier process recorded at `now`: observers see it, but nothing is
         carried out again."""
         self.state = step.state
         self.dispatch.relive(now, step.stimulus, step.instructions, step.boots)
@@ -118,19 +117,19 @@ class Executor:
         )
 
     def adopt(self, now: float) -> None:
-        """Go on from the steps relived: ask nodes for the runs, give the orders again."""
+        """Continue after the replayed steps: ask nodes for the runs, and give the orders again."""
         orders = self.engine.outstanding(self.state)
         self._queue.extend(self._choose(order) for order in orders if isinstance(order, Choose))
         self._queue.extend(self.dispatch.adopt(now, orders, self.state))
         self._work(now)
 
     def stimulate(self, now: float, *stimuli: Stimulus) -> None:
-        """Take stimuli in, and let their effects leave."""
+        """Handle stimuli, and let their effects leave."""
         self._queue.extend(stimuli)
         self._work(now)
 
     def take(self, now: float, node: str, notices: Iterable[Notice]) -> None:
-        """Take what a node's caller noticed."""
+        """Handle what a node's caller noticed."""
         for notice in notices:
             if isinstance(notice, Outcome):
                 self._ended(now, node, notice)
@@ -149,8 +148,8 @@ class Executor:
         self._work(now)
 
     def advance(self, now: float) -> None:
-        """Fire the timers that are over, start what waited for a fence, sync what has waited for
-        long."""
+        """Handle elapsed timers, start runs that waited for a fence, and sync records that have
+        waited for long."""
         if (
             self.dispatch.idle and self._unsafe_since is None
         ):  # asked at each tick of a lock-step cell
@@ -162,7 +161,7 @@ class Executor:
         self._work(now)
 
     def due(self) -> float | None:
-        """When `advance` has something to do next."""
+        """Return when `advance` is needed next."""
         due = self.dispatch.due()
         if self._unsafe_since is None:
             return due
@@ -182,8 +181,8 @@ class Executor:
         self._make_safe(now)
 
     def _make_safe(self, now: float) -> None:
-        """Before effects leave: what moves hardware, or is the end, is synced; everything else
-        survives this process.
+        """Store records before their effects leave: synced if an effect moves hardware or ends the
+        run, otherwise so that they survive this process.
 
         Independent effects of one turn share one sync. What waits is synced within `SYNC_WITHIN`,
         and acknowledged then.
@@ -260,7 +259,7 @@ class Executor:
             name = event.name.removeprefix(MEMORY_EVENTS)
             self._queue.append(VariableChanged(name, event.data.get("value"), event.source))
         elif event.name.startswith(VERDICT_EVENTS):
-            with suppress(ValueError):  # a foreign node's mistake; nobody here could mend it
+            with suppress(ValueError):  # a mistake of a foreign node, which cannot be mended here
                 self._queue.append(self.verdict(RunVerdict.of_data(event.data)))
         elif event.run:
             run = self.dispatch.run_of(event.run)
@@ -272,8 +271,8 @@ class Executor:
             self._queue.append(EventOccurred(event.name, event.source, event.number))
 
     def verdict(self, said: RunVerdict) -> Verdict:
-        """What somebody says of a run, as the engine takes it. One on another mission run's run
-        names none of this one."""
+        """Return a verdict as a stimulus. One on a run of another mission run gets an id that no
+        run here has."""
         return Verdict(
             said.run.removeprefix(f"{self.mission}/"), Status(said.status), said.cause, said.text
         )

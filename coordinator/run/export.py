@@ -1,5 +1,5 @@
-"""A journal for other tools: JSON lines (everything) and XES (process mining: one trace, an event
-for each firing and run)."""
+"""Exports a journal to other tools: JSON lines (everything), XES (process mining: one trace, with
+an event for each firing and run) and MCAP (Foxglove)."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def jsonl(journal: Journal, steps: Iterator[RecordedStep]) -> Iterator[str]:
 
 
 def xes(journal: Journal, steps: Iterator[RecordedStep]) -> Iterator[str]:
-    """The run as an XES log (IEEE 1849-2016) with one trace; times count from the date in the
-    header."""
+    """Return the run as an XES log (IEEE 1849-2016) with one trace; times count from the date in
+    the header."""
     origin = datetime.fromisoformat(
         journal.header.get("date", "1970-01-01T00:00:00+00:00")
     ).astimezone(UTC)
@@ -127,8 +127,7 @@ def _strings(values: dict[str, str]) -> str:
     )
 
 
-# A journal as an MCAP file (mcap.dev), to be looked at in Foxglove beside other recordings. Needs
-# the package `mcap`.
+# The MCAP file (mcap.dev) needs the package `mcap`.
 
 _TEXT: Final = {"type": "string"}
 _NUMBER: Final = {"type": "number"}
@@ -187,7 +186,7 @@ def write_mcap(path: Path, journal: Journal, net: Net, steps: Iterable[RecordedS
 def messages(
     journal: Journal, net: Net, steps: Iterable[RecordedStep]
 ) -> Iterator[tuple[str, int, dict[str, Any]]]:
-    """Channel, time (ns since 1970) and body of each message, in order."""
+    """Yield channel, time (ns since 1970) and body of each message, in order."""
     origin = round(datetime.fromisoformat(journal.header["date"]).timestamp() * 1e9)
     for step in steps:
         time = origin + round(step.time * 1e9)

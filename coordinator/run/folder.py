@@ -1,5 +1,5 @@
-"""Folders of mission runs: where a journal is kept, how a run is named on the command line, and how
-long it is kept."""
+"""Folders of mission runs: where a journal is kept, how a run is named on the command line, and
+which old runs are removed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ JOURNAL = "run.journal"
 RESULT = "result.json"
 DEFAULT = Path("runs")
 NODE_LOGS = DEFAULT / "logs"
-"""Where the programs that are started for a run keep their logs, a file each."""
+"""Folder of the logs of the programs that are started for a run, a file for each."""
 SEMANTICS = 4
 """The rules by which this engine executes a net, in the header of each journal (key `semantics`).
 
@@ -29,14 +29,14 @@ served, before the order in the file. A journal is replayed and resumed under it
 
 
 class NoRunError(Exception):
-    """No such mission run; the text says which there are."""
+    """There is no such mission run; the text names those that exist."""
 
 
 def header(
     mission: str, task: str, services: str, mode: str, rest: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """A journal's header: the texts of task file and services.toml, versions, and whatever else the
-    run was given."""
+    """Return a journal's header: the texts of task file and services.toml, versions, and all
+    settings of the run."""
     return {
         "mission": mission,
         "task": task,
@@ -50,7 +50,7 @@ def header(
 
 
 def journal_of(name: str, folder: Path = DEFAULT) -> Path:
-    """The journal of a run given by its id, by its folder, by its journal's path, or as `last`.
+    """Return the journal of a run, given by its id, its folder, its journal's path, or `last`.
     Raises NoRunError."""
     path = Path(name)
     candidates = [path, path / JOURNAL, folder / name / JOURNAL]
@@ -65,8 +65,8 @@ def journal_of(name: str, folder: Path = DEFAULT) -> Path:
 
 
 def retain(folder: Path, keep: int) -> list[str]:
-    """Remove the oldest ended runs beyond the newest `keep`; a run without result is never removed.
-    Gives their names."""
+    """Remove the oldest finished runs, keep the newest `keep`, and return the removed names. A run
+    without a result is never removed."""
     ended = sorted(
         (p for p in folder.glob(f"*/{RESULT}") if (p.parent / JOURNAL).exists()),
         key=lambda p: p.stat().st_mtime,
@@ -78,8 +78,8 @@ def retain(folder: Path, keep: int) -> list[str]:
 
 
 def still_there(path: Path) -> Path:
-    """The path; for a shipped file of an installation that is gone, as old records name it, the
-    file of this one."""
+    """Return the path, or, if old records name a shipped file of an installation that is gone, that
+    file in this installation."""
     if path.exists():
         return path
     tails = (_INSTALLED.joinpath(*path.parts[n:]) for n in range(1, len(path.parts) - 1))

@@ -1,4 +1,5 @@
-"""Who works with the executor: selectors, stores and observers, and the plainest of each."""
+"""Interfaces of the executor (selectors, stores and observers), with the simplest implementation of
+each."""
 
 from __future__ import annotations
 
@@ -19,28 +20,29 @@ class Selector(Protocol):
         alternatives: tuple[str, ...],
         variables: Mapping[str, Any] | None = None,
     ) -> tuple[str, str]:
-        """One alternative and why. `variables` are global memory and parameters as they are now."""
+        """Return one alternative and the reason. `variables` are the current global memory and
+        parameters."""
 
 
 class Store(Protocol):
-    """Where stimuli go before their effects leave."""
+    """Stores stimuli before their effects leave."""
 
     def append(
         self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State
     ) -> None:
-        """Keep a stimulus, and what came of it, with the next sync."""
+        """Store a stimulus and its instructions with the next sync."""
 
     def node(self, name: str, boot: str) -> None:
-        """Keep which boot of a node this run speaks to."""
+        """Store which boot of a node this run uses."""
 
     def stage(self, name: str, values: Mapping[str, Any]) -> None:
-        """Keep that the mission run has come to a stage of its own (prepared, scored)."""
+        """Store that the mission run reached a stage (prepared, scored)."""
 
     def flush(self) -> None:
-        """What was appended survives the end of this process."""
+        """Make all that was appended survive the end of this process."""
 
     def sync(self) -> None:
-        """Make all that was appended safe."""
+        """Make all that was appended durable."""
 
     @property
     def safe(self) -> bool:
@@ -53,19 +55,19 @@ class Store(Protocol):
 
 @runtime_checkable
 class Observer(Protocol):
-    """Whoever follows the mission run: report, page, terminal."""
+    """Follows a mission run: report, page, terminal."""
 
     def instruction(self, now: float, instruction: Instruction) -> None:
-        """The engine gave an instruction or a record."""
+        """Receive an instruction or a record of the engine."""
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
-        """The engine takes a stimulus in."""
+        """Receive a stimulus before the engine handles it."""
 
     def progress(self, now: float, run: str, notice: Feedback) -> None:
-        """A run says how far it is."""
+        """Receive the progress of a run."""
 
     def settled(self, now: float, state: State) -> None:
-        """The engine has handled a stimulus, with this state after it."""
+        """Receive a stimulus that the engine has handled, and the state after it."""
 
 
 class Forgetful:
@@ -93,14 +95,13 @@ class Forgetful:
 
 
 class FirstAlternative:
-    """The selector of a run that learns nothing: always the first alternative that some node
-    offers."""
+    """The selector of a run without learning: always the first alternative that a node offers."""
 
     def __init__(self, chosen: Mapping[str, str] | None = None) -> None:
         self._chosen = dict(chosen or {})
 
     def figures(self, task: str) -> Mapping[str, Mapping[str, float]]:
-        """What people are shown of each alternative: nothing is known here."""
+        """Return what is known of each alternative: here nothing."""
         return {}
 
     def choose(
@@ -110,7 +111,7 @@ class FirstAlternative:
         alternatives: tuple[str, ...],
         variables: Mapping[str, Any] | None = None,
     ) -> tuple[str, str]:
-        """The user's choice for this primitive task, else the first."""
+        """Return the user's choice for this primitive task, otherwise the first alternative."""
         if task in self._chosen:
             return self._chosen[task], "chosen by the user"
         return alternatives[0], "first of the task file"

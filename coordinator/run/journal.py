@@ -6,7 +6,8 @@ u32 CRC-32 of the payload, and the payload, a msgpack array `[number, kind, data
 header (kind "header"): texts of task file and services.toml, versions, seed. Numbers count up by
 one. A file that ends inside a record, or whose last record fails its checksum, was torn by a crash:
 the tail is dropped and reported (also one of zeros, which a file system may leave after a power
-cut). One that cannot be read with whole records behind it is damage, not a crash, and is refused.
+cut). A record that cannot be read and is followed by whole records means damage: the file is
+refused.
 
 Kinds of a mission run's journal: coordinator/run/recording.py. Why not SQLite:
 docs/decisions/journal.md has the measurement.
@@ -34,8 +35,7 @@ MAGIC = b"PETROJ%d\n" % FORMAT
 _FAMILY = re.compile(rb"PETROJ(\d+)\n")
 PREFIX = struct.Struct("<II")
 SMALLEST_RECORD, LARGEST_RECORD = 4, 1 << 25
-"""Bytes of a record's payload. What a node may send in one message must find room in it, with all
-that is kept beside it."""
+"""Sizes of a record's payload (bytes). The largest message of a node must fit into a record."""
 _ARRAY_OF_THREE = 0x93
 
 
@@ -69,14 +69,14 @@ class JournalWriter:
     commit)."""
 
     def __init__(self, path: Path, header: Mapping[str, Any] | None = None) -> None:
-        """Create a journal with a header, or, without one, go on with an existing file behind its
-        last good record."""
+        """Create a journal with a header or, without one, continue an existing file after its last
+        good record."""
         self.path = path
         self._buffer = bytearray()
         self._unsynced = False
         """Whether records were handed to the operating system since the last sync."""
         self._torn: int | None = None
-        """Where the file is to be cut before anything is appended; None: nowhere."""
+        """Where to cut the file before anything is appended; None: nowhere."""
         self.syncs = 0
         if header is not None:
             try:
@@ -99,7 +99,7 @@ class JournalWriter:
                 self.sync()
             except JournalError as fault:
                 os.close(self._file)
-                path.unlink(missing_ok=True)  # of a run that has not begun nothing is left
+                path.unlink(missing_ok=True)  # the run has not begun: leave nothing behind
                 with contextlib.suppress(OSError):
                     path.parent.rmdir()  # if there is nothing else in it
                 raise JournalError(
@@ -112,13 +112,13 @@ class JournalWriter:
             self._torn = self.found.good_bytes if self.found.torn_bytes else None
 
     def _go_on(self, path: Path) -> Journal:
-        """Be the writer of an existing journal, and read it as it is from now on; it stays as it is
-        until something is appended."""
+        """Become the writer of an existing journal, and read it. It does not change until something
+        is appended."""
         try:
             self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
         except OSError as fault:
             raise JournalError(
-                f"{path}: {fault.strerror}; it can be gone on with only where it can be written"
+                f"{path}: {fault.strerror}; a run can be continued only if its journal is writable"
             ) from fault
         self._take(path)
         try:
@@ -128,20 +128,19 @@ class JournalWriter:
             raise
 
     def _take(self, path: Path) -> None:
-        """Be the only writer for as long as this process lives: a run that goes on cannot be
-        resumed beside itself."""
+        """Lock the file for this process: an active run cannot be resumed a second time."""
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as fault:
             os.close(self._file)
             text = (
-                f"{path}: another process writes it: the run goes on; end that process "
+                f"{path}: another process writes it: the run is still active; end that process "
                 "first if it hangs"
             )
             raise JournalError(text) from fault
 
     def append(self, kind: str, data: Mapping[str, Any]) -> int:
-        """Add a record to the next sync; gives its number."""
+        """Add a record to the next sync, and return its number."""
         number = self.next_number
         payload = msgpack.packb([number, kind, data], use_bin_type=True)
         if len(payload) > LARGEST_RECORD:
@@ -174,8 +173,8 @@ class JournalWriter:
         return bool(self._buffer)
 
     def flush(self) -> None:
-        """Hand what was appended to the operating system: it survives the death of this process,
-        not of the machine."""
+        """Write what was appended to the file: it survives the end of this process, but not a power
+        cut."""
         if not self._buffer:
             return
         self._unsynced = True
@@ -183,9 +182,8 @@ class JournalWriter:
             if self._torn is not None:
                 os.ftruncate(self._file, self._torn)
                 self._torn = None
-            while (
-                self._buffer
-            ):  # what a full disk has taken of it stays taken: another try goes on behind that
+            # A full disk may take a part: another try continues after it.
+            while self._buffer:
                 del self._buffer[: os.write(self._file, self._buffer)]
         except OSError as fault:
             raise JournalError(
@@ -193,7 +191,7 @@ class JournalWriter:
             ) from fault
 
     def sync(self) -> None:
-        """Make all that was appended durable; costs nothing if it is already."""
+        """Make all that was appended durable; does nothing if it already is."""
         self.flush()
         if self._unsynced:
             try:
@@ -206,7 +204,7 @@ class JournalWriter:
             self._unsynced = False
 
     def close(self) -> None:
-        """Sync and close; closed it is in any case."""
+        """Sync and close; the file is closed even if the sync fails."""
         try:
             self.sync()
         finally:
@@ -214,8 +212,8 @@ class JournalWriter:
 
 
 def read_journal(path: Path) -> Journal:
-    """Read a journal; a torn tail is dropped and counted. Raises JournalError for anything worse,
-    OSError if unreadable."""
+    """Read a journal; a torn tail is dropped and counted. Raises JournalError for any other damage,
+    and OSError."""
     raw = path.read_bytes()
     if not raw.startswith(MAGIC):
         raise JournalError(f"{path}: {_foreign(raw)}")
@@ -238,10 +236,10 @@ def read_journal(path: Path) -> Journal:
 
 
 def _foreign(raw: bytes) -> str:
-    """What a file is that does not begin as a journal of ours does."""
+    """Return what a file is that does not begin like a journal of this format."""
     known = _FAMILY.match(raw)
     if known is None:
-        return "no journal of a mission run"
+        return "not a journal of a mission run"
     return _other_format(int(known[1]))
 
 
@@ -255,7 +253,7 @@ def _other_format(written: object) -> str:
 
 
 def _payload(raw: bytes, offset: int) -> bytes | None:
-    """The payload of the record that begins there; None if none does that is whole."""
+    """Return the payload of the whole record that begins there; None if there is none."""
     if offset + PREFIX.size > len(raw):
         return None
     length, checksum = PREFIX.unpack_from(raw, offset)
@@ -267,8 +265,8 @@ def _payload(raw: bytes, offset: int) -> bytes | None:
 
 
 def _next_record(raw: bytes, offset: int, after: int) -> int | None:
-    """Number of the first whole record from there on that comes after record `after`, None if there
-    is none."""
+    """Return the number of the first whole record from there on that comes after record `after`;
+    None if there is none."""
     for begin in range(offset, len(raw) - PREFIX.size):
         payload = _payload(raw, begin)
         if payload is not None and payload[0] == _ARRAY_OF_THREE:

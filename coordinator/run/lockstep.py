@@ -1,5 +1,4 @@
-"""The coordinator as a party of a lock-step cell: a mission run whose callers speak through
-envelopes."""
+"""The coordinator as a party of a lock-step cell: a mission run whose callers use envelopes."""
 
 from __future__ import annotations
 
@@ -14,9 +13,9 @@ NAME = "coordinator"
 
 
 class CoordinatorParty:
-    """Implements `services.comm.lockstep.party.Party`. `watch(now)` is called once a tick, for
-    progress shown to people; `begin(now)` once every node is there (the mission's start, unless a
-    recorded run is to go on)."""
+    """Implements `services.comm.lockstep.party.Party`. `watch(now)` is called at each tick, to show
+    progress to people; `begin(now)` when every node is connected (it starts the mission, unless a
+    recorded run is continued)."""
 
     def __init__(
         self,
@@ -32,18 +31,18 @@ class CoordinatorParty:
         self._begin = begin or mission.start
         self._now = 0.0
         self._nodes: dict[str, str] = {}
-        """By endpoint, as far as it was heard of: its node."""
+        """By endpoint that has sent something: its node."""
         for caller in mission.callers.values():
             caller.open(0.0)
 
     @property
     def over(self) -> bool:
-        """Whether the mission run has ended and been scored."""
+        """Whether the mission run has finished and been scored."""
         return self.mission.stage is Stage.OVER
 
     def receive(self, now: float, envelope: Envelope) -> None:
-        """Take a node's message, and what comes of it at once: so the order of arrival counts, not
-        that of the nodes."""
+        """Handle a node's message and its consequences at once, so that the order of arrival
+        counts, not that of the nodes."""
         self._now = now
         node = self._nodes.get(envelope.source)
         if node is None:
@@ -75,7 +74,7 @@ class CoordinatorParty:
             self.watch(now)
 
     def drain(self) -> Sequence[Envelope]:
-        """What was sent since the last call, in order."""
+        """Return what was sent since the last call, in order."""
         return [
             Envelope(node, NAME, _target(node, message), "call", message)
             for node, caller in self.mission.callers.items()

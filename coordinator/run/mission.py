@@ -1,5 +1,5 @@
 """A mission run from beginning to end: prepare the cell, execute the task, ask for the score. A
-machine like its parts."""
+sans-I/O machine like its parts."""
 
 from __future__ import annotations
 
@@ -31,8 +31,7 @@ from petrobot.services.comm.protocol.messages import Call, Feedback, Outcome, We
 
 SERVICE_DEADLINE = 20.0
 TOLD_ERRORS = 6
-"""How many of the last runs that ended in ERROR the result of a mission run tells that ended so
-itself."""
+"""How many of its last failed runs the result of a mission run that ended in ERROR names."""
 BAD_VALUE = "bad_value"
 """Key of the engine's report of a result that did not give a value, or gave one of another type."""
 VERDICTS = "verdicts"
@@ -41,7 +40,7 @@ text}}."""
 
 
 class Stage(Enum):
-    """Where a mission run stands."""
+    """Stage of a mission run."""
 
     CONNECTING = "connecting"
     PREPARING = "preparing"
@@ -51,7 +50,8 @@ class Stage(Enum):
 
 
 class MissionError(Exception):
-    """A mission run could not be prepared or scored: which service said what."""
+    """A mission run could not be prepared or scored; the text says which service failed, and
+    why."""
 
     def __init__(self, text: str, *, bad_input: bool = False) -> None:
         super().__init__(text)
@@ -60,7 +60,7 @@ class MissionError(Exception):
 
 @dataclass(slots=True)
 class Cycle:
-    """One token taken out of the runs place, and what became of the runs that followed."""
+    """One token taken out of the runs place, and the runs that followed from it."""
 
     number: int
     begun: float
@@ -69,14 +69,13 @@ class Cycle:
     """By run, in the order in which they ended: status, cause and text."""
 
     def count(self, run: str, status: Status | None, cause: str, text: str) -> None:
-        """Take a run into account, or the verdict on one that was before."""
+        """Add a run, or the verdict on an earlier one."""
         if status is not None:
             self.ends[run] = (status, cause, text)
 
     @property
     def worst(self) -> tuple[Status, str, str]:
-        """The worst status of its runs; of several that are as bad the first, with its cause and
-        text."""
+        """Return the run with the worst status, the first one at a tie: status, cause and text."""
         rank = {Status.SUCCESS: 0, Status.FAILURE: 1, Status.ERROR: 2}
         worst = max(self.ends.values(), key=lambda end: rank[end[0]], default=None)
         return (Status.SUCCESS, "", "") if worst is None or worst[0] is Status.SUCCESS else worst
@@ -88,11 +87,11 @@ class Cycle:
 
     @property
     def cause(self) -> str:
-        """Why it was that."""
+        """Its cause."""
         return self.worst[1]
 
     def plain(self, now: float) -> dict[str, Any]:
-        """Plain data; times as ages, since only durations cross the wire (s)."""
+        """Return plain data; times become ages (s), since only durations cross the wire."""
         ended = now if self.ended is None else self.ended
         ages = {"begun_ago": now - self.begun, "ended_ago": now - ended}
         status, cause, text = self.worst
@@ -142,8 +141,8 @@ class MissionTally:
         """Nothing to count."""
 
     def last_errors(self, directory: Directory) -> list[dict[str, Any]]:
-        """The last runs that ended in ERROR, in the order in which they ended: which action, on
-        which node, and why."""
+        """Return the last runs that ended in ERROR, in order: which action, on which node, and
+        why."""
         failed = [record for record in self.runs if record.status is Status.ERROR][-TOLD_ERRORS:]
         return [
             {
@@ -158,8 +157,8 @@ class MissionTally:
         ]
 
     def happened(self, reached_end: bool) -> str:
-        """What a reader of the result should know of the way there: runs, errors by primitive task
-        and cause, and values that a result did not give."""
+        """Return what happened on the way, in words: number of runs, errors by primitive task and
+        cause, and values that a result lacked."""
         ended = [record for record in self.runs if not record.cancelled]
         failed = Counter(
             f"{record.primitive_task}: {record.cause or 'no cause'}"
@@ -198,7 +197,7 @@ class MissionTally:
 
 
 def _node_of(action: str, directory: Directory) -> str:
-    """Where an action runs; empty for a run that never came to one."""
+    """Return the node of an action; empty for a run without one."""
     try:
         return directory.where(action)
     except DirectoryError:
@@ -216,13 +215,12 @@ class Mission:
         self.score: Mapping[str, Any] = {}
         self.begun = self.ended = 0.0
         self.point: Point | None = None
-        """Where the task begins, if not at its own beginning (a simulated run alone: no real world
-        stands elsewhere at will)."""
+        """Where the task begins, if not at its initial marking; only for simulated runs, because a
+        real world cannot be placed at will."""
         self.lost: dict[str, str] = {}
-        """Nodes that are away, with the reason."""
+        """Nodes that are not connected, with the reason."""
         self.remarks: dict[str, str] = {}
-        """What else the result tells, from whoever drives the mission run: that the host was too
-        busy for it."""
+        """Remarks of the shell for the result, for example that the host was too busy."""
         self._early: list[tuple[str, Notice]] = []
         self._resumed = False
         """Whether an earlier process may have asked for the preparation or the score."""
@@ -237,15 +235,15 @@ class Mission:
         return self.executor.callers
 
     def start(self, now: float) -> None:
-        """The nodes are there: prepare the cell, or begin at once when nothing is to be
-        prepared."""
+        """Start, with all nodes connected: prepare the cell, or begin at once if there is nothing
+        to prepare."""
         if not self._ask(now, "prepare", self.executor.task.prepare, self._preparation()):
             self._begin(now)
         else:
             self.stage = Stage.PREPARING
 
     def relive(self, now: float, step: RecordedStep) -> None:
-        """Take in a step that another process recorded at `now` (on this process's clock)."""
+        """Replay a step that another process recorded at `now` (on this process's clock)."""
         if isinstance(step.stimulus, Begin):
             self.begun = now
         self.executor.relive(now, step)
@@ -253,8 +251,8 @@ class Mission:
             self.ended = now
 
     def resume(self, now: float, stages: Mapping[str, Mapping[str, Any]]) -> None:
-        """Go on behind the last step relived; `stages` are those that the journal says to be
-        over."""
+        """Continue after the last replayed step; `stages` are those that the journal records as
+        completed."""
         self._resumed = True
         if SCORED in stages:
             self.score, self.stage = stages[SCORED], Stage.OVER
@@ -274,8 +272,8 @@ class Mission:
             self.take(now, node, [notice])
 
     def take(self, now: float, node: str, notices: Sequence[Notice]) -> None:
-        """Take what a node's caller noticed. What comes before every node is there waits: nothing
-        is led by halves."""
+        """Handle what a node's caller noticed. Notices wait until every node is connected: a
+        mission never starts with a part of its nodes."""
         self._note_links(node, notices)
         if self.stage is Stage.CONNECTING:
             self._early.extend(
@@ -297,16 +295,13 @@ class Mission:
                 self._finish(now, now)
 
     def due(self) -> float | None:
-        """When `advance` has something to do next."""
+        """Return when `advance` is needed next."""
         return self.executor.due() if self.stage is Stage.RUNNING else None
 
     def result(self, mode: str, wall_s: float) -> dict[str, Any]:
-        """The result as the command line writes it; the score's own keys stand beside the general
-        ones.
-
-        A mission run that ended in ERROR also has `last_errors`: the actions that ended so, the
-        last one last.
-        """
+        """Return the result as the command line writes it; the keys of the score stand beside the
+        general ones. A mission run that ended in ERROR also has `last_errors`: the last actions
+        that ended so, in order."""
         finished = self.executor.finished
         failed = finished is None or finished.status is Status.ERROR
         errors = self.tally.last_errors(self.executor.directory) if failed else []
@@ -348,8 +343,7 @@ class Mission:
         self.stage = Stage.SCORING if asked else Stage.OVER
 
     def _provisional(self, cycle: Cycle) -> dict[str, Any]:
-        """What the score is told of a cycle's runs that are not judged yet; nothing if there are
-        none."""
+        """Return what the score must know of a cycle's runs that have no verdict yet."""
         open_, call_id = self.executor.state.deferred, self.executor.dispatch.call_id
         runs = [
             {
@@ -364,8 +358,8 @@ class Mission:
         return {"provisional": runs} if runs else {}
 
     def _ask(self, now: float, what: str, service: str, arguments: Mapping[str, Any]) -> bool:
-        """Call a service of the task's; False when it names none, or none is placed (a real cell
-        has no referee)."""
+        """Call a service of the task. Return False if the task names none, or no node offers it (a
+        real cell has no referee)."""
         if not service or service not in self.executor.directory.services:
             return False
         caller = self.callers[self.executor.directory.where(service)]
@@ -411,7 +405,7 @@ class Mission:
 
 
 def _verdicts(said: Any) -> list[RunVerdict]:
-    """What a score says of runs. Raises MissionError when it is not {run: {status, cause,
+    """Return the verdicts of a score. Raises MissionError if they are not {run: {status, cause,
     text}}."""
     try:
         return [RunVerdict.of_data({**verdict, "run": run}) for run, verdict in said.items()]

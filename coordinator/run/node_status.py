@@ -1,5 +1,5 @@
-"""Asks the nodes of services.toml whether they are up, what they offer and how their devices
-are."""
+"""Asks the nodes of services.toml whether they are up, what they offer, and for the state of their
+devices."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 
 
 async def ask_all(directory: Directory, timeout: float) -> dict[str, Any]:
-    """What each node answers within `timeout` s: address, whether it is up, what it offers, its
-    status; else why not.
+    """Return what each node answers within `timeout` s: address, whether it is up, what it offers,
+    and its status, or why there is no answer.
 
-    `status` has the node's `devices`, those that an emergency stop holds in `emergency`, and what
-    is told of its actions without a device in `general`.
-
-    With mutual TLS also when the certificate ends that the node shows.
+    `status` has the state of the node's `devices`, those in emergency stop in `emergency`, and the
+    state of its actions without a device in `general`. With mutual TLS, there is also the date on
+    which the node's certificate expires.
     """
     asked = await asyncio.gather(*(_ask(directory, node, timeout) for node in directory.nodes))
     return dict(zip(directory.nodes, asked, strict=True))
@@ -81,8 +80,8 @@ async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any
 
 
 def _status(status: dict[str, Any], node: str, directory: Directory) -> dict[str, Any]:
-    """A node's status with devices alone under `devices`: it tells of its actions without one under
-    its own name."""
+    """Return a node's status with only devices under `devices`: a node reports its actions without
+    a device there, under its own name."""
     answers, devices = dict(status.get("answers", {})), dict(status.get("devices", {}))
     general = {}
     if node not in directory.devices and node in answers:

@@ -20,23 +20,20 @@ from petrobot.services.comm.tls.credentials import Credentials, credentials
 
 _log = logging.getLogger(__package__)
 
-# How punctual the coordinator's own event loop is: its host's load, seen by one who only wants to
-# wake up in time.
-
 PERIOD: Final = 0.05
-"""Seconds between looks."""
+"""Time between two checks (s)."""
 LATE: Final = 0.02
-"""Seconds of delay from which a look counts as late: a period of a set-point stream at 50 Hz."""
+"""Delay from which a check counts as late (s): a period of a set-point stream at 50 Hz."""
 SHARE: Final = 0.01
-"""Share of late looks from which the host counts as too busy for a run in real time,"""
+"""Share of late checks from which the host counts as too busy for a run in real time."""
 WORST: Final = 3 * LATE
-"""and a single delay (s) from which it does: so long a gap takes a set point of such a stream out
-of force."""
+"""Single delay (s) from which it counts as too busy: a set point of such a stream is stale then."""
 
 
 @dataclass
 class Punctuality:
-    """Counts looks that were to happen every `PERIOD` seconds; a machine without clock."""
+    """Measures how punctual the coordinator's event loop is: counts checks that should happen every
+    `PERIOD` seconds."""
 
     looks: int = 0
     late: int = 0
@@ -44,14 +41,14 @@ class Punctuality:
     """The longest delay (s)."""
 
     def look(self, due: float, now: float) -> float:
-        """Take in that the look that was due came now; gives when the next one is due (s)."""
+        """Note that the due check happens now, and return when the next one is due (s)."""
         self.looks += 1
         self.late += now - due > LATE
         self.worst = max(self.worst, now - due)
         return now + PERIOD
 
     def remark(self) -> str:
-        """What to say of it: empty if the host was not too busy."""
+        """Return a remark for the result; empty if the host was not too busy."""
         if self.worst < WORST and self.late <= SHARE * self.looks:
             return ""
         return (
@@ -62,17 +59,17 @@ class Punctuality:
 
 
 LINGER = 1.0
-"""Seconds that nothing at the end of a run waits for."""
+"""Longest wait for anything at the end of a run (s)."""
 LEAVE: Final = 2.5
 """How long to wait for a lost node, so that it can be sent BYE (s): a little longer than it keeps
 the leases of a coordinator that left without BYE (`services.comm.calls.callee.Retention.lease`)."""
 
 KEY_CODES: Final = ("key_needed", "no_key_here", "no_key_there", "wrong_key")
-"""Refusals (docs/protocol.md) of one whose key is not that of the node."""
+"""Refusals (docs/protocol.md) of a peer with another key than the node's."""
 
 
 class UnreachableError(Exception):
-    """Nodes that should be there are not; `nodes` names them."""
+    """Nodes cannot be reached; `nodes` names them."""
 
     def __init__(self, nodes: Sequence[str], text: str) -> None:
         super().__init__(text)
@@ -80,7 +77,8 @@ class UnreachableError(Exception):
 
 
 class RealtimeMission:
-    """Drives a mission run: what clients notice goes in, what it calls goes out, timers wake it."""
+    """Drives a mission run with asyncio: passes on what clients notice, sends its calls, and wakes
+    it by timers."""
 
     def __init__(
         self, mission: Mission, directory: Directory, proves: Credentials | None = None
@@ -108,7 +106,7 @@ class RealtimeMission:
         }
 
     async def connect(self, timeout: float = 5.0) -> None:
-        """Reach every node. Raises UnreachableError that names those that are not there."""
+        """Connect to every node. Raises UnreachableError with those that cannot be reached."""
         for client in self.clients.values():
             client.start()
         reached = await asyncio.gather(
@@ -119,8 +117,8 @@ class RealtimeMission:
             raise UnreachableError(missing, "; ".join(self._missed(missing)))
 
     def _missed(self, missing: Sequence[str]) -> Iterator[str]:
-        """Why nodes are not reached and what to do: those that run and refuse us need something
-        else than to be launched."""
+        """Return why nodes cannot be reached and what to do. Nodes that run and refuse us do not
+        have to be started."""
         source = quote(os.path.normpath(self.mission.executor.directory.source))
         refusing = [name for name in missing if self.clients[name].answered]
         if away := [name for name in missing if name not in refusing]:
@@ -146,10 +144,8 @@ class RealtimeMission:
         )
 
     async def run(self, begin: Callable[[float], None] | None = None) -> None:
-        """Run the mission to its end, from its start or from whatever `begin(now)` makes of it.
-
-        Raises MissionError, and JournalError when the journal cannot be written.
-        """
+        """Run the mission to its end. `begin(now)` starts it, or continues a recorded run. Raises
+        MissionError, and JournalError if the journal cannot be written."""
         (begin or self.mission.start)(self._loop.time())
         self.settle()
         self._look_again(self._loop.time() + PERIOD)
@@ -160,9 +156,9 @@ class RealtimeMission:
             raise self._fault
 
     async def close(self) -> None:
-        """Leave the nodes in good order: each hears what was not acknowledged yet and a good-bye,
-        which frees its devices for the next run at once. One that was just lost is waited for as
-        long as it would keep them for this one."""
+        """Take leave of the nodes: send each the missing acknowledgements and BYE, which frees its
+        devices for the next run at once. A node that was just lost is waited for as long as it
+        keeps them for this run."""
         self._closed = True
         for timer in (self._timer, self._looking):
             if timer is not None:
@@ -180,7 +176,7 @@ class RealtimeMission:
         return self._loop.time()
 
     def flush(self, node: str) -> None:
-        """Send what was said to a node."""
+        """Send what is waiting for a node."""
         self.clients[node].flush(self.now())
 
     def fail(self, fault: BaseException) -> None:
@@ -189,7 +185,7 @@ class RealtimeMission:
         self._over.set()
 
     def settle(self) -> None:
-        """Send what was said, and wake up in time for what is due next; call it after each use of
+        """Send what is waiting, and set the timer for what is due next. Call this after each use of
         the mission."""
         if self._closed:
             return
@@ -204,8 +200,7 @@ class RealtimeMission:
         self._timer = None if due is None else self._loop.call_at(due, self._wake)
 
     def _look_again(self, due: float) -> None:
-        """See how late the loop comes to what is due: if it is, so are the other processes of this
-        host."""
+        """Measure how late the loop is: if it is late, so are the other processes of this host."""
 
         def look() -> None:
             self._look_again(self._punctuality.look(due, self._loop.time()))
@@ -233,13 +228,14 @@ class RealtimeMission:
         try:
             step(self._loop.time())
         except (MissionError, JournalError) as fault:
-            # What is not safe has not left: the nodes end its runs as orphans, and `resume` goes on
-            # from what is.
+            # What is not stored has not left: the nodes end its runs as orphans, and `resume`
+            # continues from what is stored.
             self.fail(fault)
             return
         self._loop.call_soon(self.settle)
 
 
 def credentials_of(directory: Directory) -> Credentials:
-    """What the coordinator proves itself with, as services.toml says. Raises KeyFileError."""
+    """Return the coordinator's keys or certificates, as services.toml says. Raises
+    KeyFileError."""
     return credentials(directory, COORDINATOR)

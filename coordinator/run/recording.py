@@ -1,10 +1,10 @@
-"""Mission runs in the journal: what is written of each stimulus, and how a run is derived from it
-again.
+"""Mission runs in the journal: what is written for each stimulus, and how a run is replayed from
+it.
 
-Kinds of records behind the header: `stimulus` (seconds since the origin, the stimulus, the marking
-after it, a digest of the instructions), `node` (which boot of a node is spoken to from here on),
-`stage` (the mission run was prepared, or scored, with what that gave), `epoch` (a coordinator took
-the run over).
+Kinds of records after the header: `stimulus` (seconds since the origin, the stimulus, the marking
+after it, a digest of the instructions), `node` (which boot of a node is used from here on), `stage`
+(the mission run was prepared or scored, with the result), `epoch` (a coordinator took over the
+run).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ PREPARED, SCORED = "prepared", "scored"
 
 
 def digest(instructions: Sequence[Instruction]) -> int:
-    """CRC-32 of the instructions as plain data: replay compares it."""
+    """Return the CRC-32 of the instructions as plain data, which replay compares."""
     packed: bytes = msgpack.packb(
         [to_plain(instruction) for instruction in instructions], use_bin_type=True
     )
@@ -51,12 +51,12 @@ def digest(instructions: Sequence[Instruction]) -> int:
 
 
 class JournalStore:
-    """The executor's store over a journal: each stimulus with the marking and a digest of the
+    """The executor's store in a journal: each stimulus with the marking and a digest of the
     instructions that followed."""
 
     def __init__(self, writer: JournalWriter, origin: float, *, durable: bool = False) -> None:
-        """`origin` is when the journal's clock began, on the clock of whoever appends; with
-        `durable` no effect at all leaves before its cause is synced."""
+        """`origin` is the time at which the journal's clock began, on the clock of `append`. With
+        `durable`, no effect at all leaves before its cause is synced."""
         self.writer = writer
         self.durable = durable
         self._origin = origin
@@ -64,8 +64,8 @@ class JournalStore:
     def append(
         self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State
     ) -> None:
-        """Keep a stimulus and what came of it with the next sync; `t` is seconds since the
-        journal's origin."""
+        """Write a stimulus and its effects with the next sync; `t` is the time since the journal's
+        origin (s)."""
         data = {
             "t": round(now - self._origin, 6),
             "stimulus": to_plain(stimulus),
@@ -78,17 +78,16 @@ class JournalStore:
         self.writer.append(kind, data)
 
     def node(self, name: str, boot: str) -> None:
-        """Keep which boot of a node was spoken to: after a resume another boot is never asked to
-        run a call again."""
+        """Write which boot of a node is used: after a resume, a call is never repeated at another
+        boot."""
         self._write(NODE, {"node": name, "boot": boot})
 
     def stage(self, name: str, values: Mapping[str, Any]) -> None:
-        """Keep that the mission run has come to a stage of its own: what follows it does not happen
-        again after a resume."""
+        """Write that the mission run has completed a stage: it is not repeated after a resume."""
         self._write(STAGE, {"stage": name, "values": dict(values)})
 
     def flush(self) -> None:
-        """What was appended survives the end of this process."""
+        """Make all that was appended survive the end of this process."""
         self.writer.flush()
 
     def sync(self) -> None:
@@ -188,7 +187,7 @@ def unmeasured(data: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class RecordedStep:
-    """One stimulus derived again."""
+    """One replayed stimulus."""
 
     number: int
     time: float
@@ -196,7 +195,7 @@ class RecordedStep:
     instructions: tuple[Instruction, ...]
     state: State
     boots: Mapping[str, str]
-    """The boot of each node that was spoken to then."""
+    """The boot of each node that was in use then."""
 
 
 def as_recorded(engine: Engine, header: Mapping[str, Any]) -> Engine:
@@ -216,7 +215,7 @@ def as_recorded(engine: Engine, header: Mapping[str, Any]) -> Engine:
 
 
 def replay(journal: Journal, engine: Engine) -> Iterator[RecordedStep]:
-    """Derive every state and instruction of a journal again. Raises ReplayError at the first
+    """Replay a journal: compute every state and instruction again. Raises ReplayError at the first
     difference."""
     engine = as_recorded(engine, journal.header)
     state, boots = engine.initial(), dict[str, str]()
@@ -262,32 +261,26 @@ def _compare(
 
 
 def stages(journal: Journal) -> dict[str, Mapping[str, Any]]:
-    """The stages that the mission run has come to, with their values."""
+    """Return the stages that the mission run has completed, with their values."""
     return {r.data["stage"]: r.data["values"] for r in journal.records if r.kind == STAGE}
 
 
 def last_epoch(journal: Journal) -> int:
-    """The newest epoch in which the run was coordinated."""
+    """Return the newest epoch in which the run was coordinated."""
     return max([1, *(int(r.data["epoch"]) for r in journal.records if r.kind == EPOCH)])
 
 
 def clock_reading(now: float) -> dict[str, Any]:
-    """What a header keeps of the moment at which its journal's clock begins, so that another
-    process can count on from it.
-
-    `monotonic` (s) holds for all processes of one boot of the host, `unix` (s) for longer, as well
-    as the host's clock is set.
-    """
+    """Return the clock readings of a header, from which another process can continue the journal's
+    clock. `monotonic` (s) holds within one boot of the host; `unix` (s) holds longer, but only as
+    well as the host's clock is set."""
     return {"monotonic": now, "host_boot": _host_boot(), "unix": time.time()}
 
 
 def origin_of(header: Mapping[str, Any], now: float, last: float) -> float:
-    """When a journal's clock began (s), on this process's clock, which reads `now`; its last record
-    is of the time `last`.
-
-    In lock step the clock of simulated time is every process's own. In real time what passed while
-    nobody coordinated counts.
-    """
+    """Return when a journal's clock began (s), on this process's clock, which reads `now`; the time
+    of its last record is `last`. In lock step each process has its own simulated clock. In real
+    time the time without a coordinator counts, too."""
     if header["mode"] == "lockstep":
         return 0.0
     clock = header.get("clock")

@@ -1,5 +1,5 @@
-"""Launches the node processes of this host, watches them, and starts dead ones again with a growing
-pause."""
+"""Launches the node processes of this host, watches them, and restarts dead ones after growing
+pauses."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ STABLE_AFTER = 10.0  # a node that ran so long (s) starts again without pause
 
 
 class LaunchError(Exception):
-    """A node did not come up: which, and what it printed."""
+    """A node did not start; the text says which, and what it printed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Program:
     name: str
     command: Sequence[str]
     first: bool = False
-    """Others need it: they are started when it is ready."""
+    """Whether others need it: they are started when it is ready."""
 
 
 @dataclass
@@ -51,7 +51,7 @@ class _Child:
     ready: asyncio.Event = field(default_factory=asyncio.Event)
     process: asyncio.subprocess.Process | None = None
     begun_at: int = 0
-    """Where the newest start begins in the log (bytes)."""
+    """Position of the newest start in the log (bytes)."""
     starts: int = 0
     log_fault: OSError | None = None
     """Why its log could not be written before it was ready."""
@@ -59,7 +59,7 @@ class _Child:
 
 
 def is_local(host: str) -> bool:
-    """Whether an address belongs to this host: only then can a socket be bound to it."""
+    """Return whether an address belongs to this host: only then can a socket be bound to it."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, protocol) as probe:
@@ -73,16 +73,16 @@ _LIBC = ctypes.CDLL(None)
 
 
 def _end_with(launcher: int) -> None:
-    """In the child, before it becomes the program: a launcher that ended meanwhile would send no
-    signal any more."""
+    """End the child, before it becomes the program, if the launcher has ended meanwhile and will
+    not send a signal."""
     _LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != launcher:
         os._exit(0)
 
 
 class Supervisor:
-    """Keeps programs alive. Each writes to its own log and says `ready` in the first line that it
-    prints."""
+    """Keeps programs alive. Each writes to its own log, and its first printed line contains
+    `ready`."""
 
     def __init__(
         self,
@@ -98,7 +98,7 @@ class Supervisor:
         self._over = asyncio.Event()
 
     async def __aenter__(self) -> Supervisor:
-        """Start all programs; raises LaunchError when one does not get ready within 60 s."""
+        """Start all programs. Raises LaunchError if one is not ready within 60 s."""
         try:
             await self.start()
         except BaseException:
@@ -137,7 +137,7 @@ class Supervisor:
         await asyncio.gather(*waiting, return_exceptions=True)
 
     async def ended(self) -> None:
-        """Wait until all programs have ended for good."""
+        """Wait until all programs have ended and none is restarted."""
         await asyncio.wait([child.task for child in self._children if child.task])
 
     def process_ids(self) -> dict[str, int]:
@@ -149,7 +149,7 @@ class Supervisor:
         }
 
     def starts(self, name: str) -> int:
-        """How often a program has been started."""
+        """Return how often a program was started."""
         return next(c.starts for c in self._children if c.program.name == name)
 
     async def _until_ready(self, child: _Child, timeout: float) -> None:
@@ -218,11 +218,11 @@ class Supervisor:
 
 @asynccontextmanager
 async def output_pipe(limit: int = 1 << 16) -> AsyncIterator[tuple[BinaryIO, asyncio.StreamReader]]:
-    """A pipe for the output of a child: the end to pass to it, to be closed once it is started, and
-    what comes out.
+    """Return a pipe for the output of a child: the end to pass to it, which must be closed after
+    the start, and a reader.
 
-    A pipe of asyncio's own (`stdout=PIPE`) would be part of the process: `wait` would then wait for
-    the end of the pipe, which whatever the child has left running may hold open for ever.
+    asyncio's own pipe (`stdout=PIPE`) would belong to the process: `wait` would wait for the end of
+    the pipe, and a process that the child left running may hold that open for ever.
     """
     reading, writing = os.pipe()
     reader = asyncio.StreamReader(limit)
@@ -238,11 +238,8 @@ async def output_pipe(limit: int = 1 << 16) -> AsyncIterator[tuple[BinaryIO, asy
 
 
 async def _copy(child: _Child, output: asyncio.StreamReader, log: IO[bytes]) -> None:
-    """Write what a program prints to its log. It is ready when it says so.
-
-    A program is ended if its log cannot be written before it is ready; later it matters more than
-    its log.
-    """
+    """Write what a program prints to its log, and note when it is ready. If the log cannot be
+    written before that, the program is ended; later the program matters more than its log."""
     async for line in output:
         try:
             log.write(line)

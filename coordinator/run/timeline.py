@@ -1,4 +1,4 @@
-"""An observer that keeps when each run and firing happened, for reports and pictures."""
+"""An observer that records the time of each run and firing, for reports and pictures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Bar:
     begun: float
     ended: float | None = None
     status: Status | None = None
-    """None while it goes on, and for a run that was preempted and counts none."""
+    """None while it is active, and for a preempted run that does not count."""
     cause: str = ""
     text: str = ""
 

@@ -136,7 +136,7 @@ def test_a_journal_has_one_writer_at_a_time(tmp_path: Path) -> None:
     """A run that goes on is not resumed beside itself; once its process has let go, it is."""
     path = tmp_path / "run.journal"
     first = JournalWriter(path, {})
-    with pytest.raises(JournalError, match="another process writes it: the run goes on"):
+    with pytest.raises(JournalError, match="another process writes it: the run is still active"):
         JournalWriter(path)
     assert len(read_journal(path).records) == 0, "it may be read all the time"
     first.close()

@@ -55,7 +55,7 @@ def test_cut_at_every_byte_it_holds_what_was_whole_and_says_what_was_not(tmp_pat
     for cut in [*range(0, header, 97), *range(first, len(raw) + 1)]:
         path = copy(tmp_path, raw[:cut])
         if cut < header:
-            with pytest.raises(JournalError, match=r"ends inside its header|no journal"):
+            with pytest.raises(JournalError, match=r"ends inside its header|not a journal"):
                 read_journal(path)
             continue
         journal = read_journal(path)
@@ -103,7 +103,7 @@ def test_a_tail_of_zeros_is_torn(tmp_path: Path) -> None:
             "a journal of format 2, and this petrobot reads format 1; use a newer petrobot",
         ),
         (b"PETROJ0\n", "format 0, .*use the petrobot that wrote it"),
-        (b"SQLite f", "no journal of a mission run"),
+        (b"SQLite f", "not a journal of a mission run"),
     ],
 )
 def test_another_format_is_named_with_its_remedy(tmp_path: Path, magic: bytes, says: str) -> None:
@@ -165,7 +165,7 @@ def test_a_journal_that_may_not_be_written_is_said_to_be(
     monkeypatch.setattr("petrobot.coordinator.run.journal.os.open", refused)
     with pytest.raises(
         JournalError,
-        match=r"run\.journal: Read-only file system; it can be gone on with only where",
+        match=r"run\.journal: Read-only file system; a run can be continued only if",
     ):
         JournalWriter(path)
 
