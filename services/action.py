@@ -1,10 +1,9 @@
-"""How a primitive action is written: status, result, and the context through which alone it touches
-the world.
+"""How to write a primitive action: its status, its result, and its context.
 
 An action is a callable named by import path (`module:function`). Its first parameter is the
-context, all others are keyword parameters of plain data. `def` actions compute and return; `async
-def` actions may also wait, but only through their context, so the same code runs in a warm worker
-process on the wall clock and inline in a lock-step cell.
+context; all others are keyword parameters of plain data. `def` actions compute and return. `async
+def` actions may also wait, but only through their context, so the same code runs in a worker
+process in real time and inline in a lock-step cell.
 
     async def locate(ctx: Context, *, timeout: float = 5.0) -> Result:
         image = await ctx.device.read(timeout)
@@ -39,14 +38,14 @@ class Status(StrEnum):
     SUCCESS = "success"
     """The specification was fully met."""
     FAILURE = "failure"
-    """The specification was not fully met, but the task may go on along its normal branch."""
+    """The specification was not fully met, but the task may continue on its normal branch."""
     ERROR = "error"
     """The specification was not met and error recovery is required."""
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What an action returns: its status, what it writes, and why when it is not SUCCESS.
+    """What an action returns: its status, its values, and the reason if it is not SUCCESS.
 
     `values` are plain data; the task file's `out` says which of them go to which variable. `cause`
     is a short code that programs compare (`"ball_lost"`), `text` is for people.
@@ -57,48 +56,49 @@ class Result:
     cause: str = ""
     text: str = ""
     deferred: bool = False
-    """The status is provisional: it routes the task now, and a later verdict may correct it once
-    for the estimates."""
+    """Whether the status is provisional: the task uses it now, and a later verdict may correct it
+    once for the estimates."""
     executed: str = "yes"
-    """Whether the world was touched: "yes", "no" (an ERROR before anything began) or "unknown" (a
-    link was lost in between). `dataclasses.replace(result, executed="unknown")` sets it; a place's
-    `tries` and the conditions of a task look at it."""
+    """Whether the action has acted on the world: "yes", "no" (an ERROR before anything began) or
+    "unknown" (a link was lost meanwhile). Set it by `dataclasses.replace(result,
+    executed="unknown")`; the `tries` of a place and conditions of a task depend on it."""
 
 
 def success(**values: Any) -> Result:
-    """The specification was fully met."""
+    """Return SUCCESS: the specification was fully met."""
     return Result(Status.SUCCESS, values)
 
 
 def failure(cause: str, text: str = "", **values: Any) -> Result:
-    """The specification was not fully met; the task goes on along its normal branch."""
+    """Return FAILURE: the specification was not fully met; the task continues on its normal
+    branch."""
     return Result(Status.FAILURE, values, cause, text)
 
 
 def error(cause: str, text: str = "", **values: Any) -> Result:
-    """The specification was not met; the task goes on along its error branch."""
+    """Return ERROR: the specification was not met; the task continues on its error branch."""
     return Result(Status.ERROR, values, cause, text)
 
 
 def provisional(result: Result) -> Result:
-    """The same result, as far as is known yet: it routes the task now, and a later verdict
-    (`Context.verdict`, or the task's score) may correct its status once, for the estimates alone.
-    If none comes it stands."""
+    """Return the result as a provisional one: the task uses it now, and a later verdict
+    (`Context.verdict`, or the task's score) may correct its status once, for the estimates only.
+    Without a verdict it stays as it is."""
     return replace(result, deferred=True)
 
 
 class Cancelled(BaseException):
-    """Thrown into an action at its current wait when its run is cancelled; clean up and let it
-    pass."""
+    """Raised in an action at its current wait when its run is cancelled. Clean up, and do not
+    suppress it."""
 
 
 class Wait:
-    """What an action's coroutine yields: go on when `ready()` holds or when the clock reaches `due`
-    (s; None: never).
+    """What an action's coroutine yields: continue when `ready()` is true or when the clock reaches
+    `due` (s; None: never).
 
-    Awaiting it gives True if it was ready, False if its time was over. Who runs the action sends
-    that verdict, so that `ready` is asked no more once it held (it may have taken what it found);
-    sent None, it is asked again.
+    Awaiting it returns True if it was ready, False if its time was over. The runner sends that
+    answer, so that `ready` is not called again after it was true (it may have consumed what it
+    found). If the runner sends None, `ready` is called again.
     """
 
     __slots__ = ("due", "ready")
@@ -113,7 +113,7 @@ class Wait:
 
 
 class CallFailed(Exception):  # noqa: N818 - what happened, not a class of errors
-    """A service that the action depends on answered ERROR; `result` says how."""
+    """A service that the action needs answered ERROR; `result` is its answer."""
 
     def __init__(self, service: str, result: Result) -> None:
         super().__init__(f"{service}: {result.status} {result.cause} {result.text}".rstrip())
@@ -121,22 +121,22 @@ class CallFailed(Exception):  # noqa: N818 - what happened, not a class of error
 
 
 class CommandRefused(Exception):  # noqa: N818 - as above
-    """The driver refused a command, or did not take it in time; the text says why. An action that
-    does not catch it ends in ERROR, cause `command_refused`."""
+    """The driver refused a command, or did not handle it in time; the text says why. An action that
+    does not catch this ends in ERROR, cause `command_refused`."""
 
 
 class Context(Protocol[Device]):
-    """What a run may use besides its arguments. Times are seconds on the cell's clock; durations
-    cross the wire, times never.
+    """What a run may use besides its arguments. Times are seconds on the cell's clock, which
+    differs from host to host: send durations, never times.
 
-    `Context[Scanner]` says which driver `ctx.device` is, for editors and type checkers;
-    `Context[Remote]` is that of a cyclic driver.
+    `Context[Scanner]` tells editors and type checkers the class of `ctx.device`; for a cyclic
+    driver write `Context[Remote]`.
     """
 
     @property
     def now(self) -> float:
-        """The cell's clock: simulated time in lock step, monotonic time otherwise (s). It stands
-        still while the operator holds the run, so what is left of a timeout stays left."""
+        """The cell's clock: simulated time in lock step, otherwise monotonic time (s). It stands
+        still while the operator holds the run, so a pause uses up no timeout."""
 
     @property
     def run(self) -> str:
@@ -144,41 +144,38 @@ class Context(Protocol[Device]):
 
     @property
     def device(self) -> Device:
-        """The handle of the action's device: its driver, or a `Remote` of it when the driver is
-        cyclic; None without a device."""
+        """The action's device: its driver, or a `Remote` of it if the driver is cyclic; None
+        without a device."""
 
     async def command(self, body: Mapping[str, Any], timeout: float = 1.0) -> None:
-        """Send a command to the device's driver, and wait until the driver has taken it.
+        """Send a command to the device's driver, and wait until the driver has accepted it.
 
-        Raises CommandRefused if the driver refuses it (its words), or if it has not taken it after
-        `timeout` seconds.
+        Raises CommandRefused with the driver's reason if it refuses, or if it has not handled the
+        command after `timeout` seconds.
         """
 
     def wait(self, ready: Callable[[], bool], timeout: float | None = None) -> Wait:
-        """Awaitable: True as soon as `ready()` holds, False after `timeout` seconds."""
+        """Awaitable: True as soon as `ready()` is true, False after `timeout` seconds."""
 
     def sleep(self, seconds: float) -> Wait:
-        """Awaitable: goes on after so many seconds of the cell's clock."""
+        """Awaitable: returns after so many seconds of the cell's clock."""
 
     def publish(self, stream: str, values: Sequence[float]) -> None:
-        """Send newest set point to a stream; whoever receives it sees only the newest. Repeated by
-        the sender while the run goes on and stands by it."""
+        """Send a set point to a stream. The receiver sees only the newest one. It is sent
+        repeatedly until the run ends or withdraws it."""
 
     def withdraw(self, stream: str) -> None:
-        """Stop standing by the last set point of a stream; its receiver holds after three
-        periods."""
+        """Stop sending the last set point of a stream; its receiver holds after three periods."""
 
     def raise_event(self, name: str, **data: Any) -> None:
-        """Raise a named internal event while the run goes on."""
+        """Raise a named internal event during the run."""
 
     def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
-        """Judge an earlier run whose result was `provisional`: its status is corrected once, for
-        the estimates alone. `run` is what that run's own context gave as `ctx.run`; on whichever
-        node either of them lives."""
+        """Give the verdict on an earlier run whose result was `provisional`: its status is
+        corrected once, for the estimates only. `run` is the `ctx.run` of that run, on any node."""
 
     def progress(self, fraction: float, **data: Any) -> None:
-        """Tell the coordinator how far the run is, 0 to 1, with plain data for people to look
-        at."""
+        """Report the progress of the run, 0 to 1, with plain data for people."""
 
     async def call(
         self, service: str, /, deadline: float | None = None, **arguments: Any
