@@ -14,8 +14,8 @@ from dataclasses import replace
 from typing import Any
 
 from petrobot import Cancelled, CommandRefused, Context, Remote, Result, Status, error, success
-from petrobot.services.adapters.ros2.bridge import fits
 from petrobot.services.adapters.ros2.protocol import MOVING, RUNNING, Phase, filled, pick
+from petrobot.services.adapters.ros2.topics import fits
 
 Paths = Mapping[str, str]
 CONNECT, CANCEL = 5.0, 2.0

@@ -165,7 +165,7 @@ TABLE: Mapping[tuple[Phase, Word], Phase] = {
 }
 """What is not listed changes nothing."""
 
-_STATUS = {4: Word.SUCCEEDED, 5: Word.CANCELLED, 6: Word.ABORTED}
+_STATUS: Mapping[float, Word] = {4: Word.SUCCEEDED, 5: Word.CANCELLED, 6: Word.ABORTED}
 """action_msgs/msg/GoalStatus."""
 
 
@@ -197,10 +197,6 @@ class Exchanges:
 
     def __init__(self, patience: float) -> None:
         self.open: dict[str, Exchange] = {}
-        self.refused = 0
-        """Messages that could not be used."""
-        self.fault = ""
-        """What was wrong with the last one."""
         self._patience = patience
         self._own = uuid.uuid4().hex
 
@@ -254,26 +250,27 @@ class Exchanges:
                 one.heard = heard
         return sent
 
-    def receive(self, now: float, message: Message) -> None:
-        """Take feedback, a result, a response, or rosbridge's word that an operation failed."""
+    def receive(self, now: float, message: Message) -> str:
+        """Take feedback, a result, a response, or rosbridge's word that an operation failed; return
+        why it cannot be used, "" if it can."""
         identity = message.get("id")
         one = next((e for e in self.open.values() if e.request["id"] == identity), None)
         if one is None or one.phase not in MOVING:
-            return
+            return ""
         one.heard = now
         op, said = message["op"], message.get("values")
         if op == "action_feedback":
             self._move(one, Word.FEEDBACK)
             if fault := unfit(said):
-                self.refuse(f"feedback of {one.request['action']}: {fault}")
-            else:
-                one.feedback, one.count = dict(said or {}), one.count + 1
+                return f"feedback: {fault}"
+            one.feedback, one.count = dict(said or {}), one.count + 1
         elif op == "status":
             if message.get("level") == "error":
                 one.text = str(message.get("msg"))[:500]
                 self._move(one, Word.REFUSED)
         elif op in ("action_result", "service_response"):
             self._end(one, message)
+        return ""
 
     def _end(self, one: Exchange, message: Message) -> None:
         said, status = message.get("values"), message.get("status")
@@ -299,10 +296,6 @@ class Exchanges:
         if not one.fault:
             one.values = values
         self._move(one, word)
-
-    def refuse(self, fault: str) -> None:
-        """Note a message that cannot be used."""
-        self.refused, self.fault = self.refused + 1, fault[:300]
 
     @staticmethod
     def _move(one: Exchange, word: Word) -> Phase:

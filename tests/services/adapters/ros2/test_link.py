@@ -158,7 +158,7 @@ def test_rubbish_changes_nothing(bridge: Stepped, fake: FakeProcess) -> None:
     fake.post("send", json.dumps({"op": "publish", "topic": "/b", "msg": {"x": 1}}))
     bridge.until(lambda: "b" in bridge.topics, "the message after it")
     assert bridge.topics["b"] == {"msg": {"x": 1}, "count": 1} and bridge.epoch == 1
-    assert bridge.phase() is Phase.ACTIVE and bridge.exchanges.refused == 9
+    assert bridge.phase() is Phase.ACTIVE and bridge.refused == 9
 
 
 @pytest.mark.parametrize("values", [None, [], 7, "text", {"x": None}, {"x": 2**70}])
@@ -168,7 +168,7 @@ def test_odd_values_of_an_active_goal(bridge: Stepped, fake: FakeProcess, values
     one = bridge.exchanges.open["run"]
     said = {"id": one.request["id"], "action": "/slow", "values": values}
     fake.post("send", json.dumps({"op": "action_feedback", **said}))
-    bridge.until(lambda: bridge.exchanges.refused, "the refused feedback")
+    bridge.until(lambda: bridge.refused, "the refused feedback")
     assert one.feedback["state"] == "moving"
     fake.post("send", json.dumps({"op": "action_result", **said, "status": 4, "result": True}))
     bridge.until_phase(Phase.SUCCEEDED)
