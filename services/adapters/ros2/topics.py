@@ -9,7 +9,7 @@ from typing import Any
 
 from petrobot import Driver, Ports, key
 from petrobot.services.adapters.ros2 import definitions
-from petrobot.services.adapters.ros2.protocol import Message, filled, pick, unfit
+from petrobot.services.adapters.ros2.protocol import Message, filled, pick, unfit, words
 
 LARGEST_VALUE = 65_536
 """Characters of the largest topic message that is kept for actions: all of them are published each
@@ -46,6 +46,7 @@ class TopicDriver(Driver):
         """Whether the condition of an event's topic held in its newest message."""
         self.open, self.paused = set[str](), False
         """Streams whose set points an action lets through; whether the operator holds them."""
+        self.streams = {name: ports.stream(name) for name in self.setpoints}
         self.sent: dict[str, tuple[int, bool]] = {}
         """By stream: number of the last set point sent, and whether it was that of rest."""
 
@@ -79,7 +80,7 @@ class TopicDriver(Driver):
 
     def refuse(self, fault: str) -> None:
         """Note a message that cannot be used."""
-        self.refused, self.fault = self.refused + 1, fault[:300]
+        self.refused, self.fault = self.refused + 1, words(fault)[:300]
 
     def arrive(self, now: float, topic: Any, message: Any) -> None:
         """Take a message of a topic."""
@@ -107,7 +108,7 @@ class TopicDriver(Driver):
 
     def _steer(self, now: float, name: str, out: Message) -> None:
         """Send the newest set point of a stream; once that of rest when there is none."""
-        port = self.ports.stream(name)
+        port = self.streams[name]
         count, resting = self.sent.get(name, (0, True))
         values = port.values if name in self.open and not self.paused else None
         moving = values is not None and len(values) == len(out["fields"])
@@ -122,13 +123,19 @@ class TopicDriver(Driver):
         self.transmit(now, out["topic"], out["type"], message)
 
     def state(self) -> Mapping[str, Any]:
-        """`connected`, and the newest message of each topic with its `count` and `age` (s)."""
+        """`connected`, and the newest message of each topic with its `count` and `age` (s),
+        None before the first and after a lost link."""
         now = self.ports.now
         return {
             "connected": self.connected,
             "refused": self.refused,
             "fault": self.fault,
-            "topics": {n: {**t, "age": now - self.arrived[n]} for n, t in self.topics.items()},
+            "topics": {
+                name: {**self.topics[name], "age": now - self.arrived[name]}
+                if name in self.topics
+                else None
+                for name in self.subscribe
+            },
         }
 
     def stop(self, now: float) -> None:
