@@ -14,8 +14,8 @@ from dataclasses import replace
 from typing import Any
 
 from petrobot import Cancelled, CommandRefused, Context, Remote, Result, Status, error, success
-from petrobot.services.adapters.ros2.bridge import fits
-from petrobot.services.adapters.ros2.protocol import MOVING, RUNNING, Phase, filled, pick
+from petrobot.services.adapters.ros2.protocol import RUNNING, Phase, filled, pick
+from petrobot.services.adapters.ros2.topics import fits
 
 Paths = Mapping[str, str]
 CONNECT, CANCEL = 5.0, 2.0
@@ -90,10 +90,13 @@ async def wait_for(
     a list of two numbers is a range. `newest`: at most so old (s). ERROR `timeout`."""
 
     def found() -> bool:
-        told = ctx.device.state.get("topics", {}).get(topic)
+        told = ctx.device.state["topics"][topic]
         fresh = told is not None and (newest is None or told["age"] <= newest)
         return fresh and fits(told["msg"], when or {})
 
+    await ctx.wait(lambda: "topics" in ctx.device.state, CONNECT)
+    if topic not in (known := ctx.device.state.get("topics", {})):
+        return _not_executed("bad_goal", f"no topic {topic!r}; `subscribe` names {sorted(known)}")
     if not await ctx.wait(found, timeout):
         return error("timeout", f"no such message on {topic} within {timeout:g} s")
     return _ended(ctx.device.state["topics"][topic]["msg"], values, {})
@@ -305,11 +308,10 @@ async def _exchange(
     except Cancelled:
         ctx.device.send({"cancel": ctx.run})
         raise
-    end = dict(told())
-    phase = Phase(end["phase"])
-    if phase not in MOVING:
+    finally:
+        end = dict(told())
         ctx.device.send({"forget": ctx.run})
-    return _result(phase, end, late, values, expect, "call" in body, timeout)
+    return _result(Phase(end["phase"]), end, late, values, expect, "call" in body, timeout)
 
 
 def _result(

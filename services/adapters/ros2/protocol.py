@@ -12,8 +12,11 @@ from enum import StrEnum
 from typing import Any
 
 Message = dict[str, Any]
-DEPTH, ITEMS = 16, 20_000
-"""Deepest nesting and most items of the values of a message."""
+DEPTH, ITEMS, TABLES = 16, 20_000, 1_000
+"""Deepest nesting of the values of a message, most items, and most lists and tables among them:
+what a driver's state can carry several times."""
+ENDED_KEPT = 5
+"""Ended goals and calls that are kept for actions which have not read them."""
 REPEAT = 1.0
 """Seconds after which a cancel is sent again: rosbridge ignores one that comes before it has begun
 the goal."""
@@ -45,32 +48,34 @@ def unfit(values: Any) -> str:
     """
     if not isinstance(values, dict):
         return f"expected a message, found {str(values)[:60]!r}"
+    tables = 0
     for count, (path, value) in enumerate(_leaves(values, "", 0)):
-        if count > ITEMS:
-            return f"has more than {ITEMS} items"
+        tables += isinstance(value, dict | list)
+        if count > ITEMS or tables > TABLES:
+            return f"has more than {ITEMS} items, or {TABLES} lists and tables"
         if value is None or (isinstance(value, float) and not math.isfinite(value)):
             return f"{path}: is not a finite number"
         if isinstance(value, int) and not -(2**63) <= value < 2**64:
             return f"{path}: {str(value)[:30]} does not fit into 64 bits"
-        if isinstance(value, dict | list) and value:
-            return f"{path}: is nested more than {DEPTH} deep"
-        if isinstance(value, str) and not value.isascii():
-            try:
-                value.encode()
-            except UnicodeError:
-                return f"{path}: is not Unicode text"
+        if path.count(".") > DEPTH and isinstance(value, dict | list):
+            return f"{words(path)}: is nested more than {DEPTH} deep"
+        if words(path) != path or (isinstance(value, str) and words(value) != value):
+            return f"{words(path)}: is not Unicode text"
     return ""
+
+
+def words(said: Any) -> str:
+    """Return what a server says as a text that can be sent on."""
+    return str(said).encode("utf-8", "backslashreplace").decode()
 
 
 def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
     inner = value.items() if isinstance(value, dict) else enumerate(value)
     for name, item in inner:
         here = f"{path}.{name}" if path else str(name)
-        if isinstance(item, dict | list) and item and depth < DEPTH:
-            yield here, 0  # counts as an item
+        yield here, item
+        if isinstance(item, dict | list) and depth <= DEPTH:
             yield from _leaves(item, here, depth + 1)
-        else:
-            yield here, item
 
 
 def pick(values: Any, path: str) -> Any:
@@ -87,7 +92,10 @@ def pick(values: Any, path: str) -> Any:
 
 def filled(base: Mapping[str, Any], values: Mapping[str, Any]) -> Message:
     """Return a copy of a message in which the values stand at their paths."""
-    message: Message = json.loads(json.dumps(base, allow_nan=False))
+    try:
+        message: Message = json.loads(json.dumps(base, allow_nan=False))
+    except TypeError as fault:
+        raise ValueError(str(fault)) from None
     for path, value in values.items():
         *tables, last = path.split(".")
         table = message
@@ -165,7 +173,7 @@ TABLE: Mapping[tuple[Phase, Word], Phase] = {
 }
 """What is not listed changes nothing."""
 
-_STATUS = {4: Word.SUCCEEDED, 5: Word.CANCELLED, 6: Word.ABORTED}
+_STATUS: Mapping[float, Word] = {4: Word.SUCCEEDED, 5: Word.CANCELLED, 6: Word.ABORTED}
 """action_msgs/msg/GoalStatus."""
 
 
@@ -189,6 +197,8 @@ class Exchange:
     text: str = ""
     fault: str = ""
     """Why the values of its result cannot be used."""
+    read: bool = False
+    """Whether its action needs it no more."""
 
 
 class Exchanges:
@@ -197,10 +207,6 @@ class Exchanges:
 
     def __init__(self, patience: float) -> None:
         self.open: dict[str, Exchange] = {}
-        self.refused = 0
-        """Messages that could not be used."""
-        self.fault = ""
-        """What was wrong with the last one."""
         self._patience = patience
         self._own = uuid.uuid4().hex
 
@@ -208,6 +214,12 @@ class Exchanges:
         """Begin a goal or a call; return what is to be sent."""
         message = {**request, "id": f"petrobot:{self._own}:{name}:{uuid.uuid4().hex[:8]}"}
         kept = None if keep is None else frozenset(keep)
+        if name in self.open:  # an earlier goal of the same run, which may still move
+            earlier = self.open.pop(name)
+            self.open[earlier.request["id"]] = earlier
+        ended = [name for name, one in self.open.items() if one.phase not in MOVING]
+        for old in ended[:-ENDED_KEPT]:
+            del self.open[old]
         self.open[name] = Exchange(message, kept, now)
         return message
 
@@ -225,9 +237,9 @@ class Exchanges:
         return [self._cancel(now, one)]
 
     def forget(self, name: str) -> None:
-        """The client has read the result."""
-        if name in self.open and self.open[name].phase not in MOVING:
-            del self.open[name]
+        """The client needs a goal or call no more; it is kept while it may move."""
+        if name in self.open:
+            self.open[name].read = True
 
     def link(self, now: float, up: bool) -> list[Message]:
         """The link came or went; return what is to be sent: cancels of goals that were lost."""
@@ -243,6 +255,8 @@ class Exchanges:
     def advance(self, now: float) -> list[Message]:
         """Repeat cancels that were not answered, and give them up in the end."""
         sent = []
+        for name in [n for n, one in self.open.items() if one.read and one.phase not in MOVING]:
+            del self.open[name]
         for one in self.open.values():
             if one.phase not in (Phase.CANCELLING, Phase.RECALLED):
                 continue
@@ -254,26 +268,27 @@ class Exchanges:
                 one.heard = heard
         return sent
 
-    def receive(self, now: float, message: Message) -> None:
-        """Take feedback, a result, a response, or rosbridge's word that an operation failed."""
+    def receive(self, now: float, message: Message) -> str:
+        """Take feedback, a result, a response, or rosbridge's word that an operation failed; return
+        why it cannot be used, "" if it can."""
         identity = message.get("id")
         one = next((e for e in self.open.values() if e.request["id"] == identity), None)
         if one is None or one.phase not in MOVING:
-            return
+            return ""
         one.heard = now
         op, said = message["op"], message.get("values")
         if op == "action_feedback":
             self._move(one, Word.FEEDBACK)
             if fault := unfit(said):
-                self.refuse(f"feedback of {one.request['action']}: {fault}")
-            else:
-                one.feedback, one.count = dict(said or {}), one.count + 1
+                return f"feedback: {fault}"
+            one.feedback, one.count = dict(said or {}), one.count + 1
         elif op == "status":
             if message.get("level") == "error":
-                one.text = str(message.get("msg"))[:500]
+                one.text = words(message.get("msg"))[:500]
                 self._move(one, Word.REFUSED)
         elif op in ("action_result", "service_response"):
             self._end(one, message)
+        return ""
 
     def _end(self, one: Exchange, message: Message) -> None:
         said, status = message.get("values"), message.get("status")
@@ -282,7 +297,7 @@ class Exchanges:
         if nested and status is None and isinstance(said, dict):
             said, status = said["result"], said["status"]
         if message.get("result") is False and status not in (5, 6):
-            one.text = str(said or "rosbridge gives no reason")[:500]
+            one.text = words(said or "rosbridge gives no reason")[:500]
             self._move(one, Word.REFUSED)
             return
         if message["op"] == "service_response" or status is None:
@@ -291,7 +306,7 @@ class Exchanges:
             word = _STATUS.get(int(status) if isinstance(status, int | float) else 0, Word.ABORTED)
             one.text = "" if word is not Word.ABORTED else f"the goal ended with status {status}"
         if isinstance(said, str):
-            one.text, said = said[:500], {}
+            one.text, said = words(said)[:500], {}
         values = said if said else {}
         if one.keep is not None and isinstance(values, dict):
             values = {name: value for name, value in values.items() if name in one.keep}
@@ -299,10 +314,6 @@ class Exchanges:
         if not one.fault:
             one.values = values
         self._move(one, word)
-
-    def refuse(self, fault: str) -> None:
-        """Note a message that cannot be used."""
-        self.refused, self.fault = self.refused + 1, fault[:300]
 
     @staticmethod
     def _move(one: Exchange, word: Word) -> Phase:

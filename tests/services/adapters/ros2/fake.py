@@ -72,6 +72,9 @@ class Fake:
         elif op == "call_service" and message["service"] != "/silent":
             good = message["service"] != "/fails"
             values: Any = {"sum": sum(message["args"].values())} if good else "it failed"
+            if message["service"] == "/speeds":
+                told = [m["msg"] for m in self.log if m["op"] == "publish"]
+                values = {"speeds": [m["linear"]["x"] for m in told]}
             answer = {"op": "service_response", "service": message["service"], "id": message["id"]}
             return [{**answer, "values": values, "result": good}]
         elif op == "subscribe" and message["topic"] == "/latched":

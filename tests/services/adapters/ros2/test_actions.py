@@ -48,8 +48,9 @@ class ScriptedLink:
 
 
 def robot(**config: Any) -> tuple[Bridge, ScriptedLink]:
-    bridge, link = Bridge({"url": HERE, **config}, None), ScriptedLink()  # type: ignore[arg-type]
-    bridge.link = link  # type: ignore[assignment]
+    """A driver, and the link that the test breaks; a rehearsal gives it ports."""
+    bridge, link = wired(Ports(), **config)
+    bridge.ports = None  # type: ignore[assignment]
     return bridge, link
 
 
@@ -256,8 +257,8 @@ def shown(bridge: Bridge, *messages: Any, topic: str = "/button") -> None:
 
 
 def wired(ports: Ports, **config: Any) -> tuple[Bridge, ScriptedLink]:
-    bridge, link = robot(**config)
-    bridge.ports = ports  # type: ignore[assignment]
+    bridge, link = Bridge({"url": HERE, **config}, ports), ScriptedLink()  # type: ignore[arg-type]
+    bridge.link = link  # type: ignore[assignment]
     return bridge, link
 
 
@@ -294,9 +295,13 @@ def test_topics_are_values_that_an_action_waits_for() -> None:
     bridge.step(1.0)
     late = rehearse(actions.wait_for, device=bridge, timeout=0.5, **options)
     assert late.result.cause == "timeout"  # what was true before the link broke
+    unknown = rehearse(actions.wait_for, device=bridge, topic="batery")
+    assert "names ['battery']" in unknown.result.text
 
 
-@pytest.mark.parametrize("bad", [{"x": None}, [], None, {"x": 2**80}, {"x": "y" * 70_000}])
+@pytest.mark.parametrize(
+    "bad", [{"x": None}, [], None, {"x": 2**80}, {"x": "y" * 70_000}, {"\ud800": 1}]
+)
 def test_a_topic_message_that_cannot_be_used_is_refused(bad: Any) -> None:
     bridge, _ = wired(Ports(), subscribe={"b": BUTTON})
     shown(bridge, {"data": 1}, bad)

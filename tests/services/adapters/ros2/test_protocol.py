@@ -84,7 +84,9 @@ def _flat(value: Any) -> list[Any]:
         ([], "expected a message"),
         ({"a": 2**70}, "64 bits"),
         ({"a": "\ud800"}, "Unicode"),
+        ({"a": "b", "\ud800": 1}, "Unicode"),
         ({"a": [0] * 30_000}, "more than 20000 items"),
+        ({"a": [[]] * 2_000}, "1000 lists and tables"),
         (json.loads('{"a": ' * 30 + "[1]" + "}" * 30), "deep"),
     ],
 )
@@ -158,6 +160,7 @@ def test_a_goal_ends_once_and_as_the_first_word_says(words: list[tuple[Word, flo
     exchanges.advance(now + patience + 1e-6)
     assert one.phase not in MOVING
     exchanges.forget("run")
+    exchanges.advance(now + 3 * patience)
     assert not exchanges.open
 
 
@@ -170,6 +173,26 @@ def test_a_repeated_cancel_waits_no_longer() -> None:
         sent += exchanges.advance(tick * 0.1)
     assert exchanges.open["run"].phase is Phase.UNANSWERED
     assert len(sent) == 5
+
+
+def test_a_second_goal_of_a_run_leaves_the_first_one_to_be_recalled() -> None:
+    exchanges = Exchanges(5.0)
+    lost = exchanges.begin(0.0, "run", GOAL)["id"]
+    exchanges.link(0.0, False)
+    exchanges.forget("run")
+    exchanges.begin(0.0, "run", GOAL)
+    assert [m["id"] for m in exchanges.link(0.0, True)] == [lost]
+    exchanges.advance(6.0)
+    exchanges.advance(6.0)
+    assert list(exchanges.open) == ["run"]
+
+
+def test_results_that_no_action_reads_do_not_pile_up() -> None:
+    exchanges = Exchanges(5.0)
+    for number in range(100):
+        identity = exchanges.begin(0.0, f"run {number}", GOAL)["id"]
+        exchanges.receive(0.0, {"op": "action_result", "id": identity, **RESULTS[Word.SUCCEEDED]})
+    assert len(exchanges.open) < 10
 
 
 def test_ids_are_unique_in_the_world() -> None:
