@@ -1,4 +1,4 @@
-"""Primitive actions of the SO-101: move_joints, move_to, grasp, release.
+"""Primitive actions of the SO-101: move_joints, move_to, grasp, release, reset, calibrate.
 
 Error causes: `arm_fault` (the driver reports it), `unreachable`, `not_reached`, `command_refused`.
 `grasp` fails with `empty`.
@@ -67,6 +67,18 @@ async def release(ctx: Context[Remote], *, angle: float = 1.0, timeout: float = 
     """Open the gripper to an angle (rad)."""
     command = {"do": "open", "angle": angle}
     return await _do(ctx, command, lambda state: state["gripper"]["open"], timeout) or success()
+
+
+async def reset(ctx: Context[Remote]) -> Result:
+    """Forget faults and switch torque on where the arm is."""
+    return await _do(ctx, {"do": "reset"}, lambda state: state["ready"], 2.0) or success()
+
+
+async def calibrate(ctx: Context[Remote], *, pose: Sequence[float] = (0.0,) * 6) -> Result:
+    """Say that the arm, held by hand, is in this pose (six angles, rad); its zero positions are
+    written to the device's calibration file."""
+    await ctx.command({"do": "calibrate", "pose": list(pose)}, timeout=5.0)
+    return success()
 
 
 async def _do(

@@ -424,6 +424,16 @@ def test_the_gripper_holds_what_is_there_while_the_arm_moves() -> None:
     assert not arm.state()["gripper"]["holding"]
 
 
+def test_the_arm_is_reset_and_calibrated_by_actions(tmp_path: Path) -> None:
+    rig = Rig(folder=tmp_path)
+    arm = rig.arm(calibration="arm.toml", enable=False)
+    arm.run(0.3)
+    pose = [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]
+    assert rehearse(actions.calibrate, device=arm, pose=pose).result.status == "success"
+    assert rehearse(actions.reset, device=arm).result.status == "success"
+    assert arm.state()["q"][0] == pytest.approx(0.1, abs=0.002) and arm.state()["torque"]
+
+
 def test_the_gripper_finds_nothing_and_opens() -> None:
     rig = Rig(so101([0.0] * 5 + [1.0]))
     arm = rig.arm().ready()

@@ -1,0 +1,74 @@
+"""Primitive actions on an OPC UA server: write, handshake.
+
+Error causes: `link_lost`, `write_failed`, `already_acknowledged`, `not_acknowledged`,
+`not_withdrawn`, `command_refused`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from petrobot import Cancelled, Context, Remote, Result, error, success
+
+WRITING = 5.0
+"""s for a write."""
+
+
+async def write(ctx: Context[Remote], *, values: Mapping[str, Any]) -> Result:
+    """Write nodes by name, and wait until the server has taken the values."""
+    await ctx.command({"write": dict(values)})
+    device, number = ctx.device, ctx.device.state["asked"]
+    await ctx.wait(lambda: device.state["done"] >= number, WRITING)
+    if device.state["done"] < number or not device.state["up"]:
+        return error("link_lost", f"it is unknown whether {dict(values)} was written")
+    fault = device.state["write_fault"]
+    return error("write_failed", fault) if fault else success()
+
+
+async def handshake(
+    ctx: Context[Remote],
+    *,
+    request: str,
+    acknowledge: str,
+    value: Any = True,
+    idle: Any = False,
+    expect: Any = True,
+    timeout: float = 10.0,
+) -> Result:
+    """Ask a machine for something: write `request` = `value`, wait until `acknowledge` becomes
+    `expect`, withdraw the request by writing `idle`, and wait until the acknowledgement ends. Each
+    of both waits takes at most `timeout` s. The request is withdrawn, too, when nothing
+    acknowledges it and when the run is cancelled."""
+    device = ctx.device
+
+    def acknowledged() -> bool:
+        return bool(device.state["values"].get(acknowledge) == expect)
+
+    def lost() -> bool:
+        return not device.state["up"]
+
+    if acknowledged():
+        return error("already_acknowledged", f"{acknowledge} is {expect!r} before the request")
+    try:
+        result = await write(ctx, values={request: value})
+        if result.cause:
+            return result
+        await ctx.wait(lambda: acknowledged() or lost(), timeout)
+    except Cancelled:
+        device.send({"write": {request: idle}})
+        raise
+    seen = acknowledged()
+    if lost():
+        return error("link_lost", f"the link was lost while {request} was {value!r}")
+    result = await write(ctx, values={request: idle})
+    if result.cause:
+        return result
+    if not seen:
+        return error("not_acknowledged", f"{acknowledge} did not become {expect!r}")
+    await ctx.wait(lambda: not acknowledged() or lost(), timeout)
+    if lost():
+        return error("link_lost", f"the link was lost while {acknowledge} was {expect!r}")
+    if acknowledged():
+        return error("not_withdrawn", f"{acknowledge} stays {expect!r}")
+    return success()

@@ -1,0 +1,259 @@
+"""Driver of an OPC UA server: class `Session`, one client session in a thread of its own.
+
+Its command is `{"write": {NAME: value, ...}}`. Its state has `values` by name, `up`, `faults`, and
+how many writes were asked for (`asked`) and are `done`; `write_fault` is why the last one failed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import queue
+import threading
+from collections.abc import Mapping
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from petrobot import Driver, Ports, key
+
+RETRY: Final = (0.5, 8.0)
+"""Shortest and longest pause between two attempts to connect (s)."""
+LOOK: Final = 0.3
+"""s between two looks whether the link lives."""
+DOWN: Final = "no session yet"
+
+
+class Session(Driver):
+    """One OPC UA server: nodes with names, events from their values."""
+
+    period = 0.02
+    url: str = key(text="as opc.tcp://192.168.0.10:4840")
+    nodes: dict[str, str] = key(text='names, as { start = "ns=2;s=Cell.Start" }')
+    events: dict[str, Any] = key({}, 'as { part = { node = "sensor", becomes = true } }')
+    on_stop: dict[str, Any] = key({}, "what is written when it is stopped, as { start = false }")
+    interval: float = key(0.05, "s between two notifications of the server")
+    patience: float = key(4.0, "s for an answer of the server")
+    certificate: str = key("", "file (.der or .pem); with it the session is encrypted")
+    private_key: str = key("", "file of its key (.pem)")
+    server_certificate: str = key("", "file of the server's certificate: only it is trusted")
+    application_uri: str = key("urn:petrobot", "as in the certificate")
+    insecure: bool = key(False, "allow a session without security beyond this host")
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        """Start connecting. Raises ValueError for wrong keys, OSError for a missing file,
+        ImportError without asyncua."""
+        super().__init__(config, ports)
+        self._check_keys()
+        try:
+            import asyncua  # noqa: F401 - late: it takes long, and is an extra
+        except ImportError as fault:
+            raise ImportError('OPC UA needs asyncua: pip install "petrobot[opcua]"') from fault
+        names = (self.certificate, self.private_key, self.server_certificate)
+        self._files = [(name, ports.file(name)) for name in names] if self.certificate else []
+        self.values: dict[str, Any] = {}
+        self.faults: dict[str, str] = {"session": DOWN}
+        self._asked = self._done = 0
+        self._write_fault = ""
+        self._news: queue.SimpleQueue[tuple[str, Any, Any]] = queue.SimpleQueue()
+        self._loop = asyncio.new_event_loop()
+        self._jobs: asyncio.Queue[tuple[int, dict[str, Any]] | None] = asyncio.Queue()
+        self._by_id: dict[Any, str] = {}
+        self._was_up = False
+        self._thread = threading.Thread(target=self._run, name="opcua", daemon=True)
+        self._thread.start()
+
+    def _check_keys(self) -> None:
+        host = urlsplit(self.url).hostname
+        if not self.url.startswith("opc.tcp://") or not host:
+            raise ValueError(f"url: expected opc.tcp://HOST:PORT, found {self.url!r}")
+        loopback = host == "localhost"
+        with contextlib.suppress(ValueError):
+            loopback = loopback or ipaddress.ip_address(host).is_loopback
+        if not loopback and not self.certificate and not self.insecure:
+            raise ValueError(
+                f"url: {host} is another host, and the session would have no security: write"
+                " certificate, private_key and server_certificate, or insecure = true"
+            )
+        if self.certificate and not (self.private_key and self.server_certificate):
+            raise ValueError("certificate: write private_key and server_certificate, too")
+        for name, event in self.events.items():
+            if not isinstance(event, Mapping) or set(event) != {"node", "becomes"}:
+                raise ValueError(f"events.{name}: expected node and becomes, found {event!r:.60}")
+        for name in (*self.on_stop, *(event["node"] for event in self.events.values())):
+            if name not in self.nodes:
+                raise ValueError(f"no node {name!r}; there are {', '.join(self.nodes)}")
+
+    # --- driver ---------------------------------------------------------------------------------
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        """Write nodes. Raises ValueError without a session or for an unknown name."""
+        writes = body.get("write")
+        if set(body) != {"write"} or not isinstance(writes, Mapping) or not writes:
+            raise ValueError(f'expected {{"write": {{NAME: value}}}}, found {dict(body)!r:.80}')
+        for name in writes:
+            if name not in self.nodes:
+                raise ValueError(f"no node {name!r}; there are {', '.join(self.nodes)}")
+        if "session" in self.faults:
+            raise ValueError(f"{self.url}: {self.faults['session']}")
+        self._write(dict(writes))
+
+    def _write(self, values: dict[str, Any]) -> None:
+        self._asked += 1
+        self._loop.call_soon_threadsafe(self._jobs.put_nowait, (self._asked, values))
+
+    def step(self, now: float) -> None:
+        """Take what the session's thread found out; raise events of values that changed."""
+        while not self._news.empty():
+            kind, name, value = self._news.get()
+            if kind == "up":
+                self.faults = value
+            elif kind == "down":
+                self.faults = {"session": value}
+                self.values = {}
+            elif kind == "done":
+                self._done, self._write_fault = name, value
+            else:
+                known, before = name in self.values, self.values.get(name)
+                self.values[name] = value
+                # The first value of a session is no change: what happened meanwhile is unknown.
+                for event, said in self.events.items() if known and before != value else ():
+                    if said["node"] == name and value == said["becomes"]:
+                        self.ports.raise_event(event, value=value)
+
+    def state(self) -> Mapping[str, Any]:
+        """Return plain data; see the docstring of this module."""
+        return {
+            "up": "session" not in self.faults,
+            "values": dict(self.values),
+            "faults": dict(self.faults),
+            "asked": self._asked,
+            "done": self._done,
+            "write_fault": self._write_fault,
+        }
+
+    def stop(self, now: float) -> None:
+        """Write `on_stop`."""
+        if self.on_stop and "session" not in self.faults:
+            self._write(dict(self.on_stop))
+
+    def stopped(self) -> bool:
+        """Whether there is a session and the server reports the values of `on_stop`."""
+        rest = all(self.values.get(name) == value for name, value in self.on_stop.items())
+        return rest and "session" not in self.faults
+
+    def close(self) -> None:
+        """End the session."""
+        self._loop.call_soon_threadsafe(self._jobs.put_nowait, None)
+        self._thread.join(self.patience)
+
+    # --- the session's thread -------------------------------------------------------------------
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        with contextlib.closing(self._loop):
+            self._loop.run_until_complete(self._serve())
+
+    async def _serve(self) -> None:
+        """Connect again and again, until `close`."""
+        pause, over = RETRY[0], False
+        while not over:
+            try:
+                over = await self._session()
+                pause = RETRY[0]
+            except Exception as fault:  # the library raises many kinds
+                text = str(fault) or type(fault).__name__
+                self._news.put(("down", "", f"{text}; trying again"))
+                pause = RETRY[0] if self._was_up else min(2 * pause, RETRY[1])
+            self._drop_writes()
+            if not over:
+                with contextlib.suppress(TimeoutError):  # a write in a pause has no session
+                    over = await asyncio.wait_for(self._jobs.get(), pause) is None
+
+    def _drop_writes(self) -> None:
+        while not self._jobs.empty():
+            job = self._jobs.get_nowait()
+            if job is None:
+                self._jobs.put_nowait(None)
+                return
+            self._news.put(("done", job[0], "the session was lost"))
+
+    async def _session(self) -> bool:
+        """One session; True when it was closed here."""
+        from asyncua import Client, ua
+        from asyncua.crypto import security_policies
+        from asyncua.crypto.uacrypto import CertProperties
+
+        self._was_up = False
+        client = Client(self.url, timeout=self.patience)
+        client.application_uri = self.application_uri
+        if self._files:
+            mine, secret, server = (
+                CertProperties(data, name.rpartition(".")[2]) for name, data in self._files
+            )
+            policy = security_policies.SecurityPolicyBasic256Sha256
+            await client.set_security(policy, mine, secret, server_certificate=server)
+        async with client:
+            nodes: dict[str, Any] = {}
+            kinds: dict[str, Any] = {}
+            faults: dict[str, str] = {}
+            subscription = await client.create_subscription(1000 * self.interval, self)
+            self._by_id = {}
+            for name, text in self.nodes.items():
+                try:
+                    node = client.get_node(text)
+                    kinds[name] = await node.read_data_type_as_variant_type()
+                    self._by_id[node.nodeid] = name
+                    await subscription.subscribe_data_change(node)
+                    nodes[name] = node
+                except (ua.UaError, ValueError) as fault:
+                    faults[name] = f"{text}: {fault}"
+            self._news.put(("up", "", faults))
+            self._was_up = True
+            while True:
+                try:
+                    job = await asyncio.wait_for(self._jobs.get(), LOOK)
+                except TimeoutError:
+                    await client.check_connection()
+                    continue
+                if job is None:
+                    return True
+                wrong = "the session was lost: it is unknown whether it was written"
+                try:
+                    wrong = await self._written(job[1], nodes, kinds, faults)
+                finally:
+                    self._news.put(("done", job[0], wrong))
+
+    async def _written(
+        self,
+        values: Mapping[str, Any],
+        nodes: Mapping[str, Any],
+        kinds: Mapping[str, Any],
+        faults: Mapping[str, str],
+    ) -> str:
+        """Write nodes, none if one of the values does not fit; return what is wrong."""
+        from asyncua import ua
+        from asyncua.ua.ua_binary import variant_to_binary
+
+        wanted = {}
+        for name, value in values.items():
+            if name not in nodes:
+                return f"{name}: {faults[name]}"
+            kind = kinds[name]
+            try:
+                # A value that cannot be encoded would end the session.
+                variant_to_binary(ua.Variant(value, kind))
+            except Exception:
+                return f"{name}: expected {kind.name}, found {value!r:.40}"
+            wanted[name] = ua.Variant(value, kind)
+        for name, variant in wanted.items():
+            try:
+                await nodes[name].write_value(variant)
+            except ua.UaStatusCodeError as fault:
+                return f"{name}: {fault}"
+        return ""
+
+    def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
+        """Take a notification (called by asyncua, in the session's thread)."""
+        plain = value if isinstance(value, bool | int | float | str | bytes | list) else str(value)
+        self._news.put(("value", self._by_id[node.nodeid], plain))

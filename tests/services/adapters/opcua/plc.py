@@ -1,0 +1,67 @@
+"""A PLC of the tests, in a process of its own: `plc.py PORT [CERTIFICATE KEY CLIENT]`.
+
+`request` is acknowledged as `manner` says: "good", "silent", "stuck" (never withdrawn).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+
+from asyncua import Server, ua
+from asyncua.crypto.permission_rules import SimpleRoleRuleset
+from asyncua.crypto.truststore import TrustStore
+from asyncua.crypto.validator import CertificateValidator, CertificateValidatorOptions
+
+KINDS = {
+    "request": ua.VariantType.Boolean,
+    "done": ua.VariantType.Boolean,
+    "sensor": ua.VariantType.Boolean,
+    "count": ua.VariantType.Int16,
+    "speed": ua.VariantType.Float,
+    "manner": ua.VariantType.String,
+}
+
+
+async def secure(server: Server, certificate: str, key: str, clients: str) -> None:
+    """Accept encrypted sessions alone, of clients with these certificates."""
+    server.set_security_policy(
+        [ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt], SimpleRoleRuleset()
+    )
+    await server.load_certificate(certificate)
+    await server.load_private_key(key)
+    trusted = TrustStore([Path(clients)], [])
+    await trusted.load()
+    options = CertificateValidatorOptions.TRUSTED_VALIDATION
+    server.set_certificate_validator(CertificateValidator(options, trusted))
+
+
+async def serve(port: str, *security: str) -> None:
+    """Run until the process is killed."""
+    server = Server()
+    await server.init()
+    server.set_endpoint(f"opc.tcp://127.0.0.1:{port}")
+    if security:
+        await secure(server, *security)
+    else:
+        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+    space = await server.register_namespace("urn:test")
+    nodes = {}
+    for name, kind in KINDS.items():
+        start = "good" if kind == ua.VariantType.String else 0
+        value = bool(start) if kind == ua.VariantType.Boolean else start
+        identifier = ua.NodeId(f"Cell.{name}", space)
+        node = await server.nodes.objects.add_variable(identifier, name, value, kind)
+        await node.set_writable()
+        nodes[name] = node
+    async with server:
+        print("ready", flush=True)
+        while True:
+            manner, request = await nodes["manner"].get_value(), await nodes["request"].get_value()
+            if manner == "good" or (manner == "stuck" and request):
+                await nodes["done"].write_value(bool(request))
+            await asyncio.sleep(0.02)
+
+
+asyncio.run(serve(*sys.argv[1:]))

@@ -1,0 +1,274 @@
+"""The OPC UA driver and its actions against a server in a process of its own."""
+
+from __future__ import annotations
+
+import datetime
+import ipaddress
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from petrobot import Ports, check_driver, rehearse
+from petrobot.services.adapters.opcua.actions import handshake, write
+from petrobot.services.adapters.opcua.session import Session
+from tests.ports import free_ports
+from tests.waiting import Limit
+
+PLC = Path(__file__).with_name("plc.py")
+NAMES = ("request", "done", "sensor", "count", "speed", "manner")
+NODES = {name: f"ns=2;s=Cell.{name}" for name in NAMES}
+ASK: dict[str, Any] = {"request": "request", "acknowledge": "done"}
+
+
+class Desk:
+    """Ports of the driver: files of a folder, events in a list."""
+
+    now = 0.0
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.events: list[tuple[str, Any]] = []
+
+    def raise_event(self, name: str, **data: Any) -> None:
+        self.events.append((name, data))
+
+    def file(self, path: str) -> bytes:
+        return (self.folder / path).read_bytes()
+
+
+class Cell:
+    """A PLC that can be killed and started again, and drivers of it."""
+
+    def __init__(self, folder: Path) -> None:
+        pytest.importorskip("asyncua")
+        self.folder, (self.port,) = folder, free_ports(1)
+        self.desk = Desk(folder)
+        self.security: tuple[str, ...] = ()
+        self.plc: subprocess.Popen[str] | None = None
+        self.drivers: list[Session] = []
+
+    def power(self, on: bool) -> None:
+        if self.plc is not None:
+            self.plc.kill()
+            self.plc.communicate()
+            self.plc = None
+        if on:
+            command = [sys.executable, "-W", "ignore", str(PLC), str(self.port), *self.security]
+            self.plc = subprocess.Popen(
+                command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+            )
+            assert self.plc.stdout is not None and self.plc.stdout.readline() == "ready\n"
+
+    def driver(self, **keys: Any) -> Session:
+        table = {"url": f"opc.tcp://127.0.0.1:{self.port}", "nodes": NODES, **keys}
+        driver = Session(table, cast(Ports, self.desk))
+        self.drivers.append(driver)
+        return driver
+
+    def close(self) -> None:
+        for driver in self.drivers:
+            driver.close()
+        self.power(False)
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Iterator[Cell]:
+    cell = Cell(tmp_path)
+    yield cell
+    cell.close()
+
+
+def await_(driver: Session, ready: Callable[[Any], object], awaited: str) -> Any:
+    limit = Limit(awaited)
+    while not ready(driver.state()) and limit.left():
+        driver.step(0.0)
+        time.sleep(0.005)
+    return driver.state()
+
+
+def complete(state: Any) -> bool:
+    return set(state["values"]) == set(NAMES)
+
+
+def done(driver: Session, values: dict[str, Any]) -> str:
+    """Write; why it failed."""
+    driver.command(0.0, {"write": values})
+    number = driver.state()["asked"]
+    state = await_(driver, lambda state: state["done"] >= number, "the write")
+    return str(state["write_fault"])
+
+
+def pace(now: float) -> None:
+    time.sleep(0.004)
+
+
+@pytest.mark.processes
+def test_values_writes_events_and_a_restart(cell: Cell) -> None:
+    cell.power(True)
+    driver = cell.driver(events={"part": {"node": "sensor", "becomes": True}})
+    assert not driver.stopped()
+    with pytest.raises(ValueError, match="no session yet"):
+        driver.command(0.0, {"write": {"count": 1}})
+    await_(driver, complete, "all values")
+    assert driver.stopped() and driver.state()["faults"] == {}
+    assert done(driver, {"count": 7, "speed": 2, "sensor": True, "manner": "silent"}) == ""
+    state = await_(driver, lambda state: state["values"]["manner"] == "silent", "the values")
+    assert state["values"] | {"count": 7, "speed": 2.0, "sensor": True} == state["values"]
+    # What does not fit the node is refused by name and type; the session lives on.
+    assert "count: expected Int16" in done(driver, {"count": 70000})
+    assert "count: expected Int16" in done(driver, {"count": "seven"})
+    assert done(driver, {"sensor": False}) == "" and done(driver, {"sensor": True}) == ""
+    limit = Limit("two events")
+    while len(cell.desk.events) < 2 and limit.left():
+        driver.step(0.0)
+    assert cell.desk.events == [("part", {"value": True})] * 2
+    cell.power(False)
+    state = await_(driver, lambda state: not state["up"], "the lost link")
+    assert not driver.stopped() and state["values"] == {} and "trying again" in str(state["faults"])
+    with pytest.raises(ValueError, match="trying again"):
+        driver.command(0.0, {"write": {"count": 1}})
+    cell.power(True)
+    await_(driver, complete, "the values after the restart")
+    assert done(driver, {"count": 1}) == "" and len(cell.desk.events) == 2
+
+
+@pytest.mark.processes
+def test_a_handshake_and_all_that_can_go_wrong(cell: Cell) -> None:
+    cell.power(True)
+    driver = cell.driver(on_stop={"request": False})
+    await_(driver, complete, "all values")
+
+    def played(**more: Any) -> tuple[str, str]:
+        found = rehearse(handshake, device=driver, world=pace, limit=20.0, **ASK, **more)
+        return found.result.status, found.result.cause
+
+    def request_is(value: bool) -> None:
+        await_(driver, lambda state: state["values"]["request"] is value, f"request = {value}")
+
+    assert played() == ("success", "")
+    assert done(driver, {"manner": "silent"}) == ""
+    assert played(timeout=0.3) == ("error", "not_acknowledged")
+    request_is(False)
+    assert played(cancel_after=0.3) == ("error", "cancelled")
+    request_is(False)
+    assert done(driver, {"manner": "stuck"}) == ""
+    assert played(timeout=0.5) == ("error", "not_withdrawn")
+    assert played() == ("error", "already_acknowledged")
+    assert done(driver, {"request": True}) == ""
+    request_is(True)
+    assert not driver.stopped()
+    driver.stop(0.0)
+    request_is(False)
+    assert driver.stopped()
+    assert done(driver, {"manner": "silent", "done": False}) == ""
+    await_(driver, lambda state: state["values"]["done"] is False, "done = False")
+
+    def pull(now: float) -> None:
+        pace(now)
+        if now == 0.4:
+            cell.power(False)
+
+    found = rehearse(handshake, device=driver, world=pull, limit=20.0, timeout=15.0, **ASK)
+    assert (found.result.status, found.result.cause) == ("error", "link_lost")
+
+
+@pytest.mark.processes
+def test_it_keeps_the_rules_of_drivers(cell: Cell) -> None:
+    cell.power(True)
+    found = check_driver(cell.driver, cable=cell.power, within=30.0, seconds=30.0)
+    late = [fault for fault in found.faults if "took longer than the period" in fault]
+    assert found.faults == late  # a busy host delays a step; none of its steps waits
+
+
+@pytest.mark.processes
+def test_a_wrong_node_is_named_and_the_others_work(cell: Cell) -> None:
+    cell.power(True)
+    wrong = {"lost": "ns=2;s=Cell.lost", "odd": "Cell.odd"}
+    driver = cell.driver(nodes={**NODES, **wrong})
+    state = await_(driver, complete, "all values")
+    assert set(state["faults"]) == {"lost", "odd"} and "ns=2;s=Cell.lost" in state["faults"]["lost"]
+    assert done(driver, {"count": 3}) == "" and "lost: " in done(driver, {"lost": 1})
+    result = rehearse(write, device=driver, world=pace, values={"count": 1.5}).result
+    assert (result.status, result.cause) == ("error", "write_failed")
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"url": "opc.tcp://192.0.2.7:4840"}, "another host, and .* insecure = true"),
+        ({"url": "opc.tcp://plc.example:4840"}, "another host"),
+        ({"url": "http://127.0.0.1"}, "expected opc.tcp"),
+        ({"certificate": "me.der"}, "private_key and server_certificate"),
+        ({"events": {"part": {"node": "sensor"}}}, "events.part: expected node and becomes"),
+        ({"on_stop": {"nothing": 0}}, "no node 'nothing'"),
+    ],
+)
+def test_wrong_keys_are_refused(tmp_path: Path, keys: dict[str, Any], words: str) -> None:
+    table = {"url": "opc.tcp://127.0.0.1:1", "nodes": NODES, **keys}
+    with pytest.raises(ValueError, match=words):
+        Session(table, cast(Ports, Desk(tmp_path)))
+
+
+@pytest.mark.parametrize("body", [{"dance": 1}, {"write": {}}, {"write": {"nothing": 1}}])
+def test_an_unknown_command_is_refused(cell: Cell, body: Any) -> None:
+    with pytest.raises(ValueError, match=r"expected|no node"):
+        cell.driver().command(0.0, body)
+
+
+def certificate(folder: Path, name: str, uri: str) -> None:
+    """Write NAME.der, NAME.pem (its key)."""
+    x509 = pytest.importorskip("cryptography.x509")
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import rsa
+
+    key = rsa.generate_private_key(65537, 2048)
+    who = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
+    begin = datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=1)
+    other = [
+        x509.UniformResourceIdentifier(uri),
+        x509.IPAddress(ipaddress.ip_address("127.0.0.1")),
+    ]
+    usage = x509.KeyUsage(True, True, True, True, False, True, False, False, False)
+    ends = x509.ExtendedKeyUsage(
+        [x509.ExtendedKeyUsageOID.CLIENT_AUTH, x509.ExtendedKeyUsageOID.SERVER_AUTH]
+    )
+    made = x509.CertificateBuilder(who, who, key.public_key(), x509.random_serial_number())
+    made = made.not_valid_before(begin).not_valid_after(begin + datetime.timedelta(days=9))
+    for extension in (x509.SubjectAlternativeName(other), usage, ends):
+        made = made.add_extension(extension, critical=False)
+    signed = made.sign(key, hashes.SHA256())
+    (folder / f"{name}.der").write_bytes(signed.public_bytes(serialization.Encoding.DER))
+    (folder / f"{name}.pem").write_bytes(
+        key.private_bytes(
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.PKCS8,
+            serialization.NoEncryption(),
+        )
+    )
+
+
+@pytest.mark.processes
+def test_a_secured_server_accepts_its_certificate_alone(cell: Cell) -> None:
+    folder = cell.folder
+    for name in ("plc", "me", "stranger"):
+        certificate(folder, name, "urn:petrobot")
+    (folder / "trusted").mkdir()
+    (folder / "trusted" / "me.der").write_bytes((folder / "me.der").read_bytes())
+    cell.security = (str(folder / "plc.der"), str(folder / "plc.pem"), str(folder / "trusted"))
+    cell.power(True)
+
+    def driver(who: str, server: str = "plc.der") -> Session:
+        own: dict[str, Any] = {"certificate": f"{who}.der", "private_key": f"{who}.pem"}
+        return cell.driver(**own, server_certificate=server)
+
+    trusted = driver("me")
+    await_(trusted, complete, "all values")
+    assert done(trusted, {"count": 2}) == ""
+    for refused in (driver("stranger"), driver("me", "stranger.der"), cell.driver()):
+        state = await_(refused, lambda state: "trying again" in str(state["faults"]), "the refusal")
+        assert not state["up"]
