@@ -126,6 +126,8 @@ class StructureReport:
 
 CERTAIN = 1e-9
 """A probability of completion that is short of 1 by less counts as 1."""
+BY_HAND = 20_000
+"""The most stimuli and firings with the operator's tokens: as many as `petrobot check` tries."""
 SHOWN = 20
 """The most entries of a list that the text shows."""
 
@@ -156,8 +158,8 @@ class Analysis:
 
     @cached_property
     def hand_notes(self) -> list[str]:
-        """What only the operator's tokens make possible; a third of the steps is used for it."""
-        return self.progress.hand_notes(self.steps // 3) if self.progress else []
+        """What only the operator's tokens make possible, as far as BY_HAND stimuli and firings."""
+        return self.progress.hand_notes(min(self.steps // 3, BY_HAND)) if self.progress else []
 
     @property
     def ok(self) -> bool:

@@ -35,6 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--inside", metavar="MACRO", default="", help="draw what is inside a macro place"
     )
     parser.add_argument(
+        "--expanded",
+        action="store_true",
+        help="draw the net that is executed and analysed: what is written in short (`tries`, "
+        "`holds`, `[errors]`, subnets) as places and transitions",
+    )
+    parser.add_argument(
         "--graph", action="store_true", help="draw the reachability graph instead (of any net file)"
     )
     parser.add_argument(
@@ -81,9 +87,13 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _net(options: argparse.Namespace) -> str:
-    from petrobot.coordinator.drawing import draw
+    from petrobot.coordinator.drawing import draw, expanded
 
     task = load_task(options.task)
+    if options.expanded and options.inside:
+        raise CommandError(2, "--inside opens a macro place; the expanded net has none: leave one")
+    if options.expanded:
+        task = expanded(task)
     overlay = _heat(task, options) if options.heat else None
     try:
         return draw(task, error_branches=options.errors, overlay=overlay, inside=options.inside)
@@ -105,7 +115,7 @@ def _gspn(options: argparse.Namespace) -> str:
     from petrobot.coordinator.drawing import Overlay, draw
     from petrobot.coordinator.task.file import load
 
-    for name in ("errors", "inside", "heat"):
+    for name in ("errors", "expanded", "inside", "heat"):
         if getattr(options, name):
             problem = f"--{name} is of the ordinary view; leave out --view gspn"
             raise CommandError(2, problem)

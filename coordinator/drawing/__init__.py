@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from petrobot.coordinator.drawing.scene import Caption, Overlay, scene_of_net, scene_of_task
+from petrobot.coordinator.drawing.scene import (
+    Caption,
+    Overlay,
+    expanded,
+    scene_of_net,
+    scene_of_task,
+)
 from petrobot.coordinator.drawing.svg import render
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.net import Marking, Net
 
-__all__ = ["Caption", "Overlay", "draw"]
+__all__ = ["Caption", "Overlay", "draw", "expanded"]
 
 
 def draw(

@@ -382,7 +382,50 @@ def _settled(layers: Layers) -> dict[Spot, float]:
         for column in layers.columns if i % 2 == 0 else layers.columns[::-1]:
             wishes = [_wish(spot, layers, row) for spot in column]
             row |= dict(zip(column, _spaced(column, wishes), strict=True))
+    _level(layers, row)
     return row
+
+
+def _level(layers: Layers, row: dict[Spot, float]) -> None:
+    """Put each chain of nodes that follow one another without a branch on one height, where the
+    distances in their columns allow it: the averages come close to that only after many passes."""
+    limits: dict[Spot, tuple[Spot | None, Spot | None]] = {}
+    for column in layers.columns:
+        around = [None, *column, None]
+        limits |= {s: (around[i], around[i + 2]) for i, s in enumerate(column)}
+
+    def fits(spot: Spot, height: float) -> bool:
+        above, below = limits[spot]
+        return (above is None or height - row[above] >= _apart(above, spot) - 1e-6) and (
+            below is None or row[below] - height >= _apart(spot, below) - 1e-6
+        )
+
+    for chain in sorted(_chains(layers), key=len, reverse=True):
+        heights = [row[s] for s in chain]
+        for height in (sum(heights) / len(heights), *sorted(heights)):
+            if all(fits(s, height) for s in chain):
+                row |= dict.fromkeys(chain, height)
+                break
+
+
+def _chains(layers: Layers) -> list[list[str]]:
+    """Return the longest rows of nodes that follow one another without a branch."""
+    after = {
+        a: nexts[0]
+        for a, nexts in layers.next.items()
+        if len(nexts) == 1
+        and len(layers.before[nexts[0]]) == 1
+        and isinstance(a, str)
+        and isinstance(nexts[0], str)
+    }
+    inner, found = set(after.values()), list[list[str]]()
+    for first in after:
+        if first not in inner:
+            chain = [first]
+            while chain[-1] in after:
+                chain.append(after[chain[-1]])
+            found.append(chain)
+    return found
 
 
 def _apart(above: Spot, below: Spot) -> float:

@@ -63,8 +63,21 @@ def sheet_of(task: Task, inside: str, error_branches: bool, marking: Marking | N
         border=outside,
         folded=folded,
         shown=shown,
-        tokens=_tokens(task, marking, prefix, shown),
+        tokens=_tokens(task, net, marking, prefix, shown),
         prefix=prefix,
+    )
+
+
+def expanded(task: Task) -> Task:
+    """Return the net that is executed, to be drawn: nothing is written in short and no macro place
+    is closed. Its elements are laid out anew if it has more of them than the task file."""
+    flat = task.flat
+    if set(flat.places) == set(task.places) and set(flat.transitions) == set(task.transitions):
+        return task
+    return replace(
+        flat,
+        places={n: replace(p, macro="", x=None, y=None) for n, p in flat.places.items()},
+        transitions={n: replace(t, macro="", x=None, y=None) for n, t in flat.transitions.items()},
     )
 
 
@@ -128,17 +141,16 @@ def _folded(net: Task) -> frozenset[str]:
 
 
 def _tokens(
-    task: Task, marking: Marking | None, prefix: str, shown: Mapping[str, str]
+    task: Task, net: Task, marking: Marking | None, prefix: str, shown: Mapping[str, str]
 ) -> dict[str, int]:
-    """Return the tokens by drawn place; a macro place shows those of all places inside it."""
+    """Return the tokens by drawn place; a macro place shows those of all places inside it. Tokens
+    that a short form adds (`grip.left`: how many tries are left) are no runs and are not shown."""
     tokens: dict[str, int] = {}
     for name, n in zip(task.net.places, marking or task.net.initial, strict=True):
-        here = (
-            shown.get(name.removeprefix(prefix).partition(".")[0])
-            if name.startswith(prefix)
-            else None
-        )
-        if here is not None:
+        own = name.removeprefix(prefix) if name.startswith(prefix) else ""
+        head = own if own in net.places else own.partition(".")[0]
+        here = shown.get(head)
+        if here is not None and (head == own or net.places[head].kind is Kind.MACRO):
             tokens[here] = tokens.get(here, 0) + n
     return tokens
 

@@ -38,7 +38,7 @@ from petrobot.coordinator.engine import (
 from petrobot.coordinator.operator.controls import Answer, Controls, refusal
 from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
 from petrobot.coordinator.operator.feed import Feed
-from petrobot.coordinator.operator.observation import Watching, shown_selectors
+from petrobot.coordinator.operator.observation import TrialWatch, Watching, shown_selectors
 from petrobot.coordinator.operator.run_state import Narrator
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.journal import JournalError
@@ -115,7 +115,8 @@ class Operation:
             self.narrator.adopt(began, self.executor.state)
         self.executor.observers.extend([self.narrator, self])
         self.watching = Watching(shell, self.feed, selector, began, lambda: self.feed.watched)
-        self.executor.observers.append(self.watching)
+        trials = TrialWatch(self.executor.task, self.executor.directory, self.feed)
+        self.executor.observers.extend([self.watching, trials])
 
     async def close(self) -> None:
         """Stop asking the nodes."""

@@ -1,5 +1,5 @@
 """What operators see apart from the net: states of nodes and devices, camera images, ages of set
-points, and learning.
+points, learning, and what the trials so far say of the whole task.
 
 Nodes are polled a few times a second, only while a client is watching; their answers are published
 on the feed as plain data.
@@ -13,11 +13,17 @@ from collections.abc import Callable, Mapping
 from math import isfinite
 from typing import Any, Protocol
 
-from petrobot.coordinator.engine import Corrected, Instruction, RunRecorded, State, Stimulus
+from petrobot.coordinator.engine import Corrected, Instruction, Mode, RunRecorded, State, Stimulus
+from petrobot.coordinator.learning.statistics import wilson
 from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.mission import Mission
+from petrobot.coordinator.studies.campaign.block import costs
+from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.campaign.summary import Summary
+from petrobot.coordinator.studies.campaign.trials import TrialLog
 from petrobot.coordinator.task import Task
+from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import Command, Feedback
 
 POLL = 0.2
@@ -43,6 +49,47 @@ def shown_alternatives(task: Task, selector: FirstAlternative, name: str) -> lis
     as far as known."""
     figures = selector.figures(name)
     return [{"action": a, **figures.get(a, {})} for a in task.primitive_tasks[name].alternatives]
+
+
+TASK_REPORT = "the whole task"
+"""Name of the report about R, C and J of the task."""
+
+
+class TrialWatch(TrialLog):
+    """Shows R, C and J of the whole task as the trials of this run measured them: the definition of
+    `learned task` and of campaigns."""
+
+    def __init__(self, task: Task, directory: Directory, feed: Feed) -> None:
+        super().__init__(task, costs(task, directory))
+        self._task, self._feed, self._shown = task, feed, 0
+
+    def settled(self, now: float, state: State) -> None:
+        """Show the figures after each trial; of many, after each 2 % more, since all are counted
+        again (a verdict may come late)."""
+        over = state.mode is Mode.FINISHED
+        done = [trial for trial in self.trials if trial.completed or over]
+        if len(done) >= self._shown + max(1, self._shown // 50) or (over and len(done) > 0):
+            self._shown = len(done)
+            rows = [TrialRow(t.k, "", 0, t.k, 0, 0.0, t) for t in done]
+            found = Summary.of(self._task, rows)
+            report = {"kind": "text", "title": "The task so far", "text": task_text(found)}
+            self._feed.emit("report", name=TASK_REPORT, report=report)
+
+
+def task_text(found: Summary) -> str:
+    """Return goals, R, C and J of the counted trials, each with its 95 % interval."""
+    counts, figures = found.whole, found.task_figures()
+    parts = []
+    if found.task.goal_transitions:
+        low, high = wilson(counts.goals, counts.runs)
+        parts.append(f"goal met in {counts.goals} of {counts.runs} ({low:.3f} to {high:.3f})")
+    for name, what in (("R_conj", "R (every run a success)"), ("C", "C"), ("J", "J")):
+        if figures[name] is not None:
+            low, high = figures[f"{name}_interval"]
+            parts.append(f"{what} {figures[name]:.3g} ({low:.3g} to {high:.3g})")
+    if figures["rho"] is not None:
+        parts.append(f"rho {figures['rho']:.3g}")
+    return f"{counts.runs} trial{'s' * (counts.runs != 1)}: {', '.join(parts)}"
 
 
 class WatchedShell(Protocol):

@@ -356,8 +356,14 @@ def graph_and_engine_agree(task: Task, data: st.DataObject) -> None:
     free = execute(task, limit=LIMIT, engine=asking)
     event(f"conflicts: {min(len(free.contests), 2)}")
     if free.complete:
-        rivals = frozenset(name for names in free.contests for name in names)
-        served = execute(task, limit=LIMIT, engine=engine, rivals=rivals)
+        served = execute(task, limit=LIMIT, engine=engine, contests=free.contests)
+        assert {s.marking for s in served.states} == {s.marking for s in x.states}
+        for one, other in ((served.dead, x.dead), (served.final, x.final)):
+            assert one.any() == other.any()
+        assert served.graph.backward(served.final).all() == x.graph.backward(x.final).all()
+        assert {t for step in served.steps for t in step.firings} == {
+            t for step in x.steps for t in step.firings
+        }
         assert set(served.index) == {
             (served.names.key(state, orders), i in x.livelocks)
             for i, (state, orders) in enumerate(zip(x.states, x.orders, strict=True))

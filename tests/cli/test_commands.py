@@ -386,6 +386,11 @@ def test_show_draws_svg(capsys: pytest.CaptureFixture[str]) -> None:
     assert plain.startswith(("<svg", "<?xml"))
     assert len(whole) > len(plain)
     assert "recover_arm" in whole
+    sorter = str(ROOT / "examples" / "sorter" / "sort.toml")
+    assert main(["show", sorter, "--errors", "--expanded"]) == 0
+    assert "grip.left" in capsys.readouterr().out
+    assert main(["show", sorter, "--expanded", "--inside", "x"]) == 2
+    assert "the expanded net has none" in capsys.readouterr().err
 
 
 def test_show_draws_the_stochastic_view(capsys: pytest.CaptureFixture[str]) -> None:

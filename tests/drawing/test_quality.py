@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from petrobot.coordinator.drawing.layout import COLUMN, WIDEST, Point
 from petrobot.coordinator.drawing.routing import ArcPath, Box, Words, place_words, route
-from petrobot.coordinator.drawing.scene import DrawnNode, Scene, scene_of_net, scene_of_task
+from petrobot.coordinator.drawing.scene import (
+    DrawnNode,
+    Scene,
+    expanded,
+    scene_of_net,
+    scene_of_task,
+)
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import load, loads
 from tests.drawing.conftest import random_task
@@ -183,3 +189,25 @@ def test_a_long_net_is_folded(length: int, errors: bool) -> None:
     assert max(across) - min(across) <= WIDEST * COLUMN
     down = [node.at[1] for node in scene.nodes.values()]
     assert max(down) - min(down) <= 3 * WIDEST * COLUMN
+
+
+SORTER = Path(__file__).parents[2] / "examples" / "sorter" / "sort.toml"
+
+
+def test_tokens_that_a_short_form_adds_are_no_runs() -> None:
+    """Two tries are left of the three of `grip`: shown in the expanded net alone."""
+    task = load(SORTER)
+    folded = scene_of_task(task, True, None, None)
+    assert folded.nodes["grip"].tokens == 0 and folded.nodes["parts"].tokens == 5
+    whole = scene_of_task(expanded(task), True, None, None)
+    assert whole.nodes["grip"].tokens == 0 and whole.nodes["grip.left"].tokens == 2
+    assert set(whole.nodes) == {*task.flat.places, *task.flat.transitions}
+    plain = load(SORTER.parents[2] / "coordinator" / "tasks" / "catch_ball.toml")
+    assert expanded(plain) is plain
+
+
+def test_what_follows_without_a_branch_is_level() -> None:
+    """From the scanned part to the grip."""
+    nodes = scene_of_task(load(SORTER), True, None, None).nodes
+    row = {nodes[name].at[1] for name in ("scanned", "pick", "fetch", "there", "grip")}
+    assert len(row) == 1

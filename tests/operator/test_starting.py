@@ -18,6 +18,7 @@ from petrobot.coordinator.cli import main
 from petrobot.coordinator.operator import station
 from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP
 from petrobot.coordinator.operator.history import opened
+from petrobot.coordinator.operator.observation import TASK_REPORT
 from petrobot.coordinator.operator.session import RunRequest
 from petrobot.coordinator.operator.start_form import read_depart, read_start, start_form
 from petrobot.coordinator.operator.station import Station
@@ -338,7 +339,11 @@ async def test_a_run_in_lock_step_learns(cell: Simulated, tmp_path: Path) -> Non
         "runs_counted": 12,
     }
     assert {a["action"] for a in cell.state["selectors"]["look"]["alternatives"] if "j" in a}
-    assert {r["y"] for r in cell.state["reports"].values()} == {"probability", "J"}
+    reports = cell.state["reports"]
+    assert {r["y"] for r in reports.values() if r["kind"] == "curve"} == {"probability", "J"}
+    told = reports[TASK_REPORT]
+    assert told["title"] == "The task so far" and told["text"].startswith("6 trials: ")
+    assert "R (every run a success)" in told["text"] and "J " in told["text"]
     assert (await cell.station.form("moving"))["learn"]["estimates"] == ["mine"]
     _, second = await cell.simulate(runs=1, learn={**learn, "frozen": True})
     assert second["learned"]["runs_counted"] == 0

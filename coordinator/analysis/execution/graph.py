@@ -200,17 +200,17 @@ def execute(
     limit: int = STEPS,
     free_choice: bool = False,
     engine: Engine | None = None,
-    rivals: frozenset[str] | None = None,
+    contests: Iterable[tuple[str, ...]] | None = None,
 ) -> ExecutionGraph:
     """Explore the execution graph of a task, up to a limit in stimuli and firings.
 
     With `free_choice` a conflict that neither priority nor weight settles may go either way.
-    `rivals` are the transitions in such conflicts, if they are known; states then differ in the
-    order of waiting of these only.
+    `contests` are the transitions of each such conflict, if they are known; states then differ in
+    the order of waiting of these only.
     Raises TooManyValues.
     """
     engine = engine or Engine(task, policy=Policy(ask_undecided=free_choice))
-    return _Search(engine, Names(engine, rivals)).run(limit)
+    return _Search(engine, Names(engine, contests)).run(limit)
 
 
 def with_operator(x: ExecutionGraph, *, limit: int = STEPS) -> ExecutionGraph:

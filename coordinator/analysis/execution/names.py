@@ -7,9 +7,9 @@ clocks, records, reports and arguments: no firing depends on them (docs/executio
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import permutations, product
 from typing import Any
 
 from petrobot.coordinator.engine import (
@@ -68,13 +68,14 @@ class Cause:
 class Names:
     """What the conditions of a task read, and so which parts of a state count."""
 
-    def __init__(self, engine: Engine, rivals: frozenset[str] | None = None) -> None:
-        """Collect them. `rivals`: the transitions that may come into a conflict which first come,
-        first served settles; None: not known. Raises TooManyValues."""
+    def __init__(self, engine: Engine, contests: Iterable[tuple[str, ...]] | None = None) -> None:
+        """Collect them. `contests`: the transitions of each conflict that first come, first served
+        may have to settle; None: not known. Raises TooManyValues."""
         self.engine = engine
-        self._rivals = frozenset[str]() if engine.policy.ask_undecided else rivals
-        """Transitions whose order of waiting counts; None: all. It does not count where each
-        conflict may go either way."""
+        if engine.policy.ask_undecided:  # each conflict may go either way, whoever waited longer
+            contests = ()
+        self._contests = None if contests is None else frozenset(contests)
+        """Conflicts in which the order of waiting counts; None: between any two transitions."""
         compiled = engine.compiled
         self.task = task = compiled.task
         conditions = [x.when for x in compiled.transitions if x.when is not None]
@@ -163,19 +164,20 @@ class Names:
         )
 
     def _waiting(self, state: State) -> Hashable:
-        """Return by place the transitions that wait for its tokens, in the order in which they
-        came; those that came together are a set."""
-        if not state.waits:
+        """Return what each waiting transition waits for, and of each two that may come into one
+        conflict which has waited longer. No other order counts."""
+        waits = state.waits
+        if not waits or self._contests == frozenset():
             return ()
-        by_place: dict[str, dict[int, set[str]]] = {}
-        for name, wait in state.waits.items():
-            if self._rivals is not None and name not in self._rivals:
-                continue
-            by_place.setdefault(wait.place, {}).setdefault(wait.since, set()).add(name)
-        return frozenset(
-            (place, tuple(frozenset(names) for _, names in sorted(since.items())))
-            for place, since in by_place.items()
-        )
+        groups = [tuple(waits)] if self._contests is None else self._contests
+        known, older = set[tuple[str, str]](), set[tuple[str, str]]()
+        for group in groups:
+            present = [name for name in group if name in waits]
+            known.update((name, waits[name].place) for name in present)
+            older.update(
+                (a, b) for a, b in permutations(present, 2) if waits[a].since < waits[b].since
+            )
+        return frozenset(known), frozenset(older)
 
     def _run(self, run: Run, ends: list[int]) -> Hashable:
         raised = run.raised & self._waits[run.place]

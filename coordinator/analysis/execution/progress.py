@@ -672,9 +672,9 @@ def progress_of(
     free = execute(view.task, limit=limit, engine=asking)
     if not free.contests:
         return Progress(free, view, measured)
-    rivals = frozenset(name for names in free.contests for name in names) if free.complete else None
+    contests = free.contests if free.complete else None
     engine = Engine(view.task, devices)
-    served = execute(view.task, limit=limit, engine=engine, rivals=rivals)
+    served = execute(view.task, limit=limit, engine=engine, contests=contests)
     return Progress(served, view, measured, Progress(free, view))
 
 
