@@ -24,7 +24,7 @@ from petrobot.sim.picking.parts import Part, contact
 from petrobot.sim.picking.world import Table
 
 LABORATORY_FILE = Path(__file__).with_name("laboratory.toml")
-_DRAWS: Final = 4000
+_DRAWS: Final = 1500
 """Most positions that are tried for the parts of an experiment."""
 
 
