@@ -222,8 +222,10 @@ def measure(results: Results, size: Size, workers: int) -> None:
     """Kill each program so many times. One at a time, as the time counts."""
     jobs = [
         (key, (program, number, str(results.folder / "killed" / key.replace(" ", "-"))))
-        for key, program, number in keyed(PROGRAMS, range(size.kills + 1))
-    ]
+        for key, program, number in sorted(
+            keyed(PROGRAMS, range(size.kills + 1)), key=lambda job: job[2]
+        )
+    ]  # program by program in turn: what is there when it is stopped compares
     results.measure("killed", measure_one, jobs, 1)
 
 
