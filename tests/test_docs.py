@@ -51,7 +51,8 @@ def test_files_and_functions_named_by_pages_exist() -> None:
 def test_files_named_in_short_exist() -> None:
     """A page may leave out the first folders of a file: `net/qualitative.py`."""
     known = {"/" + path.relative_to(ROOT).as_posix() for path in _sources("*.py", "*.js")}
-    known |= {f"/{path.relative_to(ROOT)}" for path in (ROOT / "examples").rglob("*.py")}
+    for folder in ("examples", "experiments"):
+        known |= {f"/{path.relative_to(ROOT)}" for path in (ROOT / folder).rglob("*.py")}
     wrong = [
         f"{page.relative_to(ROOT)}: {name}"
         for page in [*PAGES, ROOT / "CHANGELOG.md"]

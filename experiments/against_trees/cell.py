@@ -24,7 +24,7 @@ from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.lockstep.cell import Delays, LockStepCell
 from petrobot.services.comm.lockstep.party import TICK, Envelope
-from petrobot.services.comm.protocol.messages import Call, Event, Message, Outcome
+from petrobot.services.comm.protocol.messages import Call, Event, Message, Outcome, Welcome
 
 EVENTS = ("image_tick", "ball_caught")
 SERVICE_DEADLINE = 20.0
@@ -115,6 +115,9 @@ class Cell:
                 if (run := self._runs.get(notice.id)) is not None:
                     run.outcome = notice
                 caller.acknowledge(now, notice.id)
+            elif isinstance(notice, Welcome):
+                for id_ in notice.runs:  # of a process of ours that was killed
+                    caller.disown(now, id_)
             elif isinstance(notice, Event) and notice.name in EVENTS:
                 self._events[notice.name] += 1
                 if notice.number:

@@ -18,7 +18,7 @@ from collections.abc import Coroutine, Mapping
 from typing import Any, NamedTuple
 
 from petrobot import Context, Result, error, failure, key, success
-from petrobot.services.device import Driver, Ports
+from petrobot.services.device import Driver, Ports, Setpoint
 
 HANG = 300.0
 """s; a run that hangs ends by itself after so long."""
@@ -84,6 +84,8 @@ class Device(Driver):
         """The ball that the arm deals with."""
         self.in_cup = self.will_catch = False
         self.hard = 0.0
+        # opened with the driver: in real time senders ask its process for the stream's port
+        self.point: Setpoint | None = ports.stream("catch_point") if self.name == "arm" else None
 
     def note(self, ctx: Context[Device], action: str, what: str) -> None:
         """Add an entry to the log."""
@@ -158,7 +160,8 @@ async def _track(
 
 
 async def _move(ctx: Context[Device], action: str, slow: float, faults: float) -> Result:
-    device, point = ctx.device, ctx.device.ports.stream("catch_point")
+    device, point = ctx.device, ctx.device.point
+    assert point is not None
     if not await ctx.wait(lambda: point.values is not None, SET_POINTS):
         return error("no_setpoint", "no prediction came in time; the arm holds")
     assert point.values is not None

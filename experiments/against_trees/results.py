@@ -33,15 +33,14 @@ class Size:
     learning: int
     """Trials of each learning policy and seed, in the plant."""
     learning_seeds: int
-    reference: int
-    """Trials that say how good a fixed combination is, for each of them and each disturbance."""
+    """How often each policy is run anew."""
     laboratory: int
     """Balls for each program and regime in the simulated laboratory."""
     training: int = 300
 
 
-FULL = Size(1000, 200, 1200, 10, 400, 200)
-TENTH = Size(100, 20, 1200, 1, 100, 12)
+FULL = Size(1000, 200, 900, 10, 120)
+TENTH = Size(100, 20, 900, 1, 12)
 
 
 class Results:

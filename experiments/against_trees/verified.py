@@ -27,7 +27,7 @@ from petrobot.services.comm.location_file import load
 
 BALLS = 10
 """Balls of a mission: enough for what only later balls show."""
-FIRST_SEED = 10_000
+FIRST_SEED = 20_000
 SOURCES = {"net": TASK, "tree": HERE / "tree.py", "machine": HERE / "machine.py"}
 STYLE = "E501,F401,I001,SIM102"
 """Rules of ruff that the transcription itself breaks: long lines, imports that were needed, an `if`

@@ -5,19 +5,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+pytest.importorskip("py_trees")
+
 from experiments.against_trees import plant
+from experiments.against_trees.costs import code_lines, reactions
 from experiments.against_trees.faults import FAULTS
+from experiments.against_trees.forecasts import CHANGES, figures
 from experiments.against_trees.judge import Report, violations
+from experiments.against_trees.learned import best, chance, regret
 from experiments.against_trees.missions import Mission, net_mission, program_mission
 from experiments.against_trees.plant import Entry
 from experiments.against_trees.results import CELL, PLANT, PROGRAMS, Results
 from experiments.against_trees.verified import first_symptom, make_of, runner, source_of
 from petrobot.coordinator.task.file import load as load_task
 from petrobot.services.comm.location_file import load
-
-pytest.importorskip("py_trees")
 
 
 def played(program: str, cell: Path, balls: int, seed: int) -> Mission:
@@ -111,3 +115,47 @@ def test_a_result_is_measured_once(tmp_path: Path) -> None:
 
 def test_the_plant_is_offered_whole() -> None:
     assert {a.args["action"] for a in load(PLANT).actions.values()} == set(plant.ACTIONS)
+
+
+CODE = '''"""A text
+of the module."""
+
+import os  # counted
+
+
+def two(a: int,
+        b: int) -> str:
+    """Not counted."""
+    # neither is this
+    return """a string
+that counts"""
+'''
+
+
+def test_lines_of_code_are_counted(tmp_path: Path) -> None:
+    (tmp_path / "one.py").write_text(CODE, encoding="utf-8")
+    assert code_lines(tmp_path / "one.py") == 5
+    task = '# no\n\n[places.a]\nkind = "action" # yes\nx = 1\ny = 2\nlabel = "no"\ntext = "no"\n'
+    (tmp_path / "one.toml").write_text(task, encoding="utf-8")
+    assert code_lines(tmp_path / "one.toml") == 2
+
+
+def test_the_chance_of_a_combination_is_the_plants() -> None:
+    usual = ("locate_background", "predict_least_squares", "intercept_tilted")
+    runs = [played("machine", PLANT, 50, seed).report.caught for seed in range(4)]
+    assert abs(sum(runs) / 200 - chance(usual, {})) < 0.11  # four standard errors
+
+
+def test_regret_is_what_the_best_choice_would_have_caught_more() -> None:
+    _, first = best({})
+    assert regret([5, 0]) == pytest.approx([5 * first - 5, 10 * first - 5])
+
+
+def test_figures_of_a_forecast_and_its_changes() -> None:
+    goal, times = np.array([1.0, 0.0, 1.0, 1.0]), np.array([1.0, np.nan, 3.0, 2.0])
+    assert figures(goal, times) == pytest.approx((0.75, 2.0, 2.8))
+    assert len(CHANGES) == 20 and len({change.name for change in CHANGES}) == 20
+
+
+def test_a_reaction_is_from_located_to_moving() -> None:
+    assert reactions(entries(*GOOD)) == pytest.approx([0.0])
