@@ -4,7 +4,6 @@ asked for."""
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,8 +19,7 @@ from petrobot.coordinator.cli.loading import (
 from petrobot.services.host.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.analysis.time.gspn import Gspn
-    from petrobot.coordinator.drawing import Caption, Overlay
+    from petrobot.coordinator.drawing import Overlay
     from petrobot.coordinator.task import Task
 
 EXAMPLE = "petrobot show catch_ball --errors --out catch_ball.svg"
@@ -112,7 +110,7 @@ def _refuse_idle(options: argparse.Namespace) -> None:
 def _gspn(options: argparse.Namespace) -> str:
     """Draw the stochastic view of a task, or a net file that has rates. Raises CommandError."""
     from petrobot.coordinator.analysis.commands import gspn_of
-    from petrobot.coordinator.drawing import Overlay, draw
+    from petrobot.coordinator.studies.report.gspn_picture import gspn_svg
     from petrobot.coordinator.task.file import load
 
     for name in ("errors", "expanded", "inside", "heat"):
@@ -131,32 +129,7 @@ def _gspn(options: argparse.Namespace) -> str:
         text = str(fault)
         named = text if text.startswith(str(path)) else f"{path}: {text}"
         raise CommandError(2, named) from fault
-    # In a GSPN of a task a place and a transition may have the same name; a drawing needs two.
-    renamed, _ = model.with_names(re.compile(".+", re.DOTALL))
-    gspn = renamed.gspn
-    assert gspn is not None
-    pairs = zip(gspn.net.transitions, model.net.transitions, strict=True)
-    captions = {
-        name: _caption(gspn, t, old, sources.get(old, "")) for t, (name, old) in enumerate(pairs)
-    }
-    overlay = Overlay(legend=f"Assumed: {assumed}." if assumed else "")
-    return draw(renamed.net, title=model.name or path.stem, captions=captions, overlay=overlay)
-
-
-def _caption(gspn: Gspn, t: int, name: str, source: str) -> Caption:
-    """What the drawing says of a transition of a GSPN: its rate or weight, and their source."""
-    from petrobot.coordinator.drawing import Caption
-
-    rate, servers = gspn.rate[t], gspn.servers[t]
-    if rate is not None:
-        said = f"{rate:.4g}/s"
-        if servers != 1:
-            said += " for each token" if servers is None else f", {servers} servers"
-    else:
-        said = f"weight {gspn.weight[t]:.4g}" if source or gspn.weight[t] != 1.0 else ""
-    kind = "immediate" if rate is None else "timed"
-    hint = "; ".join(text for text in (f"{kind} transition {name}", said, source) if text)
-    return Caption(tuple(text for text in (name, said, source) if text), hint, kind)
+    return gspn_svg(model, sources, model.name or path.stem, assumed)
 
 
 def _heat(task: Task, options: argparse.Namespace) -> Overlay:

@@ -110,9 +110,8 @@ async def _analyse(request: web.Request) -> web.StreamResponse:
 async def _export(request: web.Request) -> web.Response:
     house, name, form = request.app[HOUSE], request.match_info["name"], request.match_info["form"]
     try:
-        made = json.loads(
-            await house.apart.do("export", {**house.store.folders, "name": name, "form": form})
-        )
+        given = {**house.store.folders, "name": name, "form": form, "cell": _cell(house)}
+        made = json.loads(await house.apart.do("export", given))
     except RefusedError as refusal:
         raise refused(refusal) from refusal
     return web.Response(

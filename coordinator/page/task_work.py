@@ -18,7 +18,7 @@ import tomlkit
 from petrobot.coordinator.analysis.commands import net_file_of
 from petrobot.coordinator.analysis.formats.netfile import NetFile, NetFileError
 from petrobot.coordinator.analysis.formats.pnml import parse_pnml, write_pnml
-from petrobot.coordinator.analysis.may_run import Cell, may_run
+from petrobot.coordinator.analysis.may_run import Cell, assumed, devices_of, may_run
 from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.page.edits import EditError, Rename, parse, plain
 from petrobot.coordinator.page.task_store import Conflict, StoreError, TaskStore, TaskText
@@ -129,14 +129,27 @@ def load(text: str, filename: str) -> Task:
         raise FormatError(str(error)) from error
 
 
-def export(text: str, filename: str, form: str) -> Made:
-    """Return the task in another format. Raises FormatError."""
+def export(text: str, filename: str, form: str, cell: Fields = None) -> Made:
+    """Return the task in another format; `gspn.svg` draws its stochastic view. Raises
+    FormatError."""
     task = load(text, filename)
     if form == "toml":
         return Made(dumps(task), "application/toml")
     if form == "pnml":
         return Made(write_pnml(net_file_of(task)), "application/xml")
-    raise FormatError(f"no format {form!r}: toml and pnml are known")
+    if form == "gspn.svg":
+        # Here, because few need it and their import takes a while.
+        from petrobot.coordinator.analysis.time.stochastic import stochastic_view
+        from petrobot.coordinator.studies.report.gspn_picture import gspn_svg
+
+        known = None if cell is None else Cell(**cell)
+        try:
+            view = stochastic_view(task, devices=devices_of(known))
+        except ValueError as fault:
+            raise FormatError(f"no stochastic view: {fault}") from fault
+        model = NetFile(view.gspn.net, task.name, view.gspn)
+        return Made(gspn_svg(model, view.sources, task.name, assumed(known)), "image/svg+xml")
+    raise FormatError(f"no format {form!r}: toml, pnml and gspn.svg are known")
 
 
 def imported(form: str, text: str) -> str:
@@ -226,10 +239,10 @@ def _check(cell: Fields, name: str, **drawing: Any) -> dict[str, Any]:
     return {"findings": findings(made["text"], f"{name}.toml", cell), **made}
 
 
-def _export(tasks: str, shipped: str, name: str, form: str) -> dict[str, Any]:
+def _export(tasks: str, shipped: str, name: str, form: str, cell: Fields) -> dict[str, Any]:
     try:
         task = _store(tasks, shipped).read(name)
-        made = export(task.text, f"{task.name}.toml", form)
+        made = export(task.text, f"{task.name}.toml", form, cell)
     except StoreError as fault:
         raise _refused(fault) from fault
     except FormatError as fault:

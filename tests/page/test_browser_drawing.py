@@ -219,6 +219,26 @@ async def test_formats_and_layout(
     assert await tab.evaluate(where) == before
 
 
+async def test_the_stochastic_view_opens_beside_the_drawing(
+    browser: Browser, page: Page, tasks: Path, shots: Path
+) -> None:
+    """It is drawn from the saved file, as an image."""
+    shipped = Path(__file__).parents[2] / "coordinator" / "tasks" / "catch_ball.toml"
+    text = shipped.read_text().replace('"catch_ball"\n', '"timed"\n', 1)
+    (tasks / "timed.toml").write_text(text)
+    tab = await designer(browser, page)
+    await tab.get_by_label("Task", exact=True).select_option("timed")
+    await expect(element(tab, "locate_ball,").first).to_be_visible()
+    await tab.get_by_label("Import and export").select_option("Show stochastic view")
+    dialog = tab.get_by_role("dialog", name="Stochastic view")
+    await expect(dialog.get_by_role("img")).to_be_visible()
+    wide = "(image) => image.decode().then(() => image.naturalWidth)"
+    assert await dialog.get_by_role("img").evaluate(wide) > 1000
+    await tab.screenshot(path=shots / "stochastic.png")
+    await dialog.get_by_role("button", name="Close").click()
+    await expect(dialog).to_be_hidden()
+
+
 async def test_macro_places_open_in_both_views(
     browser: Browser, page: Page, stage: Stage, tasks: Path
 ) -> None:

@@ -27,6 +27,7 @@ from tests.page.stage import Stage
 pytestmark = pytest.mark.processes
 
 TASK = "pick_and_place"
+ROOT = Path(__file__).parents[2]
 
 FORBIDDEN = (
     (edits, "parse"),
@@ -181,6 +182,19 @@ async def test_offers_list_what_the_nodes_offer(http: aiohttp.ClientSession) -> 
     assert {"action": "pick", "primitive_task": "pick", "node": "arm"}.items() <= next(
         o for o in offers if o["action"] == "pick"
     ).items()
+
+
+async def test_the_stochastic_view_is_drawn(http: aiohttp.ClientSession, tasks: Path) -> None:
+    """With rates and where they come from; without estimates it says which one is missing."""
+    text = (ROOT / "coordinator" / "tasks" / "catch_ball.toml").read_text(encoding="utf-8")
+    (tasks / "catch_ball.toml").write_text(text, encoding="utf-8")
+    async with http.get("/api/tasks/catch_ball/export/gspn.svg") as answer:
+        drawn = await answer.text()
+        assert answer.status == 200 and answer.content_type == "image/svg+xml"
+    assert "transition timed" in drawn and "declared in the task file" in drawn
+    assert "Assumed: two runs never use one device at a time" in drawn
+    async with http.get(f"/api/tasks/{TASK}/export/gspn.svg") as answer:
+        assert answer.status == 400 and "no stochastic view: " in await answer.text()
 
 
 async def test_pnml_is_exported_and_imported(http: aiohttp.ClientSession, tasks: Path) -> None:

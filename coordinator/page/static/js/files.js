@@ -1,7 +1,7 @@
 // Task files on the server: open, save with revision, resolve a conflict with both versions in view, import and export.
 
 import { openDialog } from "./dialog.js";
-import { fill, h } from "./dom.js";
+import { fill, h, words } from "./dom.js";
 import { toast } from "./toast.js";
 
 async function ask(method, path, body) {
@@ -195,7 +195,19 @@ export async function exportAs(form, model, view, text) {
   if (!model.name || model.dirty) return toast("warning", "Save the task first: it is exported from its file.");
   const answer = await ask("GET", `/api/tasks/${encodeURIComponent(model.name)}/export/${form}`);
   if (!answer.ok) return toast("error", String(answer.value));
+  if (form === "gspn.svg") return showPicture("Stochastic view", name, answer.value);
   return download(`${name}.${form}`, answer.value, "text/xml");
+}
+
+/** An SVG from the server in a dialog, as an image: nothing in it can run. */
+function showPicture(title, name, svg) {
+  const address = URL.createObjectURL(new Blob([svg], { type: "image/svg+xml" }));
+  const dialog = h("dialog", { "aria-label": title }, h("h2", {}, `${title} of ${words(name)}`),
+    h("img", { src: address, alt: "Timed transitions are boxes, immediate ones bars" }),
+    h("div", { class: "buttons" }, h("button", { type: "button", class: "small", onclick: () => dialog.close() }, "Close")));
+  dialog.addEventListener("cancel", () => dialog.close());
+  dialog.addEventListener("close", () => URL.revokeObjectURL(address));
+  openDialog(dialog);
 }
 
 /** Ask for a name; null when it was cancelled. */

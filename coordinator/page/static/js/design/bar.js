@@ -5,7 +5,7 @@ import { attribute, fill, h, text, words } from "../dom.js";
 import { icon } from "../icons.js";
 import { layOut } from "./arrange.js";
 
-const FORMS = [["", "Import, export"], ["in", "Import PNML or TOML"], ["svg", "Export SVG"], ["png", "Export PNG"], ["pnml", "Export PNML"], ["toml", "Export TOML"]];
+const FORMS = [["", "Import, export"], ["in", "Import PNML or TOML"], ["svg", "Export SVG"], ["png", "Export PNG"], ["gspn.svg", "Show stochastic view"], ["pnml", "Export PNML"], ["toml", "Export TOML"]];
 
 export class Bar {
   constructor(designer) {
