@@ -27,7 +27,7 @@ from petrobot.coordinator.engine.instructions import (
 )
 from petrobot.coordinator.engine.state import Phase
 from petrobot.coordinator.engine.stimuli import Chosen, RunEnded, Stimulus
-from petrobot.coordinator.learning.estimate import Observation
+from petrobot.coordinator.learning.estimate import COUNT, Observation
 from petrobot.coordinator.learning.learning import Learning
 from petrobot.coordinator.learning.records import Choice, Correction, Passage, Record, RunEnd
 from petrobot.coordinator.learning.selectors import TASK, verdicts_of_task
@@ -369,7 +369,8 @@ class LearningSelector(FirstAlternative):
             self._declared is not None
             and self.learning.question(record.primitive_task).measure == "cpu"
         ):
-            return self._declared.get(record.action, 0.0)
+            used = {} if result is None else _numbers(result.values)
+            return self._declared.get(record.action, 0.0) * used.get(COUNT, 1.0)
         return None if result is None else result.cpu_seconds
 
     def _corrected(self, corrected: Corrected) -> None:

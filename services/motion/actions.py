@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from operator import sub
 from typing import Any, Final
 
 from petrobot.services.action import (
@@ -177,7 +178,8 @@ async def _intercept(
     arrive; FAILURE `late`: the predicted arrival has passed; ERROR: `no_setpoint` (none within
     `patience` s, or the stream has ceased), `unreachable`, or as the driver reports. After SUCCESS
     and FAILURE the arm keeps following, for `follow_and_wait`. If it is to be `judged`, both are
-    provisional, and `run` is what `follow_and_wait` judges by whether the ball is caught.
+    provisional, and `run` is what `follow_and_wait` judges by whether the ball is caught; `travel`
+    (rad), how far the joints have moved, all together, says how much the run wore the arm.
     """
     following = _Following(ctx, how)
     try:
@@ -189,9 +191,10 @@ async def _intercept(
         raise
     if result.status is Status.ERROR:
         ctx.device.send({"do": "hold"})
-    elif judged:
-        result = provisional(replace(result, values={**result.values, "run": ctx.run}))
-    return result
+    if judged:
+        values = {**result.values, "run": ctx.run, "travel": following.travel}
+        result = replace(result, values=values)
+    return provisional(result) if judged and result.status is not Status.ERROR else result
 
 
 class _Following:
@@ -201,6 +204,8 @@ class _Following:
         self._ctx = ctx
         self._how = how
         self._renewed = 0.0
+        self.travel = 0.0
+        """Rad that the joints have moved, all together."""
 
     async def until(
         self, judge: Callable[[Mapping[str, Any], float], Result | None], timeout: float
@@ -212,11 +217,14 @@ class _Following:
         if why:
             return _trouble(ctx.device.state) or error("refused", why)
         begun, seen, result = ctx.now, -1, None
+        before = ctx.device.state["q"]
 
         def judged() -> bool:
-            nonlocal seen, result
+            nonlocal before, seen, result
             state = ctx.device.state
             if state["cycles"] != seen:
+                self.travel += sum(map(abs, map(sub, state["q"], before)))
+                before = state["q"]
                 seen, result = state["cycles"], _trouble(state) or judge(state, ctx.now - begun)
             return result is not None
 

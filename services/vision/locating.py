@@ -9,7 +9,7 @@ edge.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -208,6 +208,9 @@ async def locate(
         raise
     if result.cause in ("no_ball", "no_image", "bad_image"):
         camera.end()
+    if specification.within > 0.0 and "images" in result.values:
+        # what the run used, for its cost
+        result = replace(result, values={**result.values, "count": result.values["images"]})
     return result
 
 

@@ -359,6 +359,8 @@ class _Chase:
     def _values(self) -> dict[str, Any]:
         """Return the values of every result."""
         values: dict[str, Any] = {"images": self._images, "seen": self._seen}
+        if self._specification.measures:
+            values["count"] = self._images  # what the run used, for its cost
         if self._latencies:
             values["latency"] = float(np.mean(self._latencies))
             values["latency_longest"] = max(self._latencies)

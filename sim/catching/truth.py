@@ -141,10 +141,13 @@ def disturb(settings: Mapping[str, Any], regime: str) -> tuple[tuple[float, floa
     name = regime.partition("@")[0]
     base, *names = (part.strip() for part in name.replace(",", "+").split("+"))
     regimes, disturbances = settings["regimes"], settings["disturbances"]
+    if base in (contests := settings.get("contests", {})):
+        base, *more = contests[base].split("+")
+        names = more + names
     if base not in regimes:
         raise LaboratoryError(
-            f"regime {regime!r}: it must begin with one of {', '.join(regimes)}, such as 'A' "
-            "or 'A+dim'"
+            f"regime {regime!r}: it must begin with one of {', '.join([*regimes, *contests])}, "
+            "such as 'A' or 'A+dim'"
         )
     values = dict(settings["nominal"])
     set_by: dict[str, str] = {}

@@ -169,7 +169,7 @@ def test_four_catches(catch: Task) -> None:
     end = cell.run()
     assert end.status is OK and [r.status for r in cell.records("catch_ball")] == [OK] * 4
     starts = [i for i in cell.all if isinstance(i, StartRun) and i.place == "track_ball"]
-    assert starts[0].arguments == {"ball": [1.0, 0.2]}
+    assert starts[0].arguments == {**catch.places["track_ball"].args, "ball": [1.0, 0.2]}
 
 
 def test_balls_that_pass_use_up_the_runs(catch: Task) -> None:

@@ -15,6 +15,7 @@ import pytest
 
 from petrobot.coordinator.engine import Engine, Override, State
 from petrobot.coordinator.engine.instructions import Corrected, RunRecorded, StartRun
+from petrobot.coordinator.engine.stimuli import RunEnded
 from petrobot.coordinator.launch import Setting, lockstep_cell, with_runs
 from petrobot.coordinator.learning.estimate import TallyKey
 from petrobot.coordinator.learning.learner import (
@@ -284,6 +285,21 @@ def test_firings_are_counted(task: Task) -> None:
     passages = [r for r in selector.records if isinstance(r, Passage)]
     assert len(passages) == mission.tally.firings
     assert {p.transition for p in passages if p.waited is not None} == {"begin"}
+
+
+def test_declared_cpu_time_counts_for_each_thing_that_a_run_used() -> None:
+    """A run that says in `count` how many images it used costs so many times its compute time."""
+    task = sorting()
+    pick = replace(task.primitive_tasks["pick"], cost="cpu")
+    costly = replace(task, primitive_tasks={**task.primitive_tasks, "pick": pick})
+    selector = LearningSelector(Learning(costly, "fixed"), seed=1, declared={"pick_fast": 0.002})
+    used: tuple[dict[str, Any], ...] = ({"count": 40.0}, {}, {"count": "x"})
+    for k, values in enumerate(used):
+        ended = ("pick", "pick", "pick_fast", Status.SUCCESS, "", "", Executed.YES, 1.0)
+        selector.stimulus(1.0, RunEnded(f"pick#{k}", Status.SUCCESS, values=values))
+        selector.instruction(1.0, RunRecorded(f"pick#{k}", *ended))
+    ends = [r.outcome.cpu_seconds for r in selector.records if isinstance(r, RunEnd)]
+    assert ends == [0.08, 0.002, 0.002]
 
 
 @pytest.mark.parametrize("declared", [None, {"pick_slow": 0.25}])

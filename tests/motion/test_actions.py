@@ -151,8 +151,10 @@ def test_a_ball_that_does_not_come_is_missed(play: Any) -> None:
 
 @pytest.mark.parametrize("caught", [True, False])
 def test_the_catch_judges_the_interception(play: Any, caught: bool) -> None:
-    ball = PredictedBall(caught=caught)
+    ball, home = PredictedBall(caught=caught), play.device.state["q"]
     moved = play.play(actions.intercept_tilted(play, judged=True), ball)
+    apart = sum(abs(a - b) for a, b in zip(play.device.state["q"], home, strict=True))
+    assert apart - 0.01 < moved.values["travel"] < 1.5 * apart
     assert moved.status is Status.SUCCESS and moved.deferred and moved.values["run"] == "test"
     play.play(actions.follow_and_wait(play, moved="move#1"), ball)
     status, cause = (Status.SUCCESS, "") if caught else (Status.FAILURE, "missed")

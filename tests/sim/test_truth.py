@@ -83,6 +83,15 @@ def test_every_disturbance_of_the_file_is_tried_here(site: Site) -> None:
         assert changed(site.truth("B"), site.truth(f"B+{name}")), name
 
 
+def test_a_contest_is_the_regime_that_the_file_names(site: Site) -> None:
+    assert len(SETTINGS["contests"]) >= 3
+    for name, meant in SETTINGS["contests"].items():
+        assert not changed(site.truth(meant), site.truth(name)), name
+        assert not changed(site.truth(f"{meant}+jitter@3"), site.truth(f"{name}+jitter@3")), name
+        with pytest.raises(LaboratoryError, match="both set"):
+            site.truth(f"{name}+{meant.rpartition('+')[2]}")
+
+
 @pytest.mark.parametrize(
     ("name", "says"),
     [

@@ -185,7 +185,9 @@ def test_it_is_measured_where_the_ball_left(
 @pytest.mark.parametrize("locator", sorted(LOCATORS))
 def test_the_tracker_judges_what_was_located(context: BenchContext, locator: str) -> None:
     context.bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.2)
-    judged(context, locator)
+    located, tracked = judged(context, locator)
+    for result in (located, tracked):
+        assert result.values["count"] == result.values["images"], "what it costs"
     assert context.verdicts == [("1", Status.SUCCESS, "")]
 
 

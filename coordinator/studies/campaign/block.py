@@ -186,16 +186,19 @@ def _cell(bench: LoadedPlan, block: Block, selector: BlockSelector) -> tuple[Mis
 
 def costs(task: Task, directory: Directory) -> CostOf:
     """Return a function that gives the cost of a run by the measure that its primitive task
-    declares. In lock step, CPU time is the compute time declared in services.toml."""
+    declares. In lock step, CPU time is the compute time declared in services.toml, times what the
+    run used (`count` of its result, else 1)."""
 
     def cost(record: RunRecorded, values: Mapping[str, Any]) -> float | None:
         measure = task.primitive_tasks[record.primitive_task].cost
         if measure == "wall":
             return record.seconds
+        used = values.get(COUNT, 1)
         if measure == "cpu":
             entry = directory.actions.get(record.action)
-            return None if entry is None else entry.compute_time
-        value = values.get(COUNT, 1) if measure == COUNT else values.get(measure.partition(":")[2])
+            used = used if isinstance(used, int | float) else 1
+            return None if entry is None else entry.compute_time * used
+        value = used if measure == COUNT else values.get(measure.partition(":")[2])
         return float(value) if isinstance(value, bool | int | float) else None
 
     return cost
