@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.intp]
 
+PRIOR = 3.0
+"""Trials for which the additive prior of a combination counts: enough to rank those that were tried
+once or twice, too few to hide what their actions do to each other."""
 SUMS = ("tries", "runs", "successes", "cost", "squares", "costed", "missing")
 
 
@@ -59,6 +62,8 @@ class Batch:
     """Declared weight of the cost; None: 1 / max C of the row."""
     declared: Array | None = None
     """Declared costs, shape (n,), used where none was measured; nan or None: none is declared."""
+    shape: tuple[int, ...] = ()
+    """If the actions are combinations: how many there are of each primitive task."""
     own: dict[str, Array] = field(default_factory=dict)
     """Further arrays that a rule needs, by name; their first axis is the row."""
 
@@ -98,9 +103,25 @@ class Batch:
     # --- figures from the sums ----------------------------------------------------------------
 
     def reliability(self) -> Array:
-        """R of each action; 0 where nothing is known."""
+        """R of each action; 0 where nothing is known. Combinations have an additive prior."""
+        if self.shape:
+            return (self.successes + PRIOR * self._additive()) / (self.runs + PRIOR)
         # 1e-300 stands for "no runs": 0 / 1e-300 is 0, without a warning of numpy
         return self.successes / np.maximum(self.runs, 1e-300)
+
+    def _additive(self) -> Array:
+        """Return R of each combination as the effects of its actions add up: each combination
+        counts the same, however often it was chosen, with one pseudo-trial at the mean."""
+        axes = tuple(range(1, len(self.shape) + 1))
+        good, runs = (x.reshape(-1, *self.shape) for x in (self.successes, self.runs))
+        mean = (good.sum(axes, keepdims=True) + 0.5) / (runs.sum(axes, keepdims=True) + 1.0)
+        cell = (good + mean) / (runs + 1.0)
+        out = (1 - len(axes)) * cell.mean(axes, keepdims=True)
+        for axis in axes:
+            others = tuple(other for other in axes if other != axis)
+            out = out + cell.mean(others, keepdims=True)
+        added: Array = np.clip(out, 0.0, 1.0).reshape(self.successes.shape)
+        return added
 
     def availability(self) -> Array:
         """A of each action; 1 where nothing is known."""

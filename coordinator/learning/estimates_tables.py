@@ -10,6 +10,7 @@ from contextlib import suppress
 from math import inf
 from typing import Any
 
+from petrobot.coordinator.learning.combinations import TOGETHER
 from petrobot.coordinator.learning.estimate import (
     Firings,
     FiringsKey,
@@ -45,7 +46,12 @@ def joined(mine: State, other: State) -> dict[str, Any]:
     for context, learner in other["learners"].items():
         if context not in learners or _weight(learner) > _weight(learners[context]):
             learners[context] = learner
-    return {**mine, "learners": dict(sorted(learners.items()))}
+    whole = {**mine, "learners": dict(sorted(learners.items()))}
+    if TOGETHER in other:  # the learner over combinations of actions
+        whole[TOGETHER] = (
+            joined(mine[TOGETHER], other[TOGETHER]) if TOGETHER in mine else other[TOGETHER]
+        )
+    return whole
 
 
 def _rank(state: State) -> tuple[float, str]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -319,7 +319,8 @@ class LearningSelector(FirstAlternative):
             known = [run[:3] for run in trial.runs]
             trial.runs.append((end.primitive_task, end.action, context, outcome))
             if trial.met is not None and trial.runs[-1][:3] not in known:
-                self._credit(trial, trial.runs[-1:])  # its node was slow to say that it ended
+                # Its node was slow to say that it ended.
+                self._credit(trial, trial.runs[-1:], late=True)
 
     # --- the task's verdict on choices --------------------------------------------------------
 
@@ -353,14 +354,19 @@ class LearningSelector(FirstAlternative):
         trial.met, trial.seconds = met, round(max(0.0, now - trial.begun), 6)
         self._credit(trial, trial.runs)
 
-    def _credit(self, trial: _Trial, runs: Sequence[tuple[str, str, str, Observation]]) -> None:
+    def _credit(
+        self,
+        trial: _Trial,
+        runs: Sequence[tuple[str, str, str, Observation]],
+        late: bool = False,
+    ) -> None:
         """Record the verdict on the actions of these runs, if the task is to judge them."""
         if self.learning.credit != TASK:
             return
         for verdict in verdicts_of_task(
             runs, bool(trial.met), trial.seconds, lambda name: self.learning.question(name).measure
         ):
-            self._note(verdict)
+            self._note(replace(verdict, beside=()) if late else verdict)
 
     def _cpu(self, record: RunRecorded, result: RunEnded | None) -> float | None:
         """Return the measured CPU seconds; the declared ones in lock step where they are the cost,

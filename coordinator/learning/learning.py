@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from petrobot.coordinator.learning.combinations import CombinationSelector
 from petrobot.coordinator.learning.estimate import (
     Firings,
     FiringsKey,
@@ -126,6 +127,12 @@ class Learning:
             if len(p.alternatives) > 1:
                 question_of = self.question(p.name)
                 self.selectors[p.name] = make(selector, p.alternatives, question_of, credit)
+        self.joint: CombinationSelector | None = None
+        """Chooses for all primitive tasks together, where the task judges; the selectors then hold
+        what of it concerns each of them."""
+        choices = {name: task.primitive_tasks[name].alternatives for name in self.selectors}
+        if credit == TASK and CombinationSelector.fits(choices):
+            self.joint = CombinationSelector(selector, choices, question or Question(), credit)
 
     def question(self, primitive_task: str) -> Question:
         """Return measure, target and rho for a primitive task: as given, with the cost measure that
@@ -144,6 +151,8 @@ class Learning:
         rng: np.random.Generator,
     ) -> tuple[str, str]:
         """Choose one of the alternatives and say why. Changes nothing."""
+        if self.joint is not None:
+            return self.joint.choose(primitive_task, context, alternatives, rng)
         return self.selectors[primitive_task].choose(context, alternatives, rng)
 
     def apply(self, record: Record) -> None:
@@ -155,21 +164,37 @@ class Learning:
     def _select(self, record: Record) -> None:
         if isinstance(record, Passage):
             return
+        joint = self.joint
+        if joint is not None and isinstance(record, Credit) and record.beside:
+            joint.update(record.context, dict(record.beside), record.outcome)
         selector = self.selectors.get(record.primitive_task)
         if selector is None:
             return
         if isinstance(record, Choice):
             selector.chosen(record.context, record.action)
+            if joint is not None:
+                joint.chosen(record.primitive_task, record.context, record.action)
         elif isinstance(record, Credit) is not (self.credit == TASK):
             return
         elif isinstance(record, RunEnd | Credit):
             selector.update(record.context, record.action, record.outcome)
+            if joint is not None and record.context in selector.learners and not selector.frozen:
+                p = joint.marginal(record.primitive_task, record.context)
+                selector.learners[record.context].p[0] = p / p.sum()
         elif record.was.status is not None:
             selector.correct(
                 record.context, record.action, record.was.status, record.status, record.age
             )
 
     # --- reading ------------------------------------------------------------------------------
+
+    def best(self, primitive_task: str, context: str) -> str:
+        """Return the action that was learned to be best, together with those of the others if the
+        task judges."""
+        if self.joint is not None:
+            return self.joint.best(context)[primitive_task]
+        p = self.selectors[primitive_task].learned(context)
+        return max(p, key=lambda action: p[action])
 
     @property
     def estimates(self) -> Estimates:
@@ -233,7 +258,8 @@ class Learning:
 
     def state(self) -> dict[str, Any]:
         """Return the state of each selector by primitive task, as plain data."""
-        return {name: selector.state() for name, selector in self.selectors.items()}
+        found = {name: selector.state() for name, selector in self.selectors.items()}
+        return found if self.joint is None else self.joint.into(found)
 
     def restore(self, states: Mapping[str, Mapping[str, Any]]) -> None:
         """Load states of the same kind of selector. Raises ValueError naming the primitive task
@@ -245,9 +271,16 @@ class Learning:
                 self.selectors[name].restore(state)
             except (ValueError, KeyError, TypeError) as fault:
                 raise ValueError(f"{name}: {fault}") from fault
+        if self.joint is not None:
+            try:
+                self.joint.restore(states)
+            except (ValueError, KeyError, TypeError) as fault:
+                raise ValueError(f"{' + '.join(self.joint.tasks)}: {fault}") from fault
 
     def freeze(self, frozen: bool = True, primitive_tasks: Iterable[str] | None = None) -> None:
         """Stop (or continue) learning. A frozen selector chooses the action that it has learned to
         be best. Estimates still count."""
         for name in self.selectors if primitive_tasks is None else primitive_tasks:
             self.selectors[name].frozen = frozen
+        if self.joint is not None and primitive_tasks is None:
+            self.joint.selector.frozen = frozen

@@ -54,6 +54,9 @@ class Credit:
     action: str
     context: str
     outcome: Observation
+    beside: tuple[tuple[str, str], ...] = ()
+    """(primitive task, action) of everything that ran for the token; only in the first of its
+    verdicts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +90,8 @@ def to_plain(record: Record) -> dict[str, Any]:
     if isinstance(record, RunEnd):
         return {"kind": "End", **about, "outcome": _observation(record.outcome)}
     if isinstance(record, Credit):
-        return {"kind": "Credit", **about, "outcome": _observation(record.outcome)}
+        beside = {"beside": [list(one) for one in record.beside]} if record.beside else {}
+        return {"kind": "Credit", **about, "outcome": _observation(record.outcome), **beside}
     if isinstance(record, Correction):
         verdict = {"status": record.status.value, "cause": record.cause, "age": record.age}
         return {"kind": "Correction", **about, "was": _observation(record.was), **verdict}
@@ -105,7 +109,8 @@ def of_plain(data: Mapping[str, Any]) -> Record:
     if kind == "End":
         return RunEnd(*about, _observed(data["outcome"]))
     if kind == "Credit":
-        return Credit(*about, _observed(data["outcome"]))
+        beside = tuple((str(task), str(action)) for task, action in data.get("beside", ()))
+        return Credit(*about, _observed(data["outcome"]), beside)
     if kind == "Correction":
         verdict = (Status(data["status"]), str(data["cause"]), int(data.get("age", 0)))
         return Correction(*about, _observed(data["was"]), *verdict)

@@ -9,6 +9,7 @@ ends of runs.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -70,14 +71,19 @@ class RuleSelector:
     """Chooses among the alternatives of one primitive task by a rule, and learns from how runs end:
     one learner for each context, all over the same actions.
 
-    `question` gives cost measure, target reliability and rho. `frozen`: learn nothing and choose
-    the learned best.
+    `question` gives cost measure, target reliability and rho. `shape`: if the actions are
+    combinations, how many actions each primitive task has. `frozen`: learn nothing and choose the
+    learned best.
     """
 
     def __init__(
-        self, rule: Rule, actions: Iterable[str], question: Question | None = None
+        self,
+        rule: Rule,
+        actions: Iterable[str],
+        question: Question | None = None,
+        shape: tuple[int, ...] = (),
     ) -> None:
-        self.rule = rule
+        self.rule, self._shape = rule, shape
         self.name = rule.name
         self.actions = tuple(actions)
         self.question = question or Question()
@@ -96,6 +102,7 @@ class RuleSelector:
     def _fresh(self, actions: Sequence[str]) -> Batch:
         batch = self.rule.begin(1, len(actions), self.question.rho)
         batch.own["admitted"] = np.zeros((1, len(actions)))
+        batch.shape = self._shape if len(actions) == prod(self._shape) else ()
         if self.question.declared:
             batch.declared = np.array([self.question.declared_cost(a) for a in actions])
         return batch
@@ -188,6 +195,28 @@ class RuleSelector:
             np.array([not missing]),
         )
         self.rule.learn(batch, trial, self._eligible(batch))
+
+    def spread(
+        self, context: str, action: str, shares: Mapping[str, float], outcome: Observation
+    ) -> None:
+        """Let a trial count for several actions by their shares (which sum to 1): change the sums
+        so that they are right after `update` has counted it for one of them."""
+        batch = self._kept(context)
+        one, missing = self.actions.index(action), _is_missing(outcome)
+        cost = cost_of(outcome, self.question.measure)
+        known = not missing and cost == cost
+        gains = {
+            "runs": float(not missing),
+            "successes": float(outcome.status is Status.SUCCESS and not missing),
+            "cost": cost if known else 0.0,
+            "squares": cost * cost if known else 0.0,
+            "costed": float(known),
+            "missing": float(missing),
+        }
+        weight = np.array([shares[name] for name in self.actions])
+        weight[one] -= 1.0
+        for name, gain in gains.items():
+            getattr(batch, name)[0] += weight * gain
 
     def learns_from(self, action: str, outcome: Observation) -> bool:
         """Return whether a run is a trial: of one of the actions, and neither censored nor
@@ -319,15 +348,19 @@ def verdicts_of_task(
     `seconds`: duration of the trial, nan if it never came to its end; `measure`: the cost measure
     of a primitive task. The cost is the trial's: its duration, or the sum of all its runs by the
     measure. A run that its node never began is judged by that, as always; one that was cancelled
-    before it began could not matter.
+    before it began could not matter. The first verdict names the first action of each primitive
+    task that ran for the token.
     """
     runs, seen = list(runs), set()
+    began = [run for run in runs if run[3].executed is not Executed.NO or _is_missing(run[3])]
+    together = tuple({run[0]: run[1] for run in reversed(began)}.items())
     for primitive_task, action, context, outcome in runs:
         missing, key = _is_missing(outcome), (primitive_task, action, context)
         if key in seen or (outcome.executed is Executed.NO and not missing):
             continue
+        beside, together = together, ()
         if missing:
-            yield Credit(*key, outcome)
+            yield Credit(*key, outcome, beside)
             continue
         seen.add(key)
         asked = measure(primitive_task)
@@ -343,6 +376,7 @@ def verdicts_of_task(
                 cpu_seconds=whole if asked == "cpu" and known else None,
                 values={} if asked in ("wall", "cpu") else {asked.removeprefix("value:"): whole},
             ),
+            beside,
         )
 
 

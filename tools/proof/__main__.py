@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import Any
 
-from tools.proof import catching, convergence, coverage, learning, long_tests, physics
+from tools.proof import catching, convergence, coverage, credit, learning, long_tests, physics
 from tools.proof.page import figures
 from tools.proof.proof import KEPT, ROOT, FigureProof
 
@@ -32,6 +32,7 @@ def proofs() -> list[FigureProof]:
         *coverage.proofs(),
         *long_tests.proofs(),
         *learning.proofs(),
+        *credit.proofs(),
     ]
 
 

@@ -41,7 +41,7 @@ def observation(task: Task, run: RunEntry) -> Observation:
         run.cause,
         Executed(run.executed),
         run.cost if measure == "cpu" else None,
-        run.values,
+        {} if run.cancelled else run.values,
         run.taken if run.cancelled else None,
         None if run.cancelled else max(0.0, round(run.took - run.seconds, 6)),
     )

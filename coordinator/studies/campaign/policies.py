@@ -182,6 +182,7 @@ class LearnedActions:
         out, context = {}, context_of(block.regime)
         for name in self._learning.selectors:
             if name in self._chosen:
+                self._learning.apply(Choice(name, self._chosen[name], context))
                 continue
             random = np.random.default_rng([block.seed, k, *name.encode()])
             action, _ = self._learning.choose(name, context, self._alternatives[name], random)
@@ -232,7 +233,7 @@ class LearnedActions:
             for a, v in selector.objective(context).items()
         }
         return {
-            "best": max(p, key=lambda a: p[a]),
+            "best": self._learning.best(name, context),
             "p": {a: round(v, 6) for a, v in p.items()},
             "J": j,
         }

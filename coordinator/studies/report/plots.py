@@ -19,6 +19,8 @@ from typing import Any
 from petrobot.coordinator.studies.report import charts
 
 PICTURES = "pictures"
+TRUTH = ("yes", "no")
+"""Groups of a column of truth values; they have the first two colours."""
 MOST = 4000
 """Largest number of marks in one picture; of more, every k-th is drawn."""
 
@@ -42,8 +44,9 @@ def _numbers(plot: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict
     """Return the number of the colour of each group. It depends on the name, not on how many trials
     are in which group: the same word has the same colour in every picture and report. If two names
     of one picture come to the same colour, the later one in the alphabet takes the next free."""
-    out: dict[str, int] = {}
-    for name in sorted({_group(plot, row) for row in rows}):
+    groups = {_group(plot, row) for row in rows}
+    out = {name: number for number, name in enumerate(TRUTH) if name in groups}
+    for name in sorted(groups - set(TRUTH)):
         number = blake2b(name.encode()).digest()[0] % len(charts.PALETTE)
         while number in out.values() and len(out) < len(charts.PALETTE):
             number = (number + 1) % len(charts.PALETTE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -15,7 +16,13 @@ from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.report.action_pictures import objective_curves
 from petrobot.coordinator.studies.report.campaign_page import CampaignReport, story, timeline_of
-from petrobot.coordinator.studies.report.comparing import Weighting, compare, cost_weight, paired
+from petrobot.coordinator.studies.report.comparing import (
+    Weighting,
+    compare,
+    cost_weight,
+    objective_intervals,
+    paired,
+)
 from petrobot.coordinator.studies.report.plots import declared, finished
 from petrobot.coordinator.studies.report.run_page import own_pictures
 from petrobot.coordinator.task.file import load
@@ -171,6 +178,54 @@ def test_declared_pictures_come_from_the_score_alone() -> None:
         ElementTree.fromstring(svg)
     assert made["points"].count("<circle") + made["points"].count("<rect x") >= 10
     assert finished({"pictures": {"a": "<svg/>", "b": "<script/>"}}) == {"a": "<svg/>"}
+
+
+def test_values_beyond_a_histogram_are_counted() -> None:
+    """Also if all of a group are, and a bar of the others is still where it belongs."""
+    rows = [{"t.x": x, "t.what": what} for x, what in [(3.0, "caught"), (160.0, "missed")]]
+    rows += [{"t.x": 400.0, "t.what": "missed"}, {"t.x": None, "t.what": "missed"}]
+    plot = {"kind": "histogram", "x": "t.x", "least": 0.0, "most": 150.0, "colour": "t.what"}
+    svg = declared({"misses": plot}, rows)["misses"]
+    assert "missed (2 beyond 150)" in svg and "caught: 1 from" in svg
+    assert "beyond" not in declared({"misses": {**plot, "most": 500.0}}, rows)["misses"]
+
+
+def test_a_word_has_the_same_colour_in_every_picture() -> None:
+    """Whichever group is larger, and whether the others are there at all."""
+
+    def colour_of(word: str, words: list[str], kind: str) -> str:
+        rows = [{"t.x": float(i), "t.y": 1.0, "t.what": what} for i, what in enumerate(words)]
+        plot = {"kind": kind, "x": "t.x", "y": "t.y", "colour": "t.what"}
+        legend = re.search(
+            rf'fill="(var\([^"]*\))"><title>{word}</title>', declared({"p": plot}, rows)["p"]
+        )
+        assert legend is not None
+        return legend[1]
+
+    words = [["caught"], ["missed", "missed", "caught"], ["caught", "caught", "missed"]]
+    for kind in ("points", "histogram"):
+        found = {colour_of("caught", some, kind) for some in words}
+        assert found == {colour_of("caught", ["caught", "dropped"], "points")}
+        assert colour_of("missed", words[1], kind) == colour_of("missed", ["missed"], kind)
+    assert colour_of("missed", ["missed"], "points") != found.pop()
+
+
+def test_combinations_have_intervals_that_cover_them() -> None:
+    """Over repeated campaigns of 40 trials, also of a combination that hardly ever fails."""
+    rng, truth = np.random.default_rng(3), 0.97
+    weighting = Weighting({"look": 0.1}, 0.2)
+    covered = np.zeros(2)
+    for _ in range(150):
+        rows = []
+        for k, good in enumerate(rng.random(40) < truth):
+            seconds = (2.0 if good else 1.0) + float(rng.uniform(-0.2, 0.2))
+            end = "success" if good else "failure"
+            rows.append(row(k, "look_quick", end, seconds, bool(good)))
+        bounds = objective_intervals(TOY, rows, weighting)
+        for i, rho in enumerate((0.1, 0.2)):
+            j = 1.0 - truth + rho * (1.0 + truth)
+            covered[i] += bounds[i][0] <= j <= bounds[i][1]
+    assert covered.min() >= 0.9 * 150
 
 
 def test_a_runs_own_pictures() -> None:
