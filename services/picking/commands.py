@@ -10,13 +10,14 @@ from petrobot.services.picking.model import Gripper
 
 
 class ArmState(NamedTuple):
-    """An arm as the actions see it: joint angles (rad), whether it stands at its goal, the gap
-    between its fingers (m), whether something holds them apart, whether they have stopped, and what
-    is wrong with it."""
+    """An arm as the actions see it: whether it is switched on, joint angles (rad), whether it
+    stands at its goal, the gap between its fingers (m; None if it is not known), whether something
+    holds them apart, whether they have stopped, and what is wrong with it."""
 
+    on: bool
     q: tuple[float, ...]
     at_goal: bool
-    grip: float
+    grip: float | None
     held: bool
     gripped: bool
     fault: str
@@ -67,6 +68,7 @@ class So101:
         grip = max(0.0, jaw["angle"] * gripper.numbers["gap_per_rad"])
         faults = "; ".join(state["faults"].values())
         return ArmState(
+            state["torque"] and not faults,
             tuple(state["q"]),
             state["at_goal"],
             grip,
@@ -76,37 +78,40 @@ class So101:
         )
 
 
-class Lines:
-    """`petrobot.services.picking.line_arm`: the gripper knows its gap."""
+class Ur:
+    """`petrobot.services.adapters.ur`: the gripper hangs on digital output 0 (close) and inputs 0
+    (holds something) and 1 (its fingers stand), and does not know its gap."""
 
     def enable(self) -> Mapping[str, Any]:
         """See `Commands`."""
-        return {"enable": True}
+        return {"do": "enable"}
 
     def move(self, joints: Sequence[float]) -> Mapping[str, Any]:
         """See `Commands`."""
-        return {"q": list(joints)}
+        return {"do": "move", "q": list(joints)}
 
     def open(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
-        """See `Commands`."""
-        return {"grip": gap}
+        """See `Commands`. It opens as far as it can."""
+        return {"do": "output", "bit": 0, "value": False}
 
     def close(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
         """See `Commands`."""
-        return {"grip": gap}
+        return {"do": "output", "bit": 0, "value": True}
 
     def state(self, gripper: Gripper, state: Mapping[str, Any]) -> ArmState:
         """See `Commands`."""
+        inputs = state["inputs"]
         return ArmState(
+            state["enabled"],
             tuple(state["q"]),
-            state["at_goal"],
-            state["grip"],
-            state["held"],
-            not state["closing"],
+            state["in_place"],
+            None,
+            bool(inputs & 1) and bool(state["outputs"] & 1),
+            bool(inputs & 2),
             state["fault"],
         )
 
 
 CLOSED: Final = 0.003
 """m up to which fingers that are stopped have met each other."""
-ARMS: Final[Mapping[str, Commands]] = {"feetech": So101(), "lines": Lines()}
+ARMS: Final[Mapping[str, Commands]] = {"feetech": So101(), "ur": Ur()}

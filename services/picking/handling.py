@@ -225,11 +225,12 @@ async def verify_width(
     except (ArmError, NumbersError) as fault:
         return _error(fault)
     narrow, grip = min(kind.size), state.grip
-    text = f"the fingers closed to {1e3 * grip:.1f} mm, the {kind.name} has {1e3 * narrow:.0f}"
+    seen = "" if grip is None else f" to {1e3 * grip:.1f} mm"
+    text = f"the fingers closed{seen}, the {kind.name} has {1e3 * narrow:.0f} mm"
     cause = ""
     if not state.held:
         cause = "slipped" if took else "missed"
-    elif abs(grip - narrow) > FIT:
+    elif grip is not None and abs(grip - narrow) > FIT:
         cause = "askew" if grip > narrow else "wrong_kind"
     for run, blamed in (
         (found, ("missed", "wrong_kind")),
@@ -240,8 +241,8 @@ async def verify_width(
         elif run:
             ctx.verdict(run, Status.SUCCESS)
     if cause:
-        return failure(cause, text, grip=grip)
-    return success(grip=grip)
+        return failure(cause, text)
+    return success()
 
 
 async def place_in_tray(
@@ -338,6 +339,8 @@ class Hand:
                 if self.ctx.now >= due:
                     raise
             await self.ctx.sleep(SETTLE)
+        if not await self.ctx.wait(lambda: self.state.on, self._timeout / 2):
+            raise ArmError("arm_fault", self.state.fault or "the arm does not switch on")
         await self.ctx.sleep(SETTLE)
 
     async def open(self, gap: float) -> None:

@@ -3,14 +3,13 @@ force of the fingers out."""
 
 from __future__ import annotations
 
-import contextlib
-import json
 import math
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Protocol
 
-from petrobot.services.host.json_text import json_text
 from petrobot.sim.bus.feetech import STEPS, so101
+from petrobot.sim.bus.ur_controller import DASHBOARD_PORT, PROGRAM_PORT, RTDE_PORT, UrController
 from petrobot.sim.catching.truth import LaboratoryError
 
 
@@ -79,81 +78,49 @@ class FeetechArm:
         """Do nothing: all is in memory."""
 
 
-class LineController:
-    """A controller that plans its own motion, with a parallel gripper, and speaks lines of JSON
-    (`petrobot.services.picking.line_arm`)."""
+class UrArm:
+    """A UR controller, reached by frames on one line (`petrobot.services.picking.ur_line`), and a
+    gripper on its digital outputs and inputs: output 0 closes it, input 0 says that it holds
+    something, input 1 that its fingers stand."""
 
     def __init__(self, numbers: Mapping[str, Any]) -> None:
         """Raises KeyError for a number that is missing."""
-        motion, gripper = numbers["motion"], numbers["gripper"]
-        self._fastest, self._rate = float(motion["speed"]), float(motion["acceleration"])
-        self._finger_speed, self._force = float(gripper["speed"]), float(gripper["force"])
-        self._q = [float(q) for q in numbers["poses"]["rest"]]
-        self._begin, self._goal = self._q, self._q
-        self._way, self._pace = 0.0, 0.0
-        self._gap = self._wish = float(gripper["opening"])
+        gripper = numbers["gripper"]
+        self._opening, self._speed = float(gripper["opening"]), float(gripper["speed"])
+        self._force, self._gap = float(gripper["force"]), float(gripper["opening"])
+        self.ur = UrController([float(q) for q in numbers["poses"]["rest"]])
+        ports = RTDE_PORT, DASHBOARD_PORT, PROGRAM_PORT
+        self._sessions = [self.ur.connect(port) for port in ports]
         self._stop: float | None = None
         self._rest = b""
 
     def receive(self, now: float, data: bytes) -> bytes:
-        """Take lines; return one answer for each."""
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        out = b""
-        for line in lines:
-            with contextlib.suppress(ValueError):
-                told = json.loads(line)
-                if isinstance(told, dict):
-                    self._obey(told)
-                    out += json_text(self._report()).encode() + b"\n"
-        return out
-
-    def _obey(self, told: Mapping[str, Any]) -> None:
-        if "stop" in told:  # brakes on the line on which it moves
-            self._goal = self._at(min(self._length(), self._way + self._braking()))
-        if "q" in told and len(told["q"]) == len(self._q):
-            self._begin, self._goal = list(self._q), [float(q) for q in told["q"]]
-            self._way = self._pace = 0.0
-        if "grip" in told:
-            self._wish = max(0.0, float(told["grip"]))
-
-    def _report(self) -> dict[str, Any]:
-        stopped = self._stop is not None and self._gap <= self._stop + 1e-9
-        return {
-            "q": self._q,
-            "moving": self._q != self._goal,
-            "grip": round(self._gap, 4),  # its scale has steps of 0.1 mm
-            "held": stopped and self._wish < self._gap,
-            "closing": self._gap != self._wish and not stopped,
-        }
-
-    def _length(self) -> float:
-        return max(abs(b - a) for a, b in zip(self._begin, self._goal, strict=True))
-
-    def _braking(self) -> float:
-        return self._pace**2 / (2.0 * self._rate)
-
-    def _at(self, way: float) -> list[float]:
-        """Return the joints `way` rad (of the joint that moves most) along the line."""
-        share = way / self._length() if self._length() > 0.0 else 1.0
-        return [a + share * (b - a) for a, b in zip(self._begin, self._goal, strict=True)]
+        """Take frames; return what the controller has to say."""
+        self._rest += data
+        while len(self._rest) >= _HEAD.size:
+            number, size = _HEAD.unpack_from(self._rest)
+            if len(self._rest) < _HEAD.size + size:
+                break
+            self._sessions[number % 3].receive(self._rest[_HEAD.size : _HEAD.size + size])
+            self._rest = self._rest[_HEAD.size + size :]
+        said = [(number, bytes(session.drain())) for number, session in enumerate(self._sessions)]
+        return b"".join(_HEAD.pack(number, len(text)) + text for number, text in said if text)
 
     def advance(self, now: float, dt: float) -> None:
-        """Move joints by a trapezoid of speed, and fingers at their speed."""
-        if self._q != self._goal:
-            left = self._length() - self._way
-            slows = math.sqrt(2.0 * self._rate * max(0.0, left))
-            self._pace = min(self._fastest, self._pace + self._rate * dt, slows)
-            self._way += self._pace * dt
-            done = left <= self._pace * dt + 1e-5
-            self._q = list(self._goal) if done else self._at(self._way)
-        step = self._finger_speed * dt
-        self._gap += max(-step, min(step, self._wish - self._gap))
+        """Let arm and fingers move for `dt` s."""
+        self.ur.advance(now + dt)
+        wish = 0.0 if self.ur.digital_out & 1 else self._opening
+        step = self._speed * dt
+        before = self._gap
+        self._gap += max(-step, min(step, wish - self._gap))
         if self._stop is not None:
             self._gap = max(self._gap, self._stop)
+        holds = self._stop is not None and wish < self._gap
+        self.ur.digital_in = int(holds) | (self._gap == before) << 1
 
     def joints(self) -> Sequence[float]:
         """Return the joint angles (rad)."""
-        return self._q
+        return self.ur.q
 
     def gap(self) -> float:
         """Return how far the fingers are apart (m)."""
@@ -161,7 +128,7 @@ class LineController:
 
     def force(self) -> float:
         """Return the force of the fingers (N) while something stops them."""
-        return self._force if self._stop is not None and self._wish < self._gap else 0.0
+        return self._force if self._stop is not None and self.ur.digital_out & 1 else 0.0
 
     def block(self, gap: float | None) -> None:
         """Put a stop where a part is."""
@@ -171,9 +138,10 @@ class LineController:
         """Do nothing: all is in memory."""
 
 
+_HEAD: Final = struct.Struct("!BH")
 CONTROLLERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Controller]]] = {
     "feetech": FeetechArm,
-    "lines": LineController,
+    "ur": UrArm,
 }
 
 
