@@ -1,0 +1,1 @@
+"""Universal Robots e-Series arms over RTDE, without anything installed beside petrobot."""
