@@ -367,8 +367,10 @@ class UrServer:
         controller: UrController,
         host: str = "127.0.0.1",
         ports: Sequence[int] = (RTDE_PORT, DASHBOARD_PORT, PROGRAM_PORT),
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """`ports`: where RTDE, dashboard and program are served; 0 for a free one."""
+        self._clock = clock
         self.controller = controller
         self._selector = selectors.DefaultSelector()
         self._sessions: dict[socket.socket, Session] = {}
@@ -379,7 +381,7 @@ class UrServer:
             self._listeners.append(listener)
             self._selector.register(listener, selectors.EVENT_READ, role)
         self.ports = [listener.getsockname()[1] for listener in self._listeners]
-        self._begin = time.monotonic() - controller.now
+        self._begin = clock() - controller.now
 
     def poll(self, timeout: float = STEP) -> None:
         """Serve for at most `timeout` s, then let the arm move."""
@@ -392,7 +394,7 @@ class UrServer:
                 self._selector.register(near, selectors.EVENT_READ)
             else:
                 self._read(key.fileobj)  # type: ignore[arg-type]
-        self.controller.advance(time.monotonic() - self._begin)
+        self.controller.advance(self._clock() - self._begin)
         for near, session in list(self._sessions.items()):
             try:
                 near.sendall(session.drain())
@@ -427,7 +429,7 @@ class UrServer:
         for listener in self._listeners:
             self._selector.unregister(listener)
             listener.close()
-        self._selector.close()
+        self._listeners.clear()
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -211,8 +211,9 @@ class Arm(Driver):
                 self._link.settled()
             self._count, self._seen = self._rtde.count, now
             echo = self._rtde.data["output_int_register_24"]
-            if echo != self._echo:
-                self._echo, self._echoed = echo, now
+            if echo != self._echo and 0 <= self._beat - echo < 100 and self._count > 1:
+                self._echoed = now  # the program has read what was sent just before
+            self._echo = echo
         for other in (self._dashboard, self._program):
             if other.poll(now):  # what they say is not needed: RTDE tells it all
                 other.settled()

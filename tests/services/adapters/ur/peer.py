@@ -1,0 +1,34 @@
+"""The client of others (`ur_rtde`) at the simulated controller, in a process of its own: its
+constructors hold the interpreter's lock. Prints what it saw as JSON."""
+
+import json
+import sys
+import time
+
+import dashboard_client  # type: ignore[import-not-found]
+import rtde_receive  # type: ignore[import-not-found]
+
+HOST = sys.argv[1]
+FIELDS = ["timestamp", "actual_q", "robot_mode", "safety_mode", "runtime_state"]
+dashboard = dashboard_client.DashboardClient(HOST)
+dashboard.connect()
+dashboard.powerOn()
+time.sleep(0.8)
+dashboard.brakeRelease()
+receive = rtde_receive.RTDEReceiveInterface(HOST, -1.0, FIELDS)
+end = time.monotonic() + 20.0
+while receive.getRobotMode() != 7 and time.monotonic() < end:
+    time.sleep(0.05)
+first = receive.getTimestamp()
+time.sleep(0.5)
+seen = {
+    "q": receive.getActualQ(),
+    "mode": receive.getRobotMode(),
+    "safety": receive.getSafetyMode(),
+    "time": receive.getTimestamp() - first,
+    "robotmode": dashboard.robotmode(),
+    "running": dashboard.running(),
+}
+receive.disconnect()
+dashboard.disconnect()
+print(json.dumps(seen), flush=True)

@@ -1,0 +1,345 @@
+"""The driver and its actions on the simulated controller: in simulated time, and over TCP."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from petrobot import Driver, check_driver, rehearse
+from petrobot.services.adapters.ur import actions, link
+from petrobot.services.adapters.ur.arm import PROGRAM, Arm
+from petrobot.sim.bus.ur_controller import RUNNING, UrController, UrServer
+
+HOME = [0.0, -1.57, 1.57, -1.57, -1.57, 0.0]
+THERE = [0.8, *HOME[1:]]
+ENABLE = {"do": "enable"}
+
+
+class Cell:
+    """A controller, a driver in the same process, and their clock."""
+
+    controller: UrController
+
+    def __init__(self, **keys: Any) -> None:
+        self.controller, self.now = UrController(), 0.0
+        type(self).made = self.controller
+        self.arm = Arm({"host": f"{__name__}:made", **keys}, None)  # type: ignore[arg-type]
+
+    made: UrController
+
+    def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
+        """Step for so long, or until it holds."""
+        for _ in range(round(seconds / self.arm.period)):
+            self.now += self.arm.period
+            self.arm.step(self.now)
+            if until():
+                return True
+        return False
+
+    def enabled(self) -> Cell:
+        """Wait until the arm is enabled."""
+        self.arm.command(self.now, ENABLE)
+        assert self.run(5.0, lambda: bool(self.arm.state()["enabled"])), self.arm.state()
+        return self
+
+    def go(self, **command: Any) -> bool:
+        """Move; whether it arrived."""
+        self.arm.command(self.now, {"do": "move", **command})
+        return self.run(8.0, lambda: bool(self.arm.state()["in_place"]))
+
+
+def made() -> UrController:
+    """The controller of the newest cell: what `host` names."""
+    return Cell.made
+
+
+def test_it_keeps_the_rules_of_drivers() -> None:
+    controller = UrController()
+    Cell.made = controller
+    sessions = list[Any]()
+    connect = controller.connect
+
+    def watched(port: int) -> Any:
+        if not plugged:
+            raise ConnectionError("no cable")
+        sessions.append(connect(port))
+        return sessions[-1]
+
+    plugged = True
+    controller.connect = watched  # type: ignore[method-assign]
+
+    def cable(there: bool) -> None:
+        nonlocal plugged
+        plugged = there
+        for session in sessions if not there else ():
+            session.closed = True
+
+    found = check_driver(
+        lambda **keys: Arm({"host": f"{__name__}:made", **keys}, None),  # type: ignore[arg-type]
+        [{"do": "move", "q": THERE}, {"do": "move", "q": HOME}],
+        first=[ENABLE],
+        seconds=4.0,
+        cable=cable,
+        simulated=True,
+    )
+    assert found.faults == [] and found.notes == []
+
+
+def test_nothing_moves_before_it_is_enabled() -> None:
+    cell = Cell()
+    cell.run(2.0)
+    with pytest.raises(ValueError, match="the arm is not enabled"):
+        cell.arm.command(cell.now, {"do": "move", "q": THERE})
+    assert not cell.controller.program and cell.controller.robot_mode != RUNNING
+
+
+def test_it_moves_as_fast_as_it_may_and_no_faster() -> None:
+    cell = Cell(top_speed=0.8).enabled()
+    cell.arm.command(cell.now, {"do": "move", "q": THERE, "speed": 0.5})
+    places = [cell.controller.q[0]]
+    while cell.now < 12.0 and not cell.arm.state()["in_place"]:
+        cell.run(0.08)
+        places.append(cell.controller.q[0])
+    speeds = [(b - a) / 0.08 for a, b in pairwise(places)]
+    assert 0.39 < max(speeds) < 0.41
+    assert cell.controller.q == pytest.approx(THERE, abs=0.003)
+
+
+def test_a_straight_way_is_straight() -> None:
+    cell = Cell().enabled()
+    begin = cell.arm.state()["tool"]
+    end = [begin[0] + 0.05, begin[1], begin[2] - 0.15, *begin[3:]]
+    cell.arm.command(cell.now, {"do": "linear", "pose": end})
+    seen = [begin]
+    while cell.now < 12.0 and not cell.arm.state()["in_place"]:
+        cell.run(0.04)
+        seen.append(cell.arm.state()["tool"])
+    assert cell.arm.state()["in_place"] and len(seen) > 10
+    for x, y, z, *_ in seen:
+        share = (begin[2] - z) / 0.15
+        assert (x, y) == pytest.approx((begin[0] + 0.05 * share, begin[1]), abs=0.003)
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ({"do": "jump"}, "unknown command 'jump'"),
+        ({"do": "move", "q": [0.0]}, "q: expected 6 finite numbers"),
+        ({"do": "move", "q": [float("nan")] * 6}, "q: expected 6 finite numbers"),
+        ({"do": "move", "q": [7.0, *HOME[1:]]}, "within 2 pi"),
+        ({"do": "move", "q": HOME, "speed": 0.0}, "speed: expected"),
+        ({"do": "linear", "pose": [3.0, 0, 0, 0, 0, 0]}, "the arm cannot pass"),
+        ({"do": "output", "bit": 9, "value": True}, "output: expected bit 0 to 7"),
+        ({"do": "output", "bit": 1, "value": 1}, "output: expected bit 0 to 7"),
+        ({"do": "move", "q": THERE}, "lies outside the workspace x = ["),
+    ],
+)
+def test_what_it_refuses(command: dict[str, Any], says: str) -> None:
+    cell = Cell(workspace={"x": [-0.55, -0.3], "y": [-0.25, 0.0]}).enabled()
+    with pytest.raises(ValueError) as fault:
+        cell.arm.command(cell.now, command)
+    assert says in str(fault.value)
+    cell.run(0.3)
+    assert cell.controller.q == pytest.approx(HOME, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        ({"model": "ur7"}, "model: expected one of ur3e, ur5e, ur10e"),
+        ({"host": "robot.lan"}, "host: expected an IP address"),
+        ({"top_speed": 9.0}, "top_speed"),
+        ({"tool": [1.0]}, "tool: expected 3 finite numbers"),
+    ],
+)
+def test_wrong_keys(keys: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        Arm({"host": "127.0.0.1", **keys}, None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("happens", "fault"),
+    [
+        (UrController.protective_stop, "protective_stop"),
+        (UrController.emergency_stop, "emergency_stop"),
+        (lambda c: setattr(c, "program", ""), "program_lost"),
+        (lambda c: setattr(c, "robot_mode", 5), "power_off"),
+    ],
+)
+def test_a_stop_of_the_controller_is_a_fault_until_it_is_enabled_again(
+    happens: Callable[[UrController], None], fault: str
+) -> None:
+    cell = Cell().enabled()
+    cell.arm.command(cell.now, {"do": "move", "q": THERE})
+    cell.run(0.6)
+    happens(cell.controller)
+    cell.run(0.5)
+    assert (cell.arm.state()["fault"], cell.arm.state()["mode"]) == (fault, "off")
+    at = list(cell.controller.q)
+    cell.run(2.0)
+    assert cell.controller.q == pytest.approx(at, abs=1e-6) and cell.arm.stopped()
+    cell.controller.release_emergency() if fault == "emergency_stop" else None
+    assert cell.enabled().go(q=THERE)
+
+
+def test_a_silent_driver_is_stopped_by_the_program() -> None:
+    cell = Cell().enabled()
+    cell.arm.command(cell.now, {"do": "move", "q": THERE})
+    cell.run(0.6)
+    assert abs(cell.controller.qd[0]) > 0.3
+    cell.controller.advance(cell.now + 0.5)  # the driver's process hangs
+    assert max(map(abs, cell.controller.qd)) < 1e-6 and cell.controller.q[0] < 0.6
+
+
+def test_in_a_dry_run_nothing_is_switched_on_or_sent() -> None:
+    cell = Cell(dry_run=True).enabled()
+    assert cell.go(q=THERE) and cell.arm.state()["q"] == pytest.approx(THERE)
+    assert cell.controller.q == HOME and not cell.controller.program
+    assert cell.controller.robot_mode != RUNNING and not cell.controller.inputs
+
+
+def test_an_emergency_stop_brakes_harder_than_a_stop() -> None:
+    ways = []
+    for stop in (Arm.stop, Arm.quick_stop):
+        cell = Cell().enabled()
+        cell.arm.command(cell.now, {"do": "move", "q": THERE})
+        cell.run(0.7)
+        begin = cell.controller.q[0]
+        stop(cell.arm, cell.now)
+        cell.run(1.5)
+        assert cell.arm.stopped()
+        ways.append(cell.controller.q[0] - begin)
+    assert 0.0 < ways[1] < 0.5 * ways[0]
+
+
+def played(action: Any, cell: Cell, **arguments: Any) -> Any:
+    """The result of an action; its driver's clock goes on from action to action."""
+
+    class Later(Driver):
+        period = Arm.period
+        __init__ = object.__init__
+
+        def __getattribute__(self, name: str) -> Any:
+            if name in ("step", "command", "stop"):
+                call = getattr(cell.arm, name)
+                return lambda now, *rest: call(begun + now, *rest)
+            return (
+                object.__getattribute__(self, name) if name == "period" else getattr(cell.arm, name)
+            )
+
+    begun = cell.now
+    result = rehearse(action, device=Later(), **arguments)
+    cell.now = begun + result.seconds + 1.0
+    return result.result
+
+
+def test_the_actions_and_their_causes() -> None:
+    cell = Cell()
+    assert played(actions.enable, cell).status == "success"
+    moved = played(actions.move_joints, cell, q=THERE)
+    assert moved.status == "success" and moved.values["q"] == pytest.approx(THERE, abs=0.003)
+    down = [*moved.values["tool"]]
+    down[2] -= 0.1
+    assert played(actions.move_linear, cell, pose=down).status == "success"
+    assert played(actions.move_linear, cell, pose=[3.0, 0, 0, 0, 0, 0]).cause == "refused"
+    assert played(actions.set_digital_out, cell, bit=2, value=True).status == "success"
+    assert cell.controller.digital_out == 4
+    assert played(actions.gripper, cell, close=True, holds=1).cause == "empty"
+    cell.controller.digital_in = 2
+    assert played(actions.gripper, cell, close=True, holds=1).status == "success"
+    assert played(actions.move_joints, cell, q=HOME, timeout=0.2).cause == "late"
+    cell.controller.protective_stop()
+    stopped = played(actions.move_joints, cell, q=HOME)
+    assert stopped.cause in ("refused", "protective_stop")
+
+
+# Over TCP: the driver never waits, so both ends live in one thread.
+
+
+class Clock:
+    """Time of both ends: a busy computer delays neither."""
+
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    """A clock that stands until a test moves it."""
+    return Clock()
+
+
+@pytest.fixture
+def server(clock: Clock) -> Iterator[UrServer]:
+    """A controller on free ports."""
+    found = UrServer(UrController(robot_mode=RUNNING), ports=(0, 0, 0), clock=clock)
+    yield found
+    found.close()
+
+
+def over(server: UrServer) -> Arm:
+    """A driver of a server's controller."""
+    names = ("rtde_port", "dashboard_port", "program_port")
+    keys = dict(zip(names, server.ports, strict=True))
+    return Arm({"host": "127.0.0.1", **keys}, None)  # type: ignore[arg-type]
+
+
+def both(arm: Arm, server: UrServer, clock: Clock, until: Callable[[], bool]) -> bool:
+    """Let both ends run for 10 s of their time, or until it holds."""
+    for _ in range(1250):
+        clock.now += arm.period
+        arm.step(clock.now)
+        server.poll(0.0)
+        server.poll(0.0)
+        if until():
+            return True
+    return False
+
+
+def test_over_tcp_it_moves_and_connects_again_after_a_cut(server: UrServer, clock: Clock) -> None:
+    arm = over(server)
+    try:
+        assert both(arm, server, clock, lambda: bool(arm.state()["connected"]))
+        for goal in (THERE, HOME):
+            arm.command(clock.now, ENABLE)
+            assert both(arm, server, clock, lambda: bool(arm.state()["enabled"])), arm.state()
+            arm.command(clock.now, {"do": "move", "q": goal})
+            assert both(arm, server, clock, lambda: bool(arm.state()["in_place"])), arm.state()
+            server.cut()
+            assert both(arm, server, clock, lambda: arm.state()["fault"] == "link_lost")
+            assert both(arm, server, clock, lambda: bool(arm.state()["connected"])), arm.state()
+            assert not arm.state()["enabled"], "it waits for a command"
+    finally:
+        arm.close()
+
+
+def test_it_waits_with_growing_pauses_for_a_controller_that_is_not_there(server: UrServer) -> None:
+    arm, ports = over(server), server.ports
+    server.close()
+    later = 0.0
+    tries = 0
+    before = arm._link._next  # type: ignore[union-attr]
+    for _ in range(400):
+        later += 0.02
+        arm.step(later)
+        after = arm._link._next  # type: ignore[union-attr]
+        tries, before = tries + (after != before), after
+        time.sleep(0.0005)
+    assert 3 <= tries <= 9 and not arm.state()["connected"] and arm.stopped()
+    arm.command(later, ENABLE)
+    arm.step(later + 0.01)
+    assert "no connection" in arm.state()["reason"] and ports
+    arm.close()
+
+
+def test_the_program_reads_the_registers_that_the_driver_writes() -> None:
+    assert all(f"read_input_float_register({n})" in PROGRAM for n in range(24, 30))
+    assert PROGRAM.startswith("def ") and PROGRAM.endswith("end\n")
+    opens = sum(PROGRAM.count(word) for word in ("def ", "while ", "    if "))
+    assert PROGRAM.count("end\n") == opens and link.FIRST_PAUSE < link.LONGEST_PAUSE
