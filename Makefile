@@ -5,6 +5,7 @@ PYTHON ?= $(shell for one in python3.11 python3.12 python3.13 python3.14 python3
 VENV := .venv
 BIN := $(VENV)/bin
 RUNS ?= 4
+MARKS ?= not proof and not browser
 ROUNDS ?= 20
 
 # Empty means not set. The tests start about a thousand processes: without cached bytecode each of
@@ -16,7 +17,7 @@ export PYTHONDONTWRITEBYTECODE :=
 help:
 	@echo "make demo   set up, start the cell's nodes, catch $(RUNS) balls in real time, leave a report"
 	@echo "make test   set up, check style and types, run the tests (goal: 6 minutes on two idle cores)"
-	@echo "make suite  run the tests that need no browser (with PYTHON and VENV: another interpreter)"
+	@echo "make suite  run the tests that need no browser (PYTHON, VENV: on another interpreter; MARKS: which)"
 	@echo "make load   repeat the tests that start processes $(ROUNDS) times while every core is busy (hours)"
 	@echo "make proof  check every promised figure in full (hours; resumes where it stopped)"
 	@echo "make bench  measure speed beside others, as ratios"
@@ -42,7 +43,7 @@ test: lint
 
 # What another interpreter has to pass, too: make suite PYTHON=python3.13 VENV=.venv-3.13
 suite: $(VENV)/.ready
-	$(BIN)/pytest -n 4 --dist worksteal -rs -m "not proof and not browser"
+	$(BIN)/pytest -n 4 --dist worksteal -rs -m "$(MARKS)"
 
 load: $(VENV)/.ready
 	$(BIN)/python -m tools.bench.under_load $(ROUNDS)

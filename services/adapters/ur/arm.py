@@ -115,7 +115,7 @@ class Arm(Driver):
         self._at = self._rate = self._most = 0.0
         self._commanded = [0.0] * 6
         self._goal: list[float] | None = None
-        self._outputs = list[dict[str, int]]()
+        self._outputs, self._pretended = list[dict[str, int]](), 0
         self._inside = True
 
     # Commands
@@ -296,8 +296,10 @@ class Arm(Driver):
             follows = int(self._enabled and not self._quick)
             values = (self._beat, follows, *self._commanded)
             self._rtde.send(0, dict(zip(SETPOINT, values, strict=True)))
-            for values_out in self._outputs:
-                self._rtde.send(1, values_out)
+        for mask, value in (tuple(each.values()) for each in self._outputs):
+            self._pretended = self._pretended & ~mask | value
+            if not self.dry_run:
+                self._rtde.send(1, dict(zip(DIGITAL, (mask, value), strict=True)))
         self._outputs.clear()
         self._link.send(now, self._rtde.drain())
 
@@ -320,7 +322,9 @@ class Arm(Driver):
             "tool": self._arm.tool(q),
             "in_place": goal is not None and not self._way and max(map(_off, q, goal)) < IN_PLACE,
             "inputs": data.get("actual_digital_input_bits", 0),
-            "outputs": data.get("actual_digital_output_bits", 0),
+            "outputs": self._pretended
+            if self.dry_run
+            else data.get("actual_digital_output_bits", 0),
         }
 
     def stop(self, now: float) -> None:
