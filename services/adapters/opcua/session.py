@@ -144,7 +144,8 @@ class Session(Driver):
 
     def close(self) -> None:
         """End the session."""
-        self._loop.call_soon_threadsafe(self._jobs.put_nowait, None)
+        with contextlib.suppress(RuntimeError):  # it has ended: closed twice
+            self._loop.call_soon_threadsafe(self._jobs.put_nowait, None)
         self._thread.join(self.patience)
 
     # --- the session's thread -------------------------------------------------------------------

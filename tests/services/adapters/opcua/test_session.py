@@ -71,9 +71,11 @@ class Cell:
         return driver
 
     def close(self) -> None:
-        for driver in self.drivers:
-            driver.close()
-        self.power(False)
+        try:
+            for driver in self.drivers:
+                driver.close()
+        finally:
+            self.power(False)
 
 
 @pytest.fixture
