@@ -13,7 +13,8 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 HERE = Path(__file__).parent
-TASK = ROOT / "coordinator" / "tasks" / "catch_ball.toml"
+TASK = HERE / "catch_ball.toml"
+"""The shipped task as it was when the experiment was registered: the faults are edits of it."""
 CELL = ROOT / "services.toml"
 PLANT = HERE / "plant.toml"
 PROGRAMS = ("net", "tree", "machine")

@@ -18,7 +18,7 @@ from experiments.against_trees.judge import Report, violations
 from experiments.against_trees.learned import best, chance, regret
 from experiments.against_trees.missions import Mission, net_mission, program_mission
 from experiments.against_trees.plant import Entry
-from experiments.against_trees.results import CELL, PLANT, PROGRAMS, Results
+from experiments.against_trees.results import CELL, PLANT, PROGRAMS, TASK, Results
 from experiments.against_trees.verified import first_symptom, make_of, runner, source_of
 from petrobot.coordinator.task.file import load as load_task
 from petrobot.services.comm.location_file import load
@@ -27,7 +27,7 @@ from petrobot.services.comm.location_file import load
 def played(program: str, cell: Path, balls: int, seed: int) -> Mission:
     directory = load(cell)
     if program == "net":
-        task = load_task("coordinator/tasks/catch_ball.toml")
+        task = load_task(TASK)
         return net_mission(directory, task, balls, seed)
     return program_mission(directory, make_of(program, None), balls, seed)
 
