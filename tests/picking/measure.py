@@ -1,4 +1,4 @@
-"""How well the finders find: `python -m tests.services.picking.measure [REGIME ...]`."""
+"""How well the finders find: `python -m tests.picking.measure [REGIME ...]`."""
 
 from __future__ import annotations
 

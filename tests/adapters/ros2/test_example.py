@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.adapters.ros2.conftest import FakeProcess
 from tests.ports import free_ports
-from tests.services.adapters.ros2.conftest import FakeProcess
 
-ROOT = Path(__file__).parents[4]
+ROOT = Path(__file__).parents[3]
 EXAMPLE = ROOT / "examples" / "ros2"
 ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}:{ROOT}"}
 
@@ -120,7 +120,7 @@ async def steer(ctx):
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
 def test_set_points_reach_the_robot(tmp_path: Path, fake: FakeProcess, mode: str) -> None:
     """Through node, worker and driver: those of the stream, then those of rest."""
-    fake_class = "tests.services.adapters.ros2.fake:Fake"
+    fake_class = "tests.adapters.ros2.fake:Fake"
     url = fake_class if mode == "lockstep" else fake.url
     cell = STREAMS.format(port=free_ports(1)[0], url=url)
     (tmp_path / "services.toml").write_text(cell)

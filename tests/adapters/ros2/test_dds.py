@@ -10,7 +10,7 @@ import pytest
 
 from petrobot.services.adapters.ros2 import definitions
 from petrobot.services.adapters.ros2.definitions import Field
-from tests.services.adapters.ros2.test_actions import Ports
+from tests.adapters.ros2.test_actions import Ports
 from tests.waiting import Limit
 
 pytest.importorskip("cyclonedds")

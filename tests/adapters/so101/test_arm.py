@@ -21,7 +21,7 @@ from petrobot.services.comm.streams.serial_line import SerialPort
 from petrobot.sim.bus import feetech
 from petrobot.sim.bus.feetech import FeetechBus, Servo, so101
 from petrobot.sim.bus.serial_line import PtyLine
-from tests.services.adapters.so101.rig import Rig, SimulatedArm
+from tests.adapters.so101.rig import Rig, SimulatedArm
 
 THERE = {"do": "move", "joints": [0.5, -0.5, 0.5, 0.2, 1.0]}
 BACK = {"do": "move", "joints": [-0.5, 0.1, 0.0, 0.3, 0.0]}

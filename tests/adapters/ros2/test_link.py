@@ -14,9 +14,9 @@ import pytest
 from petrobot.services.adapters.ros2.bridge import Bridge
 from petrobot.services.adapters.ros2.protocol import Phase
 from petrobot.services.comm.protocol.plain import plain
+from tests.adapters.ros2.conftest import FakeProcess
+from tests.adapters.ros2.test_actions import Ports
 from tests.ports import free_ports
-from tests.services.adapters.ros2.conftest import FakeProcess
-from tests.services.adapters.ros2.test_actions import Ports
 from tests.waiting import Limit
 
 pytestmark = pytest.mark.processes

@@ -20,12 +20,12 @@ import pytest
 from petrobot.services.adapters.ros2 import __main__ as offering
 from petrobot.services.adapters.ros2.link import Item
 from petrobot.services.adapters.ros2.protocol import Phase
+from tests.adapters.ros2.conftest import FakeProcess
+from tests.adapters.ros2.test_link import bridge_to
 from tests.ports import free_ports
-from tests.services.adapters.ros2.conftest import FakeProcess
-from tests.services.adapters.ros2.test_link import bridge_to
 from tests.waiting import until
 
-ROOT = Path(__file__).parents[4]
+ROOT = Path(__file__).parents[3]
 RUN_TASK = re.search(
     r"```\n(# RunTask.action.*?)```",
     (ROOT / "docs" / "robots" / "ros2.md").read_text(encoding="utf-8"),

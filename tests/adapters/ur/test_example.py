@@ -9,7 +9,7 @@ import pytest
 
 from petrobot.coordinator.cli import main
 
-TASK = str(Path(__file__).parents[4] / "examples" / "ur" / "carry.toml")
+TASK = str(Path(__file__).parents[3] / "examples" / "ur" / "carry.toml")
 
 
 @pytest.mark.processes

@@ -12,9 +12,9 @@ from petrobot import Rehearsal, Result, check_driver, rehearse
 from petrobot.services.adapters.ros2 import actions
 from petrobot.services.adapters.ros2.bridge import Bridge
 from petrobot.services.adapters.ros2.link import Item
-from tests.services.adapters.ros2.fake import Fake, Message
+from tests.adapters.ros2.fake import Fake, Message
 
-HERE = "tests.services.adapters.ros2.fake:Fake"
+HERE = "tests.adapters.ros2.fake:Fake"
 
 
 class ScriptedLink:

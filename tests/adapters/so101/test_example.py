@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-EXAMPLE = Path(__file__).parents[4] / "examples" / "so101"
+EXAMPLE = Path(__file__).parents[3] / "examples" / "so101"
 
 
 @pytest.mark.processes

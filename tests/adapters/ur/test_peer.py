@@ -15,7 +15,7 @@ from petrobot.sim.bus.ur_controller import DASHBOARD_PORT, PROGRAM_PORT, RTDE_PO
 HERE = Path(__file__).parent
 HOST = "127.0.0.77"
 """An address of this host on which nothing else has UR's fixed ports."""
-ROOT = HERE.parents[3]
+ROOT = HERE.parents[2]
 
 
 @pytest.mark.processes
