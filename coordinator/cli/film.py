@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Make the film."""
     from petrobot.coordinator.learning.estimates_file import EstimatesError
-    from petrobot.coordinator.studies.report.film import FilmError, images, refuse_file, write
+    from petrobot.coordinator.studies.report.film import NoFilmError, images, refuse_file, write
     from petrobot.coordinator.studies.report.raster import RasterError
 
     span = {"begin": options.begin, "seconds": options.seconds}
@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
         refuse_file(options.out)
         made = list(images(recorded(options.run), **span, fps=options.fps, width=options.width))
         write(options.out, made, options.fps, options.quality)
-    except (FilmError, RasterError, EstimatesError, ValueError) as fault:
+    except (NoFilmError, RasterError, EstimatesError, ValueError) as fault:
         raise CommandError(2, str(fault)) from fault
     size = options.out.stat().st_size
     print(f"{options.out}: {len(made)} images, {size / 1e6:.2f} MB")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from petrobot.services.action import Context
 from petrobot.services.device import Driver, Ports, key
-from petrobot.services.picking.model import Cell, cell_named, read_cell
+from petrobot.services.picking.model import PickingCell, cell_named, read_cell
 
 
 class TableCamera(Driver):
@@ -23,7 +23,9 @@ class TableCamera(Driver):
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         super().__init__(config, ports)
         name = str(self.cell)
-        self.known: Cell = read_cell(ports.file(name).decode(), name) if name else cell_named()
+        self.known: PickingCell = (
+            read_cell(ports.file(name).decode(), name) if name else cell_named()
+        )
         cv2.setNumThreads(1)  # other nodes share the cores
         self._images = ports.images()
         self._on = False

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.services.picking.model import Cell, Kind
+from petrobot.services.picking.model import PartKind, PickingCell
 
 Grey = NDArray[np.uint8]
 
@@ -36,7 +36,7 @@ class Found(NamedTuple):
         return dict(self._asdict())
 
 
-Finder = Callable[[Grey, Cell], list[Found]]
+Finder = Callable[[Grey, PickingCell], list[Found]]
 
 CONTRAST: Final = 26.0
 """Grey levels from the table's from which a pixel belongs to something."""
@@ -52,7 +52,7 @@ _RIM: Final = 0.006
 """m of table around a part that belongs to its template."""
 
 
-def find_by_contours(image: Grey, cell: Cell) -> list[Found]:
+def find_by_contours(image: Grey, cell: PickingCell) -> list[Found]:
     """Find what differs from the table's grey level, and take the smallest rectangle around it.
 
     Cheap. A shadow that is as dark as CONTRAST is taken for a piece of a dark part; a part that
@@ -93,9 +93,11 @@ def find_by_contours(image: Grey, cell: Cell) -> list[Found]:
     return sorted(found, key=lambda f: -f.score)
 
 
-def _kind_of(cell: Cell, area: float, long: float, short: float) -> tuple[Kind, float] | None:
+def _kind_of(
+    cell: PickingCell, area: float, long: float, short: float
+) -> tuple[PartKind, float] | None:
     """Return the kind whose size is nearest to a contour's (px), and how unlike it is."""
-    best: tuple[float, Kind] | None = None
+    best: tuple[float, PartKind] | None = None
     for kind in cell.kinds.values():
         scale = cell.eye.focal / (cell.eye.position[2] - kind.height)
         length, width = (side * scale for side in kind.size)
@@ -115,7 +117,7 @@ def _kind_of(cell: Cell, area: float, long: float, short: float) -> tuple[Kind, 
     return best[1], best[0]
 
 
-def find_by_templates(image: Grey, cell: Cell) -> list[Found]:
+def find_by_templates(image: Grey, cell: PickingCell) -> list[Found]:
     """Compare the image with every kind of part in every orientation.
 
     Dear. It compares shapes whatever the light is, so neither dim light nor the shadow at one side
@@ -147,7 +149,7 @@ def find_by_templates(image: Grey, cell: Cell) -> list[Found]:
     return _distinct(found, cell)
 
 
-def _distinct(found: Sequence[Found], cell: Cell) -> list[Found]:
+def _distinct(found: Sequence[Found], cell: PickingCell) -> list[Found]:
     """Of those that overlap, keep the best."""
     kept: list[Found] = []
     (x0, x1), (y0, y1) = cell.area
@@ -167,7 +169,7 @@ _BORDER: Final = 0.03
 """m by which the rectified image is larger than the area."""
 
 
-def _rectified(image: Grey, cell: Cell, height: float) -> Grey:
+def _rectified(image: Grey, cell: PickingCell, height: float) -> Grey:
     """The area as seen at a height: row along x, column along y."""
     (x0, x1), (y0, y1) = cell.area
     rows = round((x1 - x0 + 2 * _BORDER) * SCALE)
@@ -186,12 +188,12 @@ def _rectified(image: Grey, cell: Cell, height: float) -> Grey:
     return cv2.GaussianBlur(seen, (3, 3), 0)  # type: ignore[return-value]
 
 
-def _place(cell: Cell, row: float, column: float) -> tuple[float, float]:
+def _place(cell: PickingCell, row: float, column: float) -> tuple[float, float]:
     return cell.area[0][0] - _BORDER + row / SCALE, cell.area[1][0] - _BORDER + column / SCALE
 
 
 @lru_cache(maxsize=32)
-def _templates(kind: Kind) -> tuple[tuple[float, Grey], ...]:
+def _templates(kind: PartKind) -> tuple[tuple[float, Grey], ...]:
     """Return each orientation (rad) of a kind with its picture: bright top, dark table."""
     square = kind.size[0] == kind.size[1]
     half_turn = math.pi / 2 if square else math.pi

@@ -26,11 +26,11 @@ from petrobot.services.action import (
 )
 from petrobot.services.picking.commands import ARMS, ArmState
 from petrobot.services.picking.model import (
-    Arm,
-    Cell,
-    Kind,
+    ArmModel,
     NumbersError,
-    UnreachableError,
+    OutOfReachError,
+    PartKind,
+    PickingCell,
     arm_named,
     cell_named,
 )
@@ -82,7 +82,7 @@ class ArmError(Exception):
 # Where to grasp
 
 
-def across(kind: Kind, part: Mapping[str, Any], arm: Arm) -> Grasp:
+def across(kind: PartKind, part: Mapping[str, Any], arm: ArmModel) -> Grasp:
     """Return a grasp across a part's narrow side; a round part has none, so the fingers keep the
     direction in which the arm comes."""
     narrow, turn = min(kind.size), float(part["turn"]) + math.pi / 2
@@ -98,7 +98,7 @@ def across(kind: Kind, part: Mapping[str, Any], arm: Arm) -> Grasp:
     )
 
 
-def at_centre(kind: Kind, part: Mapping[str, Any], arm: Arm) -> Grasp:
+def at_centre(kind: PartKind, part: Mapping[str, Any], arm: ArmModel) -> Grasp:
     """Return a grasp at a part's middle, with the fingers wide open and across the direction in
     which the arm comes: they turn the part by closing."""
     return Grasp(
@@ -111,11 +111,11 @@ def at_centre(kind: Kind, part: Mapping[str, Any], arm: Arm) -> Grasp:
     )
 
 
-def _depth(kind: Kind) -> float:
+def _depth(kind: PartKind) -> float:
     return max(FLOOR, kind.height - SEAT)
 
 
-def _arriving(part: Mapping[str, Any], arm: Arm) -> float:
+def _arriving(part: Mapping[str, Any], arm: ArmModel) -> float:
     """The direction across the line from the arm's foot to the part."""
     foot = arm.points[0]
     return math.atan2(float(part["y"]) - foot[1], float(part["x"]) - foot[0]) + math.pi / 2
@@ -140,7 +140,7 @@ async def make_ready(
             await hand.move(hand.arm.over((x0 + x1) / 2, (y0 + y1) / 2, LOW, ALONG, hand.state.q))
         await hand.open(hand.arm.gripper.opening)
         await hand.move(hand.arm.poses["rest"])
-    except (ArmError, CommandRefused, NumbersError, UnreachableError) as fault:
+    except (ArmError, CommandRefused, NumbersError, OutOfReachError) as fault:
         return _error(fault)
     return success()
 
@@ -177,7 +177,7 @@ async def grasp_centre(
 
 async def _grasp(
     ctx: Context,
-    planned: Callable[[Kind, Mapping[str, Any], Arm], Grasp],
+    planned: Callable[[PartKind, Mapping[str, Any], ArmModel], Grasp],
     part: Mapping[str, Any],
     arm: str,
     cell: str,
@@ -196,7 +196,7 @@ async def _grasp(
         await ctx.sleep(SETTLE)
         took = hand.state.held
         await hand.move(middle, above, hand.arm.poses["rest"])
-    except (ArmError, CommandRefused, NumbersError, UnreachableError) as fault:
+    except (ArmError, CommandRefused, NumbersError, OutOfReachError) as fault:
         return _error(fault)
     return provisional(success(picked=ctx.run, took=took))
 
@@ -274,7 +274,7 @@ async def place_in_tray(
         held = hand.state.held
         await hand.open(min(hand.arm.gripper.opening, max(kind.size) + GAP))
         await hand.move(middle, above, hand.arm.poses["rest"])
-    except (ArmError, CommandRefused, NumbersError, UnreachableError) as fault:
+    except (ArmError, CommandRefused, NumbersError, OutOfReachError) as fault:
         return _error(fault)
     if not held:
         return failure(
@@ -289,7 +289,7 @@ async def place_in_tray(
 # What they share
 
 
-def _kind(cell: Cell, part: Mapping[str, Any]) -> Kind:
+def _kind(cell: PickingCell, part: Mapping[str, Any]) -> PartKind:
     try:
         float(part["x"]), float(part["y"]), float(part["turn"])
         return cell.kinds[str(part["kind"])]
@@ -304,7 +304,7 @@ def _kind(cell: Cell, part: Mapping[str, Any]) -> Kind:
 def _error(fault: Exception) -> Result:
     if isinstance(fault, ArmError):
         return error(fault.cause, fault.text)
-    known = (UnreachableError, "unreachable"), (NumbersError, "bad_numbers")
+    known = (OutOfReachError, "unreachable"), (NumbersError, "bad_numbers")
     cause = next((cause for kind, cause in known if isinstance(fault, kind)), "arm_fault")
     return error(cause, str(fault))
 

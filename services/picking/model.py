@@ -1,8 +1,8 @@
 """The numbers of a pick-and-place cell and of its arm, read from TOML files and checked.
 
 An arm is a row of joint axes at joint angles of zero, so any arm of five or six joints can be
-described. `Arm.tool` is its forward kinematics, `Arm.over` the joint angles for fingers that point
-straight down.
+described. `ArmModel.tool` is its forward kinematics, `ArmModel.over` the joint angles for fingers
+that point straight down.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 _NEAR: Final = 2e-4
-"""m and rad within which a pose counts as reached by `Arm.over`."""
+"""m and rad within which a pose counts as reached by `ArmModel.over`."""
 
 
 class NumbersError(ValueError):
     """A file of numbers cannot be used; the message names file, key and remedy."""
 
 
-class UnreachableError(ValueError):
+class OutOfReachError(ValueError):
     """The arm cannot bring its fingers there."""
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class PartKind:
     """A kind of part: `size` (length, width) and `height` in m; the diameter of a round one is
     both."""
 
@@ -80,13 +80,13 @@ class Tray:
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class PickingCell:
     """The cell as its services know it."""
 
     eye: Eye
     area: tuple[tuple[float, float], tuple[float, float]]
     """Where parts lie: x from, to; y from, to (m)."""
-    kinds: Mapping[str, Kind]
+    kinds: Mapping[str, PartKind]
     trays: Mapping[str, Tray]
 
 
@@ -101,7 +101,7 @@ class Gripper:
 
 
 @dataclass(frozen=True, slots=True)
-class Arm:
+class ArmModel:
     """An arm on the table, all in the table's frame at joint angles of zero."""
 
     name: str
@@ -143,7 +143,7 @@ class Arm:
         """Return joint angles with the tips at (x, y, z) m, the fingers straight down and closing
         along `turn` (rad, either way round), next to the angles `near`.
 
-        Damped least squares. Raises UnreachableError.
+        Damped least squares. Raises OutOfReachError.
         """
         starts = [self.poses["reach"]] if near is None else [tuple(near), self.poses["reach"]]
         aim = math.atan2(y - self.points[0][1], x - self.points[0][0])
@@ -161,7 +161,7 @@ class Arm:
             if found:
                 break
         if not found:
-            raise UnreachableError(
+            raise OutOfReachError(
                 f"{self.name} cannot reach x {x:.3f}, y {y:.3f}, z {z:.3f} m with its fingers down"
             )
         return min(found)[1]
@@ -210,13 +210,13 @@ def _rotation(axis: Vector, angle: float) -> Vector:
 # Reading the files
 
 
-def read_cell(text: str, source: str) -> Cell:
+def read_cell(text: str, source: str) -> PickingCell:
     """Read a cell's numbers. Raises NumbersError."""
     table = _table(text, source)
     try:
         camera, parts = table["camera"], table["parts"]
         kinds = {
-            name: Kind(
+            name: PartKind(
                 name,
                 _choice(source, f"kinds.{name}.shape", k["shape"], ("box", "round")) == "round",
                 _pair(k["size"]),
@@ -239,7 +239,7 @@ def read_cell(text: str, source: str) -> Cell:
             (x, y, z),
             float(camera["rate"]),
         )
-        cell = Cell(eye, (_pair(parts["x"]), _pair(parts["y"])), kinds, trays)
+        cell = PickingCell(eye, (_pair(parts["x"]), _pair(parts["y"])), kinds, trays)
     except (KeyError, TypeError, ValueError) as fault:
         raise _unfit(source, fault) from fault
     for kind in cell.kinds.values():
@@ -247,7 +247,7 @@ def read_cell(text: str, source: str) -> Cell:
     return cell
 
 
-def read_arm(text: str, source: str) -> Arm:
+def read_arm(text: str, source: str) -> ArmModel:
     """Read an arm's numbers. Raises NumbersError."""
     table = _table(text, source)
     try:
@@ -255,7 +255,7 @@ def read_arm(text: str, source: str) -> Arm:
         turn = _rotation(np.array((0.0, 0.0, 1.0)), float(base["yaw"]))
         foot = np.asarray(base["position"], float)
         joints = table["joints"]
-        arm = Arm(
+        arm = ArmModel(
             str(table["name"]),
             np.array([turn @ np.asarray(j["point"], float) + foot for j in joints]),
             np.array([turn @ np.asarray(j["axis"], float) for j in joints]),
@@ -284,7 +284,7 @@ def read_arm(text: str, source: str) -> Arm:
 
 
 @cache
-def arm_named(name: str) -> Arm:
+def arm_named(name: str) -> ArmModel:
     """Return the arm of a shipped file (`"so101"`, `"ur5e"`), or of the file at a path. Raises
     NumbersError."""
     own = Path(__file__).with_name(f"{name}.toml")
@@ -293,7 +293,7 @@ def arm_named(name: str) -> Arm:
 
 
 @cache
-def cell_named(name: str = "cell") -> Cell:
+def cell_named(name: str = "cell") -> PickingCell:
     """Return the cell of the shipped file, or of the file at a path. Raises NumbersError."""
     own = Path(__file__).with_name(f"{name}.toml")
     path = own if own.exists() else Path(name)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from petrobot.services.action import Context, Result, error, provisional, success
 from petrobot.services.picking.camera import TableCamera
 from petrobot.services.picking.finding import FINDERS, Finder, Found
-from petrobot.services.picking.model import Cell
+from petrobot.services.picking.model import PickingCell
 
 SAME: Final = 0.006
 """m within which parts of two images are the same part."""
@@ -107,7 +107,7 @@ async def await_tray(
     return error("not_changed", f"the tray {tray} is still full after {timeout:g} s")
 
 
-def is_empty(image: NDArray[np.uint8], cell: Cell, tray: str) -> bool:
+def is_empty(image: NDArray[np.uint8], cell: PickingCell, tray: str) -> bool:
     """Return whether nothing lies in a tray, and nothing is over it."""
     there = cell.trays[tray]
     (x, y), (along, across) = there.position, (0.8 * size for size in there.size)

@@ -1,8 +1,9 @@
 """A simulated controller of a Universal Robots arm: RTDE, dashboard, and the adapter's program.
 
-`UrController` is without sockets: `connect(port)` gives a `Session`, whose `receive` takes bytes
-and whose `drain` gives the answers; `advance(now)` moves the joints. `UrServer` serves it over TCP;
-`python -m petrobot.sim.bus.ur_controller HOST RTDE DASHBOARD PROGRAM` is that as a process.
+`UrController` is without sockets: `connect(port)` gives a `ControllerSession`, whose `receive`
+takes bytes and whose `drain` gives the answers; `advance(now)` moves the joints. `UrServer` serves
+it over TCP; `python -m petrobot.sim.bus.ur_controller HOST RTDE DASHBOARD PROGRAM` is that as a
+process.
 
 It does not interpret URScript. A program that reads set points with `servoj` from the registers of
 the adapter is followed as the adapter's own program says; any other is accepted and does nothing.
@@ -63,7 +64,7 @@ INPUTS = {
 }
 
 
-class Session:
+class ControllerSession:
     """One connection to a port of the controller."""
 
     def __init__(self, take: Callable[[bytes], bytes], hello: bytes = b"") -> None:
@@ -128,17 +129,17 @@ class UrController:
     def _stop(self, safety: int) -> None:
         self.safety_mode, self.program, self.qd = safety, "", [0.0] * 6
 
-    def connect(self, port: int) -> Session:
+    def connect(self, port: int) -> ControllerSession:
         """Return a new connection to the RTDE, dashboard or program port."""
         if port == RTDE_PORT:
             client = _Rtde(self)
-            client.session = Session(client.take)
+            client.session = ControllerSession(client.take)
             self._clients.append(client)
             return client.session
         if port == DASHBOARD_PORT:
             hello = b"Connected: Universal Robots Dashboard Server\n"
-            return Session(_Lines(self._dashboard).take, hello)
-        return Session(self._load)
+            return ControllerSession(_Lines(self._dashboard).take, hello)
+        return ControllerSession(self._load)
 
     def advance(self, now: float) -> None:
         """Let time pass until `now` (s)."""
@@ -280,7 +281,7 @@ class _Lines:
 class _Rtde:
     """The controller's end of one RTDE connection."""
 
-    session: Session
+    session: ControllerSession
 
     def __init__(self, controller: UrController) -> None:
         self._controller = controller
@@ -373,7 +374,7 @@ class UrServer:
         self._clock = clock
         self.controller = controller
         self._selector = selectors.DefaultSelector()
-        self._sessions: dict[socket.socket, Session] = {}
+        self._sessions: dict[socket.socket, ControllerSession] = {}
         self._listeners: list[socket.socket] = []
         for port, role in zip(ports, (RTDE_PORT, DASHBOARD_PORT, PROGRAM_PORT), strict=True):
             listener = socket.create_server((host, port))

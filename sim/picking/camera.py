@@ -24,9 +24,9 @@ _SIDE: Final = 0.72
 
 
 @dataclass(frozen=True, slots=True)
-class Light:
-    """Light on the table: its level, the direction (rad) and length of shadows per height, how dark
-    they are, and a broad shadow that lies across the table (where along y, how wide; m)."""
+class Lighting:
+    """Lighting on the table: its level, the direction (rad) and length of shadows per height, how
+    dark they are, and a broad shadow that lies across the table (where along y, how wide; m)."""
 
     level: float
     direction: float
@@ -73,7 +73,7 @@ def mounted(
     )
 
 
-class TableCamera:
+class SceneCamera:
     """Renders images of one installation."""
 
     def __init__(self, mount: Mounted, table: float, trays: Mapping[str, Any]) -> None:
@@ -98,7 +98,7 @@ class TableCamera:
         parts: Sequence[Part],
         arm: Sequence[Sequence[float]],
         radius: float,
-        light: Light,
+        light: Lighting,
         rng: np.random.Generator,
     ) -> Picture:
         """Return an image (height, width) of grey levels. `arm`: points of its links, `radius`:
@@ -124,7 +124,7 @@ class TableCamera:
         seen += light.noise * self._noise[dv : dv + self.mount.height, du : du + self.mount.width]
         return np.clip(seen, 0.0, 255.0).astype(np.uint8)
 
-    def _shade(self, image: Picture, parts: Sequence[Part], light: Light) -> None:
+    def _shade(self, image: Picture, parts: Sequence[Part], light: Lighting) -> None:
         if light.darkness <= 0.0:
             return
         mask = np.zeros_like(image)
@@ -138,7 +138,7 @@ class TableCamera:
         factor = 1.0 - light.darkness / 255.0 * mask.astype(np.float32)
         np.copyto(image, (image * factor).astype(np.uint8))
 
-    def _band(self, light: Light) -> NDArray[np.float32]:
+    def _band(self, light: Lighting) -> NDArray[np.float32]:
         """A soft shadow across the table, such as a person's: a factor per image column."""
         middle, width = light.band or (0.0, 0.0)
         at = self.mount.pixels([(0.15, middle, 0.0), (0.15, middle + width / 2, 0.0)])

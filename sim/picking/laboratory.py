@@ -16,7 +16,7 @@ from petrobot.services.comm.lockstep.party import TICK
 from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.faults import FaultKinds, FaultPlan
 from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
-from petrobot.sim.picking.camera import Picture, TableCamera
+from petrobot.sim.picking.camera import Picture, SceneCamera
 from petrobot.sim.picking.controllers import controller
 from petrobot.sim.picking.referee import Referee
 from petrobot.sim.picking.truth import PickingSite, picking_site_of
@@ -55,7 +55,7 @@ class PickingLaboratory(LaboratoryParty):
         self._site = site
         self.arm = site.arm()
         self.controller = controller(site.numbers)
-        self._camera = TableCamera(site.camera(), site.settings["table"]["grey"], site.trays)
+        self._camera = SceneCamera(site.camera(), site.settings["table"]["grey"], site.trays)
         self._radius = float(site.settings["arm"]["radius"])
         self._prepare(0, REGIME, None)
 

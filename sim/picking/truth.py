@@ -18,10 +18,10 @@ import numpy as np
 from petrobot.services.comm.location_file import Directory
 from petrobot.sim.catching.truth import LaboratoryError, read_toml
 from petrobot.sim.picking.arm import TrueArm, true_arm
-from petrobot.sim.picking.camera import Light, Mounted, mounted
+from petrobot.sim.picking.camera import Lighting, Mounted, mounted
 from petrobot.sim.picking.gripper import Fingers
 from petrobot.sim.picking.parts import Part, contact
-from petrobot.sim.picking.world import Table
+from petrobot.sim.picking.world import TableTop
 
 LABORATORY_FILE = Path(__file__).with_name("laboratory.toml")
 _DRAWS: Final = 1500
@@ -41,10 +41,10 @@ class PickingTruth:
         """Force of the fingers, relative."""
         return self.values["force"]
 
-    def light(self, direction: float) -> Light:
+    def light(self, direction: float) -> Lighting:
         """Return the light, with shadows towards `direction` (rad)."""
         band = self.values["band"]
-        return Light(
+        return Lighting(
             self.values["light"],
             direction,
             self.values["shadow_length"],
@@ -78,10 +78,10 @@ class PickingSite:
         return {name: kind["tray"] for name, kind in self.cell["kinds"].items()}
 
     @property
-    def table(self) -> Table:
+    def table(self) -> TableTop:
         """The table's edges."""
         (x0, x1), (y0, y1) = self.cell["table"]["x"], self.cell["table"]["y"]
-        return Table((x0, x1), (y0, y1))
+        return TableTop((x0, x1), (y0, y1))
 
     @property
     def fingers(self) -> Fingers:

@@ -46,7 +46,7 @@ class Held(NamedTuple):
 
 
 @dataclass(slots=True)
-class Table:
+class TableTop:
     """The edges of the table: x from, to, y from, to (m)."""
 
     x: tuple[float, float]
@@ -61,7 +61,7 @@ class World:
     """Parts, fingers and what happens between them."""
 
     def __init__(
-        self, table: Table, fingers: Fingers, parts: Sequence[Part], rng: np.random.Generator
+        self, table: TableTop, fingers: Fingers, parts: Sequence[Part], rng: np.random.Generator
     ) -> None:
         self.table, self.fingers, self.parts = table, fingers, list(parts)
         self._rng = rng

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from petrobot.services.adapters.so101.kinematics import forward
 from petrobot.services.picking.model import (
     NumbersError,
-    UnreachableError,
+    OutOfReachError,
     arm_named,
     cell_named,
     read_arm,
@@ -69,7 +69,7 @@ def test_the_laboratory_has_the_same_arm_but_for_its_errors(arm: str, joints: li
 
 
 def test_what_is_out_of_reach_is_refused() -> None:
-    with pytest.raises(UnreachableError, match=r"so101 cannot reach x 0\.600"):
+    with pytest.raises(OutOfReachError, match=r"so101 cannot reach x 0\.600"):
         arm_named("so101").over(0.6, 0.0, 0.02, 0.0)
 
 

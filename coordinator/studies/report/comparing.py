@@ -26,7 +26,7 @@ Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Pairs:
+class PairedTrials:
     """Trials of two campaigns with equal regime, seed and number that began in both."""
 
     one: tuple[TrialRow, ...]
@@ -35,7 +35,7 @@ class Pairs:
     """Trials without a partner, or that did not begin."""
 
 
-def paired(one: Iterable[TrialRow], other: Iterable[TrialRow]) -> Pairs:
+def paired(one: Iterable[TrialRow], other: Iterable[TrialRow]) -> PairedTrials:
     """Match the trials of two tables."""
     first = {(row.regime, row.seed, row.k): row for row in one}
     second = {(row.regime, row.seed, row.k): row for row in other}
@@ -45,7 +45,7 @@ def paired(one: Iterable[TrialRow], other: Iterable[TrialRow]) -> Pairs:
         if k in second and first[k].trial is not None and second[k].trial is not None
     ]
     left = len(first) + len(second) - 2 * len(common)
-    return Pairs(tuple(first[k] for k in common), tuple(second[k] for k in common), left)
+    return PairedTrials(tuple(first[k] for k in common), tuple(second[k] for k in common), left)
 
 
 def compare(
@@ -87,7 +87,7 @@ def compare(
     }
 
 
-def own_flags(pairs: Pairs) -> list[str]:
+def own_flags(pairs: PairedTrials) -> list[str]:
     """Return the truth values of the task's own score that every pair has."""
     names = [n for n, v in pairs.one[0].score.items() if isinstance(v, bool)]
     return [
@@ -101,7 +101,7 @@ def _flag(name: str) -> Callable[[TrialRow], bool]:
     return lambda row: bool(row.score[name])
 
 
-def share_difference(pairs: Pairs, met: Callable[[TrialRow], bool]) -> dict[str, Any]:
+def share_difference(pairs: PairedTrials, met: Callable[[TrialRow], bool]) -> dict[str, Any]:
     """Return both shares, the discordant pairs, McNemar's p-value, and the difference with its 95 %
     interval."""
     a = np.array([met(row) for row in pairs.one])
@@ -125,7 +125,7 @@ def share_difference(pairs: Pairs, met: Callable[[TrialRow], bool]) -> dict[str,
     }
 
 
-def _time(pairs: Pairs) -> dict[str, Any]:
+def _time(pairs: PairedTrials) -> dict[str, Any]:
     times = [
         (a.trial.time, b.trial.time)
         for a, b in zip(pairs.one, pairs.other, strict=True)
@@ -225,7 +225,7 @@ def _percentiles(spread: Values) -> tuple[float, float]:
 
 
 def objective_difference(
-    task: Task, pairs: Pairs, weighting: Weighting, random: np.random.Generator
+    task: Task, pairs: PairedTrials, weighting: Weighting, random: np.random.Generator
 ) -> dict[str, Any]:
     """Return the differences of J of each primitive task with alternatives, of their mean, and of J
     of the task (1 - R_goal + rho * time)."""

@@ -37,7 +37,7 @@ SAME = 1e-3
 PAPER = 255
 
 
-class FilmError(ValueError):
+class NoFilmError(ValueError):
     """The film cannot be made; the text says why and what to do."""
 
 
@@ -45,11 +45,11 @@ def images(
     found: Recorded, *, begin: float, seconds: float, fps: float, width: int
 ) -> Iterator[Picture]:
     """Simulate a recorded run again and yield its images (rows, columns, 3; blue, green, red) from
-    `begin` on (s). Raises FilmError, also for a run that does not repeat itself."""
+    `begin` on (s). Raises NoFilmError, also for a run that does not repeat itself."""
     header, task = found.journal.header, found.task
     if header["mode"] != "lockstep":
         problem = f"{header['mission']} is a run in real time, which cannot be repeated"
-        raise FilmError(f"{problem}; record one with --mode lockstep --journal FOLDER")
+        raise NoFilmError(f"{problem}; record one with --mode lockstep --journal FOLDER")
     setting = departing(found.journal, task, found.engine, Departure(header["mission"], 0))
     mission, timeline = lockstep_mission(found.directory, setting), Timeline()
     mission.executor.observers.append(timeline)
@@ -71,7 +71,7 @@ def images(
 
 
 def _refuse_other(found: Recorded, firings: Sequence[Firing], origin: float) -> None:
-    """Raise FilmError if the simulated run fires otherwise than the recorded one."""
+    """Raise NoFilmError if the simulated run fires otherwise than the recorded one."""
     recorded = (
         (step.time - origin, one.transition)
         for step in found.steps()
@@ -83,7 +83,7 @@ def _refuse_other(found: Recorded, firings: Sequence[Firing], origin: float) -> 
             return  # the film ends before the run
         if then is None or then[1] != one.transition or abs(then[0] - one.time) > SAME:
             was = f"fired {then[1]} at {then[0]:.3f} s" if then else "had ended"
-            raise FilmError(
+            raise NoFilmError(
                 f"{found.journal.header['mission']}: simulated again it fires {one.transition} at "
                 f"{one.time:.3f} s, where the recorded run {was}; record it again with this "
                 "version of petrobot and this physics"
@@ -124,22 +124,22 @@ def _stacked(pictures: Sequence[Picture]) -> Picture:
 
 
 def refuse_file(path: Path) -> None:
-    """Raise FilmError for a film that could not be written."""
+    """Raise NoFilmError for a film that could not be written."""
     if path.suffix.lower() not in FORMATS:
-        raise FilmError(f"{path}: expected a name that ends in {', '.join(FORMATS)}")
+        raise NoFilmError(f"{path}: expected a name that ends in {', '.join(FORMATS)}")
     if not path.parent.is_dir():
-        raise FilmError(f"{path}: give an existing folder")
+        raise NoFilmError(f"{path}: give an existing folder")
     if not hasattr(cv2, "imwriteanimation"):
-        raise FilmError(f"OpenCV {cv2.__version__} writes no animations; install 4.11 or later")
+        raise NoFilmError(f"OpenCV {cv2.__version__} writes no animations; install 4.11 or later")
 
 
 def write(path: Path, pictures: Sequence[Picture], fps: float, quality: int) -> None:
     """Write an animated picture that repeats for ever, in the format of the suffix. Raises
-    FilmError."""
+    NoFilmError."""
     if not pictures:
-        raise FilmError("the run has no image in that time; give another --begin")
+        raise NoFilmError("the run has no image in that time; give another --begin")
     film = cv2.Animation()
     film.frames = list(pictures)
     film.durations = [round(1000.0 / fps)] * len(pictures)
     if not cv2.imwriteanimation(str(path), film, [cv2.IMWRITE_WEBP_QUALITY, quality]):
-        raise FilmError(f"{path}: cannot be written; give another file")
+        raise NoFilmError(f"{path}: cannot be written; give another file")

@@ -1,4 +1,4 @@
-"""Driver of an OPC UA server: class `Session`, one client session in a thread of its own.
+"""Driver of an OPC UA server: class `OpcUaSession`, one client session in a thread of its own.
 
 Its command is `{"write": {NAME: value, ...}}`. Its state has `values` by name, `up`, `faults`, and
 how many writes were asked for (`asked`) and are `done`; `write_fault` is why the last one failed.
@@ -24,7 +24,7 @@ LOOK: Final = 0.3
 DOWN: Final = "no session yet"
 
 
-class Session(Driver):
+class OpcUaSession(Driver):
     """One OPC UA server: nodes with names, events from their values."""
 
     period = 0.02

@@ -1,4 +1,4 @@
-"""Offer a task to ROS 2 as an action: a goal starts a run, as an operator would start it.
+"""OfferedTask a task to ROS 2 as an action: a goal starts a run, as an operator would start it.
 
     petrobot serve --up                                   prints the page's address, with its token
     python -m petrobot.services.adapters.ros2 deliver --page ADDRESS --url ws://ROBOT:9090
@@ -37,7 +37,7 @@ NAME = "ros2"
 TYPE = "petrobot_interfaces/action/RunTask"
 
 
-class Page:
+class OperatorPage:
     """The coordinator's page, over HTTP. Its calls raise OSError when it cannot be reached."""
 
     def __init__(self, address: str, http: aiohttp.ClientSession) -> None:
@@ -67,10 +67,12 @@ class Page:
         return said
 
 
-class Offer:
+class OfferedTask:
     """One task as one action server; one goal at a time."""
 
-    def __init__(self, link: WebSocketLink, page: Page, options: argparse.Namespace) -> None:
+    def __init__(
+        self, link: WebSocketLink, page: OperatorPage, options: argparse.Namespace
+    ) -> None:
         self._link, self._page, self._options = link, page, options
         self._fields: Mapping[str, Mapping[str, Any]] = {}
         if options.definition is not None:
@@ -201,7 +203,7 @@ class Offer:
 async def main(arguments: list[str]) -> int:
     """The command."""
     parser = argparse.ArgumentParser(prog="python -m petrobot.services.adapters.ros2")
-    parser.description = "Offer a task to ROS 2 as an action."
+    parser.description = "OfferedTask a task to ROS 2 as an action."
     parser.add_argument("task", help="name of a task that the page offers")
     parser.add_argument(
         "--page",
@@ -226,7 +228,7 @@ async def main(arguments: list[str]) -> int:
     async with aiohttp.ClientSession(trust_env=False, timeout=timeout) as http:
         link = WebSocketLink(options.url, 10.0)
         try:
-            await Offer(link, Page(options.page, http), options).serve(stop)
+            await OfferedTask(link, OperatorPage(options.page, http), options).serve(stop)
         except (OSError, ValueError) as fault:
             print(fault, file=sys.stderr)
             return 2

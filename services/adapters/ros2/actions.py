@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Any
 
 from petrobot import Cancelled, CommandRefused, Context, Remote, Result, Status, error, success
-from petrobot.services.adapters.ros2.protocol import RUNNING, Phase, filled, pick
+from petrobot.services.adapters.ros2.protocol import RUNNING, ExchangePhase, filled, pick
 from petrobot.services.adapters.ros2.topics import fits
 
 Paths = Mapping[str, str]
@@ -285,7 +285,7 @@ async def _exchange(
         return found
 
     def ended() -> bool:
-        return Phase(told()["phase"]) not in RUNNING
+        return ExchangePhase(told()["phase"]) not in RUNNING
 
     begun, seen = ctx.now, 0
 
@@ -311,11 +311,11 @@ async def _exchange(
     finally:
         end = dict(told())
         ctx.device.send({"forget": ctx.run})
-    return _result(Phase(end["phase"]), end, late, values, expect, "call" in body, timeout)
+    return _result(ExchangePhase(end["phase"]), end, late, values, expect, "call" in body, timeout)
 
 
 def _result(
-    phase: Phase,
+    phase: ExchangePhase,
     end: Mapping[str, Any],
     late: bool,
     values: Paths | None,
@@ -325,23 +325,23 @@ def _result(
 ) -> Result:
     """The result of a run whose goal or call ended in a phase, or is `late`."""
     text, given = end.get("text", ""), end.get("values", {})
-    if phase is Phase.SUCCEEDED:
+    if phase is ExchangePhase.SUCCEEDED:
         if end["fault"]:
             return error("bad_result", end["fault"])
         return _ended(given, values, expect)
-    if phase is Phase.REJECTED and not service:
+    if phase is ExchangePhase.REJECTED and not service:
         return _not_executed("rejected", text)
-    if phase in (Phase.LOST, Phase.RECALLED, Phase.GONE):
+    if phase in (ExchangePhase.LOST, ExchangePhase.RECALLED, ExchangePhase.GONE):
         said = "the connection to rosbridge broke; nobody knows whether it was executed"
         return replace(error("link_lost", said), executed="unknown")
-    if phase is Phase.UNANSWERED or phase in RUNNING:
+    if phase is ExchangePhase.UNANSWERED or phase in RUNNING:
         said = f"no result within {timeout or 0.0:g} s" if late else "it was given up"
         cause = "timeout" if late else "unanswered"
         return replace(error(cause, f"{said}; its cancel was not answered"), executed="unknown")
-    if late and phase is Phase.CANCELLED:
+    if late and phase is ExchangePhase.CANCELLED:
         return Result(Status.ERROR, given, "timeout", f"cancelled after {timeout:g} s")
     cause = "failed" if service else str(phase)
-    text = text or ("another client cancelled the goal" if phase is Phase.CANCELLED else "")
+    text = text or ("another client cancelled the goal" if phase is ExchangePhase.CANCELLED else "")
     return Result(Status.ERROR, given, cause, text)
 
 

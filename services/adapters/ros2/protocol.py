@@ -107,7 +107,7 @@ def filled(base: Mapping[str, Any], values: Mapping[str, Any]) -> Message:
     return message
 
 
-class Phase(StrEnum):
+class ExchangePhase(StrEnum):
     """Where a goal or a service call is."""
 
     PENDING = "pending"
@@ -144,30 +144,30 @@ class Word(StrEnum):
     SILENCE = "silence"
 
 
-RUNNING = frozenset({Phase.PENDING, Phase.ACTIVE, Phase.CANCELLING})
-MOVING = RUNNING | {Phase.LOST, Phase.RECALLED}
+RUNNING = frozenset({ExchangePhase.PENDING, ExchangePhase.ACTIVE, ExchangePhase.CANCELLING})
+MOVING = RUNNING | {ExchangePhase.LOST, ExchangePhase.RECALLED}
 """Phases in which the robot may be moving for it."""
 
 _ENDS = {
-    Word.SUCCEEDED: Phase.SUCCEEDED,
-    Word.CANCELLED: Phase.CANCELLED,
-    Word.ABORTED: Phase.ABORTED,
-    Word.DOWN: Phase.LOST,
+    Word.SUCCEEDED: ExchangePhase.SUCCEEDED,
+    Word.CANCELLED: ExchangePhase.CANCELLED,
+    Word.ABORTED: ExchangePhase.ABORTED,
+    Word.DOWN: ExchangePhase.LOST,
 }
-TABLE: Mapping[tuple[Phase, Word], Phase] = {
+TABLE: Mapping[tuple[ExchangePhase, Word], ExchangePhase] = {
     **{(phase, word): end for phase in RUNNING for word, end in _ENDS.items()},
-    (Phase.PENDING, Word.FEEDBACK): Phase.ACTIVE,
-    (Phase.PENDING, Word.REFUSED): Phase.REJECTED,
-    (Phase.ACTIVE, Word.REFUSED): Phase.ABORTED,
-    (Phase.CANCELLING, Word.REFUSED): Phase.ABORTED,
-    (Phase.PENDING, Word.CANCEL): Phase.CANCELLING,
-    (Phase.ACTIVE, Word.CANCEL): Phase.CANCELLING,
-    (Phase.CANCELLING, Word.SILENCE): Phase.UNANSWERED,
-    (Phase.LOST, Word.UP): Phase.RECALLED,
-    (Phase.RECALLED, Word.DOWN): Phase.LOST,
-    (Phase.RECALLED, Word.SILENCE): Phase.GONE,
+    (ExchangePhase.PENDING, Word.FEEDBACK): ExchangePhase.ACTIVE,
+    (ExchangePhase.PENDING, Word.REFUSED): ExchangePhase.REJECTED,
+    (ExchangePhase.ACTIVE, Word.REFUSED): ExchangePhase.ABORTED,
+    (ExchangePhase.CANCELLING, Word.REFUSED): ExchangePhase.ABORTED,
+    (ExchangePhase.PENDING, Word.CANCEL): ExchangePhase.CANCELLING,
+    (ExchangePhase.ACTIVE, Word.CANCEL): ExchangePhase.CANCELLING,
+    (ExchangePhase.CANCELLING, Word.SILENCE): ExchangePhase.UNANSWERED,
+    (ExchangePhase.LOST, Word.UP): ExchangePhase.RECALLED,
+    (ExchangePhase.RECALLED, Word.DOWN): ExchangePhase.LOST,
+    (ExchangePhase.RECALLED, Word.SILENCE): ExchangePhase.GONE,
     **{
-        (Phase.RECALLED, word): Phase.GONE
+        (ExchangePhase.RECALLED, word): ExchangePhase.GONE
         for word in (Word.SUCCEEDED, Word.CANCELLED, Word.ABORTED, Word.REFUSED)
     },
 }
@@ -189,7 +189,7 @@ class Exchange:
     """When the server last said something of it, or was last asked to end it (s)."""
     asked: float = math.inf
     """When its cancel was last sent (s)."""
-    phase: Phase = Phase.PENDING
+    phase: ExchangePhase = ExchangePhase.PENDING
     feedback: Message = field(default_factory=dict)
     count: int = 0
     """Feedback messages so far."""
@@ -229,9 +229,9 @@ class Exchanges:
         if one is None or one.phase not in RUNNING:
             return []
         if one.request["op"] == "call_service":
-            one.phase = Phase.UNANSWERED
+            one.phase = ExchangePhase.UNANSWERED
             return []
-        if one.phase is Phase.CANCELLING:
+        if one.phase is ExchangePhase.CANCELLING:
             return []
         self._move(one, Word.CANCEL)
         return [self._cancel(now, one)]
@@ -247,8 +247,8 @@ class Exchanges:
         for one in self.open.values():
             before = self._move(one, Word.UP if up else Word.DOWN)
             if one.phase is not before and one.request["op"] == "call_service":
-                one.phase = Phase.GONE
-            elif up and one.phase is Phase.RECALLED:
+                one.phase = ExchangePhase.GONE
+            elif up and one.phase is ExchangePhase.RECALLED:
                 sent.append(self._cancel(now, one))
         return sent
 
@@ -258,7 +258,7 @@ class Exchanges:
         for name in [n for n, one in self.open.items() if one.read and one.phase not in MOVING]:
             del self.open[name]
         for one in self.open.values():
-            if one.phase not in (Phase.CANCELLING, Phase.RECALLED):
+            if one.phase not in (ExchangePhase.CANCELLING, ExchangePhase.RECALLED):
                 continue
             if now - one.heard >= self._patience:
                 self._move(one, Word.SILENCE)
@@ -316,7 +316,7 @@ class Exchanges:
         self._move(one, word)
 
     @staticmethod
-    def _move(one: Exchange, word: Word) -> Phase:
+    def _move(one: Exchange, word: Word) -> ExchangePhase:
         before = one.phase
         one.phase = TABLE.get((before, word), before)
         return before

@@ -174,7 +174,7 @@ class Arm(Driver):
         self._order = list(self.joints)
         """In which the servos are asked: those that do not answer last, each in turn first among
         them, so that none hides another."""
-        self._split = bus.Splitter()
+        self._split = bus.PacketSplitter()
         self._lost, self._retry, self._pause = "", 0.0, RETRY[0]
         self._begun = ports.now
         self._line: SerialLine | None = ports.serial(self.port, self.baud)
@@ -326,7 +326,7 @@ class Arm(Driver):
                 joint.started = joint.ready = False
             if self._line is not None:
                 self._line.close()
-            self._line, self._split = None, bus.Splitter()
+            self._line, self._split = None, bus.PacketSplitter()
 
     def _take(self, now: float, data: bytes) -> None:
         by_servo, heard = {joint.servo: joint for joint in self.joints}, []

@@ -76,7 +76,7 @@ def setup(goal: int, speed: int, limit: int) -> bytes:
     return b"\1\0" + word(goal) + word(0) + word(speed) + word(limit)
 
 
-class Answer(NamedTuple):
+class ServoAnswer(NamedTuple):
     """A status packet."""
 
     servo: int
@@ -124,15 +124,15 @@ def reading(data: bytes) -> Reading | None:
     )
 
 
-class Splitter:
+class PacketSplitter:
     """Cuts the bytes of a line into answers; skips noise and broken packets."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
-    def feed(self, data: bytes) -> list[Answer]:
+    def feed(self, data: bytes) -> list[ServoAnswer]:
         """Add bytes; return the answers that they complete."""
-        buffer, answers = self._buffer, list[Answer]()
+        buffer, answers = self._buffer, list[ServoAnswer]()
         buffer += data
         at = 0
         while (at := buffer.find(b"\xff\xff", at)) >= 0 and len(buffer) - at >= 4:
@@ -145,7 +145,7 @@ class Splitter:
             elif sum(buffer[at + 2 : end]) & 0xFF != 0xFF:
                 at += 1  # broken: its bytes may hold the begin of another
             else:
-                answers.append(Answer(servo, buffer[at + 4], bytes(buffer[at + 5 : end - 1])))
+                answers.append(ServoAnswer(servo, buffer[at + 4], bytes(buffer[at + 5 : end - 1])))
                 at = end
         del buffer[: at if at >= 0 else max(0, len(buffer) - 1)]
         return answers

@@ -100,7 +100,7 @@ class Arm(Driver):
             raise ValueError(
                 "expected top_speed in (0, 3.14] rad/s, acceleration in (0, 20] rad/s^2"
             )
-        self._arm = kinematics.Arm(self.model, _numbers(self.tool, 3, "tool"))
+        self._arm = kinematics.Geometry(self.model, _numbers(self.tool, 3, "tool"))
         addresses = [self.rtde_port, self.dashboard_port, self.program_port]
         made, self._advance = links(self.host, addresses, [30004, 29999, 30002])
         self._link, self._dashboard, self._program = made

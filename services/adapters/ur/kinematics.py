@@ -26,7 +26,7 @@ CLOSE = 1e-7
 """m and rad by which a solution may miss its pose."""
 
 
-class Arm:
+class Geometry:
     """A model with a tool point `tool` (m, in the flange's frame)."""
 
     def __init__(self, model: str, tool: Sequence[float] = (0.0, 0.0, 0.0)) -> None:

@@ -113,7 +113,7 @@ class Link:
         self._unsent.clear()
 
 
-class SimulatedLink:
+class LoopbackLink:
     """A connection to a simulated controller in this process."""
 
     def __init__(self, controller: Any, port: int) -> None:
@@ -150,7 +150,7 @@ class SimulatedLink:
 
 def links(
     host: str, ports: list[int], usual: list[int]
-) -> tuple[list[Link | SimulatedLink], Callable[[float], None]]:
+) -> tuple[list[Link | LoopbackLink], Callable[[float], None]]:
     """Return the links to the ports of a controller, and what lets its time pass: `host` is an IP
     address, or `module:Class` of a simulated one."""
     module, colon, name = host.partition(":")
@@ -160,4 +160,4 @@ def links(
         controller = getattr(importlib.import_module(module), name)()
     except (ImportError, AttributeError) as fault:
         raise ValueError(f"host: {host!r} cannot be loaded: {fault}") from fault
-    return [SimulatedLink(controller, port) for port in usual], controller.advance
+    return [LoopbackLink(controller, port) for port in usual], controller.advance

@@ -15,7 +15,7 @@ import pytest
 
 from petrobot import Ports, check_driver, rehearse
 from petrobot.services.adapters.opcua.actions import handshake, write
-from petrobot.services.adapters.opcua.session import Session
+from petrobot.services.adapters.opcua.session import OpcUaSession
 from tests.ports import free_ports
 from tests.waiting import Limit
 
@@ -50,7 +50,7 @@ class Cell:
         self.desk = Desk(folder)
         self.security: tuple[str, ...] = ()
         self.plc: subprocess.Popen[str] | None = None
-        self.drivers: list[Session] = []
+        self.drivers: list[OpcUaSession] = []
 
     def power(self, on: bool) -> None:
         if self.plc is not None:
@@ -64,9 +64,9 @@ class Cell:
             )
             assert self.plc.stdout is not None and self.plc.stdout.readline() == "ready\n"
 
-    def driver(self, **keys: Any) -> Session:
+    def driver(self, **keys: Any) -> OpcUaSession:
         table = {"url": f"opc.tcp://127.0.0.1:{self.port}", "nodes": NODES, **keys}
-        driver = Session(table, cast(Ports, self.desk))
+        driver = OpcUaSession(table, cast(Ports, self.desk))
         self.drivers.append(driver)
         return driver
 
@@ -85,7 +85,7 @@ def cell(tmp_path: Path) -> Iterator[Cell]:
     cell.close()
 
 
-def await_(driver: Session, ready: Callable[[Any], object], awaited: str) -> Any:
+def await_(driver: OpcUaSession, ready: Callable[[Any], object], awaited: str) -> Any:
     limit = Limit(awaited)
     while not ready(driver.state()) and limit.left():
         driver.step(0.0)
@@ -97,7 +97,7 @@ def complete(state: Any) -> bool:
     return set(state["values"]) == set(NAMES)
 
 
-def done(driver: Session, values: dict[str, Any]) -> str:
+def done(driver: OpcUaSession, values: dict[str, Any]) -> str:
     """Write; why it failed."""
     driver.command(0.0, {"write": values})
     number = driver.state()["asked"]
@@ -213,7 +213,7 @@ def test_a_wrong_node_is_named_and_the_others_work(cell: Cell) -> None:
 def test_wrong_keys_are_refused(tmp_path: Path, keys: dict[str, Any], words: str) -> None:
     table = {"url": "opc.tcp://127.0.0.1:1", "nodes": NODES, **keys}
     with pytest.raises(ValueError, match=words):
-        Session(table, cast(Ports, Desk(tmp_path)))
+        OpcUaSession(table, cast(Ports, Desk(tmp_path)))
 
 
 @pytest.mark.parametrize("body", [{"dance": 1}, {"write": {}}, {"write": {"nothing": 1}}])
@@ -264,7 +264,7 @@ def test_a_secured_server_accepts_its_certificate_alone(cell: Cell) -> None:
     cell.security = (str(folder / "plc.der"), str(folder / "plc.pem"), str(folder / "trusted"))
     cell.power(True)
 
-    def driver(who: str, server: str = "plc.der") -> Session:
+    def driver(who: str, server: str = "plc.der") -> OpcUaSession:
         own: dict[str, Any] = {"certificate": f"{who}.der", "private_key": f"{who}.pem"}
         return cell.driver(**own, server_certificate=server)
 

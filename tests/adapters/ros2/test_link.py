@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from petrobot.services.adapters.ros2.bridge import Bridge
-from petrobot.services.adapters.ros2.protocol import Phase
+from petrobot.services.adapters.ros2.protocol import ExchangePhase
 from petrobot.services.comm.protocol.plain import plain
 from tests.adapters.ros2.conftest import FakeProcess
 from tests.adapters.ros2.test_actions import Ports
@@ -38,10 +38,10 @@ class Stepped(Bridge):
             time.monotonic(), {"goal": {**request, "args": {}, "feedback": True}, "run": run}
         )
 
-    def phase(self, run: str = "run") -> Phase:
+    def phase(self, run: str = "run") -> ExchangePhase:
         return self.exchanges.open[run].phase
 
-    def until_phase(self, phase: Phase, run: str = "run") -> None:
+    def until_phase(self, phase: ExchangePhase, run: str = "run") -> None:
         self.until(lambda: self.phase(run) is phase, phase)
 
 
@@ -59,18 +59,18 @@ def bridge(fake: FakeProcess) -> Iterator[Stepped]:
 
 def test_goals_through_a_socket(bridge: Stepped, fake: FakeProcess) -> None:
     for name, phase in (
-        ("/ok", Phase.SUCCEEDED),
-        ("/aborts", Phase.ABORTED),
-        ("/rejects", Phase.REJECTED),
-        ("/nested", Phase.SUCCEEDED),
+        ("/ok", ExchangePhase.SUCCEEDED),
+        ("/aborts", ExchangePhase.ABORTED),
+        ("/rejects", ExchangePhase.REJECTED),
+        ("/nested", ExchangePhase.SUCCEEDED),
     ):
         bridge.goal(name, name)
         bridge.until_phase(phase, name)
     bridge.goal("/slow")
-    bridge.until_phase(Phase.ACTIVE)
+    bridge.until_phase(ExchangePhase.ACTIVE)
     assert not bridge.stopped()
     bridge.stop(time.monotonic())
-    bridge.until_phase(Phase.CANCELLED)
+    bridge.until_phase(ExchangePhase.CANCELLED)
     assert bridge.stopped()
 
 
@@ -83,16 +83,16 @@ def test_no_server_at_first() -> None:
     later = FakeProcess(port)
     bridge.until(lambda: bridge.epoch, "the server")
     bridge.goal("/ok")
-    bridge.until_phase(Phase.SUCCEEDED)
+    bridge.until_phase(ExchangePhase.SUCCEEDED)
     bridge.close()
     later.end()
 
 
 def test_a_cut_link_recalls_its_goal(bridge: Stepped, fake: FakeProcess) -> None:
     bridge.goal("/slow")
-    bridge.until_phase(Phase.ACTIVE)
+    bridge.until_phase(ExchangePhase.ACTIVE)
     fake.post("drop")
-    bridge.until_phase(Phase.LOST)
+    bridge.until_phase(ExchangePhase.LOST)
     assert not bridge.stopped()
     bridge.until(bridge.stopped, "the recall")
     goal, *cancels = fake.log("send_action_goal", "cancel_action_goal")
@@ -105,12 +105,12 @@ def test_a_killed_server_and_its_successor() -> None:
     bridge = bridge_to(fake.url, patience=1.2)
     bridge.until(lambda: bridge.epoch, "the connection")
     bridge.goal("/slow")
-    bridge.until_phase(Phase.ACTIVE)
+    bridge.until_phase(ExchangePhase.ACTIVE)
     fake.end()
-    bridge.until_phase(Phase.LOST)
+    bridge.until_phase(ExchangePhase.LOST)
     successor = FakeProcess(fake.port)
-    bridge.until_phase(Phase.RECALLED)
-    bridge.until_phase(Phase.GONE)
+    bridge.until_phase(ExchangePhase.RECALLED)
+    bridge.until_phase(ExchangePhase.GONE)
     assert bridge.stopped()
     assert {m["op"] for m in successor.log()} == {"cancel_action_goal"}
     bridge.close()
@@ -121,9 +121,9 @@ def test_a_frozen_server_is_a_lost_link(fake: FakeProcess) -> None:
     bridge = bridge_to(fake.url, heartbeat=0.4)
     bridge.until(lambda: bridge.epoch, "the connection")
     bridge.goal("/slow")
-    bridge.until_phase(Phase.ACTIVE)
+    bridge.until_phase(ExchangePhase.ACTIVE)
     os.kill(fake.process.pid, signal.SIGSTOP)
-    bridge.until_phase(Phase.LOST)
+    bridge.until_phase(ExchangePhase.LOST)
     os.kill(fake.process.pid, signal.SIGCONT)
     bridge.until(bridge.stopped, "the recall")
     bridge.close()
@@ -155,27 +155,27 @@ def test_rubbish_changes_nothing(bridge: Stepped, fake: FakeProcess) -> None:
     """Frames that are no messages, or messages of nothing that was asked for."""
     bridge.subscribe = {"b": {"topic": "/b", "type": "a/msg/B"}}
     bridge.goal("/slow")
-    bridge.until_phase(Phase.ACTIVE)
+    bridge.until_phase(ExchangePhase.ACTIVE)
     for text in RUBBISH:
         fake.post("send", text)
     fake.post("send", json.dumps({"op": "publish", "topic": "/b", "msg": {"x": 1}}))
     bridge.until(lambda: "b" in bridge.topics, "the message after it")
     assert bridge.topics["b"] == {"msg": {"x": 1}, "count": 1} and bridge.epoch == 1
-    assert bridge.phase() is Phase.ACTIVE and bridge.refused == 11
+    assert bridge.phase() is ExchangePhase.ACTIVE and bridge.refused == 11
     plain(bridge.state(), "state")  # or the driver would die of it
 
 
 @pytest.mark.parametrize("values", [None, [], 7, "text", {"x": None}, {"x": 2**70}])
 def test_odd_values_of_an_active_goal(bridge: Stepped, fake: FakeProcess, values: Any) -> None:
     bridge.goal("/slow")
-    bridge.until_phase(Phase.ACTIVE)
+    bridge.until_phase(ExchangePhase.ACTIVE)
     one = bridge.exchanges.open["run"]
     said = {"id": one.request["id"], "action": "/slow", "values": values}
     fake.post("send", json.dumps({"op": "action_feedback", **said}))
     bridge.until(lambda: bridge.refused, "the refused feedback")
     assert one.feedback["state"] == "moving"
     fake.post("send", json.dumps({"op": "action_result", **said, "status": 4, "result": True}))
-    bridge.until_phase(Phase.SUCCEEDED)
+    bridge.until_phase(ExchangePhase.SUCCEEDED)
     assert bool(one.fault) is bool(values and values != "text") and one.values == {}
 
 
@@ -183,7 +183,7 @@ def test_a_message_that_is_too_long_costs_the_link_only(bridge: Stepped, fake: F
     fake.post("send", "x" * (5 << 20))
     bridge.until(lambda: bridge.epoch == 2, "the next connection")
     bridge.goal("/ok")
-    bridge.until_phase(Phase.SUCCEEDED)
+    bridge.until_phase(ExchangePhase.SUCCEEDED)
 
 
 def test_a_full_way_out_ends_the_connection(bridge: Stepped, fake: FakeProcess) -> None:

@@ -19,7 +19,7 @@ import pytest
 
 from petrobot.services.adapters.ros2 import __main__ as offering
 from petrobot.services.adapters.ros2.link import Item
-from petrobot.services.adapters.ros2.protocol import Phase
+from petrobot.services.adapters.ros2.protocol import ExchangePhase
 from tests.adapters.ros2.conftest import FakeProcess
 from tests.adapters.ros2.test_link import bridge_to
 from tests.ports import free_ports
@@ -95,7 +95,7 @@ def played(steps: Steps, **more: Any) -> tuple[Page, Link]:
 
     async def play() -> None:
         stop = asyncio.Event()
-        offer = offering.Offer(link, page, options)  # type: ignore[arg-type]
+        offer = offering.OfferedTask(link, page, options)  # type: ignore[arg-type]
         serving = asyncio.create_task(offer.serve(stop))
         await steps(page, link)
         stop.set()
@@ -347,7 +347,7 @@ def test_petrobot_starts_petrobot(offered: FakeProcess) -> None:
     bridge = bridge_to(offered.url)
     bridge.until(lambda: bridge.epoch, "the connection")
     bridge.goal("/rest", "first")
-    bridge.until_phase(Phase.SUCCEEDED, "first")
+    bridge.until_phase(ExchangePhase.SUCCEEDED, "first")
     one = bridge.exchanges.open["first"]
     assert one.values["state"] == "success" and json.loads(one.values["result"])["task"] == "rest"
     assert one.feedback["places"]
@@ -355,11 +355,11 @@ def test_petrobot_starts_petrobot(offered: FakeProcess) -> None:
     bridge.command(
         time.monotonic(), {"goal": {**request, "args": {"seconds": 50.0}}, "run": "second"}
     )
-    bridge.until_phase(Phase.ACTIVE, "second")
+    bridge.until_phase(ExchangePhase.ACTIVE, "second")
     bridge.command(time.monotonic(), {"cancel": "second"})
-    bridge.until_phase(Phase.CANCELLED, "second")
+    bridge.until_phase(ExchangePhase.CANCELLED, "second")
     bridge.command(time.monotonic(), {"goal": {**request, "args": {"hours": 50.0}}, "run": "third"})
-    bridge.until_phase(Phase.ABORTED, "third")
+    bridge.until_phase(ExchangePhase.ABORTED, "third")
     assert "hours" in bridge.exchanges.open["third"].values["reason"]
     bridge.close()
 

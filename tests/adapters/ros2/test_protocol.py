@@ -14,8 +14,8 @@ from petrobot.services.adapters.ros2.protocol import (
     MOVING,
     RUNNING,
     TABLE,
+    ExchangePhase,
     Exchanges,
-    Phase,
     Word,
     filled,
     parse,
@@ -112,7 +112,7 @@ RESULTS = {
     Word.ABORTED: {"status": 6, "result": True, "values": {"n": 6}},
     Word.REFUSED: {"status": 0, "result": False, "values": "Action goal was rejected"},
 }
-ENDED = set(Phase) - RUNNING
+ENDED = set(ExchangePhase) - RUNNING
 
 
 @given(st.lists(st.tuples(st.sampled_from(Word), st.floats(0.0, 3.0)), max_size=30))
@@ -123,7 +123,7 @@ def test_a_goal_ends_once_and_as_the_first_word_says(words: list[tuple[Word, flo
     exchanges = Exchanges(patience)
     identity = exchanges.begin(0.0, "run", GOAL)["id"]
     one, now, up = exchanges.open["run"], 0.0, True
-    ended: Phase | None = None
+    ended: ExchangePhase | None = None
     for word, pause in words:
         now += pause
         before = one.phase
@@ -133,7 +133,9 @@ def test_a_goal_ends_once_and_as_the_first_word_says(words: list[tuple[Word, flo
             up = word is Word.UP
             sent = exchanges.link(now, up)
             assert not sent or up
-            assert before is not Phase.LOST or not up or [m["id"] for m in sent] == [identity]
+            assert (
+                before is not ExchangePhase.LOST or not up or [m["id"] for m in sent] == [identity]
+            )
         elif word is Word.SILENCE:
             sent = exchanges.advance(now)
             waited = now - one.heard >= patience
@@ -151,7 +153,7 @@ def test_a_goal_ends_once_and_as_the_first_word_says(words: list[tuple[Word, flo
             if word in RESULTS and word is not Word.REFUSED:
                 assert one.values == {"n": RESULTS[word]["status"]}
         if ended is not None:  # what a run may tell of it stays the same
-            lost = {Phase.LOST, Phase.RECALLED, Phase.GONE}
+            lost = {ExchangePhase.LOST, ExchangePhase.RECALLED, ExchangePhase.GONE}
             assert one.phase is ended or {one.phase, ended} <= lost
     # however it stands, it comes to rest
     for settled in (False, True):
@@ -171,7 +173,7 @@ def test_a_repeated_cancel_waits_no_longer() -> None:
     sent = exchanges.cancel(0.0, "run")
     for tick in range(1, 100):
         sent += exchanges.advance(tick * 0.1)
-    assert exchanges.open["run"].phase is Phase.UNANSWERED
+    assert exchanges.open["run"].phase is ExchangePhase.UNANSWERED
     assert len(sent) == 5
 
 
@@ -204,17 +206,21 @@ def test_ids_are_unique_in_the_world() -> None:
 @pytest.mark.parametrize(
     ("said", "phase", "text"),
     [
-        ({"op": "status", "level": "error", "msg": "Unknown operation"}, Phase.REJECTED, "Unknown"),
-        ({"op": "status", "level": "warning", "msg": "slow"}, Phase.PENDING, ""),
-        ({"op": "action_result", "status": 6, "result": False}, Phase.ABORTED, "status 6"),
-        ({"op": "action_result", "status": 2, "result": True}, Phase.ABORTED, "status 2"),
-        ({"op": "action_result", "result": True, "values": {}}, Phase.SUCCEEDED, ""),
-        ({"op": "action_result", "result": False}, Phase.REJECTED, "no reason"),
-        ({"op": "action_result", "status": [], "result": True}, Phase.ABORTED, "status"),
-        ({"op": "action_feedback", "values": {"x": None}}, Phase.ACTIVE, ""),
+        (
+            {"op": "status", "level": "error", "msg": "Unknown operation"},
+            ExchangePhase.REJECTED,
+            "Unknown",
+        ),
+        ({"op": "status", "level": "warning", "msg": "slow"}, ExchangePhase.PENDING, ""),
+        ({"op": "action_result", "status": 6, "result": False}, ExchangePhase.ABORTED, "status 6"),
+        ({"op": "action_result", "status": 2, "result": True}, ExchangePhase.ABORTED, "status 2"),
+        ({"op": "action_result", "result": True, "values": {}}, ExchangePhase.SUCCEEDED, ""),
+        ({"op": "action_result", "result": False}, ExchangePhase.REJECTED, "no reason"),
+        ({"op": "action_result", "status": [], "result": True}, ExchangePhase.ABORTED, "status"),
+        ({"op": "action_feedback", "values": {"x": None}}, ExchangePhase.ACTIVE, ""),
     ],
 )
-def test_words_of_unusual_servers(said: dict[str, Any], phase: Phase, text: str) -> None:
+def test_words_of_unusual_servers(said: dict[str, Any], phase: ExchangePhase, text: str) -> None:
     exchanges = Exchanges(1.0)
     identity = exchanges.begin(0.0, "run", GOAL)["id"]
     exchanges.receive(0.0, {"id": identity, **said})

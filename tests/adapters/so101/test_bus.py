@@ -76,18 +76,18 @@ def frame(servo: int, error: int, content: bytes) -> bytes:
 
 @given(st.lists(answers, max_size=6), st.integers(1, 7))
 def test_answers_are_found_however_they_are_cut(parts: list[Any], size: int) -> None:
-    stream, splitter = b"".join(frame(*part) for part in parts), bus.Splitter()
+    stream, splitter = b"".join(frame(*part) for part in parts), bus.PacketSplitter()
     pieces = [stream[at : at + size] for at in range(0, len(stream), size)]
     assert [answer for piece in pieces for answer in splitter.feed(piece)] == parts
 
 
 @given(st.binary(max_size=40), answers)
 def test_noise_costs_no_later_answer(noise: bytes, answer: Any) -> None:
-    splitter = bus.Splitter()
+    splitter = bus.PacketSplitter()
     splitter.feed(noise)
     # What looks like the begin of an answer is waited for: at most one of the greatest length.
     found = splitter.feed(frame(*answer) * (2 + (bus.LONGEST + 4) // len(frame(*answer))))
-    assert bus.Answer(*answer) in found
+    assert bus.ServoAnswer(*answer) in found
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_noise_costs_no_later_answer(noise: bytes, answer: Any) -> None:
     ],
 )
 def test_a_spoilt_answer_hides_no_other(spoilt: bytes) -> None:
-    found = bus.Splitter().feed(spoilt + frame(2, 0, b"xy") + frame(3, 4, b""))
+    found = bus.PacketSplitter().feed(spoilt + frame(2, 0, b"xy") + frame(3, 4, b""))
     assert found[-2:] == [(2, 0, b"xy"), (3, 4, b"")] and 1 not in {a.servo for a in found}
 
 

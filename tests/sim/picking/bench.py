@@ -9,11 +9,11 @@ import numpy as np
 
 from petrobot.sim.catching.truth import read_toml
 from petrobot.sim.picking.arm import ToolPose
-from petrobot.sim.picking.camera import Picture, TableCamera
+from petrobot.sim.picking.camera import Picture, SceneCamera
 from petrobot.sim.picking.gripper import Fingers
 from petrobot.sim.picking.parts import Part
 from petrobot.sim.picking.truth import LABORATORY_FILE, PickingSite
-from petrobot.sim.picking.world import Table, World
+from petrobot.sim.picking.world import TableTop, World
 
 FILES = Path(__file__).parents[3] / "services" / "picking"
 FINGERS = Fingers(0.065, 0.008, 0.014)
@@ -31,10 +31,10 @@ def site(arm: str = "so101") -> PickingSite:
 
 
 @cache
-def camera() -> TableCamera:
+def camera() -> SceneCamera:
     """The camera of the shipped installation."""
     shipped = site()
-    return TableCamera(shipped.camera(), shipped.settings["table"]["grey"], shipped.trays)
+    return SceneCamera(shipped.camera(), shipped.settings["table"]["grey"], shipped.trays)
 
 
 def scene(seed: int, regime: str = "plain") -> tuple[list[Part], Picture]:
@@ -65,7 +65,7 @@ class Crane:
 
     def __init__(self, *parts: Part) -> None:
         self.world = World(
-            Table((-0.2, 0.2), (-0.2, 0.2)), FINGERS, parts, np.random.default_rng(1)
+            TableTop((-0.2, 0.2), (-0.2, 0.2)), FINGERS, parts, np.random.default_rng(1)
         )
         self.pose = [0.0, 0.0, ABOVE, 0.0]
         self.gap = FINGERS.opening
