@@ -304,12 +304,15 @@ def faults_of_keys(driver: type, config: Mapping[str, Any]) -> list[tuple[str, s
 def faults_of_limits(driver: type, config: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return what is wrong with `speed`, `workspace` and `dry_run` in a device's table, by key: a
     driver that does not obey one would run as if it were not there. A key of this name that the
-    driver declares itself is its own."""
+    driver declares itself is its own, and so is one of a class that is not derived from `Driver`
+    and says nothing of `obeys`."""
     faults = list[tuple[str, str]]()
+    foreign = not issubclass(driver, Driver) and not hasattr(driver, "obeys")
     obeys = getattr(driver, "obeys", ())
     for name in LIMITS:
         still = name == "dry_run" and not can_move(driver)  # as in every dry run
-        if name not in config or name in keys_of(driver) or still:
+        own = name in keys_of(driver) or (foreign and name != "dry_run")
+        if name not in config or own or still:
             continue
         if name not in obeys:
             text = f'{name}: {driver.__name__} does not obey it; do without it, or write obeys = ("'
