@@ -211,7 +211,9 @@ def analysed(
     }
 
 
-def _analysis(text: str, filename: str, cell: Mapping[str, Any] | None) -> Iterator[dict[str, Any]]:
+def _analysis(
+    text: str, filename: str, cell: Mapping[str, Any] | None = None
+) -> Iterator[dict[str, Any]]:
     for view in ("ordinary", "gspn"):  # verdicts first, because a forecast may take long
         yield analysed(text, filename, cell, view)
 

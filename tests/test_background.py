@@ -65,8 +65,9 @@ def test_the_kernel_ends_a_process_that_takes_too_much_processor_time() -> None:
         "from itertools import repeat\n"
         "from petrobot.coordinator import background\n"
         "background.HARD_END = 0\n"
-        "background.analysed = lambda text, name, view: all(repeat(1)) if view == 'gspn' else "
-        "{'said': 1}\n"
+        "background.analysed = lambda text, name, cell, view: (\n"
+        "    all(repeat(1)) if view == 'gspn' else {'said': 1}\n"
+        ")\n"
         "background.main()\n"
     )
     order = b'{"work": "analysis", "given": {"text": "", "filename": "drawn.toml"}}\n'
@@ -109,7 +110,7 @@ async def apart() -> AsyncIterator[BackgroundProcess]:
     await made.close()
 
 
-FINDINGS = {"text": CATCH_BALL, "filename": "catch_ball.toml", "where": None}
+FINDINGS = {"text": CATCH_BALL, "filename": "catch_ball.toml", "cell": None}
 
 
 @pytest.mark.processes

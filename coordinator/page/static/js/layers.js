@@ -221,7 +221,40 @@ function settled(layers) {
       column.forEach((spot, k) => row.set(spot, placed[k]));
     }
   }
+  level(layers, row);
   return row;
+}
+
+// Put each chain of nodes that follow one another without a branch on one height, where the
+// distances in their columns allow it.
+function level(layers, row) {
+  const limits = new Map();
+  for (const column of layers.columns) column.forEach((spot, i) => limits.set(spot, [column[i - 1], column[i + 1]]));
+  const apart = (above, below) => APART[isPoint(above) + isPoint(below)] - 1e-6;
+  const fits = (spot, height) => {
+    const [above, below] = limits.get(spot);
+    return (above === undefined || height - row.get(above) >= apart(above, spot))
+      && (below === undefined || row.get(below) - height >= apart(spot, below));
+  };
+  for (const chain of chains(layers).sort((a, b) => b.length - a.length)) {
+    const heights = chain.map((spot) => row.get(spot));
+    const mean = heights.reduce((sum, y) => sum + y, 0) / heights.length;
+    const height = [mean, ...heights.sort((a, b) => a - b)].find((y) => chain.every((spot) => fits(spot, y)));
+    if (height !== undefined) for (const spot of chain) row.set(spot, height);
+  }
+}
+
+function chains(layers) {
+  const after = new Map();
+  for (const [a, nexts] of layers.next) {
+    if (nexts.length === 1 && layers.before.get(nexts[0]).length === 1 && !isPoint(a) && !isPoint(nexts[0])) after.set(a, nexts[0]);
+  }
+  const inner = new Set(after.values());
+  return [...after.keys()].filter((first) => !inner.has(first)).map((first) => {
+    const chain = [first];
+    while (after.has(chain.at(-1))) chain.push(after.get(chain.at(-1)));
+    return chain;
+  });
 }
 
 function offsets(column) {
