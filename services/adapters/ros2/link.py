@@ -168,4 +168,6 @@ class SimulatedLink:
         """Nothing to close."""
 
     def _take(self, messages: Iterable[Message]) -> None:
-        self._inbox += [("message", parse(json.dumps(message))) for message in messages]
+        self._inbox += [
+            ("message", parse(json.dumps(message, allow_nan=False))) for message in messages
+        ]
