@@ -49,15 +49,15 @@ def test_shipped_tasks_are_sound(path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", VARIANTS)
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_broken_variants_are_caught(path: Path, kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["catch_ball", "follow_track"])
+def test_broken_variants_are_caught(name: str, kind: str, tmp_path: Path) -> None:
     """Each variant has a witness that the net replays, and a picture that shows where it leads."""
-    task = VARIANTS[kind](load(path))
+    task = VARIANTS[kind](load(TASKS / f"{name}.toml"))
     found = judged(task)
     assert not found.ok
     bad = dict(refused(found))
-    name = next(name for name in bad if name in EXPECTED[kind])
-    verdict = bad[name]
+    against = next(verdict for verdict in bad if verdict in EXPECTED[kind])
+    verdict = bad[against]
     assert verdict.witness is not None
     *_, last = (
         task.net.replay(verdict.witness.firings) if verdict.witness.firings else (task.net.initial,)
@@ -66,7 +66,7 @@ def test_broken_variants_are_caught(path: Path, kind: str, tmp_path: Path) -> No
         p: n for p, n in zip(task.net.places, last, strict=True) if n
     } == verdict.witness.marking
     made = {p.stem: p for p in draw_witnesses(found, task, tmp_path)}
-    root = ElementTree.fromstring(made[f"{task.name}-{name}"].read_text(encoding="utf-8"))
+    root = ElementTree.fromstring(made[f"{task.name}-{against}"].read_text(encoding="utf-8"))
     texts = [e.text or "" for e in root.iter() if e.get("class") == "turn"]
     turns = sorted(
         int(turn) for text in texts for turn in text.replace("…", "").split(",") if turn.strip()
