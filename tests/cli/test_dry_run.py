@@ -40,13 +40,13 @@ host = "127.0.0.1"
 port = {port}
 [devices.axis]
 node = "pc"
-driver = "robot:{driver}"
+driver = "dry_robot:{driver}"
 {keys}
 [devices.sensor]
 node = "pc"
-driver = "robot:Sensor"
+driver = "dry_robot:Sensor"
 [actions.go]
-run = "robot:go"
+run = "dry_robot:go"
 device = "axis"
 """
 TASK = """schema = 1
@@ -75,7 +75,7 @@ done = { in = ["going:normal"] }
 def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a task, a robot and its location file."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "robot.py").write_text(ROBOT)
+    (tmp_path / "dry_robot.py").write_text(ROBOT)
     (tmp_path / "go.toml").write_text(TASK)
     place(tmp_path)
     return tmp_path

@@ -65,18 +65,18 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "[actions.locate_mog2]",
         "[actions.locate_background]",
-        ":82: actions.locate_background: is placed twice",
+        ":85: actions.locate_background: is placed twice",
     ),
     (
         'device = "camera"',
         'device = "camera"\nnode = "motion"',
-        ":80: actions.locate_background.node: is on two nodes",
+        ":82: actions.locate_background.node: is on two nodes",
     ),
-    ('device = "camera"', "", ":76: actions.locate_background: is on no node; write device"),
+    ('device = "camera"', "", ":78: actions.locate_background: is on no node; write device"),
     (
         'device = "camera"',
         'device = "camra"',
-        ":79: actions.locate_background.device: no device is named 'camra'; did you mean 'camera'?",
+        ":81: actions.locate_background.device: no device is named 'camra'; did you mean 'camera'?",
     ),
     (
         "vision.camera:Camera",
@@ -103,7 +103,7 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "actions:locate_background",
         "actions:locate_backgroud",
-        ":77: actions.locate_background.run: 'petrobot.services.vision.actions' has no",
+        ":79: actions.locate_background.run: 'petrobot.services.vision.actions' has no",
     ),
     (
         "laboratory:make_laboratory",
@@ -113,18 +113,18 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "deadline = 10.0",
         'deadline = "10 s"',
-        ":80: actions.locate_background.deadline: is '10 s'; write a number of seconds above 0",
+        ":82: actions.locate_background.deadline: is '10 s'; write a number of seconds above 0",
     ),
     (
         "deadline = 12.0",
         "args = { margn = 5 }",
-        ":142: actions.follow_and_wait.args: follow_and_wait has no argument 'margn'; did "
+        ":152: actions.follow_and_wait.args: follow_and_wait has no argument 'margn'; did "
         "you mean 'margin'?",
     ),
     (
         "deadline = 10.0",
         "args = 5",
-        ":80: actions.locate_background.args: is 5; write a table of arguments",
+        ":82: actions.locate_background.args: is 5; write a table of arguments",
     ),
     (
         'to = "arm"',
@@ -149,7 +149,7 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         'cell = "services/cell.toml"',
         'cell = "our_cell.toml"',
-        ":178: parameters.cell: {folder}/our_cell.toml is not there; write the path",
+        ":188: parameters.cell: {folder}/our_cell.toml is not there; write the path",
     ),
     ("[nodes.vision]", "[node.vision]", ":21: node: unknown table; did you mean 'nodes'?"),
     ("[nodes.vision]", "[nodes.vision", ":21: not valid TOML"),

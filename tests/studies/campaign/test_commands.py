@@ -207,7 +207,7 @@ def test_a_killed_campaign_is_resumed(tmp_path: Path) -> None:
 
     part = start(*arguments, "--out", "part")
     table = tmp_path / "part" / "table.csv"
-    _until(lambda: table.exists() or part.poll() is not None)
+    _until(lambda: part.poll() is not None or (table.exists() and b"\n" in table.read_bytes()))
     part.kill()
     part.wait()
     assert 0 < table.read_bytes().count(b"\n") < 61
