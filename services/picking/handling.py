@@ -26,7 +26,7 @@ from petrobot.services.action import (
 )
 from petrobot.services.picking.commands import ARMS, ArmState
 from petrobot.services.picking.model import (
-    ArmModel,
+    JointChain,
     NumbersError,
     OutOfReachError,
     PartKind,
@@ -82,7 +82,7 @@ class ArmError(Exception):
 # Where to grasp
 
 
-def across(kind: PartKind, part: Mapping[str, Any], arm: ArmModel) -> Grasp:
+def across(kind: PartKind, part: Mapping[str, Any], arm: JointChain) -> Grasp:
     """Return a grasp across a part's narrow side; a round part has none, so the fingers keep the
     direction in which the arm comes."""
     narrow, turn = min(kind.size), float(part["turn"]) + math.pi / 2
@@ -98,7 +98,7 @@ def across(kind: PartKind, part: Mapping[str, Any], arm: ArmModel) -> Grasp:
     )
 
 
-def at_centre(kind: PartKind, part: Mapping[str, Any], arm: ArmModel) -> Grasp:
+def at_centre(kind: PartKind, part: Mapping[str, Any], arm: JointChain) -> Grasp:
     """Return a grasp at a part's middle, with the fingers wide open and across the direction in
     which the arm comes: they turn the part by closing."""
     return Grasp(
@@ -115,7 +115,7 @@ def _depth(kind: PartKind) -> float:
     return max(FLOOR, kind.height - SEAT)
 
 
-def _arriving(part: Mapping[str, Any], arm: ArmModel) -> float:
+def _arriving(part: Mapping[str, Any], arm: JointChain) -> float:
     """The direction across the line from the arm's foot to the part."""
     foot = arm.points[0]
     return math.atan2(float(part["y"]) - foot[1], float(part["x"]) - foot[0]) + math.pi / 2
@@ -177,7 +177,7 @@ async def grasp_centre(
 
 async def _grasp(
     ctx: Context,
-    planned: Callable[[PartKind, Mapping[str, Any], ArmModel], Grasp],
+    planned: Callable[[PartKind, Mapping[str, Any], JointChain], Grasp],
     part: Mapping[str, Any],
     arm: str,
     cell: str,

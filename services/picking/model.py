@@ -1,8 +1,8 @@
 """The numbers of a pick-and-place cell and of its arm, read from TOML files and checked.
 
 An arm is a row of joint axes at joint angles of zero, so any arm of five or six joints can be
-described. `ArmModel.tool` is its forward kinematics, `ArmModel.over` the joint angles for fingers
-that point straight down.
+described. `JointChain.tool` is its forward kinematics, `JointChain.over` gives the joint angles for
+fingers that point straight down.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 _NEAR: Final = 2e-4
-"""m and rad within which a pose counts as reached by `ArmModel.over`."""
+"""m and rad within which a pose counts as reached by `JointChain.over`."""
 
 
 class NumbersError(ValueError):
@@ -101,7 +101,7 @@ class Gripper:
 
 
 @dataclass(frozen=True, slots=True)
-class ArmModel:
+class JointChain:
     """An arm on the table, all in the table's frame at joint angles of zero."""
 
     name: str
@@ -247,7 +247,7 @@ def read_cell(text: str, source: str) -> PickingCell:
     return cell
 
 
-def read_arm(text: str, source: str) -> ArmModel:
+def read_arm(text: str, source: str) -> JointChain:
     """Read an arm's numbers. Raises NumbersError."""
     table = _table(text, source)
     try:
@@ -255,7 +255,7 @@ def read_arm(text: str, source: str) -> ArmModel:
         turn = _rotation(np.array((0.0, 0.0, 1.0)), float(base["yaw"]))
         foot = np.asarray(base["position"], float)
         joints = table["joints"]
-        arm = ArmModel(
+        arm = JointChain(
             str(table["name"]),
             np.array([turn @ np.asarray(j["point"], float) + foot for j in joints]),
             np.array([turn @ np.asarray(j["axis"], float) for j in joints]),
@@ -284,7 +284,7 @@ def read_arm(text: str, source: str) -> ArmModel:
 
 
 @cache
-def arm_named(name: str) -> ArmModel:
+def arm_named(name: str) -> JointChain:
     """Return the arm of a shipped file (`"so101"`, `"ur5e"`), or of the file at a path. Raises
     NumbersError."""
     own = Path(__file__).with_name(f"{name}.toml")
