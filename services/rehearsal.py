@@ -18,7 +18,7 @@ from petrobot.services.node.memory import GlobalMemory
 from petrobot.services.worker.context import Draws, Report
 from petrobot.services.worker.outlets import Sent
 
-NAME, RUN = "action", "rehearsal"
+NAME, RUN = "action", "rehearsal/action#1"
 
 
 class StillRunningError(AssertionError):

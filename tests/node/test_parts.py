@@ -558,6 +558,18 @@ def test_a_rehearsal_shows_what_is_provisional_and_what_was_judged() -> None:
     ]
 
 
+def test_the_run_of_one_rehearsal_can_be_judged_in_another() -> None:
+    async def pick(ctx: Context) -> Result:
+        return provisional(success(run=ctx.run))
+
+    async def judge(ctx: Context, run: str) -> Result:
+        ctx.verdict(run, Status.FAILURE, "crooked")
+        return success()
+
+    picked = rehearse(pick).result.values["run"]
+    assert [run for _, run, _, _ in rehearse(judge, run=picked).verdicts] == [picked]
+
+
 def test_a_script_may_be_provisional(tmp_path: Path) -> None:
     file = tmp_path / "script.toml"
     file.write_text("schema = 1\n[actions.one]\ndeferred = true\n")
