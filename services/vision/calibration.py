@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,15 +23,16 @@ from petrobot.services.vision.optics import Optics
 
 Array = NDArray[np.float64]
 
-CORNER_SIGMA_PX = 0.07
-"""px, accuracy of a chessboard corner (residual of calibrations at 3 grey levels of noise)."""
 CORNER_WINDOW = 5
 """px, half width of the window in which a corner is refined; less than half the side of a square in
 any view."""
-PLACEMENT_SIGMA = 0.0003
-"""m, accuracy to which the position of a board on the table is known."""
-PLACEMENT_TURN = 0.0005
-"""rad, accuracy to which its direction is known."""
+RULER = (0.1, 0.002, 0.001)
+"""Accuracies that the adjustment begins with: of a corner (px), of a board's measured direction
+(rad) and of its measured place (m), as with a ruler. The images tell the real ones."""
+FINEST = (0.002, 1e-5, 1e-5)
+"""The same, least ones: exact corners or places would get weights without bound."""
+ROUNDS = 20
+"""Most rounds of estimating the accuracies."""
 FEWEST_VIEWS, FEWEST_KNOWN = 6, 3
 """Fewest views with the whole board, and fewest of them with a known pose."""
 LENS = 8
@@ -154,6 +156,11 @@ class _Adjustment:
     Unknowns: lens (8), camera pose (6: rotation vector and translation), and one pose (6) per view:
     for a known view its deviation from the stated pose in the board's frame, for any other the
     board in the camera's frame.
+
+    How well corners, directions and places are measured is unknown, too, and differs from
+    laboratory to laboratory. The three variances are estimated with the rest: each is the sum of
+    its squared residuals by their redundancy (Forstner, "Ein Verfahren zur Schaetzung von
+    Varianz- und Kovarianzkomponenten", AVN 86, 1979), in turns with the fit.
     """
 
     def __init__(
@@ -167,24 +174,22 @@ class _Adjustment:
         self._corners = corners
         self._poses = poses
         self._size = size
+        self._accuracy = np.array(RULER)
+        """Of a corner (px), a stated direction (rad) and a stated place (m)."""
+        known = sum(pose is not None for pose in poses)
+        self._kind = np.repeat(
+            [0, *[1, 2] * known], [2 * len(self._points) * len(corners), *[3] * (2 * known)]
+        )
+        """For each residual, which of the three it is an error of."""
 
     def solve(self) -> Calibration:
         """Start from calibrateCamera, refine all unknowns together, report residuals."""
-        # Imported here, not above: a node that only reads a calibration would otherwise load scipy
-        # for nothing, a third of its start.
-        from scipy.optimize import least_squares
-
-        start = self._start()
-        fit = least_squares(
-            self._residuals, start, self._slopes, method="lm", x_scale="jac", xtol=1e-10
-        )
-        if not fit.success:
-            raise CalibrationError(
-                f"the calibration does not converge ({fit.message}); take more and sharper images"
-            )
+        first = self._fit(self._start())
+        self._accuracy = self._estimated(first.fun, first.jac)
+        fit = self._fit(first.x)
         optics = self._optics(fit.x)
-        count = 2 * len(self._points) * len(self._corners)
-        residual = float(np.sqrt(2.0 * np.mean(fit.fun[:count] ** 2))) * CORNER_SIGMA_PX
+        corner = fit.fun[self._kind == 0] * self._accuracy[0]
+        residual = float(np.sqrt(2.0 * np.mean(corner**2)))
         return Calibration(
             optics,
             len(self._corners),
@@ -192,6 +197,38 @@ class _Adjustment:
             self._table_residual(optics),
             self._table_sigma(fit.x, fit.jac),
         )
+
+    def _fit(self, start: Array) -> Any:
+        # Imported here, not above: a node that only reads a calibration would otherwise load scipy
+        # for nothing, a third of its start.
+        from scipy.optimize import least_squares
+
+        fit = least_squares(
+            self._residuals, start, self._slopes, method="lm", x_scale="jac", xtol=1e-10
+        )
+        if not fit.success:
+            raise CalibrationError(
+                f"the calibration does not converge ({fit.message}); take more and sharper images"
+            )
+        return fit
+
+    def _estimated(self, residuals: Array, jacobian: Array) -> Array:
+        """Return the accuracies that a fit shows. Its Jacobian is kept, as the accuracies change
+        the solution only a little. The part of a residual that the unknowns do not take up is its
+        redundancy."""
+        accuracy = self._accuracy
+        for _ in range(ROUNDS):
+            weight = (self._accuracy / accuracy)[self._kind]
+            slopes, off = jacobian * weight[:, None], residuals * weight
+            inverse = np.linalg.pinv(slopes.T @ slopes, hermitian=True) @ slopes.T
+            off = off - slopes @ (inverse @ off)
+            redundancy = np.bincount(self._kind, 1.0 - np.einsum("ij,ji->i", slopes, inverse))
+            squares = np.bincount(self._kind, off**2)
+            before = accuracy
+            accuracy = np.maximum(before * np.sqrt(squares / redundancy), FINEST)
+            if np.allclose(accuracy, before, rtol=0.01):
+                break
+        return np.asarray(accuracy)
 
     def _start(self) -> Array:
         points = [self._points.astype(np.float32)] * len(self._corners)
@@ -227,7 +264,7 @@ class _Adjustment:
         fx, fy, cx, cy = unknown[:4]
         matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         base = _pose(unknown[LENS : LENS + 3], unknown[LENS + 3 : LENS + 6])
-        accuracy = np.array([PLACEMENT_TURN] * 3 + [PLACEMENT_SIGMA] * 3)
+        accuracy = np.repeat(self._accuracy[1:], 3)
         parts, priors = [], []
         for k, (corners, known) in enumerate(zip(self._corners, self._poses, strict=True)):
             own = unknown[LENS + 6 + 6 * k : LENS + 12 + 6 * k]
@@ -239,7 +276,7 @@ class _Adjustment:
             expected = cv2.projectPoints(self._points, turn, pose[:3, 3], matrix, unknown[4:LENS])[
                 0
             ]
-            parts.append((expected.reshape(-1, 2) - corners).ravel() / CORNER_SIGMA_PX)
+            parts.append((expected.reshape(-1, 2) - corners).ravel() / self._accuracy[0])
         return np.concatenate(parts + priors)
 
     def _slopes(self, unknown: Array) -> Array:
