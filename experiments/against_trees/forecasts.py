@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from experiments.against_trees.faults import Edit, Edits, apply
 from experiments.against_trees.results import PLANT, TASK, Line, Results, Size
 from experiments.against_trees.verified import petrobot
+from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.time.completion import completion_time
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
@@ -187,7 +188,13 @@ def by_petrobot(change: StructuralChange, train: Path, runs: int) -> dict[str, A
     rows = list(read_table(train / TABLE))
     estimates = estimates_of(task, rows, train.name)
     if change.by_view:
-        return _by_view(change, task, estimates)
+        try:
+            return _by_view(change, task, estimates)
+        except NetFileError as fault:
+            return {
+                **{name: [None, None] for name in FIGURES},
+                "from": "refused", "doubts": [str(fault)], "sha256": "",
+            }  # fmt: skip
     choices = {name: {action: 1.0} for name, action in change.choices.items()}
     trainings = trainings_of(task, estimates) if change.net else by_regime(task, rows)
     usual = choices_of(trainings[REGIME])  # as often as the training chose

@@ -89,19 +89,26 @@ def forecasts(results: Results) -> str:
             held = [low <= truth <= high for (_, span), truth in told if span
                     for low, high in [span]]  # fmt: skip
             off = [abs(value - truth) / (1.0 if name == "R_goal" else truth)
-                   for (value, _), truth in told]  # fmt: skip
+                   for (value, _), truth in told if value is not None]  # fmt: skip
             width = [span[1] - span[0] for (_, span), _ in told if span]
             rows.append([
-                name, method, f"{sum(held)} of {len(held)}", f"{mean(width):.3f}",
+                name, method, len(off), f"{sum(held)} of {len(held)}", f"{mean(width):.3f}",
                 f"{100 * median(off):.1f}", f"{100 * max(off):.1f}",
             ])  # fmt: skip
-    head = ["figure", "method", "interval held", "its mean width", "median error (%)", "largest"]
+    head = [
+        *("figure", "method", "values", "interval held", "its mean width"),
+        *("median error (%)", "largest"),
+    ]
     each = [
         [said["name"], *(f"{truth[name]:.3f} / " + " / ".join(
-            f"{said[method][name][0]:.3f}" for method in METHODS) for name in FIGURES)]
+            _number(said[method][name][0]) for method in METHODS) for name in FIGURES)]
         for said, truth in pairs
     ]  # fmt: skip
     return table(head, rows) + "\n\n" + table(["change", *FIGURES], each)
+
+
+def _number(value: float | None) -> str:
+    return "refused" if value is None else f"{value:.3f}"
 
 
 # --- (c) ------------------------------------------------------------------------------------------

@@ -1,9 +1,10 @@
 """Check every promised figure in full and write them to docs/figures.md (`make proof`).
 
-Each result is stored in reports/proof with a hash of the sources that it depends on. A proof whose
-sources have not changed is not run again, so an interrupted `make proof` continues where it
-stopped. `--only NAME ...` runs some proofs, `--fresh` forgets the stored results, `--jobs K` runs K
-at the same time (speeds are always measured alone), `--page` only writes the page.
+Each result is stored in docs/figures.json with a hash of the sources that it depends on. A proof
+whose sources have not changed is not run again, so an interrupted `make proof` continues where it
+stopped, on another machine, too. `--only NAME ...` runs some proofs, `--fresh` forgets the stored
+results, `--jobs K` runs K at the same time (speeds are always measured alone), `--page` only writes
+the page.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from tools.proof.page import figures
 from tools.proof.proof import KEPT, ROOT, FigureProof
 
 FIGURES = ROOT / "docs" / "figures.md"
+MEASURED = FIGURES.with_suffix(".json")
 
 
 def proofs() -> list[FigureProof]:
@@ -36,28 +38,24 @@ def proofs() -> list[FigureProof]:
     ]
 
 
-def kept(proof: FigureProof) -> dict[str, Any] | None:
-    """What was measured last, of whatever sources."""
-    path = KEPT / f"{proof.slug}.json"
-    if not path.exists():
-        return None
-    data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+def kept() -> dict[str, dict[str, Any]]:
+    """What was measured last, of whatever sources, by the proofs' names."""
+    if not MEASURED.exists():
+        return {}
+    data: dict[str, dict[str, Any]] = json.loads(MEASURED.read_text(encoding="utf-8"))
     return data
 
 
 def prove(proof: FigureProof) -> dict[str, Any]:
-    """Measure, judge and keep."""
+    """Measure and judge."""
     begun, sources = time.monotonic(), proof.fingerprint()
     result = proof.measure()
-    minutes = round((time.monotonic() - begun) / 60, 1)
-    data = {
+    return {
         "sources": sources,
         "holds": proof.holds(result),
         "result": dict(result),
-        "minutes": minutes,
+        "minutes": round((time.monotonic() - begun) / 60, 1),
     }
-    (KEPT / f"{proof.slug}.json").write_text(json.dumps(data, indent=2), encoding="utf-8")
-    return data
 
 
 def run(todo: Sequence[FigureProof], jobs: int) -> bool:
@@ -78,17 +76,15 @@ def run(todo: Sequence[FigureProof], jobs: int) -> bool:
                     f"[{done}/{len(todo)}, {togo:.0f} min to go] {waiting[future].name}: "
                     f"{holds}: {data['result']}"
                 )
-                write_page()
+                write(kept() | {waiting[future].name: data})
     return good
 
 
-def write_page() -> None:
-    """The page with all that is kept so far."""
-    everything = proofs()
-    FIGURES.write_text(
-        figures(everything, {p.name: data for p in everything if (data := kept(p))}),
-        encoding="utf-8",
-    )
+def write(measured: dict[str, dict[str, Any]]) -> None:
+    """Store the results, and write their page."""
+    text = json.dumps({name: measured[name] for name in sorted(measured)}, indent=1)
+    MEASURED.write_text(text + "\n", encoding="utf-8")
+    FIGURES.write_text(figures(proofs(), measured), encoding="utf-8")
 
 
 def main() -> int:
@@ -105,20 +101,19 @@ def main() -> int:
     options = parser.parse_args()
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     KEPT.mkdir(parents=True, exist_ok=True)
+    found = kept()
     if options.page:
-        write_page()
+        write(found)
         return 0
     chosen = [p for p in proofs() if options.only is None or p.name in options.only]
-    found = {p.name: kept(p) for p in chosen}
     todo = [
         p
         for p in chosen
-        if options.fresh or (found[p.name] or {}).get("sources") != p.fingerprint()
+        if options.fresh or found.get(p.name, {}).get("sources") != p.fingerprint()
     ]
-    old = all(data["holds"] for p in chosen if p not in todo and (data := found[p.name]))
+    old = all(found[p.name]["holds"] for p in chosen if p not in todo)
     print(f"{len(chosen) - len(todo)} kept, {len(todo)} to measure")
     good = run(todo, options.jobs)
-    write_page()
     return 0 if good and old else 1
 
 

@@ -12,35 +12,13 @@ import tomllib
 from collections.abc import Callable
 from typing import Any
 
-from tools.proof.proof import ROOT, FigureProof, Result, run_task
+from tools.proof.proof import LOCK_STEP, ROOT, FigureProof, Result, run_task
 
 CHAPTER = "Catching, lock step"
 THROWS = 1000
 DISTURBED_THROWS = 200
 SEED = 20_000
 FLOORS = {"A": 0.98, "B": 0.94, "C": 0.89}
-SOURCES = (
-    *(
-        "coordinator/engine",
-        "coordinator/task",
-        "coordinator/task/file",
-        "coordinator/task/conditions",
-    ),
-    *(
-        "coordinator/task/net.py",
-        "coordinator/run/executor.py",
-        "coordinator/run/interfaces.py",
-        "coordinator/run/mission.py",
-    ),
-    *(
-        "coordinator/run/lockstep.py",
-        "coordinator/tasks/catch_ball.toml",
-        "services.toml",
-        "services",
-        "sim",
-    ),
-)
-APART = ("services/mobile", "sim/track")
 
 
 def wilson_lower(successes: int, trials: int, z: float = 1.959964) -> float:
@@ -135,8 +113,7 @@ def proofs() -> list[FigureProof]:
             catching(regime, THROWS),
             _above(floor),
             f"lower bound >= {floor}",
-            SOURCES,
-            APART,
+            LOCK_STEP,
         )
         for regime, floor in FLOORS.items()
     ]
@@ -148,15 +125,14 @@ def proofs() -> list[FigureProof]:
                 catching(name, DISTURBED_THROWS),
                 lambda r: r["throws"] == DISTURBED_THROWS,
             ),
-            *("measured", SOURCES, APART),
+            *("measured", LOCK_STEP),
         )
         for name in disturbances()
     ]
     same = FigureProof(
         *("one seed, one file", "Lock step", same_file_anywhere, _same),
         "equal files; >= 10x in one process, >= 4x in four",
-        SOURCES,
-        APART,
+        LOCK_STEP,
         alone=True,
     )
     return [*main, same, *disturbed]

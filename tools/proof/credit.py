@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from tools.proof.campaigns import Result, Sizes, campaign, rows_of
-from tools.proof.proof import ROOT, FigureProof
+from tools.proof.proof import LOCK_STEP, ROOT, FigureProof
 
 from petrobot.coordinator.cli.loading import load_directory, load_task
 from petrobot.coordinator.learning.batch import Response
@@ -272,8 +272,7 @@ def proofs() -> list[FigureProof]:
             lambda result: bool(result["all that was promised"]),
             f"catches > {100 * MEAN:g} points beside the best combination, lower end > "
             f"{100 * LOWEST:g}, in {len(REGIMES)} regimes",
-            ("coordinator", "services.toml", "services", "sim"),
-            ("coordinator/page", "services/mobile", "sim/track"),
+            (*LOCK_STEP, "coordinator/learning", "coordinator/studies"),
         )
     ]
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from tools.proof.campaigns import FAST, Result, Sizes, campaign, petrobot, rows_of, speed
-from tools.proof.proof import ROOT, FigureProof
+from tools.proof.proof import LOCK_STEP, ROOT, FigureProof
 
 from petrobot.coordinator.cli.loading import load_directory, load_task
 from petrobot.coordinator.cli.report import compared
@@ -293,8 +293,7 @@ STEPS: Mapping[str, Callable[[Sizes, argparse.Namespace], Result]] = {
     "forecast": forecast,
 }
 CHAPTER = "Learning and forecasting, lock step"
-SOURCES = ("coordinator", "services.toml", "services", "sim")
-APART = ("coordinator/page", "services/mobile", "sim/track")
+SOURCES = (*LOCK_STEP, "coordinator/learning", "coordinator/studies")
 FULL = ROOT / "reports" / "proof" / "learning"
 
 
@@ -326,7 +325,6 @@ def proofs() -> list[FigureProof]:
             holds=lambda result: bool(result["all that was promised"]),
             floor=floor,
             sources=SOURCES,
-            apart=APART,
             alone=step == "speed",
         )
         for step, (name, floor, line) in floors.items()

@@ -24,6 +24,5 @@ def proofs() -> list[FigureProof]:
             lambda r: r["exit"] == 0,
             "all pass",
             SOURCES,
-            ("tools/proof",),
         )
     ]

@@ -9,11 +9,12 @@ from tools.proof.proof import FigureProof
 
 HEAD = """# Figures
 
-What petrobot promises, and what was measured. `make proof` writes this page; anyone can repeat it.
-It resumes where it stopped, and measures again what has changed since.
+What petrobot promises, and what was measured. `make proof` writes this page from figures.json;
+anyone can repeat it. It resumes where it stopped, and measures again what has changed since.
 
 `floor` is the least that is promised, `holds` says whether the measurement reaches it. `sources`
-identifies the measured code; `(older)` means that the code has changed since.
+identifies the measured code (without comments and layout); `(older)` means that the code has
+changed since.
 
 How faults that were injected on purpose ended: [figures-faults.md](figures-faults.md).
 """

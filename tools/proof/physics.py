@@ -8,14 +8,12 @@ from collections.abc import Callable
 
 import numpy as np
 from tools.proof.catching import wilson_lower
-from tools.proof.proof import KEPT, ROOT, FigureProof, Result, run_task
+from tools.proof.proof import KEPT, LOCK_STEP, ROOT, FigureProof, Result, run_task
 
 from petrobot.sim.catching.physics import BACK_ENDS, BULLET, PORTABLE, arm_dynamics
 from petrobot.sim.catching.site import CupMount, read_site
 
 CHAPTER = "Physics: Bullet and portable"
-SOURCES = ("services.toml", "services", "sim", "coordinator/tasks/catch_ball.toml")
-APART = ("services/mobile", "sim/track")
 STATES = 3000
 THROWS = 100
 SEED = 31_000
@@ -122,8 +120,7 @@ def proofs() -> list[FigureProof]:
         arm,
         lambda r: r["torque (N m)"] <= 1e-12 and r["mass matrix (kg m^2)"] <= 1e-12,
         "within 1e-12",
-        SOURCES,
-        APART,
+        LOCK_STEP,
     )
     balls = [
         FigureProof(
@@ -133,8 +130,7 @@ def proofs() -> list[FigureProof]:
             holds(regime),
             f"lower bound of each >= {floor}, same shares within "
             f"{SPRINGY if 'springy' in regime else MARGIN}",
-            SOURCES,
-            APART,
+            LOCK_STEP,
         )
         for regime, floor in FLOORS.items()
     ]

@@ -3,17 +3,31 @@ on."""
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[2]
 KEPT = ROOT / "reports" / "proof"
+"""Where the measuring commands leave their files."""
+LOCK_STEP = (
+    *("coordinator/engine", "coordinator/run", "coordinator/task"),
+    *("coordinator/tasks/catch_ball.toml", "services.toml", "services/cell.toml"),
+    *("services/action.py", "services/device.py", "services/vision", "services/motion"),
+    *("services/worker", "services/node/inline_host.py", "services/node/lockstep.py"),
+    *("services/comm/calls", "services/comm/lockstep", "services/comm/streams"),
+    *("sim/catching", "sim/bus/canopen_node.py", "sim/bus/power_drive.py", "sim/faults.py"),
+    *("sim/laboratory_party.py", "sim/exposures.py"),
+)
+"""What decides which balls are caught in lock step."""
 SUFFIXES = (".py", ".toml", ".eds", ".js", ".css", ".html")
 
 Result = Mapping[str, Any]
@@ -24,8 +38,7 @@ class FigureProof:
     """One promised figure.
 
     `chapter` is its table in docs/figures.md. `sources` are the folders and files whose change
-    makes it stale, without those in `apart`. `alone` is true where other work on the machine would
-    falsify it (speeds).
+    makes it stale. `alone` is true where other work on the machine would falsify it (speeds).
     """
 
     name: str
@@ -34,21 +47,15 @@ class FigureProof:
     holds: Callable[[Result], bool]
     floor: str
     sources: Sequence[str]
-    apart: Sequence[str] = ()
     alone: bool = False
 
-    @property
-    def slug(self) -> str:
-        """The name of its files."""
-        return "".join(c if c.isalnum() or c in "+-" else "_" for c in self.name)
-
     def fingerprint(self) -> str:
-        """Hash of all sources that the figure depends on."""
+        """Hash of what all sources that the figure depends on say to the interpreter: comments,
+        docstrings and layout do not count. It differs between versions of Python."""
         digest = hashlib.sha256()
         for path in sorted({p for source in self.sources for p in _files(ROOT / source)}):
             place = path.relative_to(ROOT).as_posix()
-            if not place.startswith(tuple(self.apart)):
-                digest.update(place.encode() + path.read_bytes())
+            digest.update(place.encode() + _meaning(path))
         return digest.hexdigest()[:16]
 
 
@@ -56,6 +63,30 @@ def _files(base: Path) -> list[Path]:
     if base.is_file():
         return [base]
     return [p for p in base.rglob("*") if p.suffix in SUFFIXES and "__pycache__" not in p.parts]
+
+
+@cache
+def _meaning(path: Path) -> bytes:
+    if path.suffix == ".toml":
+        with path.open("rb") as file:
+            return json.dumps(tomllib.load(file), sort_keys=True, default=str).encode()
+    if path.suffix != ".py":
+        return path.read_bytes()
+    tree = ast.parse(path.read_bytes())
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            node.body = [one for one in body if not _says_nothing(one)]  # type: ignore[attr-defined]
+    return ast.dump(tree).encode()
+
+
+def _says_nothing(one: ast.stmt) -> bool:
+    """Return whether a statement is a text alone: a docstring, of whatever it follows."""
+    return (
+        isinstance(one, ast.Expr)
+        and isinstance(one.value, ast.Constant)
+        and isinstance(one.value.value, str)
+    )
 
 
 def command(*arguments: str) -> subprocess.CompletedProcess[str]:
