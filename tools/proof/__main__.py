@@ -24,7 +24,7 @@ FIGURES = ROOT / "docs" / "figures.md"
 
 
 def proofs() -> list[FigureProof]:
-    """All of them, in the order in which people wait for them."""
+    """Return all proofs, those with the most important figures first."""
     return [
         *catching.proofs(),
         *physics.proofs(),
@@ -37,7 +37,7 @@ def proofs() -> list[FigureProof]:
 
 
 def kept(proof: FigureProof) -> dict[str, Any] | None:
-    """What was measured last, of whatever sources."""
+    """Return the last stored result, even if the sources have changed since."""
     path = KEPT / f"{proof.slug}.json"
     if not path.exists():
         return None
@@ -46,7 +46,7 @@ def kept(proof: FigureProof) -> dict[str, Any] | None:
 
 
 def prove(proof: FigureProof) -> dict[str, Any]:
-    """Measure, judge and keep."""
+    """Measure a figure, check it against its floor, and store the result."""
     begun, sources = time.monotonic(), proof.fingerprint()
     result = proof.measure()
     minutes = round((time.monotonic() - begun) / 60, 1)
@@ -61,8 +61,8 @@ def prove(proof: FigureProof) -> dict[str, Any]:
 
 
 def run(todo: Sequence[FigureProof], jobs: int) -> bool:
-    """Prove these: several at once, but those that measure speed one by one afterwards. False if
-    one does not hold."""
+    """Run these proofs: several at once, then those that measure speed one by one. False if one
+    does not hold."""
     good, done, begun = True, 0, time.monotonic()
     together, alone = [p for p in todo if not p.alone], [p for p in todo if p.alone]
     for group, workers in ((together, jobs), (alone, 1)):
@@ -83,7 +83,7 @@ def run(todo: Sequence[FigureProof], jobs: int) -> bool:
 
 
 def write_page() -> None:
-    """The page with all that is kept so far."""
+    """Write the page with all results stored so far."""
     everything = proofs()
     FIGURES.write_text(
         figures(everything, {p.name: data for p in everything if (data := kept(p))}),
@@ -92,7 +92,7 @@ def write_page() -> None:
 
 
 def main() -> int:
-    """Run what is not proved yet."""
+    """Run the proofs that have no result for the present sources."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -39,11 +39,11 @@ class FigureProof:
 
     @property
     def slug(self) -> str:
-        """The name of its files."""
+        """Return the name of its files."""
         return "".join(c if c.isalnum() or c in "+-" else "_" for c in self.name)
 
     def fingerprint(self) -> str:
-        """Hash of all sources that the figure depends on."""
+        """Return the hash of all sources that the figure depends on."""
         digest = hashlib.sha256()
         for path in sorted({p for source in self.sources for p in _files(ROOT / source)}):
             place = path.relative_to(ROOT).as_posix()
@@ -59,16 +59,16 @@ def _files(base: Path) -> list[Path]:
 
 
 def command(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run a module of this environment from the project's folder; what it prints is kept."""
+    """Run a module of this environment from the project's folder, and capture its output."""
     return subprocess.run(
         [sys.executable, "-m", *arguments], cwd=ROOT, capture_output=True, text=True, check=False
     )
 
 
 def run_task(name: str, *arguments: str) -> dict[str, Any]:
-    """The result of a `petrobot run`, kept under a name of its own.
+    """Return the result of a `petrobot run`, stored under this name.
 
-    Raises RuntimeError when the command fails in another way than by the task's own outcome.
+    Raises RuntimeError if the command fails for another reason than the task's outcome.
     """
     path = KEPT / f"{name}.run.json"
     done = command("petrobot.coordinator", "run", *arguments, "--quiet", "--json", str(path))
