@@ -97,7 +97,8 @@ def test_a_huge_net_ends_with_a_partial_result(net: Net, deadlock: bool, tmp_pat
 
 
 class Steps:
-    """A clock on which every look takes a second, so a limit in seconds is a number of looks."""
+    """A clock that advances by a second each time it is read, so a limit in seconds is a number of
+    readings."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -141,7 +142,7 @@ def test_all_parts_of_an_analysis_share_its_time(tmp_path: Path) -> None:
         clock = Steps()
         limits = SearchLimits(seconds=seconds, clock=clock)
         found = analyse_command(path, load, limits=limits, changes=["tin1.rate=2"])
-        assert clock.now < seconds + 100.0  # one look for each block, sweep or branch
+        assert clock.now < seconds + 100.0  # the clock is read once for each block, sweep or branch
         assert found.data["complete"] or "time limit" in found.data["reason"]
         assert found.data["throughput"] is not None or any(
             "time limit" in note for note in found.data["notes"]
@@ -150,7 +151,7 @@ def test_all_parts_of_an_analysis_share_its_time(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seconds", [3.0, 30.0, 100.0, 300.0, 600.0, 1000.0])
 def test_the_forecast_of_a_task_ends_in_time(seconds: float) -> None:
-    """Wherever the time ends, there is a result that says what is unknown."""
+    """Wherever the time limit is reached, there is a result that says what is unknown."""
     clock = Steps()
     limits = SearchLimits(seconds=seconds, clock=clock)
     found = analyse_command(CATCH, load, view="gspn", limits=limits, changes=["runs=1"])
@@ -165,8 +166,8 @@ import resource, subprocess, sys
 code = subprocess.call(sys.argv[1:], stdout=subprocess.DEVNULL)
 print(code, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 """
-"""Run a command from a small process: Linux counts what the parent held at the fork as the child's
-peak (getrusage(2)), and that of a test process is large."""
+"""Program that runs a command from a small process. Linux counts the parent's memory at the fork in
+the child's peak (getrusage(2)), and a test process is large."""
 
 
 def test_an_analysis_holds_no_more_memory_than_it_may(tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ def judged(task: Task, limit: int = 40_000) -> Progress:
 
 @dataclass(frozen=True)
 class Case:
-    """A small task that gets stuck, and what its dead end must be told by."""
+    """A small task that gets stuck, and the words that must describe its dead end."""
 
     places: str
     net: Mapping[str, Mapping[str, Any]]
@@ -49,7 +49,7 @@ class Case:
 
     @property
     def task(self) -> Task:
-        """The task."""
+        """Return the task."""
         return make_task(self.places, self.net, self.events, final=self.final, **(self.more or {}))
 
 
@@ -165,11 +165,11 @@ PICK: Mapping[str, Mapping[str, Any]] = {
     "recovered": {"in": "recover:normal", "out": "arm done"},
     "gone": {"in": "recover:error", "out": "broken"},
 }
-"""A right task: three parts, with an arm and a camera; `broken` is its honest end."""
+"""A task without faults: three parts, an arm and a camera; `broken` is its `final_error`."""
 
 
 def seeded(*told: str, cell: str = CELL, **changes: Mapping[str, Any]) -> Case:
-    """The right task with a fault."""
+    """Return the correct task with a fault."""
     net = {**PICK, **{name: {**PICK.get(name, {}), **new} for name, new in changes.items()}}
     more = {"final_error": parse("broken == 1")}
     return Case(cell, net, "parts == 0 and arm == 1 and camera == 1", told, "bell*", more)
@@ -245,7 +245,7 @@ def test_a_dead_end_is_found_replayed_and_explained(what: str) -> None:
 
 
 def test_a_task_that_gives_up_after_three_errors_is_sound() -> None:
-    """`final_error` is also satisfied on the way: only a state at rest is an end."""
+    """`final_error` is also fulfilled in passing, but only a state at rest is an end."""
     task = make_task(
         "go=1 act! left=2 failed done",
         {
@@ -353,7 +353,7 @@ def test_the_order_of_timers_is_kept() -> None:
     ("gone", "matters"), [("a b", False), ("a", True)], ids=["both go on", "one gets stuck"]
 )
 def test_a_conflict_is_a_note_unless_a_verdict_depends_on_it(gone: str, matters: bool) -> None:
-    """`first` and `second` want the same token; the engine serves `first`."""
+    """`first` and `second` compete for the same token; the engine fires `first`."""
     net: dict[str, dict[str, Any]] = {
         "first": {"in": "token", "out": "a"},
         "second": {"in": "token", "out": "b"},
@@ -498,8 +498,8 @@ def test_the_catching_task_is_back_after_an_arm_fault_as_its_estimates_say() -> 
 
 @pytest.mark.parametrize("name", ["catch_ball", "follow_track"])
 def test_the_chain_completes_as_probably_as_the_stochastic_view(name: str) -> None:
-    """Two models of the same numbers, made in different ways. follow_track has conditions on what
-    runs write, whose frequencies the two assume differently."""
+    """Two models are made from the same numbers in different ways. follow_track has conditions on
+    values that runs write; the two models assume different frequencies for them."""
     task = load(TASKS / f"{name}.toml")
     found = judged(task)
     chain = chain_of(found.x)
@@ -535,7 +535,7 @@ def test_a_preempting_event_races_with_the_run() -> None:
 
 
 def test_causes_of_an_error_are_told_apart_where_they_matter() -> None:
-    """After a drive fault nothing mends the arm; after any other error something does."""
+    """After a drive fault nothing repairs the arm; after any other error an action does."""
     net: dict[str, dict[str, Any]] = {
         "good": {"in": "act:normal", "out": "done"},
         "fault": {"in": "act:error", "out": "stopped"},
@@ -669,7 +669,8 @@ def test_each_state_after_the_operators_hand_can_be_replayed() -> None:
 
 
 def test_a_conflict_that_needs_the_operators_token_is_a_note() -> None:
-    """Only the operator says that the cup is dirty; while the arm is away both wait for it."""
+    """Only the operator can mark the cup as dirty; while the arm is away, both transitions wait for
+    it."""
     net: dict[str, dict[str, Any]] = {
         "pick": {"in": "parts arm", "out": "act"},
         "picked": {"in": "act:normal", "out": "arm"},
@@ -690,7 +691,8 @@ def test_a_conflict_that_needs_the_operators_token_is_a_note() -> None:
 
 
 def test_two_actions_of_one_device_never_run_at_a_time() -> None:
-    """What needs both at once is found only where it is known that they share a device."""
+    """The transition that needs both at once is reported only if it is known that they share a
+    device."""
     net: dict[str, dict[str, Any]] = {
         "start": {"in": "begin", "out": "drive look"},
         "seen": {"in": "drive:preempt=success look:normal", "out": "end"},

@@ -1,4 +1,4 @@
-"""`petrobot check --live`: the nodes themselves are asked whether they give what the task needs."""
+"""`petrobot check --live`: asks the nodes whether they offer what the task needs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.cli.cell import SERVICES, TASK, RobotNode, directory_in
 async def said_of(
     folder: Path, services: Path, capsys: pytest.CaptureFixture[str]
 ) -> tuple[int, str]:
-    """Exit code and output of a live check of the reaching task."""
+    """Return exit code and output of a live check of the reaching task."""
     task = folder / "reaching.toml"
     task.write_text(TASK, encoding="utf-8")
     capsys.readouterr()
@@ -26,7 +26,7 @@ async def said_of(
 
 @pytest.mark.processes
 async def test_nodes_that_give_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Up, with the same file: the task may run."""
+    """The nodes are up with the same file: the task may run."""
     directory = directory_in(tmp_path)
     robot = RobotNode(directory)
     await robot.start()

@@ -1,4 +1,5 @@
-"""`speed`, `workspace` and a dry run: who obeys them, who is refused, and what leaves."""
+"""`speed`, `workspace` and dry runs: drivers that obey them, drivers that are refused, and what is
+sent to the device."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""What a driver or an action does wrong, as the person at the coordinator finds it: exit code,
-journal and log."""
+"""Faults of drivers and actions as the user of the coordinator sees them: exit code, journal and
+log."""
 
 from __future__ import annotations
 
