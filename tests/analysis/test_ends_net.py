@@ -116,11 +116,11 @@ def test_every_path_of_the_engine_is_one_of_n(task: Task, data: st.DataObject) -
 
 
 @pytest.mark.parametrize("text", [TRIES, LISTEN, SETS])
-def test_so_it_is_for_short_forms(text: str) -> None:
+def test_every_path_of_the_engine_is_one_of_n_with_short_forms(text: str) -> None:
     assert n_holds_x(loads(text), {}, 20 * LIMIT)
 
 
-def test_bounds_are_told_in_the_names_of_the_task() -> None:
+def test_bounds_use_the_names_of_the_task() -> None:
     """N shows a leak by a pump, and the task's own net can repeat its firings."""
     task = load(TASKS / "catch_ball.toml")
     twice = (Output("arm_free"), Output("camera_free"), Output("runs", 2))
@@ -139,7 +139,7 @@ def test_bounds_are_told_in_the_names_of_the_task() -> None:
     assert all(part["bounds"][p] >= most for p, most in whole["bounds"].items())
 
 
-def test_n_proves_what_a_part_of_the_execution_graph_cannot() -> None:
+def test_n_proves_what_an_incomplete_execution_graph_cannot() -> None:
     task = load(TASKS / "catch_ball.toml")
     verdicts = analyse(task, steps=50).verdicts()
     shown = {name for name, verdict in verdicts.items() if "ends net" in verdict.reason}

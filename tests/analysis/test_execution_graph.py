@@ -412,7 +412,9 @@ def test_the_chain_of_a_graph_stops_only_where_the_graph_does(task: Task) -> Non
 @pytest.mark.parametrize("text", [TRIES, LISTEN, SETS])
 @settings(COMMON, max_examples=8)
 @given(data=st.data())
-def test_so_it_is_for_short_forms(text: str, data: st.DataObject) -> None:
+def test_every_play_of_the_engine_is_a_path_with_short_forms(
+    text: str, data: st.DataObject
+) -> None:
     graph_and_engine_agree(loads(text), data)
 
 

@@ -170,7 +170,7 @@ print(code, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 the child's peak (getrusage(2)), and a test process is large."""
 
 
-def test_an_analysis_holds_no_more_memory_than_it_may(tmp_path: Path) -> None:
+def test_an_analysis_uses_no_more_memory_than_allowed(tmp_path: Path) -> None:
     """The whole command: interpreter, search, verdicts, chain."""
     gspn = Gspn.of(kanban(4), KANBAN_RATES)
     path = tmp_path / "net.pnml"
@@ -190,7 +190,7 @@ def test_an_analysis_holds_no_more_memory_than_it_may(tmp_path: Path) -> None:
     assert data["throughput"] is not None or any("memory" in note for note in data["notes"])
 
 
-def test_what_cannot_be_solved_can_be_simulated(tmp_path: Path) -> None:
+def test_a_net_that_cannot_be_solved_can_be_simulated(tmp_path: Path) -> None:
     arguments = ("simulate", "--rates", "unit", "--replicas", "20", "--horizon", "2", "--json", "-")
     process = started(ring(300, 20), tmp_path, *arguments)
     out, complaint = process.communicate(timeout=300)

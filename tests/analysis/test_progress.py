@@ -265,7 +265,7 @@ def test_a_task_that_gives_up_after_three_errors_is_sound() -> None:
     assert may_run(task, None, Budget()).ok
 
 
-def test_a_branch_that_can_never_fire_is_told_with_its_reason() -> None:
+def test_a_branch_that_can_never_fire_is_reported_with_its_reason() -> None:
     task = make_task(
         "go=1 act! done bin",
         {
@@ -281,7 +281,7 @@ def test_a_branch_that_can_never_fire_is_told_with_its_reason() -> None:
     assert verdict.reason == "never can never fire: whenever the engine rests, it needs 2 of bin"
 
 
-def test_endless_firing_is_told() -> None:
+def test_endless_firing_is_reported() -> None:
     task = make_task(
         "go=1 a b act!",
         {
@@ -298,7 +298,7 @@ def test_endless_firing_is_told() -> None:
     assert verdict.reason == "back, forth can fire for ever without time passing"
 
 
-def test_a_loop_that_never_comes_to_its_end_is_not_sound() -> None:
+def test_a_loop_that_never_ends_is_not_sound() -> None:
     task = make_task(
         "go=1 act! done",
         {
@@ -313,7 +313,7 @@ def test_a_loop_that_never_comes_to_its_end_is_not_sound() -> None:
     assert "can go on for ever, but never comes to done == 1" in found.sound.reason
 
 
-def test_an_unfinished_graph_proves_nothing_and_still_refuses_what_it_found() -> None:
+def test_an_incomplete_graph_proves_nothing_but_still_refutes() -> None:
     grows = make_task(
         "go=1 act! bin",
         {
@@ -369,7 +369,7 @@ def test_a_conflict_is_a_note_unless_a_verdict_depends_on_it(gone: str, matters:
     assert ("second may have to wait" in found.text) is not matters
 
 
-def test_transitions_that_are_never_ready_together_are_no_conflict() -> None:
+def test_transitions_that_are_never_enabled_together_are_not_a_conflict() -> None:
     net: dict[str, dict[str, Any]] = {
         "first": {"in": "token", "out": "phase"},
         "second": {"in": "phase token2", "out": "done"},
@@ -489,7 +489,7 @@ def test_probability_and_mean_time_of_a_recovery_are_those_of_its_trials(
     assert odds.by_exit["give_up"][0] == 0.0 and not odds.missing
 
 
-def test_the_catching_task_is_back_after_an_arm_fault_as_its_estimates_say() -> None:
+def test_recovery_from_an_arm_fault_agrees_with_the_estimates() -> None:
     found = judged(load(TASKS / "catch_ball.toml"))
     p, mean = found.odds.by_exit["move_failed"]
     assert p == pytest.approx(1 - 0.05**4, abs=1e-12) and mean == pytest.approx(6.158, abs=1e-3)
@@ -534,7 +534,7 @@ def test_a_preempting_event_races_with_the_run() -> None:
     assert p == pytest.approx(0.75, abs=1e-9) and mean == pytest.approx(0.75, abs=1e-9)
 
 
-def test_causes_of_an_error_are_told_apart_where_they_matter() -> None:
+def test_causes_of_an_error_are_distinguished_where_they_matter() -> None:
     """After a drive fault nothing repairs the arm; after any other error an action does."""
     net: dict[str, dict[str, Any]] = {
         "good": {"in": "act:normal", "out": "done"},
@@ -604,7 +604,7 @@ def test_without_an_estimate_there_is_no_probability() -> None:
     assert "no probability: no estimate for `recover`" in analyse(task).text()
 
 
-def test_the_same_graph_comes_from_the_same_task() -> None:
+def test_the_same_task_gives_the_same_graph() -> None:
     task = load(TASKS / "catch_ball.toml")
     one, other = execute(task), execute(task)
     assert one.steps == other.steps and np.array_equal(one.target, other.target)
@@ -642,7 +642,7 @@ def test_almost_sure_attraction_is_the_value_one_of_the_decision_process(
 # --- what only the operator's tokens make possible -----------------------------------------------
 
 
-def test_the_operators_hand_can_make_the_catching_task_stuck() -> None:
+def test_the_operators_tokens_can_make_the_catching_task_stuck() -> None:
     found = judged(load(TASKS / "catch_ball.toml"))
     assert found.deadlock_free.holds
     notes = found.hand_notes(20_000)
@@ -654,7 +654,7 @@ def test_the_operators_hand_can_make_the_catching_task_stuck() -> None:
     assert all("the operator adds" in note or "the operator takes" in note for note in notes)
 
 
-def test_each_state_after_the_operators_hand_can_be_replayed() -> None:
+def test_each_state_after_the_operators_tokens_can_be_replayed() -> None:
     own = execute(arm(1))
     x = with_operator(own, limit=20_000)
     assert len(x) > len(own) and x.states[: len(own)] == own.states
@@ -690,7 +690,7 @@ def test_a_conflict_that_needs_the_operators_token_is_a_note() -> None:
     assert note.endswith(path)
 
 
-def test_two_actions_of_one_device_never_run_at_a_time() -> None:
+def test_two_actions_of_one_device_never_run_at_the_same_time() -> None:
     """The transition that needs both at once is reported only if it is known that they share a
     device."""
     net: dict[str, dict[str, Any]] = {

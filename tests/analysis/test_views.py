@@ -124,7 +124,7 @@ def test_preselection_gives_the_mean_of_the_mixture() -> None:
     assert any("estimates declared in the task file" in text for text in view.assumptions)
 
 
-def test_every_rate_says_where_it_comes_from() -> None:
+def test_every_rate_has_its_source() -> None:
     task = one_step(alternatives=("slow", "fast"))
     runs = {("act", "slow"): {Status.SUCCESS: Estimate(1.0, 4.0, 0.5)}}
     said = {("act", "slow"): "measured in 7 runs"}
@@ -137,7 +137,7 @@ def test_every_rate_says_where_it_comes_from() -> None:
     assert view.sources["act.slow"] == "assumed equally likely"
 
 
-def test_a_change_counts_before_what_was_measured() -> None:
+def test_a_change_overrides_measurements() -> None:
     """Measurements are stored by place, changes are given by primitive task or action."""
     task = one_step()
     runs = {("act", "a"): {Status.SUCCESS: Estimate(0.5, 4.0), Status.ERROR: Estimate(0.3, 1.0)}}

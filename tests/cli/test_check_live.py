@@ -25,7 +25,9 @@ async def said_of(
 
 
 @pytest.mark.processes
-async def test_nodes_that_give_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_nodes_that_offer_everything(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The nodes are up with the same file: the task may run."""
     directory = directory_in(tmp_path)
     robot = RobotNode(directory)
@@ -38,7 +40,9 @@ async def test_nodes_that_give_all(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.processes
-async def test_a_node_that_is_away(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_a_node_that_is_not_running(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Its address, what it would have offered and the remedy are named; the exit code is that of an
     unreachable node."""
     directory = directory_in(tmp_path)

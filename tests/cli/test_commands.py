@@ -140,7 +140,7 @@ def test_bad_input_is_exit_code_2_and_names_the_fault(
     assert said in capsys.readouterr().err
 
 
-def test_nodes_that_are_not_there_are_exit_code_3(
+def test_unreachable_nodes_are_exit_code_3(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`run` and `nodes` say which node does not answer."""
@@ -192,7 +192,7 @@ def test_a_node_ends_with_its_command(tmp_path: Path) -> None:
     "command", [("run", "catch_ball", "--mode", "lockstep"), ("serve",), ("resume", "last")]
 )
 @pytest.mark.parametrize("port", ["99999", "-1", "web"])
-def test_what_is_no_port_is_refused(
+def test_an_invalid_port_is_refused(
     command: tuple[str, ...], port: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """It is not read as another number."""
@@ -352,7 +352,7 @@ deadline = 5.0
 """
 
 
-def test_every_view_knows_the_devices_of_the_location_file(
+def test_every_view_uses_the_devices_of_the_location_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Two runs on one device take 2 + 3 s. Without a location file both views name their
@@ -435,7 +435,7 @@ def test_analyse_reports_measures_of_the_user(capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.processes
-def test_new_writes_what_works(tmp_path: Path) -> None:
+def test_the_skeletons_of_new_work(tmp_path: Path) -> None:
     """The skeletons' own tests pass as they are written."""
     for what, name in (("action", "wave"), ("task", "greet")):
         assert petrobot("new", what, name, cwd=tmp_path).returncode == 0
@@ -512,7 +512,7 @@ async def recover(ctx):
 """
 
 
-def test_a_run_that_was_given_up_says_why(
+def test_a_given_up_run_says_why(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After an argument of a wrong type, the terminal and the JSON have its action, node and text,
@@ -545,7 +545,7 @@ def test_a_run_that_was_given_up_says_why(
     assert "--journal" in said.err
 
 
-def test_a_task_of_ones_own_comes_before_a_shipped_one(
+def test_the_users_task_comes_before_a_shipped_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What the page saved under `tasks` is found by its bare name."""

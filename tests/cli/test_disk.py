@@ -55,7 +55,7 @@ def _mounts() -> bool:
 
 
 @pytest.mark.parametrize("disk", DISKS)
-def test_a_disk_that_cannot_be_written_is_told_in_one_line(disk: str, tmp_path: Path) -> None:
+def test_a_disk_that_cannot_be_written_is_reported_in_one_line(disk: str, tmp_path: Path) -> None:
     if not _mounts():
         pytest.skip("this machine gives nobody a mount namespace of his own (unshare -rm)")
     commands = [shlex.split(command) for command in COMMANDS]

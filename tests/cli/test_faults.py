@@ -142,7 +142,7 @@ def test_bad_input_names_file_key_and_remedy(command: str, said: str, petrobot: 
 
 
 @pytest.mark.processes
-def test_a_cell_that_was_not_given_is_named(petrobot: Petrobot) -> None:
+def test_the_location_file_in_use_is_named(petrobot: Petrobot) -> None:
     """The location file is looked for beside the task, one folder above it, and here, and no other
     cell's file is used."""
     assert petrobot("check", "work.toml")[0] == 0
@@ -166,7 +166,7 @@ def test_a_cell_that_was_not_given_is_named(petrobot: Petrobot) -> None:
 
 
 @pytest.mark.processes
-def test_an_action_that_translates_another_task_is_told(petrobot: Petrobot) -> None:
+def test_an_action_for_another_primitive_task_is_a_warning(petrobot: Petrobot) -> None:
     """This is a warning; the task may still run."""
     Path("services.toml").write_text(
         CELL.replace('task = "work"', 'task = "wrok"'), encoding="utf-8"
@@ -181,7 +181,7 @@ def test_an_action_that_translates_another_task_is_told(petrobot: Petrobot) -> N
 
 
 @pytest.mark.processes
-def test_check_does_not_promise_what_analyse_does_not_do(petrobot: Petrobot) -> None:
+def test_check_does_not_promise_that_analyse_searches_longer(petrobot: Petrobot) -> None:
     """`analyse` searches longer than `check`, but not if the net is unbounded."""
     endless = WORK.replace('out = ["robot_free"]', 'out = ["robot_free", "runs*2"]', 1)
     Path("work.toml").write_text(endless, encoding="utf-8")
@@ -191,7 +191,7 @@ def test_check_does_not_promise_what_analyse_does_not_do(petrobot: Petrobot) -> 
 
 
 @pytest.mark.processes
-def test_a_search_that_was_cut_short_may_go_on(
+def test_a_search_that_was_cut_short_may_be_continued(
     petrobot: Petrobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If a limit ended the search, `check` refers to `analyse`, which has a larger limit."""
@@ -201,13 +201,13 @@ def test_a_search_that_was_cut_short_may_go_on(
 
 
 @pytest.mark.parametrize("name", [command.name for command in COMMANDS])
-def test_help_says_which_location_file(name: str, petrobot: Petrobot) -> None:
+def test_help_says_which_location_file_is_used(name: str, petrobot: Petrobot) -> None:
     """The location file that the task names comes first."""
     out = " ".join(petrobot(name, "--help")[1].split())
     assert "--services FILE the" not in out or "the one that the task names in its key" in out
 
 
-def test_exit_codes_are_told(petrobot: Petrobot) -> None:
+def test_help_explains_exit_codes(petrobot: Petrobot) -> None:
     """Help also says what 1 means for commands that run no task."""
     code, out, _ = petrobot("--help")
     assert code == 0

@@ -359,7 +359,7 @@ WARNINGS = (
 @pytest.mark.parametrize(
     "mistake", [*IN_THE_TASK, *IN_THE_CELL, *IN_THE_CODE], ids=lambda m: m[2][:40]
 )
-def test_each_mistake_is_told(
+def test_each_mistake_is_reported(
     sound: dict[str, str], mistake: Mistake, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name, old, _, pattern = mistake
@@ -372,7 +372,7 @@ def test_each_mistake_is_told(
 
 @pytest.mark.processes
 @pytest.mark.parametrize(("mistakes", "pattern"), BOTH, ids=["out", "prepare"])
-def test_mistakes_between_files_are_told(
+def test_mistakes_between_files_are_reported(
     sound: dict[str, str],
     mistakes: list[Mistake],
     pattern: str,
@@ -386,7 +386,7 @@ def test_mistakes_between_files_are_told(
 
 @pytest.mark.processes
 @pytest.mark.parametrize(("arguments", "pattern"), ON_THE_LINE, ids=lambda a: " ".join(a[-2:])[:40])
-def test_mistakes_on_the_command_line_are_told(
+def test_mistakes_on_the_command_line_are_reported(
     sound: dict[str, str],
     arguments: list[str],
     pattern: str,

@@ -95,7 +95,7 @@ def test_a_new_driver_can_be_placed(
         (["robot", "kept"], "exists already; choose another name or --folder"),
     ],
 )
-def test_what_cannot_be_made_is_refused(
+def test_a_robot_that_cannot_be_made_is_refused(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

@@ -46,7 +46,7 @@ async def said(directory: Directory, capsys: pytest.CaptureFixture[str], *comman
     return capsys.readouterr().out
 
 
-async def test_a_node_is_no_device_of_its_own(
+async def test_a_node_is_not_listed_as_a_device(
     directory: Directory, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Actions without a device are listed under the node's name; the table of devices leaves them

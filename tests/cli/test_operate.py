@@ -50,13 +50,13 @@ async def test_a_node_that_is_frozen_counts_as_lost(petrobot: Terminal) -> None:
     assert said.json["nodes"] == {"robot": "lost"}
 
 
-async def test_paused_with_nothing_under_way_the_node_is_idle(petrobot: Terminal) -> None:
+async def test_a_node_without_active_runs_is_idle_in_a_pause(petrobot: Terminal) -> None:
     """No device had to hold."""
     said = await petrobot("pause", "--json", "-")
     assert said.json["nodes"] == {"robot": "idle"}
 
 
-async def test_what_was_held_is_released_by_an_abort(petrobot: Terminal) -> None:
+async def test_an_abort_releases_held_devices(petrobot: Terminal) -> None:
     """At the next mission run, the arm must no longer hold."""
     await petrobot.working()
     await petrobot("pause")
@@ -88,7 +88,7 @@ async def test_breakpoints(petrobot: Terminal) -> None:
     await petrobot.until(lambda: petrobot.arm.moving)
 
 
-async def test_tokens_go_into_and_out_of_control_places_only(petrobot: Terminal) -> None:
+async def test_tokens_can_be_changed_in_control_places_only(petrobot: Terminal) -> None:
     """Tokens stay within the capacity; a refused command changes nothing and has exit code 1."""
     assert (await petrobot("token", "jobs", "+2", "--json", "-")).json["tokens"] == 4
     assert (await petrobot("token", "jobs", "-1", "--json", "-")).json["tokens"] == 3
@@ -99,7 +99,7 @@ async def test_tokens_go_into_and_out_of_control_places_only(petrobot: Terminal)
     assert petrobot.tokens("jobs") == 3
 
 
-async def test_a_forced_exit_leaves_an_action_that_hangs(petrobot: Terminal) -> None:
+async def test_a_forced_transition_ends_a_hanging_action(petrobot: Terminal) -> None:
     """The run is cancelled, and counts neither as success nor as failure."""
     await petrobot.working()
     said = await petrobot("force", "work", "done")
@@ -170,7 +170,7 @@ async def test_one_operator_holds_the_controls(petrobot: Terminal) -> None:
     assert (await petrobot("continue", "--as", "ana")).code == 0
 
 
-async def test_controls_are_asked_for_and_handed_over(petrobot: Terminal) -> None:
+async def test_controls_are_requested_and_handed_over(petrobot: Terminal) -> None:
     """`--take` waits until the holder hands them over."""
     from petrobot.coordinator.cli.operate.hand import connect
 
@@ -185,7 +185,7 @@ async def test_controls_are_asked_for_and_handed_over(petrobot: Terminal) -> Non
         assert refused["code"] == "not_holder"
 
 
-async def test_controls_of_a_script_go_free(
+async def test_controls_of_a_silent_script_are_released(
     petrobot: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A script takes the controls over plain HTTP and sends nothing more."""
@@ -203,7 +203,7 @@ async def test_controls_of_a_script_go_free(
             await beat(0.01)
 
 
-async def test_watch_tells_what_happens_until_the_end(petrobot: Terminal) -> None:
+async def test_watch_follows_the_run_until_its_end(petrobot: Terminal) -> None:
     """It prints lines of text or JSON lines; its exit code is the run's."""
     path = petrobot.folder / "changes.jsonl"
     watching = asyncio.create_task(petrobot("watch", "--json", str(path)))
@@ -259,14 +259,16 @@ def test_without_a_run_every_command_says_so(
     assert "is active; start one with `petrobot run`" in capsys.readouterr().err
 
 
-async def test_a_coordinator_that_is_gone_is_exit_code_3(petrobot: Terminal) -> None:
+async def test_an_unreachable_coordinator_is_exit_code_3(petrobot: Terminal) -> None:
     """Its process lives, but no server listens at its address any more."""
     await petrobot.page.close()
     said = await petrobot("pause")
     assert said.code == 3 and "cannot be reached" in said.err
 
 
-def test_the_door_is_its_owners_alone_and_gone_with_its_run(tmp_path: Path) -> None:
+def test_only_the_owner_can_read_the_runs_address_which_is_removed_at_its_end(
+    tmp_path: Path,
+) -> None:
     """The token in the file permits every command."""
     import os
 
@@ -281,7 +283,7 @@ def test_the_door_is_its_owners_alone_and_gone_with_its_run(tmp_path: Path) -> N
         find_door("r", tmp_path)
 
 
-def test_the_door_of_a_killed_coordinator_is_no_door(tmp_path: Path) -> None:
+def test_the_address_of_a_killed_coordinator_is_ignored(tmp_path: Path) -> None:
     """The door of a process that has ended does not count. The next coordinator of this run
     replaces it."""
     (tmp_path / "r").mkdir()
@@ -291,7 +293,7 @@ def test_the_door_of_a_killed_coordinator_is_no_door(tmp_path: Path) -> None:
         find_door(folder=tmp_path)
 
 
-async def test_a_host_that_was_too_busy_is_told_with_the_result(petrobot: Terminal) -> None:
+async def test_the_result_says_that_the_host_was_too_busy(petrobot: Terminal) -> None:
     """The event loop did not run for longer than any set point is valid, so failures may be due to
     that."""
     await petrobot.working()

@@ -24,7 +24,7 @@ def verbs(terminal: Terminal) -> list[str]:
     return asked
 
 
-async def test_pictures_and_states_come_while_somebody_looks(petrobot: Terminal) -> None:
+async def test_pictures_and_states_come_while_an_operator_watches(petrobot: Terminal) -> None:
     """The page gets the newest picture as text, joints and values of the device, and the age of its
     set points."""
     petrobot.arm.sees, petrobot.arm.setpoint_age = b"not really a picture", 0.012
@@ -48,7 +48,7 @@ async def test_pictures_and_states_come_while_somebody_looks(petrobot: Terminal)
     assert age == 0.012 and time > 0.0
 
 
-async def test_nobody_looks_nothing_is_asked(petrobot: Terminal) -> None:
+async def test_without_an_operator_nothing_is_requested(petrobot: Terminal) -> None:
     """Without operators a node gets no request; it gets requests again as soon as one watches."""
     asked = verbs(petrobot)
     feed = petrobot.operation.feed
@@ -61,7 +61,7 @@ async def test_nobody_looks_nothing_is_asked(petrobot: Terminal) -> None:
     stop()
 
 
-async def test_old_set_points_are_none(petrobot: Terminal) -> None:
+async def test_old_set_points_are_not_shown(petrobot: Terminal) -> None:
     """A stream without a sender does not show an old set point for ever. A device without a picture
     shows none."""
     petrobot.arm.setpoint_age = 3.0

@@ -90,7 +90,7 @@ def _without_accepts(path: Path) -> None:
         ),
     ],
 )
-def test_what_a_flood_made_its_node_forget_is_not_run_again(
+def test_a_run_that_its_node_has_forgotten_is_not_run_again(
     tmp_path: Path, ids: Callable[[int], str], calls: int, accepted: bool
 ) -> None:
     services = shuttle_services(tmp_path, fetch=0.4, carry=0.4, orphan=60.0)

@@ -30,7 +30,7 @@ ROOM = 6
 has four."""
 
 
-def test_a_full_disk_ends_the_run_in_clear_and_loses_nothing(tmp_path: Path) -> None:
+def test_a_full_disk_ends_the_run_with_a_clear_error_and_loses_nothing(tmp_path: Path) -> None:
     shuttle_services(tmp_path, fetch=0.2, carry=0.2, orphan=60.0)
     runs = tmp_path / "runs"
     given = [

@@ -76,7 +76,7 @@ def usual(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.processes
-def test_one_process_a_node_gives_the_same(usual: dict[str, Any], tmp_path: Path) -> None:
+def test_one_process_per_node_gives_the_same(usual: dict[str, Any], tmp_path: Path) -> None:
     """Coordinator, laboratory, vision and motion in four processes."""
     assert run(services_file(tmp_path), "--processes", "0") == usual
 
@@ -118,7 +118,7 @@ def test_another_seed_gives_other_throws(usual: dict[str, Any], tmp_path: Path) 
         ("track_ball", {"lead": 3.0}, "late"),
     ],
 )
-def test_the_numbers_of_the_task_file_are_what_judges(
+def test_the_task_files_numbers_decide_success(
     place: str, asked: dict[str, float], cause: str
 ) -> None:
     """For a caught ball, each action meets its specification, unless the task file asks for

@@ -91,7 +91,7 @@ async def run_and_kill(
 
 
 @pytest.mark.parametrize(("place", "node"), [("track_ball", "vision"), ("catch_ball", "motion")])
-async def test_a_node_killed_in_mid_catch_is_an_error_and_the_task_goes_on(
+async def test_a_node_killed_during_a_catch_is_an_error_and_the_task_continues(
     tmp_path: Path, place: str, node: str
 ) -> None:
     """kill -9: its run ends in ERROR with executed = unknown and a reason, the node is restarted,

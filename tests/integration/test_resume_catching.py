@@ -17,7 +17,7 @@ RUNS = 3
 
 
 @pytest.mark.parametrize("place", ["track_ball", "catch_ball", "return_home"])
-def test_killed_in_mid_catch_the_task_goes_on_to_its_end(place: str, tmp_path: Path) -> None:
+def test_killed_during_a_catch_the_task_continues_to_its_end(place: str, tmp_path: Path) -> None:
     """The arm's action is not rejoined, since the ball has passed: it ends in ERROR with a cause,
     or with its stored result. Then the other balls are caught.
 

@@ -93,7 +93,7 @@ def ends_of(folder: Path) -> dict[str, RunRecorded]:
     return {i.run: i for i in told if isinstance(i, RunRecorded) and i.primitive_task != "tidy"}
 
 
-def test_a_run_in_real_time_killed_twice_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_a_real_time_run_killed_twice_continues(tmp_path: Path) -> None:
     """Active runs are rejoined, and results that came meanwhile are fetched: every move is made
     once and none is lost."""
     shuttle_services(tmp_path, fetch=0.4, carry=0.5, orphan=60.0)
@@ -120,7 +120,7 @@ def test_a_run_in_real_time_killed_twice_goes_on_where_it_was(tmp_path: Path) ->
     assert "Traceback" not in journal
 
 
-def test_a_run_in_lock_step_whose_nodes_wait_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_a_lock_step_run_whose_nodes_wait_continues(tmp_path: Path) -> None:
     """One process per node: the nodes, and with them simulated time, wait for the resumed
     coordinator."""
     shuttle_services(tmp_path, fetch=0.4, carry=0.5)

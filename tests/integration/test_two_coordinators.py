@@ -58,7 +58,7 @@ def judged(mission: Mission) -> tuple[list[RunRecorded], list[RunRecorded]]:
     return [r for r in runs if r.status is not None], [r for r in runs if r.status is None]
 
 
-async def test_the_second_coordinator_is_refused_until_the_first_has_gone(tmp_path: Path) -> None:
+async def test_the_second_coordinator_is_refused_until_the_first_has_ended(tmp_path: Path) -> None:
     """No device is shared, no run of the first one is affected, and the next coordinator gets the
     hands at once."""
     directory = load(shuttle_services(tmp_path, fetch=0.8, carry=0.8))
@@ -84,7 +84,7 @@ async def test_the_second_coordinator_is_refused_until_the_first_has_gone(tmp_pa
     assert not any(call.startswith(second.executor.mission) for call in begun)
 
 
-async def test_a_good_bye_whose_link_is_broken_is_said_over_another(tmp_path: Path) -> None:
+async def test_a_goodbye_is_sent_over_a_new_link_if_the_first_breaks(tmp_path: Path) -> None:
     """The link breaks just as the first one ends: it connects again to say goodbye, and the next
     coordinator gets the hands at once."""
     directory = load(shuttle_services(tmp_path))
