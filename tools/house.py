@@ -31,7 +31,7 @@ COLUMNS = 100
 
 @dataclass
 class Measures:
-    """What was counted in one checkout."""
+    """The counts of one checkout."""
 
     files: int = 0
     code: list[int] = field(default_factory=list)
@@ -47,7 +47,7 @@ class Measures:
     tests: int = 0
 
     def rows(self) -> list[tuple[str, str]]:
-        """The measures with their names."""
+        """Return the measures with their names."""
         repeated = sum(1 for count in self.classes.values() if count > 1)
         return [
             ("code lines / files", f"{sum(self.code) / 1000:.1f}k / {self.files}"),
@@ -67,7 +67,7 @@ def _median_most(sizes: list[int]) -> str:
 
 
 def code_lines(text: str, tree: ast.Module) -> set[int]:
-    """Numbers of the lines that hold code."""
+    """Return the numbers of the lines with code."""
     prose: set[int] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Expr) and isinstance(getattr(node.value, "value", None), str):
@@ -120,7 +120,7 @@ def measure(root: Path) -> Measures:
 
 
 def imports(tree: ast.Module) -> set[str]:
-    """Dotted names that a module imports: modules, and what is taken from them."""
+    """Return the dotted names that a module imports: modules, and names from them."""
     found: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -131,7 +131,7 @@ def imports(tree: ast.Module) -> set[str]:
 
 
 def main_path() -> int:
-    """How many files docs/life-of-a-run.md names between the token and the firing."""
+    """Return how many files docs/life-of-a-run.md names between the token and the firing."""
     page = ROOT / "docs" / "life-of-a-run.md"
     if not page.exists():
         return 0

@@ -214,7 +214,7 @@ def _told(found: Analysis, structure: bool) -> tuple[Analysis, dict[str, Any], l
     """Return the analysis with its data and text.
 
     Structure and the distribution of the completion time are computed only now, so Ctrl-C may
-    arrive here, or the time end: then the forecast is left out.
+    arrive here, or the time limit be reached: then the forecast is left out.
     """
     try:
         return found, found.to_json(structure=structure), [found.text()]
@@ -262,7 +262,7 @@ def _changed(
 
 
 def _compared(now: Analysis, then: Analysis) -> list[str]:
-    """Return a table of what the changes alter: verdicts, then numbers."""
+    """Return a table of the verdicts and numbers before and after the changes."""
     words = {True: "yes", False: "NO", None: "unknown"}
     rows = [
         (name.replace("_", " "), words[before.holds], words[after.holds])

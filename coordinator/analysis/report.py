@@ -125,7 +125,7 @@ class StructureReport:
 
 
 CERTAIN = 1e-9
-"""A probability of completion that is short of 1 by less counts as 1."""
+"""A probability of completion that differs from 1 by less than this counts as 1."""
 BY_HAND = 20_000
 """The most stimuli and firings with the operator's tokens: as many as `petrobot check` tries."""
 SHOWN = 20
@@ -158,12 +158,13 @@ class Analysis:
 
     @cached_property
     def hand_notes(self) -> list[str]:
-        """What only the operator's tokens make possible, as far as BY_HAND stimuli and firings."""
+        """Notes on what only the operator's tokens make possible, searched up to BY_HAND stimuli
+        and firings."""
         return self.progress.hand_notes(min(self.steps // 3, BY_HAND)) if self.progress else []
 
     @property
     def ok(self) -> bool:
-        """Whether the task is known to have no objection against running it."""
+        """Whether it is known that nothing speaks against running the task."""
         named = self.verdicts()
         known = ("bounded", "deadlock_free", "one_run_each")
         return not self.objections and all(named[n].holds for n in known if n in named)
@@ -671,7 +672,7 @@ def _verdict_lines(name: str, verdict: PropertyVerdict) -> list[str]:
 
 
 def _mended_line(verdict: PropertyVerdict) -> str:
-    return f"{'':26}if somebody mends it: {_word(verdict.holds)}, {verdict.reason}"
+    return f"{'':26}if the operator repairs it: {_word(verdict.holds)}, {verdict.reason}"
 
 
 def _recovery_lines(progress: Progress) -> list[str]:

@@ -107,7 +107,7 @@ PLAIN = (
     *("calibrate", "convert", "film", "keys", "learned", "log", "new", "node", "nodes", "report"),
     *("serve", "show", "sim", "up"),
 )
-"""Commands that neither run nor judge anything: their exit codes are few."""
+"""Commands that neither run nor judge a task; they use only some of the exit codes."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -174,7 +174,8 @@ def _dispatch(command: Subcommand, arguments: Sequence[str]) -> int:
         print("interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        sys.stderr.close()  # the reader is gone; Python would complain about it again at exit
+        # The program that reads our output has closed it; Python would report that again at exit.
+        sys.stderr.close()
         return 1
 
 

@@ -32,13 +32,13 @@ if TYPE_CHECKING:
 
 EXAMPLE = "petrobot analyse catch_ball --view gspn --what-if locate_ball.error.share=0.01"
 TOLD_EVERY, TOLD_AFTER = 0.5, 2.0
-"""Seconds between lines of progress, and before the first."""
+"""Seconds between two lines of progress; the first appears after as long."""
 REASON_LETTERS = 150
-"""Letters of a reason that are written below a picture."""
+"""Longest reason that is written below a picture (characters); the rest is cut."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument(
         "file", help="a net or task file, or the name of a task that comes with petrobot"
     )
@@ -104,7 +104,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Analyse."""
+    """Analyse the net; print and write what was found. Return the exit code."""
     from petrobot.coordinator.analysis.commands import analyse_command
     from petrobot.coordinator.analysis.net.space import SearchLimits
     from petrobot.coordinator.task.file import load
@@ -146,8 +146,8 @@ def _draw(analysis: Analysis, path: Path, folder: Path, *, quiet: bool) -> None:
 
 @contextmanager
 def progress_of_search(limits: SearchLimits) -> Iterator[SearchLimits]:
-    """The same limits with a line on the terminal that tells how far a long search is; nothing
-    elsewhere."""
+    """Return the limits with a progress line in the terminal; unchanged where there is no
+    terminal."""
     from petrobot.coordinator.analysis.commands import limited
 
     if not sys.stderr.isatty():
@@ -172,12 +172,12 @@ def progress_of_search(limits: SearchLimits) -> Iterator[SearchLimits]:
 
 
 LEAST = 64 << 20
-"""Bytes that an analysis may always take, whatever the process holds already."""
+"""Bytes that an analysis may always allocate, however much memory the process has already."""
 
 
 @contextmanager
 def bounded_memory(most: int) -> Iterator[None]:
-    """Let this process hold at most so many bytes; beyond them Python raises MemoryError.
+    """Limit this process to this many bytes; beyond them Python raises MemoryError.
 
     The system counts private writable mappings (RLIMIT_DATA, setrlimit(2)), which is what numpy
     allocates. Mappings that are reserved but not resident are allowed for.
@@ -200,8 +200,8 @@ def bounded_memory(most: int) -> Iterator[None]:
 
 
 def give(outcome: CommandResult, json_file: str | None) -> int:
-    """Print and write what an analysis command found; gives its exit code. Raises CommandError for
-    bad input."""
+    """Print and write what an analysis command found, and return its exit code. Raises CommandError
+    for bad input."""
     from petrobot.coordinator.analysis.commands import BAD_INPUT
 
     if json_file:
@@ -213,11 +213,11 @@ def give(outcome: CommandResult, json_file: str | None) -> int:
     return outcome.code
 
 
-# --- pictures of what speaks against a net -------------------------------------------------------
+# --- pictures of refuted verdicts ----------------------------------------------------------------
 
 
 def draw_witnesses(analysis: Analysis, model: Task | Net, folder: Path) -> list[Path]:
-    """One SVG for each verdict that is refused with a witness; gives their paths. Raises
+    """Write an SVG for each verdict that is refuted with a witness, and return the paths. Raises
     CommandError."""
     made = []
     try:
@@ -235,8 +235,8 @@ def draw_witnesses(analysis: Analysis, model: Task | Net, folder: Path) -> list[
 
 
 def refused(analysis: Analysis) -> Iterator[tuple[str, PropertyVerdict]]:
-    """Verdicts that do not hold and can show why. A task need not be safe: several tokens are
-    several runs to do."""
+    """Return the verdicts that do not hold and have a witness. "Safe" is left out for a task:
+    several tokens are several runs to do."""
     order = sorted(analysis.verdicts().items(), key=lambda item: item[0] != "one_run_each")
     for name, verdict in order:
         if (
@@ -253,8 +253,8 @@ def refused(analysis: Analysis) -> Iterator[tuple[str, PropertyVerdict]]:
 
 
 def picture(model: Task | Net, name: str, reason: str, witness: Witness) -> str:
-    """The net after the witness's firings, with the turns at which each transition fired (a loop
-    goes on after them)."""
+    """Draw the net after the witness's firings, and number each transition by when it fired (a loop
+    follows them)."""
     from petrobot.coordinator.drawing import Overlay, draw
     from petrobot.coordinator.task.net import Net
 

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Take images if asked to; calibrate."""
+    """Take the images if --simulated is given; calibrate."""
     from petrobot.coordinator.launch import load_object
 
     if options.simulated and options.views is not None:

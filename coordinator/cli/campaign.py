@@ -169,7 +169,7 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run or resume the campaign; print and write its result."""
+    """Run or resume the campaign; print and write its result. Return the exit code."""
     from petrobot.coordinator.studies.campaign.conduct import Campaign, ProgressLine
     from petrobot.coordinator.studies.campaign.plan import CampaignError, identity, read_manifest
     from petrobot.coordinator.studies.campaign.table import held, write_parquet
@@ -192,7 +192,9 @@ def run(options: argparse.Namespace) -> int:
                 / f"{task.name}-{plan.selector}-{plan.seed}-{identity(plan)[:6]}"
             )
         if options.check is not None:
-            _refuse_misfit(options.check, plan)  # before the work, not after it
+            _refuse_misfit(
+                options.check, plan
+            )  # report a forecast that does not fit before the work, not after it
         campaign = Campaign(folder, plan, shown)
         with _written(folder), held(folder):
             if campaign.complete and options.json != "-":
@@ -220,8 +222,8 @@ def run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _written(folder: Path) -> Iterator[None]:
-    """A disk that is full in the middle: what is in the folder is whole blocks, and the campaign
-    can be resumed."""
+    """Turn an OSError, such as a full disk, into CommandError. The folder then contains whole
+    blocks only, so the campaign can be resumed."""
     try:
         yield
     except OSError as fault:
@@ -361,7 +363,7 @@ def _pair(option: str, text: str) -> tuple[str, str]:
 
 
 def _task_line(found: Mapping[str, Any], wide: int) -> list[str]:
-    """R_conj, C and J of the whole task, where it is hardest."""
+    """Describe R_conj, C and J of the whole task in the regime that is hardest for it."""
     shown = [
         f"{name} {found[name]:.4g} [{found[f'{name}_interval'][0]:.4g}, "
         f"{found[f'{name}_interval'][1]:.4g}]"
@@ -373,7 +375,7 @@ def _task_line(found: Mapping[str, Any], wide: int) -> list[str]:
 
 
 def text_of(result: dict[str, Any]) -> str:
-    """The result for people."""
+    """Return the result as text for the terminal."""
     lines = [
         f"{result['task']}: {result['begun']} runs, selector {result['selector']}, seed "
         f"{result['seed']}"
@@ -422,7 +424,7 @@ def text_of(result: dict[str, Any]) -> str:
 
 
 def _in_brackets(result: dict[str, Any], task: str, action: str) -> str:
-    """J of an action, or why it has none."""
+    """Return J of an action in brackets, or why it has none."""
     j, judged = result["J"].get(task, {}).get(action), result["judged"].get(task, {})
     if j is not None:
         ends = result.get("J_interval", {}).get(task, {}).get(action)
@@ -438,7 +440,7 @@ def _in_brackets(result: dict[str, Any], task: str, action: str) -> str:
 
 
 def _remarks(judged: dict[str, Any]) -> list[str]:
-    """What J of a primitive task cannot say."""
+    """Return warnings about J of a primitive task: what it does not show."""
     out = []
     if judged and not judged["meet_target"] and judged["target"] is not None:
         out.append(

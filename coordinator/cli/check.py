@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 
 EXAMPLE = "petrobot check catch_ball"
 NO_CELL = "no-cell"
-"""Code of the finding about the location file that was not given."""
+"""Code of the finding that no location file was given."""
 PATIENCE = 2.0
 """Seconds that a node has to answer."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument("task", help="a task file, or the name of a task that comes with petrobot")
     add_services_argument(parser)
     parser.add_argument(
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Check; 0 when the task may run, 2 when it may not, 3 when only a node that it needs is
+    """Check the task. Return 0 if it may run, 2 if it may not, 3 if only a node that it needs is
     missing."""
     task = load_task(options.task)
     services = find_cell(options.services, options.task, task)
@@ -99,8 +99,8 @@ def _checked(task: Task, services: Path | None) -> tuple[MayRun, CheckReport]:
 
 
 def _with_code(task: Task, directory: Directory, report: CheckReport) -> CheckReport:
-    """The findings with those about the code that the location file names. Raises CommandError for
-    what is wrong in that file."""
+    """Add findings about the code that the location file names. Raises CommandError for errors in
+    that file."""
     from petrobot.coordinator.task.check import CheckReport, Severity
     from petrobot.coordinator.task.check.code import code_findings
     from petrobot.services.comm.location_file import read_text
@@ -123,12 +123,12 @@ def _with_code(task: Task, directory: Directory, report: CheckReport) -> CheckRe
 
 
 def _driver(directory: Directory, device: str) -> str:
-    """The import path of a device's driver, empty without one."""
+    """Return the import path of a device's driver; empty if it has none."""
     return directory.devices[device].driver if device else ""
 
 
 def _noted(report: CheckReport, said: str) -> CheckReport:
-    """The findings with a note about the location file that was not given."""
+    """Add the finding that no location file was given."""
     from petrobot.coordinator.task.check import CheckReport, Finding, Severity
 
     remedy = "write one of your own, or give --services FILE"
@@ -138,8 +138,8 @@ def _noted(report: CheckReport, said: str) -> CheckReport:
 
 
 def _missing(task: Task, services: Path | None) -> list[str]:
-    """What the task needs and the nodes do not give now: a line for each node that is away or
-    offers less than it should."""
+    """Return one line for each node that the task needs and that does not answer, or offers less
+    than services.toml says."""
     from petrobot.coordinator.run.node_status import ask_all
 
     directory = load_directory(services)
@@ -182,7 +182,8 @@ def _plain(report: CheckReport, name: str) -> list[dict[str, Any]]:
 
 
 def _told(report: CheckReport, name: str) -> list[str]:
-    """The findings for people, each with the place in the task file that it is about."""
+    """Return the findings as text for the terminal, each with the line of the task file that it is
+    about."""
     path = task_path(name)
     places = [f"{path}:{line}: " if line else "" for line in _lines(report, name)]
     return [
@@ -192,8 +193,8 @@ def _told(report: CheckReport, name: str) -> list[str]:
 
 
 def _lines(report: CheckReport, name: str) -> list[int | None]:
-    """The line of each finding's key, or of the macro place in which it is; None for what is not
-    about the task file."""
+    """Return the line of each finding's key, or of the macro place that contains it; None if the
+    finding is not about the task file."""
     from petrobot.coordinator.task.file.errors import key_lines, line_of
 
     lines = key_lines(task_path(name).read_text(encoding="utf-8"))
@@ -207,9 +208,8 @@ def _lines(report: CheckReport, name: str) -> list[int | None]:
 def _text(name: str, analysis: Analysis | None, ok: bool) -> str:
     ended, lines = "", list[str]()
     if analysis is not None:
-        shown = {
-            k: v for k, v in analysis.verdicts().items() if k != "safe"
-        }  # a place may hold several tokens: they count
+        # A place of a task may have several tokens, so "safe" says nothing about it.
+        shown = {k: v for k, v in analysis.verdicts().items() if k != "safe"}
         told = [f"{key.replace('_', ' ')} {_word(v)}" for key, v in shown.items()]
         lines += [f"{'note':8}{note}" for note in (*analysis.notes, *analysis.hand_notes)]
         lines.append(f"{_size(analysis)}: {', '.join(told)}{_cut(analysis)}")

@@ -18,7 +18,7 @@ EXAMPLE = "petrobot convert catch_ball catch_ball.pnml"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument(
         "source", help="a net or task file, or the name of a task that comes with petrobot"
     )
@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Convert."""
+    """Convert the file, and list what could not be kept."""
     from petrobot.coordinator.analysis.commands import convert_command
     from petrobot.coordinator.cli.analyse import give
     from petrobot.coordinator.task.file import load

@@ -1,5 +1,5 @@
-"""Emergency stop: stop all devices through their nodes and their bus, whatever the coordinator
-does. Anybody may give it."""
+"""Emergency stop: stop all devices through their nodes and their bus, without the coordinator.
+Every user of this host may give it."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 EXAMPLE = "petrobot estop"
 COORDINATOR_PATIENCE = 1.0
-"""How long to wait for the coordinator's answer (s). The devices are stopped before it is
-notified."""
+"""How long to wait for the coordinator's answer (s). The coordinator is notified after the devices
+were stopped."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument(
         "--clear",
         action="store_true",

@@ -17,7 +17,7 @@ EXAMPLE = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument("run", help="a run's id or folder, or `last`")
     parser.add_argument(
         "--out",
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Make the film."""
+    """Make the film, and print where it is."""
     from petrobot.coordinator.learning.estimates_file import EstimatesError
     from petrobot.coordinator.studies.report.film import NoFilmError, images, refuse_file, write
     from petrobot.coordinator.studies.report.raster import RasterError

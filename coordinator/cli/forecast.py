@@ -36,7 +36,7 @@ EXAMPLE = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument(
         "task", nargs="?", help="a task file, or the name of a task that comes with petrobot"
     )
@@ -159,8 +159,8 @@ def _forecast(options: argparse.Namespace) -> int:
 def _refuse_other_cell(
     task: Task, services: Path, requests: Mapping[str, Request], about: Mapping[str, Any]
 ) -> None:
-    """Raises CommandError when the new trials cannot run with a location file as the forecast
-    assumes: another physics, or an action that it gives to no node."""
+    """Check that the new trials can run with this location file as the forecast assumes. Raises
+    CommandError for another physics, or an action that is on no node."""
     directory = load_directory(services)
     try:
         physics = physics_of(directory)
@@ -187,8 +187,8 @@ def _refuse_other_cell(
 def _trainings(
     task: Task, path: Path, plant: str | None
 ) -> tuple[dict[str, Training], Estimates, dict[str, Any]]:
-    """Training trials by regime, the estimates, and what the forecast says about where they come
-    from."""
+    """Return the training trials by regime, the estimates, and their source as the forecast names
+    it."""
     from petrobot.coordinator.learning.estimates_file import MOCK, SIMULATED
     from petrobot.coordinator.studies.campaign.observed import estimates_of
     from petrobot.coordinator.studies.campaign.plan import digest, read_manifest
@@ -241,7 +241,8 @@ def _told(physics: str, plant: str = "") -> dict[str, str]:
 
 
 def _refuse_other_task(task: Task, plan: CampaignPlan, path: Path) -> None:
-    """Raises CommandError when a campaign ran a task of another name, where its file still is."""
+    """Check that the campaign ran a task of this name, if its file still exists. Raises
+    CommandError."""
     from petrobot.coordinator.studies.campaign.plan import MANIFEST
 
     if not Path(plan.task).is_file():
@@ -256,8 +257,8 @@ def _refuse_other_task(task: Task, plan: CampaignPlan, path: Path) -> None:
 
 
 def _refuse_other_runs(task: Task, rows: Iterable[TrialRow], path: Path) -> None:
-    """Raises CommandError for runs in places or of actions that the task does not have (any
-    more)."""
+    """Check that the task still has the places and actions of the recorded runs. Raises
+    CommandError."""
     from petrobot.coordinator.studies.campaign.table import TABLE
 
     actions: dict[str, dict[str, None]] = {}
@@ -288,7 +289,7 @@ def _refuse_other_actions(task: Task, primitive: str, actions: Iterable[str], so
 
 
 def _refuse_other_names(task: Task, path: Path, found: Mapping[str, Iterable[str]]) -> None:
-    """Raises CommandError when an estimates file says nothing about the task."""
+    """Check that the estimates file has primitive tasks of this task. Raises CommandError."""
     if not set(found) & set(task.flat.primitive_tasks):
         raise CommandError(
             2,
@@ -356,7 +357,7 @@ def _compare(registered: Path, folder: Path, options: argparse.Namespace) -> int
 
 
 def fitting(registered: Path, forecast: dict[str, Any], plan: CampaignPlan) -> Task:
-    """The task of a campaign that may be compared with a registered forecast. Raises
+    """Return the task of a campaign that may be compared with a registered forecast. Raises
     CommandError."""
     task = load_task(plan.task)
     if task.name != forecast["task"]:
@@ -376,7 +377,7 @@ def fitting(registered: Path, forecast: dict[str, Any], plan: CampaignPlan) -> T
 
 
 def _planned(plan: CampaignPlan, task: Task) -> dict[str, dict[str, dict[str, float]]]:
-    """By regime: how a campaign that learns nothing will choose; empty where its file of services
+    """Return by regime how a campaign that learns nothing will choose; empty if its location file
     is not here."""
     from petrobot.coordinator.studies.campaign.policies import learns, policy_of
 
@@ -396,7 +397,8 @@ def _planned(plan: CampaignPlan, task: Task) -> dict[str, dict[str, dict[str, fl
 
 
 def _certain(counts: Mapping[str, float]) -> dict[str, float]:
-    """A plan's shares are known exactly, however few runs it has: they weigh as a thousand runs."""
+    """Return the shares of a plan with the weight of a thousand runs: they are known exactly,
+    however few runs it has."""
     whole = sum(counts.values())
     return {action: 1000.0 * n / whole for action, n in counts.items()}
 
@@ -407,7 +409,7 @@ def _refuse_other_choices(
     regime: str,
     counts: Mapping[str, Mapping[str, float]],
 ) -> None:
-    """Raises CommandError when a regime's runs choose otherwise than their forecast says."""
+    """Check that the runs of each regime choose as their forecast says. Raises CommandError."""
     from petrobot.coordinator.studies.forecast.choices import in_words, misfit, remedy
 
     said = forecast["regimes"].get(regime)
@@ -424,8 +426,8 @@ def _refuse_other_choices(
 
 
 def compared(registered: Path, folder: Path) -> dict[str, Any]:
-    """A registered forecast beside what a campaign measured. Raises CommandError when they do not
-    belong together."""
+    """Compare a registered forecast with what a campaign measured. Raises CommandError if they do
+    not belong together."""
     from petrobot.coordinator.studies.campaign.plan import read_manifest
     from petrobot.coordinator.studies.campaign.table import TABLE, began, read_table
     from petrobot.coordinator.studies.forecast.agreement import agreement

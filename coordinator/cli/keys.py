@@ -18,7 +18,7 @@ EXAMPLE = "petrobot keys --tls"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument(
         "--file",
         type=Path,
@@ -73,9 +73,8 @@ def _instead(directory: Directory, kind: str, new: str) -> str:
     if old == new:
         return ""
     both = [f'{kind} = "{new}", also = "{old}"']
-    if (
-        kind == "certificates"
-    ):  # a certificate of the new authority is shown only where all accept it
+    # No host may show a certificate of the new authority before all hosts accept that authority.
+    if kind == "certificates":
         both.insert(0, f'{kind} = "{old}", also = "{new}"')
     passes = [*both, f'{kind} = "{new}" alone']
     lines = [

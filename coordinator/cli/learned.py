@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def show_task(kept: FileContents, options: argparse.Namespace) -> int:
-    """Print what the actions' estimates come to, for one run of the task."""
+    """Print R, C and J of the whole task, computed from the estimates of its actions."""
     if len(options.more) != 1:
         raise CommandError(2, "which task? Write `petrobot learned task FILE TASK`")
     if options.budget is not None:
@@ -41,7 +41,8 @@ def show_task(kept: FileContents, options: argparse.Namespace) -> int:
 
 
 def figures(kept: FileContents, name: str, options: argparse.Namespace) -> dict[str, Any]:
-    """Plain data: the parts, and the whole for one token in the runs place."""
+    """Return the figures as plain data: of the primitive tasks, and of the task for one token in
+    its runs place."""
     from petrobot.coordinator.analysis.time.stochastic import NoEstimate
     from petrobot.coordinator.launch import with_runs
     from petrobot.coordinator.learning.propagation import propagate
@@ -174,7 +175,7 @@ VERBS = ("show", "task", "merge", "freeze", "thaw", "reset")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument("verb", choices=VERBS, help="what to do with the file")
     parser.add_argument("file", type=Path, help="an estimates file, as `run --learn FILE` keeps it")
     parser.add_argument(
@@ -230,7 +231,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Do it."""
+    """Do what was asked for, and return the exit code."""
     from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, said
 
     file = EstimatesFile(options.file)

@@ -1,5 +1,5 @@
-"""`learned show`: what is known of actions, how they are judged, over all contexts and in each, and
-what remains to be said."""
+"""`learned show`: the estimates of actions and how they compare, over all contexts and in each
+context, with warnings."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ def show(kept: FileContents, tasks: Sequence[str], options: argparse.Namespace) 
         shown = {}
         for task in tasks:
             question, of = asked_question(kept, task, options), {p: known[task, p] for p in plants}
-            # A primitive task that ran only in another plant is shown as it is known there.
+            # A primitive task that ran only in another plant is shown with the numbers of that
+            # plant.
             main = kept.plant if of.get(kept.plant) else next((p for p in plants if of[p]), "")
             tallies = of.pop(main, {})
             about = _plain(kept, task, tallies, question, compare(tallies, question), options)
@@ -60,8 +61,8 @@ def show(kept: FileContents, tasks: Sequence[str], options: argparse.Namespace) 
 
 
 def asked_question(kept: FileContents, task: str, options: argparse.Namespace) -> Question:
-    """As given; else by what the file says that the actions were judged (its target counts over
-    contexts, not in one)."""
+    """Return the question of the options; what they leave out is taken from the file. The file's
+    target is for all contexts together, not for one."""
     asked = kept.question(task)
     target = asked.target if options.target is None and options.context is None else options.target
     return replace(
@@ -89,7 +90,7 @@ def refuse_unknown_context(
 
 
 def refuse_unknown_cost(known: Mapping[Any, Tallies], options: argparse.Namespace) -> None:
-    """A number that no result has would be a cost of 0 for everything."""
+    """Raise CommandError for a cost that no result has: it would be 0 for every action."""
     kind, _, name = (options.cost or "").partition(":")
     tallies = [
         t
@@ -199,7 +200,7 @@ def _times(tally: Tally) -> dict[str, Any]:
 
 
 def _by_context(tallies: Tallies, asked: Question) -> list[dict[str, Any]]:
-    """Each action in each context by itself, J with the rho of the whole comparison."""
+    """Return each action in each context. J uses the rho of the comparison over all contexts."""
     from petrobot.coordinator.learning.objective import compare
 
     out = []
@@ -226,7 +227,8 @@ def _by_context(tallies: Tallies, asked: Question) -> list[dict[str, Any]]:
 
 
 def _selectors(kept: FileContents, task: str) -> dict[str, Any]:
-    """Of the plant that judges by their own names; those of others with the plant."""
+    """Return the selectors' states by name. The name of another plant's selector ends with that
+    plant."""
     from petrobot.coordinator.learning.estimates_tables import selector_name
 
     return {
@@ -243,8 +245,8 @@ def _selectors(kept: FileContents, task: str) -> dict[str, Any]:
 
 
 def _break_even(judged: Comparison) -> list[dict[str, Any]]:
-    """rho at which the best action would stop being so, against each other one: `above` or `below`
-    it the other is better."""
+    """Return for each other action the rho at which it would become the best; it is better `above`
+    or `below` that rho."""
     from petrobot.coordinator.learning.objective import break_even
 
     if judged.best is None:
@@ -277,7 +279,7 @@ def _number(x: float) -> float | None:
 
 
 def _words(asked: Question) -> str:
-    """A question as the options that ask it."""
+    """Return a question as command-line options."""
     parts = [f"--cost {asked.measure}"]
     parts += [f"--target {asked.target:g}"] if asked.target is not None else []
     parts += [f"--rho {asked.rho:g}"] if asked.rho is not None else []
@@ -285,7 +287,7 @@ def _words(asked: Question) -> str:
 
 
 WIDTH = 110
-"""Least width of the tables (characters): in fewer, the numbers would be cut."""
+"""Least width of the tables (characters): narrower ones would cut the numbers."""
 
 # --- for people -------------------------------------------------------------------------------
 
@@ -359,7 +361,7 @@ def _named(context: str) -> str:
 
 
 def _warnings(about: Mapping[str, Any]) -> list[str]:
-    """What J of this table cannot say."""
+    """Return warnings about this table: what its J does not show."""
     own = [row for row in about["actions"] if row["source"] == about["source"]]
     lines, run = [], [row for row in own if row["runs"]]
     if len(own) < len(about["actions"]):

@@ -23,7 +23,7 @@ EXAMPLE = "petrobot log last --format xes --out run.xes"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument(
         "run", help="a run's id or folder, or `last`; or a node of services.toml, for its own log"
     )
@@ -131,7 +131,7 @@ def _write(path: str, lines: Iterator[str]) -> None:
 
 
 def _ended(run: RunRecorded) -> str:
-    """How a run ended, and as what it counts."""
+    """Return how a run ended, and whether it counts as success or failure."""
     status = run.status.value.upper() if run.status else ""
     if run.cancelled:
         return f"{status or '-'}  {run.taken_away}"

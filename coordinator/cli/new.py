@@ -396,7 +396,7 @@ pythonpath = ["."]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument("what", choices=("robot", "driver", "action", "task"))
     parser.add_argument("name", help="its name, such as close_gripper")
     parser.add_argument(

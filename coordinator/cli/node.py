@@ -12,7 +12,7 @@ EXAMPLE = "petrobot node vision --services services.toml"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument("name", help="the node's name in services.toml")
     add_services_argument(parser)
     add_log_level_argument(parser, "info")

@@ -19,7 +19,7 @@ EXAMPLE = "petrobot nodes --json -"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     add_services_argument(parser)
     parser.add_argument(
         "--timeout",
@@ -67,8 +67,8 @@ def _troubles(status: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _stopped(directory: Directory, answers: Mapping[str, Any]) -> dict[str, list[str]]:
-    """By node the devices that an emergency stop holds: as it says itself, or as this host says of
-    one that does not run."""
+    """Return by node the devices that an emergency stop holds: as the node reports, or, if it does
+    not run, as its file on this host says."""
     from petrobot.coordinator.operator.emergency_stop import still_stopped
     from petrobot.services.host.emergency_latch import ALL, latch_of
 
@@ -121,8 +121,8 @@ def _print(answers: dict[str, Any]) -> None:
 def _devices(
     devices: Mapping[str, Any], stopped: Sequence[str], troubles: Mapping[str, str]
 ) -> str:
-    """Names of devices, each with what is wrong with it: an emergency stop, why it takes no call,
-    refusals, late cycles."""
+    """Return the names of devices, each with its troubles: an emergency stop, why it accepts no
+    call, refusals, late cycles."""
     from rich.markup import escape
 
     shown = []
@@ -131,7 +131,8 @@ def _devices(
         if device in stopped:
             said.append("[red]stopped (petrobot estop --clear)[/]")
         elif device in troubles:
-            said.append(f"[yellow]{escape(troubles[device])}[/]")  # a driver's text, perhaps
+            # the text may come from a driver, with brackets that rich would read as markup
+            said.append(f"[yellow]{escape(troubles[device])}[/]")
         if told.get("refused"):
             said.append(f"[yellow]{told['refused']} refused[/]")
         if told.get("overruns"):
@@ -142,7 +143,7 @@ def _devices(
 
 
 def _ends(ends: str) -> str:
-    """The day on which a certificate ends, red when that is soon."""
+    """Return the day on which a certificate ends, red if that is soon."""
     if not ends:
         return ""
     left = datetime.fromisoformat(ends) - datetime.now(UTC)

@@ -1,4 +1,5 @@
-"""What a run shows: progress in the terminal, then its result there, as JSON and as a report."""
+"""The output of a run: its progress in the terminal, then its result there, as JSON and as a
+report."""
 
 from __future__ import annotations
 
@@ -43,8 +44,8 @@ def progress(options: argparse.Namespace) -> Iterator[Callable[[Mission, float],
 
 @contextmanager
 def live_progress() -> Iterator[Callable[[Mission, float], None]]:
-    """Show a line about the active run. Calls within 0.1 s of wall time of the last one return at
-    once."""
+    """Show a line about the active run, at most every 0.1 s of wall time; calls in between do
+    nothing."""
     shown = 0.0
     with Live(
         Text("connecting"), console=Console(stderr=True), auto_refresh=False, transient=True
@@ -134,8 +135,7 @@ def _cell(key: str, value: Any) -> Text:
 
 
 def give(session: RunSession, options: argparse.Namespace) -> None:
-    """Write the result where it was asked for and beside the journal, print it, leave the
-    report."""
+    """Write the result beside the journal and where --json says, print it, and write the report."""
     result = session.result()
     session.keep_result()
     if options.json:

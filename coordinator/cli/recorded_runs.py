@@ -1,5 +1,4 @@
-"""Recorded runs on the command line: where runs are kept, how many, how durably, and how one is
-read."""
+"""Recorded runs on the command line: options for where and how runs are kept, and reading one."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def add_journal_arguments(parser: argparse.ArgumentParser) -> None:
-    """`--journal`, `--keep`, `--durable`."""
+    """Add `--journal`, `--keep` and `--durable`."""
     parser.add_argument(
         "--journal",
         metavar="FOLDER",
@@ -39,7 +38,7 @@ def add_journal_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def journal_folder(options: argparse.Namespace) -> Path | None:
-    """Where this run is to be kept, None if nowhere."""
+    """Return the folder in which to keep this run; None if it is not kept."""
     from petrobot.coordinator.run.folder import DEFAULT
 
     return options.journal if options.journal is not None or options.mode == "lockstep" else DEFAULT
@@ -56,7 +55,8 @@ def tidy(options: argparse.Namespace, folder: Path | None) -> None:
 
 
 def recorded(name: str) -> Recorded:
-    """Read the run of this name, with its task, cell and engine. Raises CommandError."""
+    """Read the run of this id, folder or `last`, with its task, cell and engine. Raises
+    CommandError."""
     from petrobot.coordinator.operator.start_from import read_recorded
     from petrobot.coordinator.run.folder import NoRunError, journal_of
     from petrobot.coordinator.run.journal import JournalError

@@ -13,7 +13,7 @@ EXAMPLE = "petrobot replay last"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument("run", help="a run's id or folder, or `last`")
     parser.add_argument(
         "--json", metavar="FILE", help="write the outcome as JSON (- for standard output)"
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Replay. Return 0 if everything is the same, 1 at a difference."""
+    """Replay. Return 0 if everything is the same, 1 if there is a difference."""
     from petrobot.coordinator.run.journal import JournalError
     from petrobot.coordinator.run.recording import ReplayError
 

@@ -31,7 +31,7 @@ EXAMPLE = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument(
         "subject",
         metavar="RUN|CAMPAIGN",
@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write page and pictures."""
+    """Write the page and its pictures."""
     from petrobot.coordinator.studies.campaign.plan import MANIFEST, CampaignError
 
     folder = Path(options.subject)
@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
         if (folder / MANIFEST).exists():
             page, pictures, target = _campaign(folder, options)
         elif options.against is not None:
-            raise CommandError(2, f"{folder} is no campaign: --against compares two campaigns")
+            raise CommandError(2, f"{folder} is not a campaign: --against compares two campaigns")
         else:
             page, pictures, target = _run(options.subject)
     except CampaignError as fault:
@@ -103,7 +103,8 @@ def _write(page: Path, html: str, pictures: Mapping[str, str], *, quiet: bool) -
 
 
 def _draw(path: Path, svg: str, *, raster: bool) -> None:
-    """A picture's files. A task's own picture that only browsers understand stays an SVG."""
+    """Write a picture as SVG and PNG. A task's own picture that only browsers can draw is written
+    as SVG only."""
     from petrobot.coordinator.studies.report.raster import RasterError, png
 
     write_whole(path.with_name(f"{path.name}.svg"), svg)
@@ -148,7 +149,8 @@ def _names(one: Path, other: Path) -> tuple[str, str]:
 
 
 def opened(folder: Path) -> tuple[CampaignPlan, Task, list[TrialRow]]:
-    """Plan, task and rows of a campaign. Raises CampaignError, and CommandError without rows."""
+    """Return plan, task and rows of a campaign. Raises CampaignError, and CommandError if it has no
+    rows."""
     from petrobot.coordinator.studies.campaign.plan import read_manifest
     from petrobot.coordinator.studies.campaign.table import TABLE, read_table
 
@@ -160,8 +162,8 @@ def opened(folder: Path) -> tuple[CampaignPlan, Task, list[TrialRow]]:
 
 
 def compared(one: Path, other: Path, rho_of: Path | None = None) -> dict[str, Any]:
-    """The numbers of a comparison of two campaigns' folders; rho is that of a third one's actions,
-    if given."""
+    """Return the comparison of two campaigns' folders as numbers. J weighs costs with the rho of
+    the campaign `rho_of`; without it, with that of the two."""
     from petrobot.coordinator.studies.report.comparing import Weighting, compare
 
     _, task, rows = opened(one)
@@ -226,8 +228,8 @@ def _run(name: str) -> tuple[str, dict[str, str], Path]:
 
 
 def _observer(found: Recorded) -> ObservedRun:
-    """What sees the run's actions; with the selector that learned in it, as far as its estimates
-    file is still there."""
+    """Return the observer of the run's actions, with the selector that learned in it if its
+    estimates file still exists."""
     from petrobot.coordinator.learning.estimates_file import EstimatesError
     from petrobot.coordinator.learning.session import session_of
     from petrobot.coordinator.studies.report.run_page import ObservedRun

@@ -21,7 +21,7 @@ EXAMPLE = "petrobot resume last --json out.json"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument("run", help="a run's id or folder, or `last`")
     parser.add_argument(
         "--json", metavar="FILE", help="write the result as JSON (- for standard output)"

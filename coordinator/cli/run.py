@@ -82,7 +82,7 @@ REFUSED = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument(
         "task",
         nargs="?",

@@ -34,7 +34,7 @@ ESTIMATES = Path("estimates")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     add_services_argument(parser)
     parser.add_argument(
         "--tasks",

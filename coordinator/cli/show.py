@@ -26,7 +26,7 @@ EXAMPLE = "petrobot show catch_ball --errors --out catch_ball.svg"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument("task", help="a task file, or the name of a task that comes with petrobot")
     parser.add_argument("--errors", action="store_true", help="draw the error branches too")
     parser.add_argument(
@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Draw."""
+    """Draw the picture and write it."""
     _refuse_idle(options)
     svg = (
         _graph(options.task)
@@ -100,7 +100,7 @@ def _net(options: argparse.Namespace) -> str:
 
 
 def _refuse_idle(options: argparse.Namespace) -> None:
-    """Refuse an option that this drawing would ignore. Raises CommandError."""
+    """Raise CommandError for an option that this drawing would ignore."""
     timed = not options.graph and (options.heat or options.view == "gspn")
     for name in ("estimates", "services"):
         if getattr(options, name) is not None and not timed:
@@ -133,7 +133,7 @@ def _gspn(options: argparse.Namespace) -> str:
 
 
 def _heat(task: Task, options: argparse.Namespace) -> Overlay:
-    """The forecast's bottleneck: how much of the mean time each action place takes. Raises
+    """Return an overlay of each action place's share of the mean time, as forecast. Raises
     CommandError."""
     from petrobot.coordinator.analysis.may_run import assumed, devices_of
     from petrobot.coordinator.analysis.report import analyse, heat

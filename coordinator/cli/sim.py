@@ -12,7 +12,7 @@ EXAMPLE = "petrobot sim --services services.toml"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     add_services_argument(parser)
     add_log_level_argument(parser, "info")
 

@@ -19,7 +19,7 @@ EXAMPLE = "petrobot simulate catch_ball --replicas 2000 --seed 1"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument(
         "file", help="a net or task file, or the name of a task that comes with petrobot"
     )
@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Simulate."""
+    """Simulate the net; print and write the answer."""
     import numpy as np
 
     from petrobot.coordinator.analysis.commands import simulate_command

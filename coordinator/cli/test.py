@@ -1,6 +1,6 @@
 """Check that the driver of a device keeps the rules of drivers (docs/drivers.md).
 
-The device moves: give commands that are safe where it stands now.
+The device moves: give commands that are safe from its present position.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ EXAMPLE = """petrobot test driver axis --command '{"to": 0.2}' --command '{"to":
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument("what", choices=["driver"], help="what to test")
     parser.add_argument("device", help="name of the device in services.toml")
     add_services_argument(parser)
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=number(least=0.01),
         default=1.0,
         metavar="S",
-        help="how soon the device stands still after a stop (default: %(default)g s)",
+        help="how soon the device must stand still after a stop (default: %(default)g s)",
     )
 
 
@@ -66,7 +66,7 @@ def _command(text: str) -> Mapping[str, Any]:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Test, and print what was found."""
+    """Test the driver, and print the faults found."""
     from petrobot.coordinator.launch import load_object
 
     check_device = load_object("petrobot.services.conformance:check_device")

@@ -31,7 +31,7 @@ EXAMPLE = "petrobot up --services services.toml"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     add_services_argument(parser)
     parser.add_argument(
         "--logs",
@@ -133,7 +133,7 @@ async def _up(directory: Directory, options: argparse.Namespace) -> int:
         asyncio.get_running_loop().add_signal_handler(each, stop.set)
     respawn = not (
         options.no_respawn or options.lockstep
-    )  # a member of a lock-step cell that died cannot join again
+    )  # a member of a lock-step cell that died cannot join it again
     supervisor = Supervisor(programs, options.logs, respawn=respawn)
     try:
         async with supervisor:

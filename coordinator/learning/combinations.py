@@ -1,11 +1,11 @@
 """Choices judged by the task: one learner over all combinations of actions.
 
-If each primitive task learns by itself, what the task credits to an action depends on what the
-others choose meanwhile. They then end where no single change helps, which may be far from the best
-combination (a Nash equilibrium of a common-interest game). So with `--credit task` one rule learns
-which *combination* of actions is best. The choices of one token are drawn one after the other, each
-among the combinations that contain the choices before it, so together they follow the rule's
-probabilities over combinations.
+If each primitive task learns by itself, the credit of an action depends on what the others choose
+meanwhile. They then converge to choices that no single change improves, which may be far from the
+best combination (a Nash equilibrium of a common-interest game). So with `--credit task` one rule
+learns which *combination* of actions is best. The choices of one token are drawn one after the
+other, each among the combinations that contain the choices before it, so together they follow the
+rule's probabilities over combinations.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ from petrobot.coordinator.learning.rules import Rule
 from petrobot.coordinator.learning.selectors import RULES, RuleSelector, credited
 
 MOST = 256
-"""Largest number of combinations that one learner tells apart; of more, each primitive task learns
-by itself."""
+"""Largest number of combinations for one learner; if there are more, each primitive task learns by
+itself."""
 TRIALS = 2
-"""First trials of each combination (rules that try every action a few times first). A single
-action gets more: of combinations there are many, and the additive prior tells of those untried."""
+"""First trials of each combination, for rules that try everything a few times first. Single actions
+get more first trials: there are many combinations, and the additive prior estimates the untried
+ones."""
 
 
 TOGETHER = "together"
@@ -39,8 +40,8 @@ class CombinationSelector:
     """Chooses the actions of several primitive tasks together.
 
     `alternatives`: the actions of each primitive task, in the order of the task file. `rho` of the
-    question is 0 unless it is given: a trial that misses the goal is given up earlier, so its time
-    would speak for it.
+    question is 0 unless given: a trial that misses the goal ends earlier, so its shorter time would
+    count in its favour.
     """
 
     def __init__(
@@ -59,11 +60,11 @@ class CombinationSelector:
         made.name = credited(name, credit)
         self.selector = made
         self._open: dict[str, dict[str, str]] = {}
-        """By context: the choices of the token that is on its way."""
+        """By context: the choices made so far for the present token."""
 
     @staticmethod
     def fits(alternatives: Mapping[str, Sequence[str]]) -> bool:
-        """Return whether there are several choices, and not too many combinations of them."""
+        """Return whether there are several choices, and at most MOST combinations of them."""
         return len(alternatives) > 1 and prod(map(len, alternatives.values())) <= MOST
 
     def choose(
@@ -73,7 +74,7 @@ class CombinationSelector:
         if none of the alternatives is known."""
         before = {t: a for t, a in self._open.get(context, {}).items() if t != task}
         if task in self._open.get(context, {}):
-            before = {}  # the next token
+            before = {}  # a second choice of the same primitive task: the next token
         at = self.tasks.index(task)
         offered = self._with(before, at, alternatives) or self._with({}, at, alternatives)
         chosen, why = self.selector.choose(context, [self._name(i) for i in offered], rng)
@@ -82,8 +83,8 @@ class CombinationSelector:
     def _with(
         self, chosen: Mapping[str, str], at: int = 0, among: Sequence[str] | None = None
     ) -> list[int]:
-        """Return the combinations that contain these choices, and one of `among` for the primitive
-        task at this place."""
+        """Return the combinations that contain these choices, and one of the actions `among` of
+        this primitive task."""
         fixed = [(self.tasks.index(t), a) for t, a in chosen.items()]
         return [
             i
@@ -95,7 +96,7 @@ class CombinationSelector:
         return self.selector.actions[index]
 
     def chosen(self, task: str, context: str, action: str) -> None:
-        """Remember a choice. A second one of the same primitive task belongs to the next token."""
+        """Record a choice. A second one of the same primitive task belongs to the next token."""
         known = self._open.setdefault(context, {})
         if task in known:
             known.clear()
@@ -105,10 +106,10 @@ class CombinationSelector:
                 self.selector.chosen(context, self._name(i))
 
     def update(self, context: str, actions: Mapping[str, str], outcome: Observation) -> None:
-        """Learn from the verdict on a token that these actions served.
+        """Learn from the verdict on a token, with the actions that ran for it.
 
-        If it ended before every primitive task was chosen for, the trial counts for all
-        combinations that contain these actions, each by the probability with which it would have
+        If it ended before an action of every primitive task was chosen, the trial counts for all
+        combinations that contain these actions, each with the probability with which it would have
         been chosen.
         """
         self._open.pop(context, None)

@@ -49,7 +49,7 @@ def is_loopback(host: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Doors:
+class AccessRules:
     """Allow-lists and secret of one server."""
 
     token: str
@@ -152,13 +152,13 @@ def names_for(host: str, extra: Sequence[str]) -> frozenset[str]:
     )
 
 
-def middleware(doors: Doors) -> Middleware:
+def middleware(access: AccessRules) -> Middleware:
     """Return the aiohttp middleware that refuses requests and adds the headers to every answer,
     including refusals and errors."""
 
     @web.middleware
     async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
-        fault = doors.fault(request)
+        fault = access.fault(request)
         try:
             if fault is not None:
                 raise fault

@@ -13,7 +13,7 @@ from aiohttp import web
 
 from petrobot.coordinator.background import BackgroundProcess
 from petrobot.coordinator.operator.port import HistoryPort, MissionPort, OffersPort, StartsPort
-from petrobot.coordinator.page.access import Doors
+from petrobot.coordinator.page.access import AccessRules
 from petrobot.coordinator.page.connection_limits import Gate
 from petrobot.coordinator.page.sessions import Session, carry_out, encode
 from petrobot.coordinator.page.task_store import TaskStore
@@ -26,12 +26,12 @@ ENCODED_KEPT = 8
 
 
 @dataclass
-class House:
+class PageState:
     """State of one page server."""
 
     port: MissionPort
     store: TaskStore
-    doors: Doors
+    access: AccessRules
     offers: OffersPort | None = None
     history: HistoryPort | None = None
     starts: StartsPort | None = None
@@ -88,4 +88,4 @@ class House:
         task.add_done_callback(self.commands.discard)
 
 
-HOUSE: web.AppKey[House] = web.AppKey("house", House)
+PAGE_STATE: web.AppKey[PageState] = web.AppKey("page_state", PageState)

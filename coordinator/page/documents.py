@@ -14,7 +14,7 @@ from typing import Any
 from aiohttp import web
 
 from petrobot.coordinator.background import RefusedError
-from petrobot.coordinator.page.app_state import HOUSE, House
+from petrobot.coordinator.page.app_state import PAGE_STATE, PageState
 from petrobot.coordinator.page.requests import json_answer, read_object, refused, send_json
 from petrobot.coordinator.page.task_store import StoreError
 
@@ -38,12 +38,16 @@ def add_routes(app: web.Application) -> None:
 
 
 async def _list(request: web.Request) -> web.Response:
-    return json_answer(request.app[HOUSE].store.listed())
+    return json_answer(request.app[PAGE_STATE].store.listed())
 
 
 async def _open(request: web.Request) -> web.StreamResponse:
-    house = request.app[HOUSE]
-    given = {**house.store.folders, "name": request.match_info["name"], "cell": _cell(house)}
+    page_state = request.app[PAGE_STATE]
+    given = {
+        **page_state.store.folders,
+        "name": request.match_info["name"],
+        "cell": _cell(page_state),
+    }
     return await _done(request, "opening", given)
 
 
@@ -52,7 +56,7 @@ async def _revision(request: web.Request) -> web.Response:
     every few seconds."""
     try:
         return json_answer(
-            {"revision": request.app[HOUSE].store.read(request.match_info["name"]).revision}
+            {"revision": request.app[PAGE_STATE].store.read(request.match_info["name"]).revision}
         )
     except StoreError as fault:
         raise refused(RefusedError(fault.status, str(fault))) from fault
@@ -61,14 +65,18 @@ async def _revision(request: web.Request) -> web.Response:
 async def _save(request: web.Request) -> web.StreamResponse:
     """{base, document, renames} or, to resolve a conflict, {base, text}; 409 returns both
     versions."""
-    house = request.app[HOUSE]
+    page_state = request.app[PAGE_STATE]
     body = await read_object(request)
     content = (
         {"text": body["text"]}
         if isinstance(body.get("text"), str)
         else {"document": _document(body)}
     )
-    about = {**house.store.folders, "name": request.match_info["name"], "cell": _cell(house)}
+    about = {
+        **page_state.store.folders,
+        "name": request.match_info["name"],
+        "cell": _cell(page_state),
+    }
     return await _done(
         request, "saving", {**about, "base": body.get("base"), "content": content} | _renames(body)
     )
@@ -81,25 +89,27 @@ async def _check(request: web.Request) -> web.StreamResponse:
     Earlier requests from the same desk, including analyses, are cancelled: they were about an older
     drawing.
     """
-    house = request.app[HOUSE]
+    page_state = request.app[PAGE_STATE]
     body = await read_object(request)
     desk = str(body.get("desk") or "")[:DESK_AT_MOST]
-    house.analyses.give_up(desk)
-    return await _done(request, "check", {**_drawing(house, body), "cell": _cell(house)}, desk)
+    page_state.analyses.give_up(desk)
+    return await _done(
+        request, "check", {**_drawing(page_state, body), "cell": _cell(page_state)}, desk
+    )
 
 
 async def _analyse(request: web.Request) -> web.StreamResponse:
     """{name, document, desk}: verdicts on an unsaved document, and how its time is spent; one
     analysis at a time."""
-    house = request.app[HOUSE]
+    page_state = request.app[PAGE_STATE]
     body = await read_object(request)
     desk = str(body.get("desk") or "")[:DESK_AT_MOST]
-    drawing = _drawing(house, body)
+    drawing = _drawing(page_state, body)
     try:
-        text = json.loads(await house.apart.do("drawing", drawing))["text"]
-        said = await house.analyses.do(
+        text = json.loads(await page_state.apart.do("drawing", drawing))["text"]
+        said = await page_state.analyses.do(
             "analysis",
-            {"text": text, "filename": f"{drawing['name']}.toml", "cell": _cell(house)},
+            {"text": text, "filename": f"{drawing['name']}.toml", "cell": _cell(page_state)},
             desk,
         )
     except RefusedError as refusal:
@@ -108,10 +118,14 @@ async def _analyse(request: web.Request) -> web.StreamResponse:
 
 
 async def _export(request: web.Request) -> web.Response:
-    house, name, form = request.app[HOUSE], request.match_info["name"], request.match_info["form"]
+    page_state, name, form = (
+        request.app[PAGE_STATE],
+        request.match_info["name"],
+        request.match_info["form"],
+    )
     try:
-        given = {**house.store.folders, "name": name, "form": form, "cell": _cell(house)}
-        made = json.loads(await house.apart.do("export", given))
+        given = {**page_state.store.folders, "name": name, "form": form, "cell": _cell(page_state)}
+        made = json.loads(await page_state.apart.do("export", given))
     except RefusedError as refusal:
         raise refused(refusal) from refusal
     return web.Response(
@@ -133,19 +147,19 @@ async def _import(request: web.Request) -> web.StreamResponse:
 
 
 async def _offers(request: web.Request) -> web.Response:
-    offers = request.app[HOUSE].offers
+    offers = request.app[PAGE_STATE].offers
     return json_answer(list(offers()) if offers is not None else [])
 
 
 async def _runs(request: web.Request) -> web.StreamResponse:
-    history = request.app[HOUSE].history
+    history = request.app[PAGE_STATE].history
     if history is None:
         return json_answer([])
     return await _done(request, "runs", {"folder": str(history.folder)})
 
 
 async def _run(request: web.Request) -> web.StreamResponse:
-    history = request.app[HOUSE].history
+    history = request.app[PAGE_STATE].history
     if history is None:
         raise web.HTTPNotFound(text="no such run")
     return await _done(
@@ -158,7 +172,7 @@ async def _done(
 ) -> web.StreamResponse:
     """Have the work done in the other process, and pass on its result."""
     try:
-        said = await request.app[HOUSE].apart.do(work, given, desk)
+        said = await request.app[PAGE_STATE].apart.do(work, given, desk)
     except RefusedError as refusal:
         return _refusal(refusal)
     return await send_json(request, said)
@@ -171,20 +185,20 @@ def _refusal(refusal: RefusedError) -> web.Response:
     raise refused(refusal) from refusal
 
 
-def _cell(house: House) -> dict[str, Any] | None:
+def _cell(page_state: PageState) -> dict[str, Any] | None:
     """Return the fields of the `Cell` that the nodes are."""
-    if house.offers is None:
+    if page_state.offers is None:
         return None
-    offers = list(house.offers())
+    offers = list(page_state.offers())
     return {
         "offers": {str(offer["action"]): str(offer["node"]) for offer in offers},
         "devices": {str(o["action"]): str(o["device"]) for o in offers if o["device"]},
     }
 
 
-def _drawing(house: House, body: Mapping[str, Any]) -> dict[str, Any]:
+def _drawing(page_state: PageState, body: Mapping[str, Any]) -> dict[str, Any]:
     named = {"name": str(body.get("name") or "new_task"), "document": _document(body)}
-    return {**house.store.folders, **named, **_renames(body)}
+    return {**page_state.store.folders, **named, **_renames(body)}
 
 
 def _document(body: Mapping[str, Any]) -> dict[str, Any]:

@@ -23,8 +23,8 @@ from petrobot.coordinator.operator.port import (
 )
 from petrobot.coordinator.page import documents
 from petrobot.coordinator.page import server as feeds
-from petrobot.coordinator.page.access import Doors, Handler, middleware, names_for
-from petrobot.coordinator.page.app_state import HOUSE, House
+from petrobot.coordinator.page.access import AccessRules, Handler, middleware, names_for
+from petrobot.coordinator.page.app_state import PAGE_STATE, PageState
 from petrobot.coordinator.page.connection_limits import Gate
 from petrobot.coordinator.page.requests import LARGEST_BODY, json_answer, read_object, refused
 from petrobot.coordinator.page.sessions import LARGEST_MESSAGE, Session, carry_out, who_is
@@ -39,46 +39,46 @@ class Page:
     """A served page: `url` holds the token; `await close()` ends it."""
 
     def __init__(
-        self, runner: web.AppRunner, listening: asyncio.Server, house: House, url: str
+        self, runner: web.AppRunner, listening: asyncio.Server, page_state: PageState, url: str
     ) -> None:
         self._runner = runner
         self._listening = listening
-        self._house = house
+        self._page_state = page_state
         self.url = url
         self.base = url.partition("/?")[0]
         """The address without the token."""
-        self.token = house.doors.token
+        self.token = page_state.access.token
 
     @property
     def sessions(self) -> frozenset[Session]:
         """The connected clients."""
-        return frozenset(self._house.sessions)
+        return frozenset(self._page_state.sessions)
 
     @property
     def gate(self) -> Gate:
         """The factory of connections."""
-        assert self._house.gate is not None
-        return self._house.gate
+        assert self._page_state.gate is not None
+        return self._page_state.gate
 
     async def idle(self) -> None:
         """Wait until no command is being carried out."""
-        while self._house.commands:
-            await asyncio.wait(set(self._house.commands))
+        while self._page_state.commands:
+            await asyncio.wait(set(self._page_state.commands))
 
     async def close(self) -> None:
         """Close all connections and the port. The last commands are still answered, unless they
         take too long."""
         self._listening.close()
-        self._house.closing = True
+        self._page_state.closing = True
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LAST_COMMANDS_S):
                 await self.idle()
-        await asyncio.gather(*(session.leave() for session in self._house.sessions))
-        await asyncio.gather(self._house.apart.close(), self._house.analyses.close())
+        await asyncio.gather(*(session.leave() for session in self._page_state.sessions))
+        await asyncio.gather(self._page_state.apart.close(), self._page_state.analyses.close())
         await self._runner.cleanup()
-        for task in list(self._house.commands):
+        for task in list(self._page_state.commands):
             task.cancel()
-        await asyncio.gather(*self._house.commands, return_exceptions=True)
+        await asyncio.gather(*self._page_state.commands, return_exceptions=True)
 
 
 async def start_page(
@@ -105,18 +105,23 @@ async def start_page(
     address cannot be bound."""
     listener = _listen(host, port)
     number = listener.getsockname()[1]
-    doors = Doors(
+    access = AccessRules(
         token or secrets.token_urlsafe(24), number, names_for(host, names), tls is not None
     )
-    house = House(port_object, TaskStore(tasks_folder, shipped), doors, offers, history, starts)
+    page_state = PageState(
+        port_object, TaskStore(tasks_folder, shipped), access, offers, history, starts
+    )
     runner = web.AppRunner(
-        _application(house, page), access_log=None, keepalive_timeout=30.0, shutdown_timeout=1.0
+        _application(page_state, page),
+        access_log=None,
+        keepalive_timeout=30.0,
+        shutdown_timeout=1.0,
     )
     await runner.setup()
     assert runner.server is not None
-    house.gate = Gate(runner.server)
+    page_state.gate = Gate(runner.server)
     listening = await asyncio.get_running_loop().create_server(
-        house.gate, sock=listener, ssl=tls, backlog=128
+        page_state.gate, sock=listener, ssl=tls, backlog=128
     )
     shown = (
         "127.0.0.1"
@@ -128,8 +133,8 @@ async def start_page(
     return Page(
         runner,
         listening,
-        house,
-        f"{'https' if tls else 'http'}://{shown}:{number}/?token={doors.token}",
+        page_state,
+        f"{'https' if tls else 'http'}://{shown}:{number}/?token={access.token}",
     )
 
 
@@ -148,17 +153,17 @@ def _listen(host: str, port: int) -> sockets.socket:
     return listener
 
 
-def _application(house: House, page: bool) -> web.Application:
+def _application(page_state: PageState, page: bool) -> web.Application:
     @web.middleware
     async def count(request: web.Request, handler: Handler) -> web.StreamResponse:
-        if house.gate is not None:
-            house.gate.asked(request)
+        if page_state.gate is not None:
+            page_state.gate.asked(request)
         return await handler(request)
 
     app = web.Application(
-        middlewares=[count, middleware(house.doors)], client_max_size=LARGEST_BODY
+        middlewares=[count, middleware(page_state.access)], client_max_size=LARGEST_BODY
     )
-    app[HOUSE] = house
+    app[PAGE_STATE] = page_state
     feeds.add_routes(app)
     if page:
         app.router.add_get("/", _index)
@@ -168,12 +173,12 @@ def _application(house: House, page: bool) -> web.Application:
 
 
 async def _index(request: web.Request) -> web.StreamResponse:
-    doors = request.app[HOUSE].doors
+    access = request.app[PAGE_STATE].access
     if "token" in request.query:
         away = web.HTTPSeeOther(
             "/"
         )  # The token disappears from the address bar and the history of the browser.
-        doors.hand_out(away)
+        access.hand_out(away)
         raise away
     return web.FileResponse(PAGE_FILES / "index.html", headers={"Cache-Control": "no-store"})
 
@@ -192,8 +197,8 @@ def add_routes(app: web.Application) -> None:
 
 
 async def _live(request: web.Request) -> web.StreamResponse:
-    house = request.app[HOUSE]
-    if len(house.sessions) >= CLIENTS:
+    page_state = request.app[PAGE_STATE]
+    if len(page_state.sessions) >= CLIENTS:
         raise web.HTTPServiceUnavailable(text=f"{CLIENTS} clients are connected already")
     socket = web.WebSocketResponse(
         heartbeat=15.0, max_msg_size=LARGEST_MESSAGE, compress=False, timeout=0.5
@@ -201,23 +206,23 @@ async def _live(request: web.Request) -> web.StreamResponse:
     if not socket.can_prepare(request).ok:
         raise web.HTTPUpgradeRequired(text="this address speaks WebSocket")
     await socket.prepare(request)
-    session = Session(socket, house.port, house.encode_once, house.commands)
-    house.sessions.add(session)
+    session = Session(socket, page_state.port, page_state.encode_once, page_state.commands)
+    page_state.sessions.add(session)
     try:
         await session.run()
     finally:
-        house.left(session)
+        page_state.left(session)
     return socket
 
 
 async def _snapshot(request: web.Request) -> web.Response:
-    snapshot = request.app[HOUSE].port.snapshot()
+    snapshot = request.app[PAGE_STATE].port.snapshot()
     return json_answer({**snapshot, "type": "snapshot", "protocol": PROTOCOL})
 
 
 async def _start(request: web.Request) -> web.Response:
     """The options for starting this task, with types and defaults."""
-    starts = request.app[HOUSE].starts
+    starts = request.app[PAGE_STATE].starts
     if starts is None:
         raise web.HTTPNotFound(text="no run can be started here")
     try:
@@ -229,12 +234,12 @@ async def _start(request: web.Request) -> web.Response:
 async def _command(request: web.Request) -> web.Response:
     """{name, verb, data}: for scripts. Their `who` is their name and digits of the token, the same
     at each call."""
-    house = request.app[HOUSE]
+    page_state = request.app[PAGE_STATE]
     body = await read_object(request)
     data = body.get("data", {})
     if not isinstance(data, dict):
         raise web.HTTPBadRequest(text="data must be an object")
-    who = who_is(str(body.get("name", "script")), house.doors.pass_value)
-    answer = await carry_out(house.port, who, str(body.get("verb")), data)
-    house.heard(who)
+    who = who_is(str(body.get("name", "script")), page_state.access.pass_value)
+    answer = await carry_out(page_state.port, who, str(body.get("verb")), data)
+    page_state.heard(who)
     return json_answer(answer, 200 if answer.get("ok") else 409)

@@ -1,9 +1,9 @@
-"""The thin adapter: a program that is no net runs primitive actions on nodes, over the same callers
-and in the same two shells (lock step and real time) as petrobot's coordinator.
+"""The adapter for programs that are not nets: it runs primitive actions on nodes, with the same
+callers and in the same two modes (lock step and real time) as petrobot's coordinator.
 
 A program gets a `Cell`. `start` calls an action by name and returns a `Run` to poll, `cancel` asks
-it to stop, `count` says how often an external event has come. A run for a device that still stops
-a cancelled one waits for it, as an action client usually does for its user.
+it to stop, `count` says how often an external event has come. A run waits until its device has
+stopped a cancelled run, as an action client usually does for its user.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from petrobot.services.comm.protocol.messages import Call, Event, Message, Outco
 
 EVENTS = ("image_tick", "ball_caught")
 SERVICE_DEADLINE = 20.0
-"""s for preparing and scoring the laboratory, as in petrobot's own mission run."""
+"""Limit for preparing and scoring the laboratory (s), as in petrobot's own mission runs."""
 PERIOD = 0.01
-"""s between two ticks of a program in real time."""
+"""Time between two ticks of a program in real time (s)."""
 
 
 class Run:
@@ -48,7 +48,7 @@ class Run:
 
 
 class Cell:
-    """What a program reaches of the cell. Machine without clock or sockets, as the callers are."""
+    """The cell, as a program can use it. Sans-I/O, like the callers."""
 
     def __init__(self, directory: Directory, name: str, boot: str, seed: int) -> None:
         self.directory = directory
@@ -57,7 +57,7 @@ class Cell:
         self._name, self._seed = name, seed
         self._runs: dict[str, Run] = {}
         self._last: dict[str, Run] = {}
-        """By device: the run that was started last."""
+        """The last run started, by device."""
         self._waiting: deque[tuple[Run, Call]] = deque()
         self._calls: Counter[str] = Counter()
         self._events: Counter[str] = Counter()
@@ -108,7 +108,7 @@ class Cell:
         return any(run.outcome is None for run in self._runs.values())
 
     def take(self, now: float, node: str, notices: Sequence[Notice]) -> None:
-        """Take what a node's caller noticed."""
+        """Process the notices of a node's caller."""
         self.now, caller = now, self.callers[node]
         for notice in notices:
             if isinstance(notice, Outcome):
@@ -116,7 +116,7 @@ class Cell:
                     run.outcome = notice
                 caller.acknowledge(now, notice.id)
             elif isinstance(notice, Welcome):
-                for id_ in notice.runs:  # of a process of ours that was killed
+                for id_ in notice.runs:  # of an earlier process that was killed
                     caller.disown(now, id_)
             elif isinstance(notice, Event) and notice.name in EVENTS:
                 self._events[notice.name] += 1
@@ -130,11 +130,11 @@ class Cell:
 
 
 class Program(Protocol):
-    """A catching program: ticked until it is over."""
+    """A catching program: ticked until it has ended."""
 
     over: bool
     gave_up: bool
-    """The arm could not be recovered."""
+    """Whether it gave up, since the arm could not be recovered."""
     caught: int
     """Balls in the cup, as the program counts them."""
 
@@ -143,12 +143,12 @@ class Program(Protocol):
 
 
 Make = Callable[[Cell, int], Program]
-"""Makes a program that deals with so many balls."""
+"""Makes a program for so many balls."""
 
 
 class ProgramParty:
-    """A program in the coordinator's place of a lock-step cell, ticked every `every` ticks of the
-    cell."""
+    """A program that replaces the coordinator of a lock-step cell, ticked every `every` ticks of
+    the cell."""
 
     def __init__(
         self, cell: Cell, make: Make, balls: int, prepare: Mapping[str, Any], every: int = 1
@@ -157,7 +157,7 @@ class ProgramParty:
         self.program: Program | None = None
         self.score: Run | None = None
         self.ticks, self.tick_s = 0, 0.0
-        """How often the program was ticked, and the processor time of that (s)."""
+        """How often the program was ticked, and the processor time of the ticks (s)."""
         self._make, self._balls, self._every = make, balls, every
         self._prepare = prepare
         self._prepared: Run | None = None
@@ -169,7 +169,7 @@ class ProgramParty:
 
     @property
     def over(self) -> bool:
-        """Whether the program is over, its runs have ended, and the laboratory has the score."""
+        """Return whether the program and its runs have ended, and the laboratory has scored."""
         return self.score is not None and self.score.outcome is not None
 
     def receive(self, now: float, envelope: Envelope) -> None:
@@ -240,7 +240,7 @@ def simulated_time(cell: Cell) -> Iterator[None]:
 
 
 class Played(Protocol):
-    """What is known of a mission in lock step."""
+    """The result of a mission in lock step."""
 
     program: Program | None
 
@@ -275,7 +275,7 @@ def play(
 
 
 async def play_in_real_time(directory: Directory, make: Make, *, balls: int, boot: str) -> Program:
-    """Run a program against nodes that are up, ticked every `PERIOD` seconds."""
+    """Run a program with nodes that are up, ticked every `PERIOD` seconds."""
     cell = Cell(directory, f"program-{boot}", boot, 0)
     clients = {}
     for node, caller in cell.callers.items():

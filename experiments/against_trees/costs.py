@@ -1,5 +1,5 @@
-"""What each program costs beside its faults: lines, start, time per tick, how soon it reacts, and
-what it catches in the simulated laboratory, with the same balls for all."""
+"""The costs of each program: lines, start, time per tick, reaction time, and what it catches in the
+simulated laboratory, with the same balls for all."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STARTS = {
     "tree": "from experiments.against_trees.tree import create_root; create_root(None, 4)",
     "machine": "import experiments.against_trees.machine",
 }
-"""What loads and makes each program, without a cell."""
+"""Code that loads and makes each program, without a cell."""
 TREE_PERIODS = (1, 5, 25)
 """Ticks of the cell (4 ms) between two ticks of the tree: 250, 50 and 10 Hz."""
 LAYOUT = re.compile(r"(x|y|label|text) = ")

@@ -1,8 +1,8 @@
 """Thirty design faults, each transcribed into the net, the tree and the state machine.
 
-A fault is a few edits of the correct program's text. Where a program has nothing of the kind to get
-wrong, its edits are None: the tree has no resources to lose, for example, because its parallels
-join by themselves. That counts for it.
+A fault is a few edits of the correct program's text. Where a fault is impossible in a program, its
+edits are None: for example, the tree has no resources to lose, because its parallels join by
+themselves. That counts in its favour.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 
 class Edit(NamedTuple):
-    """Replace `old` by `new`. In the net it is looked for in one TOML table only; an empty `old`
-    removes that table. Elsewhere `old` must occur `times` times."""
+    """Replace `old` by `new`. In the net, `old` is looked for in one TOML table only; an empty
+    `old` removes that table. In other programs `old` must occur `times` times."""
 
     old: str
     new: str = ""
@@ -26,7 +26,7 @@ Edits = tuple[Edit, ...]
 
 @dataclass(frozen=True)
 class DesignFault:
-    """What is wrong, and how each program says it. None: it cannot be said there."""
+    """A design fault, and its edits in each program. None: the fault is impossible there."""
 
     name: str
     kind: str
@@ -36,7 +36,7 @@ class DesignFault:
 
 
 def apply(text: str, edits: Edits) -> str:
-    """Return the text with the edits made. Raises ValueError for one that does not fit."""
+    """Return the text with the edits. Raises ValueError for an edit that does not fit."""
     for edit in edits:
         begin, end = 0, len(text)
         if edit.table:

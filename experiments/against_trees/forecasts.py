@@ -1,13 +1,13 @@
 """Part (b): forecasts of twenty structural changes from 300 trials, against what then happens.
 
-The training chooses every alternative at random. Forecast are the share of balls caught, the mean
-and the 90 % quantile of the time of a trial, each with a 95 % interval for the new trials where the
+The training chooses every alternative at random. The forecasts are the share of balls caught, and
+the mean and 90 % quantile of a trial's time, each with a 95 % interval for the new trials if the
 method has one.
 
 - petrobot: `register` (as `petrobot forecast`) for other choices and for other nets; for slower
   and more faulty actions the stochastic view with the changes of `petrobot analyse --what-if`,
   which has no intervals.
-- product: what one computes by hand. Steps succeed and last independently of each other: the
+- product: computed by hand. Steps succeed and last independently of each other: the
   product of their shares, the sum of their means, a normal quantile; intervals by a bootstrap.
 - bootstrap: the training trials that made the new choices, resampled; other changes are not seen.
 """
@@ -75,7 +75,7 @@ class StructuralChange:
     faults: Mapping[str, float] = field(default_factory=dict)
     net: Edits = ()
     looks: int = 1
-    """How often a ball is looked for before it counts as not thrown."""
+    """How often the arm looks for a ball before it counts as not thrown."""
 
     @property
     def by_view(self) -> bool:
@@ -240,14 +240,14 @@ def _by_view(change: StructuralChange, task: Task, estimates: Any) -> dict[str, 
 
 @dataclass(frozen=True)
 class Steps:
-    """What the training says of each trial, one row each; nan where a step did not run."""
+    """The steps of the training trials, one row per trial; nan where a step did not run."""
 
     goal: Samples
     time: Samples
-    """s from the trial's begin to its end."""
+    """Duration of each trial (s)."""
     seconds: Mapping[str, Samples]
     well: Mapping[str, Samples]
-    """1 where a step ended as it should: no error, and for catching the ball in the cup."""
+    """1 where a step succeeded: no error, and for catching, the ball in the cup."""
     chosen: Mapping[str, NDArray[Any]]
 
 
@@ -281,8 +281,8 @@ def steps_of(trials: Sequence[Trial]) -> Steps:
 
 
 def chosen_rows(change: StructuralChange, steps: Steps) -> NDArray[np.bool_]:
-    """Return which training trials made the choices of the change (a step that did not run made
-    every choice)."""
+    """Return which training trials made the choices of the change (a step that did not run agrees
+    with every choice)."""
     kept = np.ones(len(steps.goal), dtype=bool)
     for name, action in change.choices.items():
         kept &= (steps.chosen[name] == action) | (steps.chosen[name] == "")
@@ -298,7 +298,7 @@ def by_product(change: StructuralChange, steps: Steps, runs: int) -> dict[str, A
     for _ in range(RESAMPLED):
         share, mean, q90, spread = _product(change, steps, rng.integers(0, n, n))
         noise = rng.normal(size=2) * spread / np.sqrt(runs)
-        # a normal sample's 90 % quantile scatters 1.71 times as much as its mean
+        # the standard error of a normal sample's 90 % quantile is 1.71 times that of its mean
         drawn.append((rng.binomial(runs, share) / runs, mean + noise[0], q90 + 1.71 * noise[1]))
     return _with_intervals(point[:3], np.array(drawn))
 
@@ -316,7 +316,7 @@ def _product(
         action = wanted or ALTERNATIVES.get(name, ARM_STEPS.get(name, ("",)))[0]
         slow, faults = change.slow.get(action, 1.0), change.faults.get(action, 1.0)
         right = float(well.mean()) if len(well) else 1.0
-        if name != "catch_ball":  # a miss is no fault
+        if name != "catch_ball":  # a missed ball is not a fault
             right = max(0.0, 1.0 - (1.0 - right) * faults)
         looks = change.looks if name == "locate_ball" else 1
         lasts = float(seconds.mean()) * slow if len(seconds) else 0.0

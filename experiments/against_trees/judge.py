@@ -1,4 +1,4 @@
-"""The referee: what a mission in the scripted plant must look like, whoever led it.
+"""The referee: rules that every mission in the scripted plant must keep, whichever program led it.
 
 It reads only the plant's log and the program's own report, so it is the same for a net, a tree and
 a state machine.
@@ -19,7 +19,7 @@ STEPS = {
     "empty": "home",
     "reset": "recover",
 }
-"""By the first word of an action's name: the step that it does."""
+"""The step of an action, by the first word of the action's name."""
 DEADLINES = {
     "locate": 8.0,
     "track": 6.0,
@@ -28,14 +28,16 @@ DEADLINES = {
     "home": 10.0,
     "recover": 30.0,
 }
-"""s that a run of a step may last."""
+"""Longest time of a run, by step (s)."""
 ATTEMPTS = 4
 SLACK = 0.1
-"""s between what should follow and what does: links, ticks and a program's own turn."""
+"""Longest delay between an event and the required next step (s): links, ticks and the program's own
+period."""
 
 
 class Report(NamedTuple):
-    """What a program says at its end. `crash` is what it raised, or that it never ended."""
+    """The report of a program at its end. `crash`: the exception that it raised, or that it never
+    ended."""
 
     caught: int
     gave_up: bool
@@ -43,7 +45,7 @@ class Report(NamedTuple):
 
 
 class Past(NamedTuple):
-    """A run as the log tells it."""
+    """A run as recorded in the log."""
 
     step: str
     ball: int
@@ -51,7 +53,7 @@ class Past(NamedTuple):
     ended: float
     what: str
     caught: float
-    """When the ball came into the cup during this run; 0 if it did not."""
+    """When the ball came into the cup during this run (s); 0 if it did not."""
 
 
 def step_of(action: str) -> str:
@@ -60,7 +62,7 @@ def step_of(action: str) -> str:
 
 
 def runs_of(entries: Sequence[Entry]) -> tuple[dict[str, list[Past]], list[str]]:
-    """Return the runs of each device in order, and what is wrong with them one by one."""
+    """Return the runs of each device in order, and the violations of single runs."""
     runs: dict[str, list[Past]] = {"camera": [], "arm": []}
     open_: dict[str, Entry] = {}
     caught: dict[str, float] = {}
@@ -82,7 +84,7 @@ def runs_of(entries: Sequence[Entry]) -> tuple[dict[str, list[Past]], list[str]]
 
 
 def violations(entries: Sequence[Entry], report: Report, balls: int) -> list[str]:
-    """Return what was wrong with a mission of so many balls; empty if nothing was."""
+    """Return the violations in a mission of so many balls; empty if there are none."""
     runs, wrong = runs_of(entries)
     if report.crash:
         wrong.append(report.crash)
@@ -103,7 +105,7 @@ def violations(entries: Sequence[Entry], report: Report, balls: int) -> list[str
 
 
 def _camera(camera: Sequence[Past], arm: Sequence[Past]) -> Iterator[str]:
-    """A ball that was located is tracked and met at once, and only then."""
+    """Check that a ball is tracked and met at once after it was located, and only then."""
     for n, run in enumerate(camera):
         after = camera[n + 1] if n + 1 < len(camera) else None
         tracked = after is not None and after.step == "track" and after.ball == run.ball
@@ -117,7 +119,7 @@ def _camera(camera: Sequence[Past], arm: Sequence[Past]) -> Iterator[str]:
 
 
 def _arm(arm: Sequence[Past]) -> Iterator[str]:
-    """Each run of the arm is followed by what its end asks for."""
+    """Check that each run of the arm is followed by the step that its end requires."""
     failed = 0
     for n, run in enumerate(arm):
         after = arm[n + 1] if n + 1 < len(arm) else None

@@ -1,7 +1,7 @@
 """Part (d): kill -9 of the coordinating process at random moments, with real processes.
 
-The nodes live on. The net is continued by `petrobot resume`; the tree starts again from its
-beginning, as py_trees keeps nothing, or with what its author wrote to a file after each ball. The
+The nodes continue. The net is continued by `petrobot resume`; the tree starts again from its
+beginning, as py_trees stores nothing, or with what its author wrote to a file after each ball. The
 plant's own log, synced before each action continues, is the referee.
 
 `python -m experiments.against_trees.killed LOCATION_FILE [KEPT]` is the process of a tree.
@@ -37,15 +37,15 @@ from petrobot.services.comm.location_file import load
 PROGRAMS = ("net", "tree", "tree and file")
 BALLS = 3
 SLOW = 4.0
-"""The plant's times are so many times longer than in lock step."""
+"""Factor of the plant's times, compared with lock step."""
 SPAN = 6.0
-"""s after the first action in which the kill falls; about as long as the mission."""
+"""The kill comes within this time after the first action (s); about the length of the mission."""
 PATIENCE = 240.0
-"""s that anything may take on a busy host."""
+"""Limit of every wait on a busy host (s)."""
 ONCE = ("locate", "track", "move", "home")
-"""Steps that every ball takes once when nothing fails (one caught early needs no wait)."""
+"""Steps that every ball needs once if nothing fails (a ball caught early needs no wait)."""
 ERROR_ON_RESUME = ("intercept_tilted", "follow_and_wait")
-"""As in services.toml: the ball is gone when a coordinator resumes."""
+"""As in services.toml: the ball has passed when a coordinator resumes."""
 
 
 # --- the tree's process ---------------------------------------------------------------------------
@@ -62,7 +62,7 @@ class KeptTree(TreeProgram):
         self.over = self.left == 0
 
     def tick(self) -> None:
-        """Tick the tree, and keep what is done."""
+        """Tick the tree, and store how many balls are done."""
         super().tick()
         root = self.tree.root
         assert isinstance(root, Repeat)
@@ -172,10 +172,10 @@ def _commands(program: str, services: Path, folder: Path) -> tuple[list[str], li
 
 
 def measure_one(program: str, number: int, folder: str) -> Line:
-    """Kill a mission once (number 0: not at all). Return what the referee saw.
+    """Kill a mission once (number 0: not at all). Return the referee's findings.
 
-    `twice`: steps begun beyond one for each ball; `never`: steps that no run did to its end.
-    `seconds` from the first entry of the log to the last; `down` from the kill to the next run.
+    `twice`: steps begun more than once for a ball; `never`: steps that no run completed. `seconds`
+    from the first entry of the log to the last; `down` from the kill to the next run.
     """
     here = Path(folder)
     here.mkdir(parents=True, exist_ok=True)
@@ -219,13 +219,13 @@ def measure_one(program: str, number: int, folder: str) -> Line:
 
 
 def measure(results: Results, size: Size, workers: int) -> None:
-    """Kill each program so many times. One at a time, as the time counts."""
+    """Kill each program so many times. One at a time, since times are measured."""
     jobs = [
         (key, (program, number, str(results.folder / "killed" / key.replace(" ", "-"))))
         for key, program, number in sorted(
             keyed(PROGRAMS, range(size.kills + 1)), key=lambda job: job[2]
         )
-    ]  # program by program in turn: what is there when it is stopped compares
+    ]  # the programs take turns, so that results are comparable whenever the measurement is stopped
     results.measure("killed", measure_one, jobs, 1)
 
 

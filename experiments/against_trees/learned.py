@@ -1,7 +1,7 @@
 """Part (c): task-level regret while disturbances switch, which no program is told.
 
-Regret counts balls: the chance of the best fixed combination under the disturbance at hand, minus
-what was caught. The plant is scripted, so that chance is known (`chance`). petrobot's selectors
+Regret counts balls: the chance of the best fixed combination under the present disturbance, minus
+the balls caught. The plant is scripted, so that chance is known (`chance`). petrobot's selectors
 get task credit and, as everything here counts balls, rho = 0.
 """
 
@@ -46,7 +46,7 @@ DISTURBANCES: Mapping[str, Mapping[str, float]] = {
 }
 """By disturbance: the factor on the share of errors of the actions that suffer."""
 BALLS = 5
-"""Balls of a mission; learning goes on from mission to mission."""
+"""Balls of a mission; learning continues from mission to mission."""
 EACH = 100
 """Trials after which the disturbance switches."""
 LEARNERS = ("tracking", "nikolic_fu_fast", "thompson")
@@ -71,7 +71,7 @@ def chance(combination: Combination, faults: Mapping[str, float]) -> float:
     locate, track, move = combination
     good = ACTIONS[locate].good * ACTIONS[track].good * ACTIONS[move].good
     into_cup = np.minimum(good * (1.15 - 0.4 * HARD * HARD), 1.0)
-    waited = 0.1 + 0.9 * fine("follow_and_wait", HARD)  # one in ten comes before the wait
+    waited = 0.1 + 0.9 * fine("follow_and_wait", HARD)  # one ball in ten is caught before the wait
     return float(fine(locate, 0.0) * np.mean(fine(move, HARD) * into_cup * waited))
 
 
@@ -99,8 +99,8 @@ def directory_of(disturbance: str) -> Directory:
 
 
 class Choice:
-    """An epsilon-greedy choice with a constant step, as its author would write it who knows that
-    the world changes: it forgets."""
+    """An epsilon-greedy choice with a constant step, so that it forgets, as an author would write
+    it who knows that the world changes."""
 
     def __init__(self, actions: tuple[str, ...], rng: np.random.Generator) -> None:
         self.actions, self.rng = actions, rng
@@ -123,7 +123,7 @@ class Choice:
 
 
 class Pick(Act):
-    """A primitive action that is chosen when it starts."""
+    """A primitive action whose alternative is chosen when it starts."""
 
     def __init__(self, cell: Cell, choice: Choice, reads: str = "", writes: str = "") -> None:
         super().__init__(cell, choice.actions[0], reads, writes)
@@ -136,7 +136,7 @@ class Pick(Act):
 
 
 class Learn(Behaviour):
-    """Tells every choice whether the ball was caught."""
+    """Reports to every choice whether the ball was caught."""
 
     def __init__(self, choices: Mapping[str, Choice]) -> None:
         super().__init__("learn")
@@ -152,8 +152,8 @@ class Learn(Behaviour):
 
 
 class ChoosingTree(TreeProgram):
-    """The tree with other behaviours in its places for locating, tracking and moving. Without
-    choices it falls back on other ways of locating when the first one fails."""
+    """The tree with other behaviours for locating, tracking and moving. Without choices it tries
+    other ways of locating when the first one fails."""
 
     def __init__(self, cell: Cell, balls: int, choices: Mapping[str, Choice]) -> None:
         super().__init__(cell, balls)

@@ -27,14 +27,14 @@ LIMIT_BALL = 10.0
 
 @dataclass
 class Mission:
-    """What a mission has shown."""
+    """The result of a mission."""
 
     report: Report
     entries: list[plant.Entry]
     seconds: float
-    """Of simulated time, with the cell's own start."""
+    """Duration in simulated time (s), with the start of the cell."""
     score: Mapping[str, Any] = field(default_factory=dict)
-    """The laboratory's own count."""
+    """Balls caught, as the laboratory counts them."""
     ticks: int = 0
     tick_s: float = 0.0
 
@@ -105,7 +105,7 @@ def program_mission(
     try:
         limit = LIMIT + LIMIT_BALL * balls
         party, now = play(directory, make, balls=balls, seed=seed, limit=limit, prepare=parameters)
-    except Exception as fault:  # of the program, or of what it asked for
+    except Exception as fault:  # of the program itself, or of the cell for a wrong request
         crash = f"{type(fault).__name__}: {fault}"
         return Mission(Report(0, False, crash), list(plant.ENTRIES), 0.0)
     program = party.program
@@ -116,5 +116,5 @@ def program_mission(
 
 
 Run = Callable[[int, int], Mission]
-"""Runs a mission of so many balls with a seed."""
+"""A function that runs a mission of so many balls with a seed."""
 _: type[Observer] = _Goals

@@ -139,7 +139,7 @@ def learned(results: Results) -> str:
 
 
 def killed(results: Results) -> str:
-    """Return what became of the missions that were killed."""
+    """Return the results of the missions that were killed."""
     rows = []
     for program in KILLED:
         own = [line for line in results.of("killed") if line["program"] == program]

@@ -1,12 +1,12 @@
 """A scripted plant: the catching cell's primitive actions under their own names, without physics.
 
-A trial takes 0.5 s of simulated time and a few ms of CPU, so faults that show once in a hundred
-trials can be waited for. Each ball has a hidden hardness in 0..1 that its camera and arm actions
-share: so the statuses of one trial depend on each other, as those of a real throw do. Like the
-real ones, the arm's actions follow a stream of set points that `track_ball` publishes, and the
-light barrier is an external event, which a ball that falls out of the cup may raise as well.
+A trial takes 0.5 s of simulated time and a few ms of CPU, so even faults that show once in a
+hundred trials can be measured. Each ball has a hidden hardness in 0..1 that its camera and arm
+actions share, so the statuses of one trial depend on each other, as in a real throw. Like the real
+ones, the arm's actions follow a stream of set points that `track_ball` publishes, and the light
+barrier is an external event, which a ball that falls out of the cup may raise as well.
 
-Every run is logged where it begins and ends: the referee of all that programs are judged by.
+Every run is logged at its beginning and end; the referee judges all programs by this log.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from petrobot import Context, Result, error, failure, key, success
 from petrobot.services.device import Driver, Ports, Setpoint
 
 HANG = 300.0
-"""s; a run that hangs ends by itself after so long."""
+"""Time after which a hanging run ends by itself (s)."""
 SET_POINTS = 0.3
-"""s that the arm waits for the first set point."""
+"""How long the arm waits for the first set point (s)."""
 
 
 class Character(NamedTuple):
-    """What an action is like: shortest and longest duration (s), shares of errors and of runs that
-    hang, and how good its result is (a factor of the chance to catch)."""
+    """Properties of an action: shortest and longest duration (s), shares of errors and of hanging
+    runs, and the quality of its result (a factor of the chance to catch)."""
 
     shortest: float
     longest: float
@@ -79,9 +79,9 @@ class Device(Driver):
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         super().__init__(config, ports)
         self.balls = 0
-        """Located so far."""
+        """Number of balls located so far."""
         self.ball = 0
-        """The ball that the arm deals with."""
+        """The ball that the arm is catching."""
         self.in_cup = self.will_catch = False
         self.hard = 0.0
         # opened with the driver: in real time senders ask its process for the stream's port
@@ -101,10 +101,10 @@ class Device(Driver):
             os.close(file)
 
     def stop(self, now: float) -> None:
-        """Nothing moves."""
+        """Do nothing: nothing moves."""
 
     def stopped(self) -> bool:
-        """Nothing moves."""
+        """Return True: nothing moves."""
         return True
 
 
@@ -118,14 +118,15 @@ async def _run(
     if hang < like.hang * min(faults, 1.0):
         await ctx.sleep(HANG)
         return "hung"
-    share = like.error * faults * (0.5 + 1.5 * hard * hard)  # an arm without a ball: half of it
+    # the factor is 1 in the mean over all balls, and 0.5 for an arm without a ball
+    share = like.error * faults * (0.5 + 1.5 * hard * hard)
     seconds = like.shortest + span * (like.longest - like.shortest)
     await ctx.sleep(seconds * slow * (1.0 + 0.5 * hard))
     return "broken" if fails < share else ""
 
 
 async def _logged(ctx: Context[Device], action: str, run: Coroutine[Any, Any, Result]) -> Result:
-    """Run it between two entries of the log."""
+    """Run the action between two entries of the log."""
     ctx.device.note(ctx, action, "begin")
     try:
         result = await run
@@ -175,7 +176,7 @@ async def _move(ctx: Context[Device], action: str, slow: float, faults: float) -
     cause = await _run(ctx, action, slow, faults, hard)
     if cause:
         return error("drive_fault", "a drive reported a fault")
-    if early and device.will_catch:  # faster than the report that the cup is in place
+    if early and device.will_catch:  # the ball comes before the report that the cup is in place
         _catch(ctx, action)
         await ctx.sleep(0.05)
     return success()
@@ -219,9 +220,8 @@ async def _recover(ctx: Context[Device], action: str, slow: float, faults: float
 async def locate(
     ctx: Context[Device], *, action: str, slow: float = 1.0, faults: float = 1.0
 ) -> Result:
-    """Find the ball: `ball` is its number, its hardness and how well it was located. `slow`
-    multiplies times, `faults` the shares of errors (0: no run hangs either); so do they in all
-    actions here."""
+    """Find the ball: `ball` is its number, its hardness and how well it was located. In all actions
+    here, `slow` multiplies times, and `faults` the shares of errors (0: no run hangs either)."""
     return await _logged(ctx, action, _locate(ctx, action, slow, faults))
 
 
@@ -241,7 +241,8 @@ async def track(
 async def move(
     ctx: Context[Device], *, action: str, slow: float = 1.0, faults: float = 1.0
 ) -> Result:
-    """Bring the cup to the point of the stream. A quick ball is caught before that is reported."""
+    """Bring the cup to the point of the stream. A fast ball may be caught before the action
+    ends."""
     return await _logged(ctx, action, _move(ctx, action, slow, faults))
 
 

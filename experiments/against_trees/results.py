@@ -1,4 +1,4 @@
-"""Sizes of the experiment, and its results as lines of JSON: a result that is there is not measured
+"""Sizes of the experiment, and its results as lines of JSON: a stored result is not measured
 again."""
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ class Size:
     of it would be another experiment."""
 
     trials: int
-    """For each design fault, and for each change that was forecast."""
+    """Trials for each design fault, and for each forecast change."""
     kills: int
-    """For each program."""
+    """Kills of each program."""
     learning: int
     """Trials of each learning policy and seed, in the plant."""
     learning_seeds: int
-    """How often each policy is run anew."""
+    """Number of seeds of each policy."""
     laboratory: int
     """Balls for each program and regime in the simulated laboratory."""
     training: int = 300
@@ -55,7 +55,8 @@ class Results:
         if self._path.exists():
             whole = self._path.read_text(encoding="utf-8").splitlines(keepends=True)
             for line in whole:
-                if line.endswith("\n"):  # a line without its end was being written at a kill
+                # an incomplete line was being written when the process was killed
+                if line.endswith("\n"):
                     found = json.loads(line)
                     self._lines[found["part"], found["key"]] = found
             if whole and not whole[-1].endswith("\n"):

@@ -1,4 +1,4 @@
-"""Part (a): which design faults are found before running, within so many trials, or never.
+"""Part (a): which design faults are found before running, within a number of trials, or never.
 
 Before running, the net has `petrobot check`. The tree has what its users have: mypy (strict), ruff,
 and py_trees itself when the tree is built and set up. The state machine has mypy and ruff.
@@ -26,7 +26,7 @@ from petrobot.coordinator.task.wording import Severity
 from petrobot.services.comm.location_file import load
 
 BALLS = 10
-"""Balls of a mission: enough for what only later balls show."""
+"""Balls of a mission: enough for faults that only later balls show."""
 FIRST_SEED = 20_000
 SOURCES = {"net": TASK, "tree": HERE / "tree.py", "machine": HERE / "machine.py"}
 STYLE = "E501,F401,I001,SIM102"
@@ -57,8 +57,8 @@ def petrobot(*arguments: str, fine: tuple[int, ...] = (0,)) -> str:
 
 
 def source_of(program: str, fault: int | None) -> str | None:
-    """Return a program's text with a design fault (None: the correct one); None where the fault
-    cannot be said."""
+    """Return a program's text with a design fault (None: the correct one); None if the fault is
+    impossible in it."""
     text = SOURCES[program].read_text(encoding="utf-8")
     if fault is None:
         return text
@@ -70,9 +70,9 @@ def source_of(program: str, fault: int | None) -> str | None:
 
 
 def checked_net(fault: int | None) -> dict[str, str]:
-    """Return what `petrobot check` says against the net in the real cell: errors and warnings, and
-    every verdict that does not hold. (The command also reads the code of the actions, which is the
-    same for all faults.)"""
+    """Return the objections of `petrobot check` to the net in the real cell: errors and warnings,
+    and every verdict that does not hold. (The command also reads the code of the actions, which is
+    the same for all faults.)"""
     text = source_of("net", fault)
     assert text is not None
     try:
@@ -97,7 +97,7 @@ def checked_net(fault: int | None) -> dict[str, str]:
 
 
 def before_net(fault: int) -> Line:
-    """Return whether `petrobot check` refuses or warns, and by what."""
+    """Return whether `petrobot check` refuses or warns, and its messages."""
     usual = {text.partition(":")[0] for text in checked_net(None)}
     said = checked_net(fault)
     new = {text: level for text, level in said.items() if text.partition(":")[0] not in usual}
@@ -109,7 +109,7 @@ def before_net(fault: int) -> Line:
 
 
 def before_programs(program: str) -> dict[int, Line]:
-    """Return for each fault what mypy, ruff and (tree) py_trees say against the text."""
+    """Return for each fault the messages of mypy, ruff and (for the tree) py_trees."""
     found: dict[int, Line] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -158,7 +158,7 @@ def _built(fault: int) -> str:
 
 
 def make_of(program: str, fault: int | None) -> Make:
-    """Return what makes the program with a design fault."""
+    """Return a function that makes the program with a design fault."""
     text = source_of(program, fault)
     assert text is not None
     with tempfile.TemporaryDirectory() as folder:
@@ -173,8 +173,8 @@ def make_of(program: str, fault: int | None) -> Make:
 
 
 def runner(program: str, fault: int | None) -> Run:
-    """Return what runs missions of a program with a design fault. Raises TaskFileError for a net
-    that is no task."""
+    """Return a function that runs missions of a program with a design fault. Raises TaskFileError
+    for a net that is not a task."""
     directory = load(PLANT)
     if program == "net":
         text = source_of("net", fault)
@@ -186,7 +186,7 @@ def runner(program: str, fault: int | None) -> Run:
 
 
 def first_symptom(run: Run, trials: int) -> tuple[int | None, str]:
-    """Return the trial that shows the fault and how; None if none does."""
+    """Return the first trial that shows the fault, and how; None if no trial does."""
     for n in range(trials // BALLS):
         mission: Mission = run(BALLS, FIRST_SEED + n)
         wrong = violations(mission.entries, mission.report, BALLS)
@@ -196,7 +196,7 @@ def first_symptom(run: Run, trials: int) -> tuple[int | None, str]:
 
 
 def measure_one(program: str, fault: int, trials: int, before: dict[str, Any] | None) -> Line:
-    """Return what finds a fault in a program. `fault` -1: the correct program."""
+    """Return how a fault is found in a program. `fault` -1: the correct program."""
     which = None if fault < 0 else fault
     known: Line = {"program": program, "fault": fault, "trials": trials}
     if which is not None and getattr(FAULTS[fault], program) is None:

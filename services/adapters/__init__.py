@@ -1,1 +1,2 @@
-"""Robots and programs of others: one folder each, written against petrobot's public API alone."""
+"""Adapters for other vendors' robots and programs: one folder each, written with petrobot's public
+API only."""

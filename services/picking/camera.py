@@ -26,14 +26,14 @@ class TableCamera(Driver):
         self.known: PickingCell = (
             read_cell(ports.file(name).decode(), name) if name else cell_named()
         )
-        cv2.setNumThreads(1)  # other nodes share the cores
+        cv2.setNumThreads(1)  # one thread: other nodes share the cores
         self._images = ports.images()
         self._on = False
         self._count = 0
         self._newest: NDArray[np.uint8] | None = None
 
     async def take(self, ctx: Context, count: int, timeout: float) -> list[NDArray[np.uint8]]:
-        """Return `count` images exposed from now on; fewer if the next does not come within
+        """Return `count` images exposed from now on, or fewer if the next one does not come within
         `timeout` s. Raises ValueError for images of another size."""
         eye, taken = self.known.eye, list[NDArray[np.uint8]]()
         self._images.start(eye.rate)
@@ -61,7 +61,7 @@ class TableCamera(Driver):
 
     def _pop(self) -> NDArray[np.uint8]:
         image, self._newest = self._newest, None
-        assert image is not None  # `_arrived` said so
+        assert image is not None  # as `_arrived` reported
         return image
 
     def state(self) -> Mapping[str, Any]:

@@ -1,5 +1,5 @@
-"""What the drivers of the arms are told, and how their states are read: the only place that knows
-one arm from another. An arm of yours is one more class in ARMS."""
+"""Commands for the drivers of the arms, and reading their states: only this module distinguishes
+arms. To add your own arm, add a class to ARMS."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from petrobot.services.picking.model import Gripper
 
 
 class ArmState(NamedTuple):
-    """An arm as the actions see it: whether it is switched on, joint angles (rad), whether it
-    stands at its goal, the gap between its fingers (m; None if it is not known), whether something
-    holds them apart, whether they have stopped, and what is wrong with it."""
+    """The state of an arm for the actions: whether it is switched on, joint angles (rad), whether
+    it is at its goal, the gap between its fingers (m; None if unknown), whether a part keeps them
+    apart, whether they have stopped, and its faults."""
 
     on: bool
     q: tuple[float, ...]
@@ -27,7 +27,7 @@ class Commands(Protocol):
     """The commands of one kind of driver."""
 
     def enable(self) -> Mapping[str, Any]:
-        """Switch on, and forget faults."""
+        """Switch on, and clear faults."""
 
     def move(self, joints: Sequence[float]) -> Mapping[str, Any]:
         """Move to joint angles (rad)."""
@@ -36,7 +36,7 @@ class Commands(Protocol):
         """Open the fingers to a gap (m)."""
 
     def close(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
-        """Close the fingers on what is between them, at the least to a gap (m) if the gripper knows
+        """Close the fingers on what is between them, but not below a gap (m) if the gripper accepts
         one."""
 
     def state(self, gripper: Gripper, state: Mapping[str, Any]) -> ArmState:
@@ -59,7 +59,7 @@ class So101:
         return {"do": "open", "angle": gap / gripper.numbers["gap_per_rad"]}
 
     def close(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
-        """See `Commands`. It closes until it squeezes, however far that is."""
+        """See `Commands`. It closes until it squeezes and ignores the gap."""
         return {"do": "close", "squeeze": gripper.numbers["squeeze"]}
 
     def state(self, gripper: Gripper, state: Mapping[str, Any]) -> ArmState:
@@ -79,8 +79,8 @@ class So101:
 
 
 class Ur:
-    """`petrobot.services.adapters.ur`: the gripper hangs on digital output 0 (close) and inputs 0
-    (holds something) and 1 (its fingers stand), and does not know its gap."""
+    """`petrobot.services.adapters.ur`: the gripper is connected to digital output 0 (close) and
+    inputs 0 (holds something) and 1 (its fingers have stopped), and does not measure its gap."""
 
     def enable(self) -> Mapping[str, Any]:
         """See `Commands`."""
@@ -113,5 +113,5 @@ class Ur:
 
 
 CLOSED: Final = 0.003
-"""m up to which fingers that are stopped have met each other."""
+"""Gap up to which stopped fingers have met each other (m)."""
 ARMS: Final[Mapping[str, Commands]] = {"feetech": So101(), "ur": Ur()}

@@ -1,8 +1,7 @@
 """Find parts in an image: by their contours, or by templates of the kinds that are handled. Pure.
 
-Both return the parts that lie where parts are looked for, best first. The camera looks straight
-down; a part's top is nearer to it than the table, so a pixel is projected to the height of the top
-of its kind.
+Both return the parts in the search area, best first. The camera looks straight down; a part's top
+is nearer to it than the table, so a pixel is projected to the height of the top of its kind.
 """
 
 from __future__ import annotations
@@ -39,24 +38,24 @@ class Found(NamedTuple):
 Finder = Callable[[Grey, PickingCell], list[Found]]
 
 CONTRAST: Final = 26.0
-"""Grey levels from the table's from which a pixel belongs to something."""
+"""Least difference from the table's grey level of a pixel that belongs to a part."""
 _UNLIKE: Final = 0.35
-"""Relative error of an area from which a contour is no kind of part."""
+"""Relative error of the area above which a contour is not of any kind."""
 MATCH: Final = 0.62
-"""Correlation from which a template is a part."""
+"""Least correlation of a template with a part."""
 SCALE: Final = 1250.0
 """Pixels per metre of the rectified image in which templates are compared."""
 TURNS: Final = 12
-"""Orientations in which a box's template is compared, over half a turn."""
+"""Number of orientations of a box's template, over half a turn."""
 _RIM: Final = 0.006
-"""m of table around a part that belongs to its template."""
+"""Margin of table around the part in a template (m)."""
 
 
 def find_by_contours(image: Grey, cell: PickingCell) -> list[Found]:
     """Find what differs from the table's grey level, and take the smallest rectangle around it.
 
-    Cheap. A shadow that is as dark as CONTRAST is taken for a piece of a dark part; a part that
-    differs less is not seen.
+    Fast. A shadow that differs by CONTRAST is taken for a piece of a dark part; a part that differs
+    by less is not seen.
     """
     (x0, x1), (y0, y1) = cell.area
     eye = cell.eye
@@ -68,7 +67,7 @@ def find_by_contours(image: Grey, cell: PickingCell) -> list[Found]:
     table = float(np.median(region))
     away = region.astype(np.float32) - table
     contours: list[Grey] = []
-    for side in (away, -away):  # apart: the shadow of a bright part is dark
+    for side in (away, -away):  # dark and bright separately: the shadow of a bright part is dark
         mask = (side > CONTRAST).astype(np.uint8)
         mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))  # type: ignore[assignment]
         contours += cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]  # type: ignore[arg-type]
@@ -96,7 +95,7 @@ def find_by_contours(image: Grey, cell: PickingCell) -> list[Found]:
 def _kind_of(
     cell: PickingCell, area: float, long: float, short: float
 ) -> tuple[PartKind, float] | None:
-    """Return the kind whose size is nearest to a contour's (px), and how unlike it is."""
+    """Return the kind whose size is nearest to a contour's (px), and the difference."""
     best: tuple[float, PartKind] | None = None
     for kind in cell.kinds.values():
         scale = cell.eye.focal / (cell.eye.position[2] - kind.height)
@@ -120,8 +119,8 @@ def _kind_of(
 def find_by_templates(image: Grey, cell: PickingCell) -> list[Found]:
     """Compare the image with every kind of part in every orientation.
 
-    Dear. It compares shapes whatever the light is, so neither dim light nor the shadow at one side
-    of a part matters much; two parts that touch are still two.
+    Slow. It compares shapes independently of brightness, so neither dim light nor a shadow at one
+    side of a part matters much; two touching parts are still found as two.
     """
     found: list[Found] = []
     for kind in cell.kinds.values():
@@ -150,7 +149,7 @@ def find_by_templates(image: Grey, cell: PickingCell) -> list[Found]:
 
 
 def _distinct(found: Sequence[Found], cell: PickingCell) -> list[Found]:
-    """Of those that overlap, keep the best."""
+    """Keep the best of overlapping parts."""
     kept: list[Found] = []
     (x0, x1), (y0, y1) = cell.area
     for one in sorted(found, key=lambda f: -f.score):
@@ -166,11 +165,11 @@ def _distinct(found: Sequence[Found], cell: PickingCell) -> list[Found]:
 
 
 _BORDER: Final = 0.03
-"""m by which the rectified image is larger than the area."""
+"""Margin of the rectified image around the search area (m)."""
 
 
 def _rectified(image: Grey, cell: PickingCell, height: float) -> Grey:
-    """The area as seen at a height: row along x, column along y."""
+    """Return the search area as seen at a height: rows along x, columns along y."""
     (x0, x1), (y0, y1) = cell.area
     rows = round((x1 - x0 + 2 * _BORDER) * SCALE)
     columns = round((y1 - y0 + 2 * _BORDER) * SCALE)
@@ -194,7 +193,7 @@ def _place(cell: PickingCell, row: float, column: float) -> tuple[float, float]:
 
 @lru_cache(maxsize=32)
 def _templates(kind: PartKind) -> tuple[tuple[float, Grey], ...]:
-    """Return each orientation (rad) of a kind with its picture: bright top, dark table."""
+    """Return the template of a kind in each orientation (rad): bright top, dark table."""
     square = kind.size[0] == kind.size[1]
     half_turn = math.pi / 2 if square else math.pi
     count = 1 if kind.round else TURNS // 2 if square else TURNS

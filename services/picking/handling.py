@@ -1,8 +1,7 @@
 """Primitive actions of the arm: make ready, grasp, verify, place.
 
-They use any arm whose driver `petrobot.services.picking.commands` knows. Which arm it is says
-their argument `arm`: the file of its numbers (`petrobot.services.picking.model.arm_named`); `cell`
-is the cell's file.
+They use any arm whose driver `petrobot.services.picking.commands` knows. Their argument `arm` is
+the file of the arm's numbers (`petrobot.services.picking.model.arm_named`), `cell` the cell's file.
 
 Error causes: `unreachable`, `arm_timeout`, `arm_fault`, `bad_part`.
 """
@@ -36,32 +35,32 @@ from petrobot.services.picking.model import (
 )
 
 ABOVE: Final = 0.065
-"""m over the table at which the finger tips travel."""
+"""Height over the table at which the finger tips travel (m)."""
 LOW: Final = 0.03
-"""m over the table at which fingers let something go that is not to be placed."""
+"""Height over the table at which the fingers drop a part that must not be placed (m)."""
 SEAT: Final = 0.012
-"""m of a part's height that the fingers reach around."""
+"""How deep the fingers reach around a part (m)."""
 FLOOR: Final = 0.004
-"""m over the table below which the finger tips never go."""
+"""Least height of the finger tips over the table (m)."""
 GAP: Final = 0.012
-"""m that the fingers are opened beyond a part's side when they know its direction."""
+"""How much wider than a part's side the fingers open if its direction is known (m)."""
 SQUEEZE: Final = 0.006
-"""m that the fingers are told to close beyond a part's size."""
+"""How much further than a part's size the fingers are commanded to close (m)."""
 ALONG: Final = 0.0
-"""rad, the direction in which fingers close over a tray."""
+"""Direction in which the fingers close over a tray (rad)."""
 TAKEN: Final = 0.06
-"""s until a driver's state shows what a command has changed."""
+"""Time until a driver's state shows the effect of a command (s)."""
 CLOSING: Final = 2.0
-"""s within which fingers stop."""
+"""Time within which the fingers stop (s)."""
 FIT: Final = 0.003
-"""m by which the gap between the fingers may differ from the side that they hold."""
+"""Tolerance of the gap between the fingers, compared with the side that they hold (m)."""
 SETTLE: Final = 0.25
-"""s that fingers have to take hold before they are lifted."""
+"""Time for the fingers to grip before they are lifted (s)."""
 
 
 class Grasp(NamedTuple):
-    """How to grasp: where the finger tips go (m), along which direction they close (rad), how far
-    they open before and are to close (m)."""
+    """How to grasp: position of the finger tips (m), direction of closing (rad), gap before, and
+    gap to close to (m)."""
 
     x: float
     y: float
@@ -72,7 +71,7 @@ class Grasp(NamedTuple):
 
 
 class ArmError(Exception):
-    """The arm did not do what it was told: cause and text."""
+    """The arm did not do what it was commanded; cause and text."""
 
     def __init__(self, cause: str, text: str) -> None:
         super().__init__(text)
@@ -83,8 +82,8 @@ class ArmError(Exception):
 
 
 def across(kind: PartKind, part: Mapping[str, Any], arm: JointChain) -> Grasp:
-    """Return a grasp across a part's narrow side; a round part has none, so the fingers keep the
-    direction in which the arm comes."""
+    """Return a grasp across a part's narrow side. A round part has none: the fingers close across
+    the direction from which the arm comes."""
     narrow, turn = min(kind.size), float(part["turn"]) + math.pi / 2
     if kind.round:
         turn = _arriving(part, arm)
@@ -99,8 +98,8 @@ def across(kind: PartKind, part: Mapping[str, Any], arm: JointChain) -> Grasp:
 
 
 def at_centre(kind: PartKind, part: Mapping[str, Any], arm: JointChain) -> Grasp:
-    """Return a grasp at a part's middle, with the fingers wide open and across the direction in
-    which the arm comes: they turn the part by closing."""
+    """Return a grasp at a part's middle, with the fingers wide open and closing across the
+    direction from which the arm comes; closing turns the part."""
     return Grasp(
         float(part["x"]),
         float(part["y"]),
@@ -116,7 +115,7 @@ def _depth(kind: PartKind) -> float:
 
 
 def _arriving(part: Mapping[str, Any], arm: JointChain) -> float:
-    """The direction across the line from the arm's foot to the part."""
+    """Return the direction across the line from the arm's base to the part (rad)."""
     foot = arm.points[0]
     return math.atan2(float(part["y"]) - foot[1], float(part["x"]) - foot[0]) + math.pi / 2
 
@@ -127,10 +126,10 @@ def _arriving(part: Mapping[str, Any], arm: JointChain) -> float:
 async def make_ready(
     ctx: Context, *, arm: str = "so101", cell: str = "cell", timeout: float = 20.0
 ) -> Result:
-    """Switch the arm on, open the fingers and fold it back out of the camera's view, whatever
-    happened before. What the fingers still hold is put down where parts are looked for.
+    """Switch the arm on, open the fingers and fold the arm out of the camera's view, whatever
+    happened before. A part that the fingers still hold is put down in the search area.
 
-    SUCCESS when it stands there; ERROR `arm_fault` or `arm_timeout`.
+    SUCCESS when it is there; ERROR `arm_fault` or `arm_timeout`.
     """
     try:
         hand, known = Hand(ctx, arm, timeout), cell_named(cell)
@@ -153,7 +152,7 @@ async def grasp_narrow(
     cell: str = "cell",
     timeout: float = 10.0,
 ) -> Result:
-    """Grasp a part across its narrow side and lift it, out of the camera's view.
+    """Grasp a part across its narrow side, lift it, and leave the camera's view.
 
     SUCCESS, provisionally: `picked` is the id of this run, `took` says whether the fingers closed
     on something; the action that verifies the grasp gives the verdict. ERROR `unreachable` if the
@@ -170,8 +169,8 @@ async def grasp_centre(
     cell: str = "cell",
     timeout: float = 10.0,
 ) -> Result:
-    """Grasp a part at its middle, whatever its direction: quicker, and enough for round parts.
-    Otherwise as `grasp_narrow`."""
+    """Grasp a part at its middle without regard to its direction: faster, and enough for round
+    parts. Otherwise as `grasp_narrow`."""
     return await _grasp(ctx, at_centre, part, arm, cell, timeout)
 
 
@@ -214,10 +213,10 @@ async def verify_width(
     """Verify by the gap between the fingers that the part is held, and give the verdicts on the
     runs that found and picked it.
 
-    SUCCESS if it is held at the right gap. FAILURE `missed`: the fingers closed on nothing, for
-    which both runs are blamed; `wrong_kind`: on something smaller, for which the run that found it
-    is; `askew`: on something wider, and `slipped`: it was lost while it was lifted (`took`), for
-    which the run that grasped it is.
+    SUCCESS if it is held at the right gap. FAILURE `missed`: the fingers closed on nothing; both
+    runs get the verdict FAILURE. `wrong_kind`: they closed on something smaller; the run that found
+    it gets it. `askew`: on something wider, and `slipped`: it was lost while being lifted (`took`);
+    the run that grasped it gets it.
     """
     try:
         kind = _kind(cell_named(cell), part)
@@ -256,9 +255,9 @@ async def place_in_tray(
 ) -> Result:
     """Put the part that is held into the next slot of the tray of its kind.
 
-    SUCCESS, provisionally, if it was held until there: `slots` counts what lies in each tray,
-    `tray` is the one; the referee gives the verdict. FAILURE `lost_on_the_way` if not. Raises the
-    event `tray_full` with the last slot.
+    SUCCESS, provisionally, if it was held until there: `slots` counts the parts in each tray,
+    `tray` is the one used; the laboratory's score gives the verdict. FAILURE `lost_on_the_way` if
+    it was not. Raises the event `tray_full` with the last slot.
     """
     try:
         hand, known = Hand(ctx, arm, timeout), cell_named(cell)
@@ -286,7 +285,7 @@ async def place_in_tray(
     return provisional(success(slots=used, tray=kind.tray))
 
 
-# What they share
+# Shared by the actions
 
 
 def _kind(cell: PickingCell, part: Mapping[str, Any]) -> PartKind:
@@ -310,7 +309,7 @@ def _error(fault: Exception) -> Result:
 
 
 class Hand:
-    """An arm of known numbers, as the actions use it."""
+    """An arm with its numbers, as the actions use it."""
 
     def __init__(self, ctx: Context, arm: str, timeout: float) -> None:
         """Raises ArmError, NumbersError."""
@@ -324,12 +323,12 @@ class Hand:
 
     @property
     def state(self) -> ArmState:
-        """The newest state of the arm."""
+        """Return the newest state of the arm."""
         return self._commands.state(self.arm.gripper, self.ctx.device.state)
 
     async def enable(self) -> None:
-        """Switch the arm on, whatever happened before; a controller that is just starting refuses
-        that for a while. Raises CommandRefused."""
+        """Switch the arm on, whatever happened before. A controller that is still starting refuses
+        that at first, so try again. Raises CommandRefused."""
         due = self.ctx.now + self._timeout / 2
         while True:
             try:
@@ -344,7 +343,7 @@ class Hand:
         await self.ctx.sleep(SETTLE)
 
     async def open(self, gap: float) -> None:
-        """Open the fingers to a gap (m), and wait until they are."""
+        """Open the fingers to a gap (m), and wait until they are open."""
         await self._fingers(self._commands.open(self.arm.gripper, gap))
 
     async def close(self, gap: float) -> None:

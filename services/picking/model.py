@@ -1,7 +1,7 @@
 """The numbers of a pick-and-place cell and of its arm, read from TOML files and checked.
 
-An arm is a row of joint axes at joint angles of zero, so any arm of five or six joints can be
-described. `JointChain.tool` is its forward kinematics, `JointChain.over` gives the joint angles for
+An arm is described by its joint axes at joint angles of zero, so any arm of five or six joints can
+be used. `JointChain.tool` is its forward kinematics, `JointChain.over` gives the joint angles for
 fingers that point straight down.
 """
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 _NEAR: Final = 2e-4
-"""m and rad within which a pose counts as reached by `JointChain.over`."""
+"""Tolerance of a pose in `JointChain.over` (m and rad)."""
 
 
 class NumbersError(ValueError):
@@ -54,7 +54,7 @@ class Eye:
     rate: float
 
     def pixel(self, x: float, y: float, z: float) -> tuple[float, float]:
-        """Return where a point of the table's frame (m) is in the image (px)."""
+        """Return the pixel of a point of the table's frame (m)."""
         scale = self.focal / (self.position[2] - z)
         return (
             self.width / 2 - 0.5 - scale * (y - self.position[1]),
@@ -72,7 +72,7 @@ class Eye:
 
 @dataclass(frozen=True, slots=True)
 class Tray:
-    """A tray: its middle, size along x and y, and where parts are put, in order (m)."""
+    """A tray: its middle, its size along x and y, and its slots in the order of filling (m)."""
 
     position: tuple[float, float]
     size: tuple[float, float]
@@ -81,18 +81,18 @@ class Tray:
 
 @dataclass(frozen=True, slots=True)
 class PickingCell:
-    """The cell as its services know it."""
+    """The cell, as far as its services know it."""
 
     eye: Eye
     area: tuple[tuple[float, float], tuple[float, float]]
-    """Where parts lie: x from, to; y from, to (m)."""
+    """Search area for parts: x from, to; y from, to (m)."""
     kinds: Mapping[str, PartKind]
     trays: Mapping[str, Tray]
 
 
 @dataclass(frozen=True, slots=True)
 class Gripper:
-    """Two parallel fingers (m). `numbers`: what else the arm's driver needs to know."""
+    """Two parallel fingers (m). `numbers`: further numbers for the arm's driver."""
 
     opening: float
     thickness: float
@@ -106,20 +106,20 @@ class JointChain:
 
     name: str
     points: Vector
-    """(n, 3) a point on each axis."""
+    """A point on each axis (m), shape (n, 3)."""
     axes: Vector
-    """(n, 3) unit vectors."""
+    """Unit vectors of the axes, shape (n, 3)."""
     tip: Vector
-    """(3,) the middle between the finger tips."""
+    """The middle between the finger tips (m), shape (3,)."""
     approach: Vector
-    """(3,) where the fingers point."""
+    """Unit vector along the fingers, shape (3,)."""
     closing: Vector
-    """(3,) along which they close."""
+    """Unit vector along which the fingers close, shape (3,)."""
     limits: Vector
-    """(n, 2) rad."""
+    """Lowest and highest angle of each joint (rad), shape (n, 2)."""
     gripper: Gripper
     controller: str
-    """What its driver is told: a key of `petrobot.services.picking.commands.ARMS`."""
+    """Commands of its driver: a key of `petrobot.services.picking.commands.ARMS`."""
     poses: Mapping[str, tuple[float, ...]]
 
     def tool(self, joints: Sequence[float]) -> tuple[Vector, Vector, Vector, Vector]:
@@ -141,7 +141,7 @@ class JointChain:
         self, x: float, y: float, z: float, turn: float, near: Sequence[float] | None = None
     ) -> tuple[float, ...]:
         """Return joint angles with the tips at (x, y, z) m, the fingers straight down and closing
-        along `turn` (rad, either way round), next to the angles `near`.
+        along `turn` (rad, modulo half a turn), nearest to the angles `near`.
 
         Damped least squares. Raises OutOfReachError.
         """

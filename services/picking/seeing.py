@@ -19,21 +19,21 @@ from petrobot.services.picking.finding import FINDERS, Finder, Found
 from petrobot.services.picking.model import PickingCell
 
 SAME: Final = 0.006
-"""m within which parts of two images are the same part."""
+"""Distance within which parts of two images are the same part (m)."""
 ROOM: Final = 0.05
-"""m from its neighbours at which a part stands free."""
+"""Distance from its neighbours at which a part is easy to grasp (m)."""
 EMPTY: Final = 9.0
-"""Grey levels, standard deviation within a tray up to which nothing lies there."""
+"""Largest standard deviation of grey levels within an empty tray."""
 
 
 async def locate_contours(
     ctx: Context[TableCamera], *, images: int = 2, timeout: float = 1.0
 ) -> Result:
-    """Locate a part by contours: cheap; needs even light.
+    """Locate a part by contours: fast; needs even light.
 
     SUCCESS, provisionally: `part` (kind, x, y, turn, score) is the one that is easiest to grasp,
-    `found` the id of this run. The action that finds out whether it was there gives the verdict.
-    ERROR `no_part` if none is seen in most of the images.
+    `found` the id of this run. The action that verifies the grasp gives the verdict. ERROR
+    `no_part` if none is seen in most of the images.
     """
     return await _locate(ctx, FINDERS["contours"], images, timeout)
 
@@ -41,7 +41,7 @@ async def locate_contours(
 async def locate_templates(
     ctx: Context[TableCamera], *, images: int = 2, timeout: float = 1.0
 ) -> Result:
-    """Locate a part by templates of the known kinds: dear; shadows and dim light hardly matter.
+    """Locate a part by templates of the known kinds: slow; shadows and dim light hardly matter.
     Otherwise as `locate_contours`."""
     return await _locate(ctx, FINDERS["templates"], images, timeout)
 
@@ -59,7 +59,8 @@ async def _locate(ctx: Context[TableCamera], find: Finder, images: int, timeout:
 
 
 def confirmed(looks: Sequence[Sequence[Found]]) -> list[Found]:
-    """Return the parts that were seen alike in more than half of the looks, as in the last one."""
+    """Return the parts that were seen in more than half of the images, as the last one shows
+    them."""
     return [
         one
         for one in looks[-1]
@@ -68,7 +69,8 @@ def confirmed(looks: Sequence[Sequence[Found]]) -> list[Found]:
 
 
 def easiest(parts: Sequence[Found]) -> Found:
-    """Return the part that is sure and has most room around it for fingers."""
+    """Return the part that was recognised with enough certainty and has most room around it for the
+    fingers."""
 
     def ease(one: Found) -> float:
         room = min(
@@ -90,7 +92,7 @@ async def await_tray(
     slots: Mapping[str, int] | None = None,
     timeout: float = 60.0,
 ) -> Result:
-    """Watch a full tray until it has been changed for an empty one.
+    """Watch a full tray until it has been replaced by an empty one.
 
     SUCCESS when three images in a row show it empty; `slots` then counts it as empty. ERROR
     `not_changed` after `timeout` s.

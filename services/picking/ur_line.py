@@ -1,6 +1,6 @@
-"""The UR arm's driver with the simulated cell's serial line in place of its three TCP connections,
-so that it also runs in lock step. On an arm, `petrobot.services.adapters.ur.arm:Arm` stands in the
-location file.
+"""The UR arm's driver with the simulated cell's serial line instead of its three TCP connections,
+so that it also runs in lock step. For a real arm, write `petrobot.services.adapters.ur.arm:Arm` in
+the location file.
 
 A frame on the line is a channel (u8: 0 RTDE, 1 dashboard, 2 program), a length (u16, big endian)
 and so many bytes.
@@ -20,14 +20,14 @@ HEAD: Final = struct.Struct("!BH")
 
 
 class _Line:
-    """The line, and what has come on each of its channels."""
+    """The line, and the bytes received on each of its channels."""
 
     def __init__(self, line: SerialLine) -> None:
         self._line, self._rest = line, b""
         self._came = [b"", b"", b""]
 
     def take(self, channel: int) -> bytes:
-        """Return what has come on a channel since the last call."""
+        """Return the bytes received on a channel since the last call."""
         self._rest += self._line.receive()
         while len(self._rest) >= HEAD.size:
             number, size = HEAD.unpack_from(self._rest)
@@ -55,7 +55,7 @@ class _Channel:
         self.up, self.connections, self.why = True, 1, ""
 
     def poll(self, now: float) -> bytes:
-        """Return what has come."""
+        """Return the bytes received."""
         try:
             return self._line.take(self._number)
         except ConnectionError as fault:
@@ -71,7 +71,7 @@ class _Channel:
         """Do nothing."""
 
     def drop(self, now: float, why: str) -> None:
-        """Give it up."""
+        """Close the connection."""
         self.up, self.why = False, why
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Where the gripper of an arm truly is: forward kinematics by joint axes, with the errors of one
+"""The true pose of an arm's gripper: forward kinematics by joint axes, with the errors of one
 installation."""
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class ToolPose(NamedTuple):
 
 
 class TrueArm:
-    """An arm as it is bolted down, all in the table's frame at joint angles of zero."""
+    """An arm as it is really mounted, all in the table's frame at joint angles of zero."""
 
     def __init__(
         self,
@@ -35,8 +35,7 @@ class TrueArm:
         offsets: Sequence[float],
     ) -> None:
         """`points`, `axes` (n, 3): a point on each axis, and its unit vector; `tool`: tip, approach
-        and closing direction; `offsets`: rad by which each joint stands beside what its encoder
-        says."""
+        and closing direction; `offsets`: error of each joint's encoder (rad)."""
         self._tip, self._approach, self._closing = tool
         self._offsets = list(offsets)
         self._points = list(points)
@@ -44,8 +43,8 @@ class TrueArm:
         self._last: tuple[list[float], list[Vector], Vector] | None = None
 
     def _chain(self, joints: Sequence[float]) -> tuple[list[Vector], Vector]:
-        """Return where the joints and the tip are, and the rotation of the last link (product of
-        exponentials)."""
+        """Return the positions of the joints and the tip, and the rotation of the last link
+        (product of exponentials)."""
         angles = [a + b for a, b in zip(joints, self._offsets, strict=True)]
         if self._last is not None and self._last[0] == angles:
             return self._last[1:]
@@ -61,7 +60,7 @@ class TrueArm:
         return places, rotation
 
     def tool(self, joints: Sequence[float]) -> ToolPose:
-        """Return where the fingers are."""
+        """Return the pose of the fingers."""
         places, rotation = self._chain(joints)
         x, y, z = places[-1].tolist()
         closing, approach = rotation @ self._closing, rotation @ self._approach

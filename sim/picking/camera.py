@@ -1,5 +1,5 @@
-"""What the camera above the table sees: parts as prisms with their sides and shadows, trays, arm,
-light, noise."""
+"""Images of the camera above the table: parts as prisms with their sides and shadows, trays, arm,
+light and noise."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from petrobot.sim.picking.parts import Part, Point, rectangle
 Picture = NDArray[np.uint8]
 Vector = NDArray[np.float64]
 _SHIFT: Final = 4
-"""Binary digits of a pixel's fraction, for OpenCV's drawing."""
+"""Fractional bits of pixel coordinates in OpenCV's drawing functions."""
 _SIDE: Final = 0.72
 """Brightness of a part's sides relative to its top."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
-    """Lighting on the table: its level, the direction (rad) and length of shadows per height, how
-    dark they are, and a broad shadow that lies across the table (where along y, how wide; m)."""
+    """Lighting on the table: its level, the direction (rad) and length of shadows per height, their
+    darkness, and a broad shadow across the table (position along y and width; m)."""
 
     level: float
     direction: float
@@ -34,7 +34,7 @@ class Lighting:
     darkness: float
     band: tuple[float, float] | None
     noise: float
-    """Sigma, grey levels."""
+    """Standard deviation of the noise (grey levels)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,8 @@ class SceneCamera:
         np.copyto(image, (image * factor).astype(np.uint8))
 
     def _band(self, light: Lighting) -> NDArray[np.float32]:
-        """A soft shadow across the table, such as a person's: a factor per image column."""
+        """Return a soft shadow across the table, such as a person's, as a factor per image
+        column."""
         middle, width = light.band or (0.0, 0.0)
         at = self.mount.pixels([(0.15, middle, 0.0), (0.15, middle + width / 2, 0.0)])
         u = np.arange(self.mount.width, dtype=np.float32)

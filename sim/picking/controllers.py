@@ -1,5 +1,5 @@
-"""The arm's controllers as the laboratory sees them: bytes of the driver in, joint angles, gap and
-force of the fingers out."""
+"""The arms' controllers for the laboratory: they receive bytes of the driver, and give joint
+angles, gap and force of the fingers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from petrobot.sim.catching.truth import LaboratoryError
 
 
 class Controller(Protocol):
-    """An arm with its gripper, seen from both sides."""
+    """An arm with its gripper: its interface to the driver, and to the laboratory."""
 
     def receive(self, now: float, data: bytes) -> bytes:
         """Take bytes of the driver; return the answer."""
@@ -26,16 +26,16 @@ class Controller(Protocol):
         """Return the joint angles (rad)."""
 
     def gap(self) -> float:
-        """Return how far the fingers are apart, as far as the motor is concerned (m)."""
+        """Return the gap between the fingers by the motor's position (m)."""
 
     def force(self) -> float:
-        """Return with how much the fingers press on what stops them (N)."""
+        """Return the force of the fingers on what stops them (N)."""
 
     def block(self, gap: float | None) -> None:
-        """Let a part stop the fingers at a gap (m); None: nothing is there."""
+        """Let a part stop the fingers at a gap (m); None: no part."""
 
     def close(self) -> None:
-        """Release what it holds."""
+        """Release its resources."""
 
 
 class FeetechArm:
@@ -70,7 +70,7 @@ class FeetechArm:
         return max(0.0, -self._jaw.torque) / self._lever
 
     def block(self, gap: float | None) -> None:
-        """Put a stop where a part is; without one, the fingers meet at 0."""
+        """Stop the jaw at a part; without a part, the fingers meet at 0."""
         angle = max(0.0, gap or 0.0) / self._lever
         self._jaw.low = 2048.0 + angle / (2 * math.pi) * STEPS
 
@@ -80,8 +80,8 @@ class FeetechArm:
 
 class UrArm:
     """A UR controller, reached by frames on one line (`petrobot.services.picking.ur_line`), and a
-    gripper on its digital outputs and inputs: output 0 closes it, input 0 says that it holds
-    something, input 1 that its fingers stand."""
+    gripper on its digital outputs and inputs: output 0 closes it, input 0 shows that it holds
+    something, input 1 that its fingers have stopped."""
 
     def __init__(self, numbers: Mapping[str, Any]) -> None:
         """Raises KeyError for a number that is missing."""
@@ -95,7 +95,7 @@ class UrArm:
         self._rest = b""
 
     def receive(self, now: float, data: bytes) -> bytes:
-        """Take frames; return what the controller has to say."""
+        """Take frames; return the controller's frames."""
         self._rest += data
         while len(self._rest) >= _HEAD.size:
             number, size = _HEAD.unpack_from(self._rest)
@@ -123,7 +123,7 @@ class UrArm:
         return self.ur.q
 
     def gap(self) -> float:
-        """Return how far the fingers are apart (m)."""
+        """Return the gap between the fingers (m)."""
         return self._gap
 
     def force(self) -> float:
@@ -131,7 +131,7 @@ class UrArm:
         return self._force if self._stop is not None and self.ur.digital_out & 1 else 0.0
 
     def block(self, gap: float | None) -> None:
-        """Put a stop where a part is."""
+        """Stop the fingers at a part."""
         self._stop = gap
 
     def close(self) -> None:

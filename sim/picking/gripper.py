@@ -1,13 +1,12 @@
-"""Two fingers and what they do to a part: push it, turn it, hold it, or let it slip.
+"""Two fingers and their effects on a part: they push it, turn it, hold it, or let it slip.
 
 All of it happens in the gripper's frame, seen from above: x is the closing direction, y along the
-fingers' width, the origin in the middle between them. A part is held only if the fingers stop on
-it from both sides; how firmly, follows from friction, contact width and depth:
+fingers' width, the origin in the middle between them. A part is held only if both fingers stop on
+it; how firmly depends on friction, contact width and depth:
 
     capacity = 2 mu F min(1, contact width / full) min(1, depth / full depth)
 
-A part whose weight and acceleration need more than the capacity slips, and falls when it has
-slipped out.
+A part whose weight and acceleration exceed the capacity slips, and falls when it has slipped out.
 """
 
 from __future__ import annotations
@@ -19,20 +18,20 @@ from typing import Final, NamedTuple
 from petrobot.sim.picking.parts import Part, Point, clipped
 
 PAD: Final = 2e-4
-"""m by which the rubber of the pads gives way: what is so near the front-most point is in
-contact."""
+"""How far the rubber of the pads gives way (m): everything within this distance of the front-most
+point is in contact."""
 FULL_WIDTH: Final = 0.006
-"""m of contact width from which a grip is as firm as friction allows."""
+"""Contact width from which a grip is as firm as friction allows (m)."""
 FULL_DEPTH: Final = 0.006
-"""m of a part's height between the fingers from which that is so."""
+"""Height of a part between the fingers from which a grip is as firm as friction allows (m)."""
 _TURNS: Final = 24
-"""Most steps by which a closing finger turns or pushes a part in one tick."""
+"""Most steps in which closing fingers turn or push a part in one tick."""
 _LARGEST_TURN: Final = math.radians(2.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Fingers:
-    """The numbers of a gripper (m): greatest gap, and a finger's size along and across the closing
+    """Sizes of a gripper (m): greatest gap, and a finger's size along and across the closing
     direction."""
 
     opening: float
@@ -52,13 +51,13 @@ class Span(NamedTuple):
 
     @property
     def size(self) -> float:
-        """What a finger gap must be at least (m)."""
+        """Return the least gap of the fingers (m)."""
         return self.high - self.low
 
 
 def span(outline: list[Point], half: float) -> Span | None:
-    """Return the extent of an outline (gripper's frame) within the fingers' width; None if nothing
-    of it is there."""
+    """Return the extent of an outline (gripper's frame) within the fingers' width; None if it is
+    outside."""
     inside = clipped(outline, half)
     if len(inside) < 3:
         return None
@@ -75,7 +74,7 @@ def span(outline: list[Point], half: float) -> Span | None:
 
 
 def _touching(outline: list[Point], front: float, inwards: float) -> tuple[float, float]:
-    """Return from where to where (y) an outline lies within PAD of its front-most x."""
+    """Return the range of y in which an outline is within PAD of its front-most x."""
     limit = front + inwards * PAD
     ys: list[float] = []
     for k, (x1, y1) in enumerate(outline):
@@ -100,15 +99,15 @@ def close_on(part: Part, frame: tuple[float, float, float], gap: float, f: Finge
     """Let fingers that are `gap` m apart act on a part; `frame` is the pose of the gripper (x, y,
     turn). Moves the part; returns a Grip if it stops the fingers.
 
-    One finger alone pushes. Two fingers turn the part while the line between their contacts is
+    A single finger pushes. Two fingers turn the part while the line between their contacts is
     outside the friction cone, squeeze it out sideways while they touch slanting sides, and are
-    stopped otherwise.
+    otherwise stopped by it.
     """
     for _ in range(_TURNS):
         shape = _local(part, frame)
         held = span(shape, f.width / 2)
         if held is None or abs(held.low + held.high) > gap:
-            return None  # nothing of it, or less than half, is between the fingers
+            return None  # less than half of it is between the fingers
         left, right = -gap / 2 - held.low, held.high - gap / 2
         if left <= 1e-9 and right <= 1e-9:
             return None
@@ -134,8 +133,8 @@ def close_on(part: Part, frame: tuple[float, float, float], gap: float, f: Finge
 
 
 def _slope(shape: list[Point], half: float) -> float:
-    """Return half of how much the extent grows per m that the part moves along y: the tangent of
-    the slant of the two sides that the fingers touch."""
+    """Return half of the growth of the extent per m that the part moves along y: the tangent of the
+    slant of the two sides that the fingers touch."""
     step = 2e-4
     ahead = span([(x, y + step) for x, y in shape], half)
     behind = span([(x, y - step) for x, y in shape], half)
@@ -167,6 +166,6 @@ def _shift(part: Part, frame: tuple[float, float, float], distance: float) -> No
 
 
 def _shift_along(part: Part, frame: tuple[float, float, float], distance: float) -> None:
-    """Move along the closing direction: both fingers close alike and centre what they hold."""
+    """Move along the closing direction: both fingers close equally and centre the part."""
     part.x += math.cos(frame[2]) * distance
     part.y += math.sin(frame[2]) * distance

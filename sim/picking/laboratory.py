@@ -1,5 +1,5 @@
-"""The pick-and-place laboratory as one party: table, parts, trays, camera, and the arm that the
-location file names, which answers as its hardware would."""
+"""The pick-and-place laboratory as one party: table, parts, trays, camera, and the simulated
+hardware of the arm that the location file names."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PICKING_FAULTS: Final = FaultKinds(
 REGIME: Final = "plain"
 """The default regime."""
 _PARTS, _IMAGE, _WORLD, _FAULTS = 0x7061, 0x696D, 0x776F, 0x6661
-"""Keep draws of the same seed separate."""
+"""Names of random streams: they keep draws of the same seed separate."""
 
 
 class PickingLaboratory(LaboratoryParty):
@@ -51,7 +51,7 @@ class PickingLaboratory(LaboratoryParty):
     ) -> None:
         """`boot`, `directory`: as in services.comm.calls.callee."""
         super().__init__(name, where, boot, directory)
-        cv2.setNumThreads(1)  # Other nodes share the cores.
+        cv2.setNumThreads(1)  # one thread: other nodes share the cores
         self._site = site
         self.arm = site.arm()
         self.controller = controller(site.numbers)
@@ -60,8 +60,8 @@ class PickingLaboratory(LaboratoryParty):
         self._prepare(0, REGIME, None)
 
     def _prepare(self, seed: int, regime: str, parts: int | None) -> None:
-        """Begin a new experiment: new parts on the table, an empty score. The arm stays where it
-        is."""
+        """Begin a new experiment: new parts on the table, an empty score. The arm keeps its
+        pose."""
         self.truth = self._site.truth(regime)
         drawn = self._site.parts(self.truth, np.random.default_rng((seed, _PARTS)), parts)
         self.world = World(
@@ -74,7 +74,7 @@ class PickingLaboratory(LaboratoryParty):
         self.referee = Referee(self.world, self._site.trays, self._site.belongs, self.now)
         self.controller.block(None)
 
-    # The world, as lock step and real time drive it
+    # The world, for lock step and real time
 
     def tick(self, now: float) -> None:
         """Expose the world as it is at `now`, then advance it to `now` + TICK."""
@@ -92,7 +92,7 @@ class PickingLaboratory(LaboratoryParty):
         self.now = now + TICK
 
     def picture(self) -> Picture:
-        """Return what the camera sees: (height, width) grey levels."""
+        """Return the camera's image: grey levels, shape (height, width)."""
         links = self.arm.links(self.controller.joints())
         return self._camera.take(
             self.world.parts, links, self._radius, self.light, self._image_draws

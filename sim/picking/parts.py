@@ -14,12 +14,12 @@ from typing import Final, NamedTuple
 
 Point = tuple[float, float]
 CORNERS: Final = 24
-"""Corners of the polygon that stands for a circle: its radius is at most 0.9 % too small."""
+"""Corners of the polygon that approximates a circle: its radius is at most 0.9 % too small."""
 
 
 class Contact(NamedTuple):
-    """How deep (m) two outlines overlap, the unit normal from the first to the second, and where
-    they touch."""
+    """Overlap of two outlines: depth (m), unit normal from the first to the second, and point of
+    contact."""
 
     depth: float
     normal: Point
@@ -34,7 +34,7 @@ class Part:
     kind: str
     round: bool
     length: float
-    """Along its own x axis; the diameter of a round one."""
+    """Length along its own x axis (m); the diameter of a round part."""
     width: float
     height: float
     mass: float
@@ -43,11 +43,11 @@ class Part:
     x: float = 0.0
     y: float = 0.0
     turn: float = 0.0
-    """rad, of its own x axis in the table's frame."""
+    """Direction of its own x axis in the table's frame (rad)."""
     z: float = 0.0
-    """Height of its bottom above the table."""
+    """Height of its bottom above the table (m)."""
     lost: bool = False
-    """It fell off the table."""
+    """Whether it fell off the table."""
     _outline: list[Point] = field(default_factory=list)
     _pose: tuple[float, float, float] = (math.inf, 0.0, 0.0)
 
@@ -81,7 +81,8 @@ class Part:
         return [(-a, -b), (a, -b), (a, b), (-a, b)]
 
     def push(self, direction: Point, distance: float, at: Point) -> None:
-        """Move so that the point `at` goes `distance` m along the unit vector `direction`.
+        """Move the part so that its point `at` moves `distance` m along the unit vector
+        `direction`.
 
         For a force f at r from the centre, the ellipsoid gives a velocity along f and a turn
         (r x f) / c^2, c the ratio of the greatest friction torque to the greatest friction force.

@@ -1,4 +1,5 @@
-"""What really became of each part: the score of a run, and verdicts on what was only believed."""
+"""The referee: finds out where each part really is, for the score of a run and verdicts on
+provisional results."""
 
 from __future__ import annotations
 
@@ -13,16 +14,16 @@ from petrobot.sim.picking.parts import Part
 from petrobot.sim.picking.world import World
 
 EXCHANGE: Final = 3.0
-"""s that a person takes to change a full tray."""
+"""Time that a person needs to change a full tray (s)."""
 _LOOK: Final = 0.02
-"""s between two looks."""
+"""Time between two checks (s)."""
 _AWAY: Final = 0.12
-"""m from a tray's middle where fingers are no danger to the person's hands."""
+"""Distance from a tray's middle at which the fingers are safe for the person's hands (m)."""
 
 
 @dataclass(slots=True)
 class _Delivery:
-    """A part that came to lie in a tray: when (s), and whether it was the right one."""
+    """A part that was put into a tray: when (s), and whether the tray was the right one."""
 
     time: float
     part: int
@@ -30,8 +31,8 @@ class _Delivery:
 
 
 class Referee:
-    """Watches the world. It also changes full trays, as a person would: the parts in it are taken
-    away, and an empty tray lies there."""
+    """Watches the world. It also changes full trays, as a person would: it removes their parts and
+    puts an empty tray there."""
 
     def __init__(
         self,
@@ -50,7 +51,7 @@ class Referee:
         self._count = len(world.parts)
 
     def watch(self, now: float, tool: ToolPose) -> None:
-        """Look at the trays, and change those that are full."""
+        """Check the trays, and change the full ones."""
         if now < self._due - 1e-9:
             return
         self._due += _LOOK
@@ -79,7 +80,7 @@ class Referee:
             self._changed += 1
 
     def score(self, now: float, cycles: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """Return what became of the parts, and verdicts on provisional runs.
+        """Return where the parts are, and verdicts on provisional runs.
 
         `parts`, `in_tray` (the right one), `wrong_tray`, `on_table`, `lost` (fell off); `grips`,
         `slips`, `drops`, `struck`, `table_hits`: how often they happened; `trays_changed`; `time_s`

@@ -1,5 +1,5 @@
-"""What the pick-and-place cell really is: the nominal numbers, one installation's random errors,
-the parts of a seed, and a regime's disturbances.
+"""The true pick-and-place cell: the nominal numbers, one installation's random errors, the parts of
+a seed, and a regime's disturbances.
 
 Only the laboratory reads this. A regime name is `plain` or `many` and any number of disturbances of
 `sim/picking/laboratory.toml`, joined by `+` (or a comma): `plain+dim+oily`.
@@ -25,7 +25,7 @@ from petrobot.sim.picking.world import TableTop
 
 LABORATORY_FILE = Path(__file__).with_name("laboratory.toml")
 _DRAWS: Final = 1500
-"""Most positions that are tried for the parts of an experiment."""
+"""Most random positions that are tried for the parts of an experiment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class PickingTruth:
 
     @property
     def force(self) -> float:
-        """Force of the fingers, relative."""
+        """Return the force of the fingers, relative to the nominal one."""
         return self.values["force"]
 
     def light(self, direction: float) -> Lighting:
@@ -56,7 +56,8 @@ class PickingTruth:
 
 @dataclass(frozen=True, slots=True)
 class PickingSite:
-    """The files of the cell: what is known (`cell`, `numbers` of the arm) and what is true."""
+    """The files of the cell: what its services know (`cell`, `numbers` of the arm), and the
+    truth."""
 
     cell: Mapping[str, Any]
     numbers: Mapping[str, Any]
@@ -64,7 +65,7 @@ class PickingSite:
 
     @property
     def readout(self) -> float:
-        """s from the exposure's middle until the image leaves the camera."""
+        """Return the time from the middle of the exposure until the image leaves the camera (s)."""
         return 0.02
 
     @property
@@ -122,8 +123,8 @@ class PickingSite:
     def parts(
         self, truth: PickingTruth, rng: np.random.Generator, count: int | None = None
     ) -> list[Part]:
-        """Return the parts of an experiment, where they lie. Raises LaboratoryError when so many do
-        not fit on the table."""
+        """Return the parts of an experiment at their positions. Raises LaboratoryError if so many
+        do not fit on the table."""
         wanted = truth.parts if count is None else count
         area, placed = self.cell["parts"], list[Part]()
         for _ in range(_DRAWS):

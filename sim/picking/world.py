@@ -1,7 +1,8 @@
-"""The table with its parts, and a gripper over it: what is pushed, held, carried, dropped.
+"""The table with its parts, and a gripper over it, which pushes, holds, carries and drops them.
 
-The arm's motion is given (`World.move`); the world answers how far the fingers close and how hard
-they press. It knows neither actions nor time of day; its chance is the generator that it is given.
+The arm's motion is an input (`World.move`); the world computes how far the fingers close and how
+hard they press. It knows neither actions nor a clock; all randomness comes from the generator
+passed to it.
 """
 
 from __future__ import annotations
@@ -19,28 +20,28 @@ from petrobot.sim.picking.parts import Part, contact, rectangle, within
 
 GRAVITY: Final = 9.81
 _LAG: Final = 0.03
-"""s, of the low pass by which the tool's acceleration is taken from its positions: servos move in
-small steps, and the arm's own compliance smooths them."""
+"""Time constant of the low pass that gives the tool's acceleration from its positions (s): servos
+move in small steps, which the arm's compliance smooths."""
 _LOW: Final = 0.0025
-"""m of height over the table up to which a part that is let go stands as it was held."""
+"""Height over the table up to which a released part stays as it was held (m)."""
 _PLAY: Final = 5e-4
-"""m by which fingers open before a part is free."""
+"""How far the fingers open before a part is free (m)."""
 _JAM: Final = 0.003
-"""m by which a part may be wider than the gap and still be wedged in between."""
+"""How much wider than the gap a part may be and still be wedged between the fingers (m)."""
 _TILTED: Final = 0.35
-"""rad from straight down beyond which fingers do not close on a part that stands on the table."""
+"""Greatest tilt from straight down at which the fingers can close on a part on the table (rad)."""
 
 
 class Held(NamedTuple):
-    """A part between the fingers: its pose in the gripper's frame, how deep it sits (m), and how
-    firmly."""
+    """A part between the fingers: its pose in the gripper's frame, its depth between them (m), and
+    how firmly it is held."""
 
     part: Part
     x: float
     y: float
     turn: float
     rise: float
-    """Height of the part's bottom over the finger tips."""
+    """Height of the part's bottom over the finger tips (m)."""
     size: float
     firmness: float
 
@@ -58,7 +59,7 @@ class TableTop:
 
 
 class World:
-    """Parts, fingers and what happens between them."""
+    """Parts and fingers, and how they act on each other."""
 
     def __init__(
         self, table: TableTop, fingers: Fingers, parts: Sequence[Part], rng: np.random.Generator
@@ -66,19 +67,19 @@ class World:
         self.table, self.fingers, self.parts = table, fingers, list(parts)
         self._rng = rng
         self.gap = fingers.opening
-        """m between the fingers."""
+        """Gap between the fingers (m)."""
         self.load = 0.0
-        """N with which the fingers press."""
+        """Force with which the fingers press (N)."""
         self.held: Held | None = None
         self.counts = {"grips": 0, "slips": 0, "drops": 0, "struck": 0, "table_hits": 0}
-        """What has happened, for the referee."""
+        """Counts of slips, drops and the like, for the referee."""
         self._tool: ToolPose | None = None
         self._smooth, self._speed = [0.0] * 3, [0.0] * 3
         self._sliding = 0.0
 
     def move(self, tool: ToolPose, wanted: float, force: float, dt: float) -> None:
-        """Move the tool to its next pose within `dt` s, and the fingers to a gap of `wanted` m as
-        far as nothing stops them; then they press with `force` (N)."""
+        """Move the tool to its next pose within `dt` s, and the fingers to a gap of `wanted` m
+        unless a part stops them; then they press with `force` (N)."""
         acceleration = self._accelerate(tool, dt)
         before, self._tool = self._tool, tool
         if before is not None and tool.z < 0.0 <= before.z:
@@ -113,7 +114,7 @@ class World:
     # Free fingers
 
     def _touch(self, tool: ToolPose, before: ToolPose | None) -> None:
-        """Let the fingers push what stands in their way, and close on what is between them."""
+        """Let the fingers push parts that they touch, and close on what is between them."""
         frame = tool.x, tool.y, tool.turn
         near = [
             part
@@ -155,7 +156,8 @@ class World:
         self._separate(near)
 
     def _knock(self, part: Part, frame: tuple[float, float, float]) -> None:
-        """Fingers come down on a part that is too wide for their gap: it flies off along them."""
+        """Knock a part away along the fingers: they come down on one that is too wide for their
+        gap."""
         aside = -math.sin(frame[2]), math.cos(frame[2])
         y = (part.x - frame[0]) * aside[0] + (part.y - frame[1]) * aside[1]
         away = math.copysign(part.reach + self.fingers.width / 2, y) - y
@@ -174,7 +176,7 @@ class World:
                 continue
             body = rectangle(x, y, frame[2], fingers.thickness, fingers.width)
             found = contact(body, part.outline())
-            # What lies before the finger's inner side is the business of `close_on`.
+            # parts at the finger's inner side are handled by `close_on`
             inner = (
                 found is not None
                 and (found.normal[0] * math.cos(frame[2]) + found.normal[1] * math.sin(frame[2]))
@@ -187,8 +189,8 @@ class World:
         return struck
 
     def _separate(self, moved: Sequence[Part]) -> None:
-        """Push parts out of each other, those that were just moved first; what leaves the table
-        falls."""
+        """Push overlapping parts apart, those that were just moved first; a part that leaves the
+        table falls."""
         queue = list(moved)
         for _ in range(4 * len(self.parts)):
             if not queue:
@@ -215,8 +217,8 @@ class World:
     # A part between the fingers
 
     def _carry(self, tool: ToolPose, needed: float, dt: float) -> None:
-        """Move what is held with the fingers; it slips if `needed` (m/s^2) is more than they can
-        give."""
+        """Move the held part with the fingers; it slips if they cannot give it the acceleration
+        `needed` (m/s^2)."""
         held = self.held
         if held is None:
             return
@@ -224,7 +226,7 @@ class World:
         capacity = 2.0 * part.friction * self.load * held.firmness
         lifted = part.z > 1e-4
         if lifted or self._sliding > 0.0:
-            # Friction that is used up lets the part slide; friction to spare brakes it again.
+            # without enough friction the part slides; with enough it slows down again
             excess = needed - capacity / part.mass
             self._sliding = max(0.0, self._sliding + excess * dt)
             held = self.held = held._replace(rise=held.rise - self._sliding * dt)
@@ -233,7 +235,7 @@ class World:
         part.y = tool.y + s * held.x + c * held.y
         part.turn = tool.turn + held.turn
         part.z = tool.z + held.rise
-        if part.z < 0.0:  # it stands on the table while the fingers go further down
+        if part.z < 0.0:  # it is on the table while the fingers move further down
             part.z, self.held, self._sliding = 0.0, held._replace(rise=-tool.z), 0.0
         if part.z < max((p.top for p in self.parts if p is not part), default=0.0):
             self._separate([part])
@@ -249,8 +251,8 @@ class World:
             self._fall(part, self._tool)
 
     def _fall(self, part: Part, tool: ToolPose | None) -> None:
-        """Let a part fall on the table: the higher, the farther it comes to lie from where it was
-        let go; a round one rolls on."""
+        """Let a part fall on the table: the higher the fall, the farther from the point of release
+        it comes to rest; a round part rolls on."""
         height, self.held, self.load = part.z, None, 0.0
         if height > _LOW:
             away = (0.6 if part.round else 0.3) * height

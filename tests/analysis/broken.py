@@ -34,7 +34,7 @@ def error_exits(task: Task) -> list[Transition]:
 
 
 def missing_recovery(task: Task) -> Task:
-    """The first error exit gives nothing back: what the failed run held is lost."""
+    """The first error exit returns nothing: the failed run's resources are lost."""
     return _with(task, replace(error_exits(task)[0], outputs=()))
 
 
@@ -50,7 +50,7 @@ def double_resource(task: Task) -> Task:
 
 
 def leaking_token(task: Task) -> Task:
-    """The first error exit gives a resource back twice: each error adds a token."""
+    """The first error exit returns a resource twice: each error adds a token."""
     exit_ = next(t for t in error_exits(task) if _resource(task, t))
     resource = _resource(task, exit_)
     assert resource is not None
@@ -73,8 +73,8 @@ VARIANTS: dict[str, Callable[[Task], Task]] = {
 
 
 def damaged(task: Task) -> Iterator[tuple[str, Task]]:
-    """Yield a task with all kinds of single mistakes: arcs lost, doubled, redirected or added,
-    tokens changed."""
+    """Yield the task with each single mistake: an arc lost, doubled, redirected or added, or tokens
+    changed."""
     for t in task.transitions.values():
         for i, o in enumerate(t.outputs):
             others = (*t.outputs[:i], *t.outputs[i + 1 :])
@@ -104,7 +104,7 @@ def damaged(task: Task) -> Iterator[tuple[str, Task]]:
 
 
 def judged(task: Task) -> Analysis:
-    """Return the analysis of a variant; that of an unbounded one ends early."""
+    """Return the analysis of a variant; of an unbounded one it ends early."""
     return analyse(task, limits=LIMITS)
 
 

@@ -56,8 +56,8 @@ def philosophers(n: int) -> Net:
 
 
 def queue(capacity: int) -> Net:
-    """A queue with room for `capacity` customers; arrivals are blocked when it is full (M/M/c/K by
-    its rates)."""
+    """A queue with room for `capacity` customers; arrivals are blocked when it is full (with rates:
+    M/M/c/K)."""
     return Net.build(
         {"free": capacity, "waiting": 0},
         {"arrive": ({"free": 1}, {"waiting": 1}), "serve": ({"waiting": 1}, {"free": 1})},

@@ -27,14 +27,14 @@ EXPECTED = {
     "double_resource": {"one_run_each", "deadlock_free"},
     "leaking_token": {"one_run_each", "deadlock_free"},
 }
-"""What is refused of each at least in part: two runs at once, an end that never comes, or a
-resource that is not given back."""
+"""Verdicts of which each broken variant refutes at least one: two runs at once, an end that is
+never reached, or a resource that is not returned."""
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_tasks_are_sound(path: Path) -> None:
-    """Nothing speaks against running the shipped tasks, what does not hold holds if somebody mends
-    what `final_error` leaves, and every error exit returns to the nominal flow."""
+    """Nothing speaks against running the shipped tasks. Verdicts that do not hold would hold if the
+    operator repaired what `final_error` leaves. Every error exit returns to the nominal flow."""
     found = judged(load(path))
     assert found.ok and found.progress is not None
     again = found.progress.mended
@@ -80,7 +80,7 @@ def carried(task: Task) -> Task:
 
 
 def faults_by_brute_force(task: Task) -> set[str]:
-    """Return what is wrong with a task by checking its markings one by one."""
+    """Return the faults of a task, found by checking its markings one by one."""
     found = brute_force(task.net, 5000)
     if found is None:
         return {"bounded"}
@@ -109,14 +109,14 @@ def faults_by_brute_force(task: Task) -> set[str]:
 
 
 EVERY = {"catch_ball": 18, "follow_track": 40}
-"""The step of the sample: the rover's graphs are larger."""
+"""Every how many mistakes one is tried: the rover's graphs are larger."""
 
 
 @pytest.mark.parametrize("name", EVERY)
 @pytest.mark.processes
 def test_single_mistakes_are_refused_if_they_matter(name: str, tmp_path: Path) -> None:
-    """A sample of all single mistakes: the analysis refuses what deadlocks or leaks, and its
-    witness replays."""
+    """For a sample of all single mistakes, the analysis refuses tasks that deadlock or leak, with a
+    witness that replays."""
     refused_, harmless = 0, 0
     for what, task in list(damaged(carried(load(TASKS / f"{name}.toml"))))[:: EVERY[name]]:
         file = tmp_path / "damaged.toml"

@@ -31,7 +31,7 @@ from tests.engine.test_properties import DEVICES, tasks
 
 
 def marking_of(n: EndsNet, x: ExecutionGraph, state: State) -> Marking:
-    """Return the marking of N in which an engine state at rest is."""
+    """Return the marking of N that corresponds to an engine state at rest."""
     net, tokens = n.net, Counter[str]()
     action_places = x.engine.compiled.action_places
     for place, held in zip(n.task.net.places, state.marking, strict=True):
@@ -53,8 +53,8 @@ def marking_of(n: EndsNet, x: ExecutionGraph, state: State) -> Marking:
 
 
 def follow(n: EndsNet, space: Space, start: set[int], firings: tuple[str, ...]) -> set[int]:
-    """Return where N can be after the firings of a stimulus, which may itself be an end of a run,
-    a stop or a change of a variable."""
+    """Return the markings that N can reach by the firings of a stimulus, which may itself be an end
+    of a run, a stop or a change of a variable."""
 
     def after(at: set[int], wanted: str | None) -> Iterator[int]:
         for i in at:
@@ -103,7 +103,7 @@ def n_holds_x(task: Task, devices: dict[str, str], limit: int = LIMIT) -> bool:
     alive[space.source[fires]] = True
     alive = Graph(len(space), space.source, space.target).backward(alive)
     for dead in np.flatnonzero(x.dead).tolist():
-        # N knows no devices: there a run may end although another one holds its device.
+        # N has no devices: a run may end there although another run holds its device
         if dead in number and not n.left_out and not devices:
             assert not alive[number[dead]], x.firings(dead)
     return True
@@ -116,12 +116,12 @@ def test_every_path_of_the_engine_is_one_of_n(task: Task, data: st.DataObject) -
 
 
 @pytest.mark.parametrize("text", [TRIES, LISTEN, SETS])
-def test_so_it_is_for_short_forms(text: str) -> None:
+def test_every_path_of_the_engine_is_one_of_n_with_short_forms(text: str) -> None:
     assert n_holds_x(loads(text), {}, 20 * LIMIT)
 
 
-def test_bounds_are_told_in_the_names_of_the_task() -> None:
-    """A leak shows in N by a pump, whose firings the task's own net repeats."""
+def test_bounds_use_the_names_of_the_task() -> None:
+    """N shows a leak by a pump, and the task's own net can repeat its firings."""
     task = load(TASKS / "catch_ball.toml")
     twice = (Output("arm_free"), Output("camera_free"), Output("runs", 2))
     leaking = replace(task.transitions["not_located"], outputs=twice)
@@ -139,7 +139,7 @@ def test_bounds_are_told_in_the_names_of_the_task() -> None:
     assert all(part["bounds"][p] >= most for p, most in whole["bounds"].items())
 
 
-def test_n_proves_what_a_part_of_the_execution_graph_cannot() -> None:
+def test_n_proves_what_an_incomplete_execution_graph_cannot() -> None:
     task = load(TASKS / "catch_ball.toml")
     verdicts = analyse(task, steps=50).verdicts()
     shown = {name for name, verdict in verdicts.items() if "ends net" in verdict.reason}
@@ -149,8 +149,8 @@ def test_n_proves_what_a_part_of_the_execution_graph_cannot() -> None:
 
 @pytest.mark.parametrize("what", STUCK)
 def test_n_keeps_how_a_run_ended(what: str) -> None:
-    """Tasks that get stuck with an ended run: N is stuck there too, the ordinary net need not be.
-    So N proves nothing of them."""
+    """For tasks that get stuck with an ended run, N gets stuck too, though the ordinary net may
+    not. So N proves nothing about them."""
     task = STUCK[what].task
     n = ends_net(task)
     assert "deadlock_free" not in proven(n, explore(n.net), OrdinaryView(task))

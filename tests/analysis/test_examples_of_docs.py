@@ -1,4 +1,4 @@
-"""The examples of docs/analysis-examples.md, run as they stand on the page."""
+"""The examples of docs/analysis-examples.md, run exactly as written there."""
 
 from __future__ import annotations
 

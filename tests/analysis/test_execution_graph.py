@@ -1,6 +1,6 @@
-"""The execution graph against the engine: random tasks are played with other values and other names
-than the graph was made with, by a clock, and no play leaves the graph; each dead end is replayed
-from the beginning, and the engine reports it."""
+"""The execution graph against the engine. Random tasks are played with a clock, with other values
+and ids than those of the graph; no play leaves the graph. Each dead end is replayed from the
+beginning, and the engine reports it."""
 
 from __future__ import annotations
 
@@ -107,9 +107,10 @@ out = ["failed"]
 
 @st.composite
 def whole_tasks(draw: st.DrawFn) -> Task:
-    """A random task with short forms, subnets, ends of both kinds and branches that only listen.
+    """Draw a random task with short forms, subnets, both kinds of ends and branches without an
+    action.
 
-    What does not fit the task at hand is left out.
+    A drawn feature that does not fit the task is left out.
     """
     task = draw(tasks())
     for change in draw(st.lists(st.sampled_from(CHANGES), max_size=4, unique=True)):
@@ -129,7 +130,7 @@ Change = Callable[[Task, Place, Transition, str], Task]
 
 
 def plain(task: Task, place: Place, transition: Transition, other: str) -> Task:
-    """A resource or control place becomes a plain one."""
+    """Make a resource or control place a plain one."""
     return moved(task, places=[replace(place, kind=Kind.PLAIN)])
 
 
@@ -142,7 +143,7 @@ def given_up(task: Task, place: Place, transition: Transition, other: str) -> Ta
 
 
 def writing(task: Task, place: Place, transition: Transition, other: str) -> Task:
-    """A transition sets a variable."""
+    """Make a transition set a variable."""
     return moved(task, transitions=[replace(transition, sets=(("n", parse("3")),))])
 
 
@@ -163,12 +164,12 @@ def holding(task: Task, place: Place, transition: Transition, other: str) -> Tas
 
 
 def erring(task: Task, place: Place, transition: Transition, other: str) -> Task:
-    """Action places without an error arc get one."""
+    """Add an error arc to action places that have none."""
     return replace(task, errors_to=other)
 
 
 def nesting(task: Task, place: Place, transition: Transition, other: str) -> Task:
-    """An action place becomes a subnet with an action in it."""
+    """Replace an action place by a subnet with an action in it."""
     body = loads(BODY)
     whole = replace(body.places["whole"], name=place.name)
     ends = {End.PREEMPT: End.ERROR, End.GOING: End.NORMAL}
@@ -213,7 +214,7 @@ CHANGES: tuple[Change, ...] = (
 
 @dataclass
 class Player:
-    """The world: answers every order, raises events, and lets timers elapse by a clock."""
+    """The world: answers every instruction, raises events, and lets timers elapse by a clock."""
 
     engine: Engine
     data: st.DataObject
@@ -222,7 +223,7 @@ class Player:
     open: dict[str, Choose] = field(default_factory=dict)
 
     def heard(self, said: tuple[Instruction, ...]) -> None:
-        """Note the orders of the engine."""
+        """Record the instructions of the engine."""
         for one in said:
             if isinstance(one, ArmTimer):
                 self.due[one.key] = self.now + one.seconds
@@ -230,7 +231,7 @@ class Player:
                 self.open[one.key] = one
 
     def next(self, state: State) -> Stimulus | None:
-        """Draw one of the things that can happen now; None if nothing can."""
+        """Draw one of the stimuli that can arrive now; None if there is none."""
         if state.suspended is not None and state.suspended.key:
             return Chosen(
                 state.suspended.key, self.data.draw(st.sampled_from(state.suspended.alternatives))
@@ -245,7 +246,7 @@ class Player:
         chosen = self.data.draw(st.sampled_from(possible))
         if isinstance(chosen, TimerFired):
             self.now = self.due.pop(chosen.key)
-        elif self.data.draw(st.booleans()):  # else it comes at the same moment as the last one
+        elif self.data.draw(st.booleans()):  # otherwise it arrives at the same time as the last one
             end = self.now + 1.0 if first is None else first
             self.now += (end - self.now) * self.data.draw(st.sampled_from((0.25, 0.5)))
         return chosen
@@ -283,12 +284,12 @@ class Player:
 
 
 class Path:
-    """A play, followed on the graph."""
+    """A play and its path on the graph."""
 
     def __init__(self, x: ExecutionGraph) -> None:
         self.x = x
         self.undecided = False
-        """Whether the order in the file settled a conflict in some play."""
+        """Whether the order in the file decided a conflict in some play."""
         self.index: dict[Hashable, int] = {}
         for i, (state, orders) in enumerate(zip(x.states, x.orders, strict=True)):
             self.index.setdefault(x.names.key(state, orders), i)
@@ -326,7 +327,8 @@ class Path:
 
 
 def graph_and_engine_agree(task: Task, data: st.DataObject) -> None:
-    """Make the graph, play beside it, replay its dead ends, and compare what the engine reports."""
+    """Make the graph, follow random plays on it, replay its dead ends, and compare with what the
+    engine reports."""
     devices = data.draw(st.sampled_from(({}, DEVICES)))
     engine = Engine(task, devices, Policy(firing_limit=40))
     try:
@@ -388,7 +390,7 @@ ESTIMATES = {
 @settings(COMMON, max_examples=20)
 @given(whole_tasks())
 def test_the_chain_of_a_graph_stops_only_where_the_graph_does(task: Task) -> None:
-    """And its probabilities add up."""
+    """Its probabilities add up to 1."""
     primitives = {n: replace(p, estimates=ESTIMATES) for n, p in task.primitive_tasks.items()}
     events = {n: replace(e, mean_wait=2.0) for n, e in task.events.items()}
     try:
@@ -410,7 +412,9 @@ def test_the_chain_of_a_graph_stops_only_where_the_graph_does(task: Task) -> Non
 @pytest.mark.parametrize("text", [TRIES, LISTEN, SETS])
 @settings(COMMON, max_examples=8)
 @given(data=st.data())
-def test_so_it_is_for_short_forms(text: str, data: st.DataObject) -> None:
+def test_every_play_of_the_engine_is_a_path_with_short_forms(
+    text: str, data: st.DataObject
+) -> None:
     graph_and_engine_agree(loads(text), data)
 
 

@@ -181,8 +181,8 @@ def test_an_unbounded_net_is_recognised_early(tmp_path: Path) -> None:
 
 
 def test_a_pump_that_no_inhibitor_can_stop_is_enough() -> None:
-    """p0 is inhibited and grows, but by a transition without inhibitor; the Karp-Miller tree
-    cannot be used here."""
+    """p0 has an inhibitor arc and grows by a transition without one, so the Karp-Miller tree cannot
+    be used."""
     net = Net.build(
         {"p": 0}, {"grow": ({}, {"p": 3}), "use": ({"p": 1}, {})}, inhibitors={"use": {"p": 2}}
     )
@@ -195,8 +195,8 @@ def test_a_pump_that_no_inhibitor_can_stop_is_enough() -> None:
     )
     barred = Net.build({"p": 0}, {"grow": ({}, {"p": 1})}, inhibitors={"grow": {"p": 5}})
     assert find_pump(explore(barred)) is None
-    # With the second token an urgent transition takes both away: what grows is consumed above the
-    # pump.
+    # With the second token, a transition of higher priority takes both: the tokens do not grow
+    # further.
     urgent = Net.build({"p": 0}, {"in": ({}, {"p": 1}), "out": ({"p": 2}, {})}, priority={"out": 1})
     assert explore(urgent).complete and find_pump(explore(urgent)) is None
 
@@ -255,7 +255,7 @@ def test_empty_nets(tmp_path: Path) -> None:
 
 
 def test_a_simulation_without_time_is_valid_json(tmp_path: Path) -> None:
-    """Immediate transitions fire for ever, so nothing is observed: the result is null, not NaN."""
+    """Immediate transitions fire for ever, so no time is observed: the result is null, not NaN."""
     import numpy as np
 
     path, rates = pnml(tmp_path, LOOP), tmp_path / "rates.toml"

@@ -97,7 +97,8 @@ def test_a_huge_net_ends_with_a_partial_result(net: Net, deadlock: bool, tmp_pat
 
 
 class Steps:
-    """A clock on which every look takes a second, so a limit in seconds is a number of looks."""
+    """A clock that advances by a second each time it is read, so a limit in seconds is a number of
+    readings."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -141,7 +142,7 @@ def test_all_parts_of_an_analysis_share_its_time(tmp_path: Path) -> None:
         clock = Steps()
         limits = SearchLimits(seconds=seconds, clock=clock)
         found = analyse_command(path, load, limits=limits, changes=["tin1.rate=2"])
-        assert clock.now < seconds + 100.0  # one look for each block, sweep or branch
+        assert clock.now < seconds + 100.0  # the clock is read once for each block, sweep or branch
         assert found.data["complete"] or "time limit" in found.data["reason"]
         assert found.data["throughput"] is not None or any(
             "time limit" in note for note in found.data["notes"]
@@ -150,7 +151,7 @@ def test_all_parts_of_an_analysis_share_its_time(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seconds", [3.0, 30.0, 100.0, 300.0, 600.0, 1000.0])
 def test_the_forecast_of_a_task_ends_in_time(seconds: float) -> None:
-    """Wherever the time ends, there is a result that says what is unknown."""
+    """Wherever the time limit is reached, there is a result that says what is unknown."""
     clock = Steps()
     limits = SearchLimits(seconds=seconds, clock=clock)
     found = analyse_command(CATCH, load, view="gspn", limits=limits, changes=["runs=1"])
@@ -165,11 +166,11 @@ import resource, subprocess, sys
 code = subprocess.call(sys.argv[1:], stdout=subprocess.DEVNULL)
 print(code, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 """
-"""Run a command from a small process: Linux counts what the parent held at the fork as the child's
-peak (getrusage(2)), and that of a test process is large."""
+"""Program that runs a command from a small process. Linux counts the parent's memory at the fork in
+the child's peak (getrusage(2)), and a test process is large."""
 
 
-def test_an_analysis_holds_no_more_memory_than_it_may(tmp_path: Path) -> None:
+def test_an_analysis_uses_no_more_memory_than_allowed(tmp_path: Path) -> None:
     """The whole command: interpreter, search, verdicts, chain."""
     gspn = Gspn.of(kanban(4), KANBAN_RATES)
     path = tmp_path / "net.pnml"
@@ -189,7 +190,7 @@ def test_an_analysis_holds_no_more_memory_than_it_may(tmp_path: Path) -> None:
     assert data["throughput"] is not None or any("memory" in note for note in data["notes"])
 
 
-def test_what_cannot_be_solved_can_be_simulated(tmp_path: Path) -> None:
+def test_a_net_that_cannot_be_solved_can_be_simulated(tmp_path: Path) -> None:
     arguments = ("simulate", "--rates", "unit", "--replicas", "20", "--horizon", "2", "--json", "-")
     process = started(ring(300, 20), tmp_path, *arguments)
     out, complaint = process.communicate(timeout=300)

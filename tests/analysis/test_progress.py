@@ -38,7 +38,7 @@ def judged(task: Task, limit: int = 40_000) -> Progress:
 
 @dataclass(frozen=True)
 class Case:
-    """A small task that gets stuck, and what its dead end must be told by."""
+    """A small task that gets stuck, and the words that must describe its dead end."""
 
     places: str
     net: Mapping[str, Mapping[str, Any]]
@@ -49,7 +49,7 @@ class Case:
 
     @property
     def task(self) -> Task:
-        """The task."""
+        """Return the task."""
         return make_task(self.places, self.net, self.events, final=self.final, **(self.more or {}))
 
 
@@ -165,11 +165,11 @@ PICK: Mapping[str, Mapping[str, Any]] = {
     "recovered": {"in": "recover:normal", "out": "arm done"},
     "gone": {"in": "recover:error", "out": "broken"},
 }
-"""A right task: three parts, with an arm and a camera; `broken` is its honest end."""
+"""A task without faults: three parts, an arm and a camera; `broken` is its `final_error`."""
 
 
 def seeded(*told: str, cell: str = CELL, **changes: Mapping[str, Any]) -> Case:
-    """The right task with a fault."""
+    """Return the correct task with a fault."""
     net = {**PICK, **{name: {**PICK.get(name, {}), **new} for name, new in changes.items()}}
     more = {"final_error": parse("broken == 1")}
     return Case(cell, net, "parts == 0 and arm == 1 and camera == 1", told, "bell*", more)
@@ -245,7 +245,7 @@ def test_a_dead_end_is_found_replayed_and_explained(what: str) -> None:
 
 
 def test_a_task_that_gives_up_after_three_errors_is_sound() -> None:
-    """`final_error` is also satisfied on the way: only a state at rest is an end."""
+    """`final_error` is also fulfilled in passing, but only a state at rest is an end."""
     task = make_task(
         "go=1 act! left=2 failed done",
         {
@@ -265,7 +265,7 @@ def test_a_task_that_gives_up_after_three_errors_is_sound() -> None:
     assert may_run(task, None, Budget()).ok
 
 
-def test_a_branch_that_can_never_fire_is_told_with_its_reason() -> None:
+def test_a_branch_that_can_never_fire_is_reported_with_its_reason() -> None:
     task = make_task(
         "go=1 act! done bin",
         {
@@ -281,7 +281,7 @@ def test_a_branch_that_can_never_fire_is_told_with_its_reason() -> None:
     assert verdict.reason == "never can never fire: whenever the engine rests, it needs 2 of bin"
 
 
-def test_endless_firing_is_told() -> None:
+def test_endless_firing_is_reported() -> None:
     task = make_task(
         "go=1 a b act!",
         {
@@ -298,7 +298,7 @@ def test_endless_firing_is_told() -> None:
     assert verdict.reason == "back, forth can fire for ever without time passing"
 
 
-def test_a_loop_that_never_comes_to_its_end_is_not_sound() -> None:
+def test_a_loop_that_never_ends_is_not_sound() -> None:
     task = make_task(
         "go=1 act! done",
         {
@@ -313,7 +313,7 @@ def test_a_loop_that_never_comes_to_its_end_is_not_sound() -> None:
     assert "can go on for ever, but never comes to done == 1" in found.sound.reason
 
 
-def test_an_unfinished_graph_proves_nothing_and_still_refuses_what_it_found() -> None:
+def test_an_incomplete_graph_proves_nothing_but_still_refutes() -> None:
     grows = make_task(
         "go=1 act! bin",
         {
@@ -353,7 +353,7 @@ def test_the_order_of_timers_is_kept() -> None:
     ("gone", "matters"), [("a b", False), ("a", True)], ids=["both go on", "one gets stuck"]
 )
 def test_a_conflict_is_a_note_unless_a_verdict_depends_on_it(gone: str, matters: bool) -> None:
-    """`first` and `second` want the same token; the engine serves `first`."""
+    """`first` and `second` compete for the same token; the engine fires `first`."""
     net: dict[str, dict[str, Any]] = {
         "first": {"in": "token", "out": "a"},
         "second": {"in": "token", "out": "b"},
@@ -369,7 +369,7 @@ def test_a_conflict_is_a_note_unless_a_verdict_depends_on_it(gone: str, matters:
     assert ("second may have to wait" in found.text) is not matters
 
 
-def test_transitions_that_are_never_ready_together_are_no_conflict() -> None:
+def test_transitions_that_are_never_enabled_together_are_not_a_conflict() -> None:
     net: dict[str, dict[str, Any]] = {
         "first": {"in": "token", "out": "phase"},
         "second": {"in": "phase token2", "out": "done"},
@@ -489,7 +489,7 @@ def test_probability_and_mean_time_of_a_recovery_are_those_of_its_trials(
     assert odds.by_exit["give_up"][0] == 0.0 and not odds.missing
 
 
-def test_the_catching_task_is_back_after_an_arm_fault_as_its_estimates_say() -> None:
+def test_recovery_from_an_arm_fault_agrees_with_the_estimates() -> None:
     found = judged(load(TASKS / "catch_ball.toml"))
     p, mean = found.odds.by_exit["move_failed"]
     assert p == pytest.approx(1 - 0.05**4, abs=1e-12) and mean == pytest.approx(6.158, abs=1e-3)
@@ -498,8 +498,8 @@ def test_the_catching_task_is_back_after_an_arm_fault_as_its_estimates_say() -> 
 
 @pytest.mark.parametrize("name", ["catch_ball", "follow_track"])
 def test_the_chain_completes_as_probably_as_the_stochastic_view(name: str) -> None:
-    """Two models of the same numbers, made in different ways. follow_track has conditions on what
-    runs write, whose frequencies the two assume differently."""
+    """Two models are made from the same numbers in different ways. follow_track has conditions on
+    values that runs write; the two models assume different frequencies for them."""
     task = load(TASKS / f"{name}.toml")
     found = judged(task)
     chain = chain_of(found.x)
@@ -534,8 +534,8 @@ def test_a_preempting_event_races_with_the_run() -> None:
     assert p == pytest.approx(0.75, abs=1e-9) and mean == pytest.approx(0.75, abs=1e-9)
 
 
-def test_causes_of_an_error_are_told_apart_where_they_matter() -> None:
-    """After a drive fault nothing mends the arm; after any other error something does."""
+def test_causes_of_an_error_are_distinguished_where_they_matter() -> None:
+    """After a drive fault nothing repairs the arm; after any other error an action does."""
     net: dict[str, dict[str, Any]] = {
         "good": {"in": "act:normal", "out": "done"},
         "fault": {"in": "act:error", "out": "stopped"},
@@ -604,7 +604,7 @@ def test_without_an_estimate_there_is_no_probability() -> None:
     assert "no probability: no estimate for `recover`" in analyse(task).text()
 
 
-def test_the_same_graph_comes_from_the_same_task() -> None:
+def test_the_same_task_gives_the_same_graph() -> None:
     task = load(TASKS / "catch_ball.toml")
     one, other = execute(task), execute(task)
     assert one.steps == other.steps and np.array_equal(one.target, other.target)
@@ -642,7 +642,7 @@ def test_almost_sure_attraction_is_the_value_one_of_the_decision_process(
 # --- what only the operator's tokens make possible -----------------------------------------------
 
 
-def test_the_operators_hand_can_make_the_catching_task_stuck() -> None:
+def test_the_operators_tokens_can_make_the_catching_task_stuck() -> None:
     found = judged(load(TASKS / "catch_ball.toml"))
     assert found.deadlock_free.holds
     notes = found.hand_notes(20_000)
@@ -654,7 +654,7 @@ def test_the_operators_hand_can_make_the_catching_task_stuck() -> None:
     assert all("the operator adds" in note or "the operator takes" in note for note in notes)
 
 
-def test_each_state_after_the_operators_hand_can_be_replayed() -> None:
+def test_each_state_after_the_operators_tokens_can_be_replayed() -> None:
     own = execute(arm(1))
     x = with_operator(own, limit=20_000)
     assert len(x) > len(own) and x.states[: len(own)] == own.states
@@ -669,7 +669,8 @@ def test_each_state_after_the_operators_hand_can_be_replayed() -> None:
 
 
 def test_a_conflict_that_needs_the_operators_token_is_a_note() -> None:
-    """Only the operator says that the cup is dirty; while the arm is away both wait for it."""
+    """Only the operator can mark the cup as dirty; while the arm is away, both transitions wait for
+    it."""
     net: dict[str, dict[str, Any]] = {
         "pick": {"in": "parts arm", "out": "act"},
         "picked": {"in": "act:normal", "out": "arm"},
@@ -689,8 +690,9 @@ def test_a_conflict_that_needs_the_operators_token_is_a_note() -> None:
     assert note.endswith(path)
 
 
-def test_two_actions_of_one_device_never_run_at_a_time() -> None:
-    """What needs both at once is found only where it is known that they share a device."""
+def test_two_actions_of_one_device_never_run_at_the_same_time() -> None:
+    """The transition that needs both at once is reported only if it is known that they share a
+    device."""
     net: dict[str, dict[str, Any]] = {
         "start": {"in": "begin", "out": "drive look"},
         "seen": {"in": "drive:preempt=success look:normal", "out": "end"},

@@ -233,7 +233,7 @@ def test_graph_primitives(n: int, pairs: list[tuple[int, int]], data: st.DataObj
 def test_sweeps_find_what_a_search_on_reversed_edges_finds(
     seed: int, n: int, m: int, swept: int
 ) -> None:
-    """Also where blocks are small and some vertices have no edge."""
+    """It holds also if blocks are small and some vertices have no edge."""
     random = np.random.default_rng(seed)
     source = np.sort(random.integers(0, n, m)).astype(np.int32)
     target = (source + random.integers(-5, 9, m)).clip(0, n - 1).astype(np.int32)
@@ -246,7 +246,8 @@ def test_sweeps_find_what_a_search_on_reversed_edges_finds(
 
 @pytest.mark.parametrize("net", [kanban(2), philosophers(5), fms(1)], ids=["kanban", "phil", "fms"])
 def test_verdicts_of_large_graphs_are_those_of_small_ones(net: Net) -> None:
-    """Large graphs take other ways: sweeps, and one component where they reach everything."""
+    """Large graphs use other algorithms: sweeps, and a single component if it reaches
+    everything."""
     usual = examine(explore(net))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(graphs, "SMALL", -1)

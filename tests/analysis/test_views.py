@@ -124,7 +124,7 @@ def test_preselection_gives_the_mean_of_the_mixture() -> None:
     assert any("estimates declared in the task file" in text for text in view.assumptions)
 
 
-def test_every_rate_says_where_it_comes_from() -> None:
+def test_every_rate_has_its_source() -> None:
     task = one_step(alternatives=("slow", "fast"))
     runs = {("act", "slow"): {Status.SUCCESS: Estimate(1.0, 4.0, 0.5)}}
     said = {("act", "slow"): "measured in 7 runs"}
@@ -137,8 +137,8 @@ def test_every_rate_says_where_it_comes_from() -> None:
     assert view.sources["act.slow"] == "assumed equally likely"
 
 
-def test_a_change_counts_before_what_was_measured() -> None:
-    """Measurements are kept by place, changes are written by primitive task or action."""
+def test_a_change_overrides_measurements() -> None:
+    """Measurements are stored by place, changes are given by primitive task or action."""
     task = one_step()
     runs = {("act", "a"): {Status.SUCCESS: Estimate(0.5, 4.0), Status.ERROR: Estimate(0.3, 1.0)}}
     changed, measured = change_task(task, Measured(runs), [read_change("act.error.share=0.2")])
@@ -150,7 +150,7 @@ def test_a_change_counts_before_what_was_measured() -> None:
 
 
 def test_errors_of_fits_are_reported_if_they_matter() -> None:
-    """A constant duration needs many phases; one that is never waited for needs none."""
+    """A constant duration needs many phases; one on which nothing waits needs none."""
     fixed = {Status.SUCCESS: Estimate(1.0, 2.0, 0.0)}
     found = forecast(stochastic_view(one_step(estimates=fixed), stages=2))
     assert [text.partition(":")[0] for text in found.approximations] == ["act.a.success"]
@@ -295,8 +295,8 @@ def beside(*names: str, stopped: str = "", servers: int | None = None) -> Task:
 @pytest.mark.parametrize("stopped", ["", "a", "b"])
 @pytest.mark.parametrize("shared", ["ab", "bc", "abc", ""])
 def test_runs_that_share_a_device_take_turns(shared: str, stopped: str) -> None:
-    """As the engine runs them: against the chain on its execution graph, which knows the devices
-    and the order of waiting. Where three wait and one is stopped that order matters, and the view
+    """The view against the chain on the execution graph, which knows the devices and the order of
+    waiting, as the engine does. If three wait and one is stopped, that order matters, and the view
     only assumes one."""
     task = beside("a", "b", "c", stopped=stopped)
     devices = {f"do_{name}": "arm" for name in shared}

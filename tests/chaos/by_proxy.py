@@ -1,8 +1,7 @@
-"""`petrobot` as it is, but for the way to its nodes: `by_proxy.py LEFT,RIGHT ARGUMENT ...` reaches
-them through these ports.
+"""Run `petrobot` with its nodes reached through a proxy: `by_proxy.py LEFT,RIGHT ARGUMENT ...`
+connects to these ports.
 
-services.toml, and so its hash, is that of the nodes: only the addresses that are connected to are
-others.
+services.toml, and so its hash, is that of the nodes; only the addresses for connecting differ.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ NODES = ("left", "right")
 def by_proxy(
     parse: Callable[[str, Path], Directory], ports: list[int]
 ) -> Callable[[str, Path], Directory]:
-    """`parse` with the nodes' ports replaced."""
+    """Parse services.toml, and replace the nodes' ports."""
 
     def moved(text: str, source: Path) -> Directory:
         read = parse(text, source)

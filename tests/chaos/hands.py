@@ -1,5 +1,5 @@
-"""Toy hands for tests with real processes: quick actions that leave a line for each execution and
-notice a second performer."""
+"""Toy hands for tests with real processes: quick actions that log each execution, and log an
+overlap if two move one hand."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from petrobot.services.action import Context, Result, success
 
 
 class Hand:
-    """A device without cyclic duty that stands still whenever nobody moves it."""
+    """A device without cyclic work; it stands still unless an action moves it."""
 
     period = None
 
@@ -21,37 +21,37 @@ class Hand:
         self.held = False
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Takes none."""
+        """Refuse commands."""
 
     def step(self, now: float) -> None:
-        """No cycle."""
+        """Do nothing: it has no cycle."""
 
     def state(self) -> Mapping[str, Any]:
-        """Whether it is held."""
+        """Return whether it is held."""
         return {"held": self.held}
 
     def stop(self, now: float) -> None:
-        """It stands still."""
+        """Do nothing: it stands still."""
 
     def stopped(self) -> bool:
-        """Always."""
+        """Return True."""
         return True
 
     def hold(self, now: float) -> str:
-        """It can."""
+        """Hold."""
         self.held = True
         return "held"
 
     def release(self, now: float) -> None:
-        """Go on."""
+        """Continue."""
         self.held = False
 
     def close(self) -> None:
-        """Nothing to let go."""
+        """Release nothing."""
 
 
 async def move(ctx: Context, log: str, hand: str, seconds: float = 0.05) -> Result:
-    """Move a hand for a while. The log gets `begin`, `end` and, if somebody else moves the hand,
+    """Move a hand for a while. The log gets `begin`, `end` and, if another run moves the hand,
     `overlap`."""
     with Path(f"{log}.{hand}").open("w") as lock:
         try:
@@ -65,12 +65,12 @@ async def move(ctx: Context, log: str, hand: str, seconds: float = 0.05) -> Resu
 
 
 def note(log: str, what: str, run: str) -> None:
-    """One line, in one write."""
+    """Append one line to the log, in one write."""
     file = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
     os.write(file, f"{what} {run}\n".encode())
     os.close(file)
 
 
 async def nothing(ctx: Context) -> Result:
-    """End at once: what is left is what everything around it costs."""
+    """End at once; measures the cost of everything around an action."""
     return success()

@@ -1,9 +1,9 @@
 """A TCP proxy between coordinator and nodes that cuts, delays and repeats: `proxy.py PORT:NODE_PORT
-...`, orders on standard input.
+...`, commands on standard input.
 
-Orders, one a line: `cut N` breaks the connections of the N-th pair, `delay N SECONDS` holds back
-both directions for a while, `repeat N` sends the next frame of either direction twice. Frames are
-told apart by their length (docs/protocol.md); the handshake is passed on as it is.
+Commands, one per line: `cut N` breaks the connections of the N-th pair, `delay N SECONDS` delays
+both directions, `repeat N` sends the next frame of each direction twice. Frames are separated by
+their length (docs/protocol.md); the handshake is passed on as it is.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Pair:
         self._repeats = 0
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Pass a connection on for as long as it lasts."""
+        """Forward a connection until it ends."""
         try:
             there, back = await asyncio.open_connection("127.0.0.1", self._node_port)
         except OSError:
@@ -58,12 +58,12 @@ class Pair:
             target.transport.abort()
 
     def cut(self) -> None:
-        """Break all connections, both ways."""
+        """Break all connections, in both directions."""
         for writer in list(self._writers):
             writer.transport.abort()
 
     def delay(self, seconds: float) -> None:
-        """Pass nothing on for a while; then all that came meanwhile."""
+        """Forward nothing for a while, then everything that arrived meanwhile."""
         self._open.clear()
         asyncio.get_running_loop().call_later(seconds, self._open.set)
 

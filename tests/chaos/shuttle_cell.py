@@ -1,4 +1,4 @@
-"""The shuttle's cell: its services.toml on free ports, and what the hands' log says."""
+"""The shuttle's cell: its services.toml on free ports, and reading the hands' log."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ args = {{ log = "{log}", hand = "right", seconds = 0.02 }}
 def shuttle_services(
     folder: Path, *, fetch: float = 0.05, carry: float = 0.1, orphan: float = 1.0
 ) -> Path:
-    """A services.toml in this folder; the hands log to `moves.txt` beside it. Times of actions and
-    orphans in seconds."""
+    """Write a services.toml in this folder; the hands log to `moves.txt` beside it. Action times
+    and orphan time in seconds."""
     path = folder / "services.toml"
     text = SERVICES.format(
         *free_ports(3), log=folder / "moves.txt", fetch=fetch, carry=carry, orphan=orphan
@@ -64,7 +64,7 @@ def shuttle_services(
 
 
 def moves(folder: Path, what: str) -> Counter[str]:
-    """Call ids by how often the log says this of them: `begin`, `end` or `overlap`."""
+    """Count in the log, by call id, the lines with this word: `begin`, `end` or `overlap`."""
     path = folder / "moves.txt"
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     return Counter(line.split()[1] for line in lines if line.startswith(what))

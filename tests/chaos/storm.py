@@ -2,11 +2,10 @@
 [--lo]`. Prints one JSON object.
 
 Nodes live under the supervisor of `petrobot up`, each behind a proxy. Each mission run is a process
-`petrobot run`. Seeded weather kills nodes, workers and the coordinator (SIGKILL; `petrobot resume`
-then goes on with the run), freezes nodes and workers (SIGSTOP), cuts, delays and repeats what goes
-over the wire, and, in a network namespace of its own (`--lo`), takes the loopback down. Mission
-runs follow one another; each is judged by its journal and by what the hands noted. Last comes one
-in calm weather.
+`petrobot run`. Faults drawn from the seed kill nodes, workers and the coordinator (SIGKILL;
+`petrobot resume` then continues the run), freeze nodes and workers (SIGSTOP), cut, delay and repeat
+frames, and, in a separate network namespace (`--lo`), take the loopback down. Mission runs follow
+one another; each is checked by its journal and by the hands' log. The last one runs without faults.
 """
 
 from __future__ import annotations
@@ -41,23 +40,22 @@ from tests.processes import children, kill
 from tests.waiting import beat
 
 MARK = "PETROBOT_STORM"
-"""Environment variable that all processes of a storm carry."""
+"""Environment variable that all processes of a storm have."""
 LEAST_MISSIONS, LEAST_EVENTS = 3, 10
-"""What makes a storm, however long it takes."""
+"""Fewest mission runs and faults of a storm, however long they take."""
 LONGEST = 240.0
 """Seconds after which a mission run counts as hanging."""
 RUNS = 24
 QUIET = ("--quiet", "--no-page")
 KILLS = 4
-"""Times at most that the coordinator of one mission run is killed: it has to come to its end some
-day."""
+"""Most kills of the coordinator of one mission run, so that the run can end."""
 UNREACHABLE, HANGS = 3, 1000
 PATIENCE = 60.0
-"""Seconds that nodes have to notice that everybody has left."""
+"""Seconds within which nodes must notice that all clients have disconnected."""
 
 
-class Weather:
-    """What breaks, and when: all drawn from a seed."""
+class FaultSchedule:
+    """The faults and their times, all drawn from a seed."""
 
     def __init__(
         self,
@@ -68,7 +66,7 @@ class Weather:
         lo: bool,
         ports: list[int],
     ) -> None:
-        """`crash` is set when the coordinator shall die; nodes listen at `ports`."""
+        """`crash` is set when the coordinator must be killed; nodes listen at `ports`."""
         self._ports = ports
         self._crashing = crash
         self._draw = np.random.default_rng(seed)
@@ -90,7 +88,7 @@ class Weather:
         self.seen: Counter[str] = Counter()
 
     async def blow(self) -> None:
-        """Break something every now and then, until cancelled."""
+        """Cause faults at random times, until cancelled."""
         try:
             while True:
                 await beat(float(self._draw.exponential(0.35)))
@@ -102,8 +100,8 @@ class Weather:
                 _signal(process, signal.SIGCONT)
 
     async def _kill_node(self) -> None:
-        """Unless one is still being started: on a busy machine nothing would ever be up for long
-        enough to break."""
+        """Kill a node, unless one is still starting: on a busy machine no node would ever be up
+        long enough."""
         if all([await _listens(port) for port in self._ports]):
             _signal(self._node(), signal.SIGKILL)
 
@@ -172,7 +170,7 @@ class Storm:
         self._faults: list[str] = []
 
     async def pass_over(self, seconds: float) -> dict[str, Any]:
-        """Run missions for so long in the storm, then one in calm weather; what was seen."""
+        """Run missions for so long with faults, then one without; return what was observed."""
         pairs = [
             f"{port}:{self._directory.nodes[n].port}"
             for port, n in zip(self._proxied, NODES, strict=True)
@@ -187,7 +185,7 @@ class Storm:
             async with Supervisor(
                 local_programs(self._directory), self._folder / "logs"
             ) as supervisor:
-                weather = Weather(self._seed, supervisor, proxy, self._crash, self._lo, ports)
+                weather = FaultSchedule(self._seed, supervisor, proxy, self._crash, self._lo, ports)
                 loop = asyncio.get_running_loop()
                 before, end = _sockets(supervisor), loop.time() + seconds
                 blowing = loop.create_task(weather.blow())
@@ -202,14 +200,13 @@ class Storm:
             await proxy.wait()
         return self._told(weather, left)
 
-    def _hardly(self, weather: Weather) -> bool:
-        """Whether too little has happened yet to be called a storm: a slow machine needs longer for
-        that."""
+    def _hardly(self, weather: FaultSchedule) -> bool:
+        """Return whether too few faults have happened yet: a slow machine needs longer."""
         return (
             sum(self._ends.values()) < LEAST_MISSIONS or sum(weather.seen.values()) < LEAST_EVENTS
         )
 
-    def _told(self, weather: Weather, sockets: dict[str, int]) -> dict[str, Any]:
+    def _told(self, weather: FaultSchedule, sockets: dict[str, int]) -> dict[str, Any]:
         begun = moves(self._folder, "begin")
         return {
             "missions": sum(self._ends.values()),
@@ -231,8 +228,8 @@ class Storm:
         }
 
     async def _calm(self, supervisor: Supervisor) -> None:
-        """All nodes are up again: a mission run without any error; then no fence was left
-        behind."""
+        """Run a mission without faults, once all nodes are up again: if it has no error, no fence
+        was left behind."""
         loop = asyncio.get_running_loop()
         end = loop.time() + LONGEST
         self._crash.clear()
@@ -243,8 +240,8 @@ class Storm:
         self._faults.append("no calm mission run without error came about")
 
     async def _left(self, supervisor: Supervisor, before: dict[str, int]) -> dict[str, int]:
-        """Sockets that nodes have more than at first, once those who left have had time to be
-        gone."""
+        """Return how many more sockets nodes have than at first, after those of former clients had
+        time to close."""
         loop = asyncio.get_running_loop()
         end = loop.time() + PATIENCE
         while True:
@@ -258,7 +255,7 @@ class Storm:
             await beat(0.1)
 
     async def _mission(self) -> bool:
-        """One mission run, judged; True if all its runs ended well."""
+        """Run one mission and check it; return whether all its runs ended well."""
         self._number += 1
         kept = self._folder / "runs" / f"{self._number}"
         common = ["--journal", str(kept), "--services", str(self._services), *QUIET]
@@ -288,8 +285,8 @@ class Storm:
         return self._judge(next(kept.iterdir()), code)
 
     async def _life(self, given: list[str], kept: Path, until: float, *, mortal: bool) -> int:
-        """One life of the coordinator: its exit code, -9 if the weather has killed it (once it had
-        something to lose)."""
+        """Run one coordinator process; return its exit code, -9 if it was killed (only after its
+        journal has records)."""
         before = _stimuli(kept)
         ports = ",".join(map(str, self._proxied))
         with (self._folder / "coordinator.txt").open("ab") as out:
@@ -320,8 +317,8 @@ class Storm:
         return code
 
     def _judge(self, folder: Path, code: int) -> bool:
-        """The end has a reason, every run one end, every firing is one of the net, the journal says
-        the same again; whether all runs ended well."""
+        """Check that the end has a reason, every run one end, every firing is one of the net, and
+        the journal replays; return whether all runs ended well."""
         found = recorded(str(folder))
         self._torn += found.journal.torn_bytes > 0
         steps = list(found.steps())
@@ -358,7 +355,7 @@ class Storm:
 
 
 async def _listens(port: int) -> bool:
-    """Whether a node takes connections there."""
+    """Return whether a node accepts connections there."""
     with contextlib.suppress(OSError, TimeoutError):
         async with asyncio.timeout(0.5):
             _, writer = await asyncio.open_connection("127.0.0.1", port)
@@ -377,7 +374,7 @@ def _link(state: str) -> None:
 
 
 def _sockets(supervisor: Supervisor) -> dict[str, int]:
-    """Sockets that each node has open."""
+    """Return how many sockets each node has open."""
     counts = {}
     for name, process in supervisor.process_ids().items():
         counts[name] = 0
@@ -389,7 +386,7 @@ def _sockets(supervisor: Supervisor) -> dict[str, int]:
 
 
 def _stimuli(kept: Path) -> int:
-    """How many stimuli the journal of a mission run holds; 0 while it has not begun."""
+    """Return how many stimuli the journal of a mission run has; 0 before it begins."""
     journal = next(kept.glob(f"*/{JOURNAL}"), None)
     try:
         return (
@@ -402,8 +399,8 @@ def _stimuli(kept: Path) -> int:
 
 
 def _marked() -> list[str]:
-    """Command lines of the other processes that carry this storm's mark: none may be left when it
-    is over."""
+    """Return the command lines of the other processes with this storm's mark; none may be left at
+    its end."""
     mark, found = f"{MARK}={os.environ.get(MARK, '')}".encode(), []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and int(entry.name) != os.getpid():
@@ -419,7 +416,7 @@ def _marked() -> list[str]:
 
 
 def main() -> None:
-    """One storm."""
+    """Run one storm."""
     seed, seconds, folder, *options = sys.argv[1:]
     lo = "--lo" in options
     if lo:

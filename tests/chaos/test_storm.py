@@ -21,8 +21,8 @@ NAMESPACE = ("unshare", "--user", "--map-root-user", "--net")
 
 
 def storm(folder: Path, seed: int, seconds: float, *, lo: bool = False) -> dict[str, Any]:
-    """What a storm tells (tests/chaos/storm.py), in a network namespace of its own if the loopback
-    is to be taken down."""
+    """Run a storm (tests/chaos/storm.py) and return its result; in a separate network namespace if
+    the loopback is taken down."""
     command = [sys.executable, "-m", "tests.chaos.storm", str(seed), str(seconds), str(folder)]
     command = [*NAMESPACE, *command, "--lo"] if lo else command
     done = subprocess.run(
@@ -40,7 +40,7 @@ def storm(folder: Path, seed: int, seconds: float, *, lo: bool = False) -> dict[
 
 
 def judge(told: dict[str, Any]) -> None:
-    """All that must hold in any weather."""
+    """Check everything that must hold under any faults."""
     assert told["faults"] == []
     assert told["missions"] >= LEAST_MISSIONS and sum(told["weather"].values()) >= LEAST_EVENTS, (
         "hardly a storm"
@@ -53,8 +53,8 @@ def judge(told: dict[str, Any]) -> None:
     leased = sum(
         times for cause, times in told["causes"].items() if cause.startswith("device_leased")
     )
-    # A coordinator that leaves unheard keeps its devices for 2 s. Its successor asks ten times a
-    # second.
+    # A coordinator that disappears without a message keeps its devices for 2 s. Its successor asks
+    # ten times a second.
     unheard = told["killed"] + sum(
         told["weather"].get(kind, 0) for kind in ("cut", "delay", "freeze_node")
     )
@@ -62,7 +62,7 @@ def judge(told: dict[str, Any]) -> None:
 
 
 def namespace_permitted() -> bool:
-    """Whether this user may have a network namespace of its own and set its loopback."""
+    """Return whether this user may create a network namespace and configure its loopback."""
     if not shutil.which("unshare") or not shutil.which("ip"):
         return False
     tried = subprocess.run(

@@ -1,5 +1,5 @@
-"""A cell in one process: a node with an arm that takes its time, over real sockets, and a task with
-a bit of everything."""
+"""A cell in one process: a node with an arm that arrives when the test lets it, over real sockets,
+and a task with most features."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ out = ["out_of_order"]
 
 
 class Arm(Driver):
-    """A driver that reaches when an action has told it to and the test lets it."""
+    """A driver that reaches on an action's command, when the test lets it."""
 
     newest: Arm
 
@@ -119,20 +119,20 @@ class Arm(Driver):
         self.moving = True
 
     def arrive(self) -> None:
-        """The test lets it arrive."""
+        """Let the arm arrive (called by the test)."""
         self.moving = False
         self.reaches += 1
 
     def step(self, now: float) -> None:
-        """Nothing moves by itself."""
+        """Do nothing: the test moves the arm."""
 
     def state(self) -> Mapping[str, Any]:
-        """How often it has reached."""
+        """Return how often it has reached."""
         state = {"reaches": self.reaches, "moving": self.moving, "held": self.held, "q": [0.0, 1.5]}
         return state if self.setpoint_age is None else {**state, "setpoint_age": self.setpoint_age}
 
     def picture(self) -> Mapping[str, Any]:
-        """What the test shows it."""
+        """Return the picture that the test has set."""
         return (
             {"mime": "image/png", "data": self.sees, "width": 2, "height": 1, "age": 0.5}
             if self.sees
@@ -140,16 +140,16 @@ class Arm(Driver):
         )
 
     def stop(self, now: float) -> None:
-        """Stand."""
+        """Stop."""
         self.moving = False
 
     def quick_stop(self, now: float) -> None:
-        """Stand at once."""
+        """Stop at once."""
         self.moving = False
         self.quick_stops.append(now)
 
     def stopped(self) -> bool:
-        """Whether it stands still."""
+        """Return whether it stands still."""
         return not self.moving
 
     def hold(self, now: float) -> str:
@@ -158,11 +158,11 @@ class Arm(Driver):
         return "held" if self.holdable else "cannot hold"
 
     def release(self, now: float) -> None:
-        """Go on."""
+        """Continue."""
         self.held = False
 
     def close(self) -> None:
-        """Nothing to let go."""
+        """Release nothing."""
 
 
 async def reach(ctx: Context) -> Result:
@@ -174,12 +174,12 @@ async def reach(ctx: Context) -> Result:
 
 
 async def recover(ctx: Context) -> Result:
-    """Be ready at once."""
+    """Return at once."""
     return success()
 
 
 class RobotNode(NodeInLoop):
-    """The node, in this loop."""
+    """The node, in this event loop."""
 
     def __init__(self, directory: Directory) -> None:
         self.directory = directory
@@ -191,7 +191,7 @@ class RobotNode(NodeInLoop):
 
 
 def directory_in(folder: Path) -> Directory:
-    """The cell's location file on a free port."""
+    """Return the cell's location file with a free port."""
     path = folder / "services.toml"
     path.write_text(SERVICES.format(port=free_ports(1)[0]), encoding="utf-8")
     return parse(path.read_text(encoding="utf-8"), path)

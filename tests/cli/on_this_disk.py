@@ -1,7 +1,7 @@
-"""Runs commands one after the other in the present folder, and says in JSON what each said and left
-behind.
+"""Run commands one after the other in the present folder, and print as JSON what each printed and
+which files it left.
 
-A process for itself, since the folder is on a disk that this process's mount namespace alone has.
+This is a separate process, since the folder is on a disk that exists only in its mount namespace.
 Its argument is a JSON list of command lines, each a list.
 """
 
@@ -18,7 +18,8 @@ from petrobot.coordinator.cli import main
 
 
 def outcome(command: list[str], there: set[Path]) -> dict[str, object]:
-    """Exit code, standard error, and files that were not `there` before; they are removed."""
+    """Return exit code, standard error, and the files that were not `there` before; remove these
+    files."""
     said = io.StringIO()
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
         try:
@@ -34,7 +35,7 @@ def outcome(command: list[str], there: set[Path]) -> dict[str, object]:
 
 
 def run() -> None:
-    """All of them."""
+    """Run all commands."""
     there = set(Path().rglob("*"))
     print(json.dumps([outcome(command, there) for command in json.loads(sys.argv[1])]))
 

@@ -1,4 +1,4 @@
-"""`petrobot check --live`: the nodes themselves are asked whether they give what the task needs."""
+"""`petrobot check --live`: asks the nodes whether they offer what the task needs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.cli.cell import SERVICES, TASK, RobotNode, directory_in
 async def said_of(
     folder: Path, services: Path, capsys: pytest.CaptureFixture[str]
 ) -> tuple[int, str]:
-    """Exit code and output of a live check of the reaching task."""
+    """Return exit code and output of a live check of the reaching task."""
     task = folder / "reaching.toml"
     task.write_text(TASK, encoding="utf-8")
     capsys.readouterr()
@@ -25,8 +25,10 @@ async def said_of(
 
 
 @pytest.mark.processes
-async def test_nodes_that_give_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Up, with the same file: the task may run."""
+async def test_nodes_that_offer_everything(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The nodes are up with the same file: the task may run."""
     directory = directory_in(tmp_path)
     robot = RobotNode(directory)
     await robot.start()
@@ -38,7 +40,9 @@ async def test_nodes_that_give_all(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.processes
-async def test_a_node_that_is_away(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_a_node_that_is_not_running(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Its address, what it would have offered and the remedy are named; the exit code is that of an
     unreachable node."""
     directory = directory_in(tmp_path)

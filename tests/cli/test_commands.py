@@ -1,5 +1,5 @@
-"""The command line as a user meets it: help with an example everywhere, exit codes, one clear line
-for each fault."""
+"""The command line: help with an example for each command, exit codes, one clear line for each
+fault."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_bad_input_is_exit_code_2_and_names_the_fault(
     assert said in capsys.readouterr().err
 
 
-def test_nodes_that_are_not_there_are_exit_code_3(
+def test_unreachable_nodes_are_exit_code_3(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`run` and `nodes` say which node does not answer."""
@@ -161,8 +161,8 @@ def test_nodes_that_are_not_there_are_exit_code_3(
 
 @pytest.mark.processes
 def test_a_node_ends_with_its_command(tmp_path: Path) -> None:
-    """`petrobot node` is the node, not its parent: a signal that ends the command leaves nothing
-    that holds the port."""
+    """`petrobot node` is the node itself, not its parent: after a signal that ends the command, no
+    process occupies the port."""
     [port] = free_ports(1)
     services = tmp_path / "services.toml"
     services.write_text(
@@ -192,10 +192,10 @@ def test_a_node_ends_with_its_command(tmp_path: Path) -> None:
     "command", [("run", "catch_ball", "--mode", "lockstep"), ("serve",), ("resume", "last")]
 )
 @pytest.mark.parametrize("port", ["99999", "-1", "web"])
-def test_what_is_no_port_is_refused(
+def test_an_invalid_port_is_refused(
     command: tuple[str, ...], port: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It is not taken for another number."""
+    """It is not read as another number."""
     assert main([*command, "--page-port", port]) == 2
     said = capsys.readouterr().err
     assert "--page-port" in said and "from 1 to 65535" in said
@@ -259,8 +259,8 @@ def test_a_task_without_error_branch_is_refused(
 def test_a_task_that_can_deadlock_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without its honest end the skeleton can come to a dead marking: no file fault, but the state
-    space tells."""
+    """Without its `final_error` the skeleton can reach a dead marking: the file has no fault, but
+    the state space shows it."""
     from petrobot.coordinator.cli.new import TASK
 
     path = tmp_path / "stuck.toml"
@@ -352,11 +352,12 @@ deadline = 5.0
 """
 
 
-def test_every_view_knows_the_devices_of_the_location_file(
+def test_every_view_uses_the_devices_of_the_location_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Two runs on one device take 2 + 3 s; without a location file both views say what they assume,
-    and the longer of two exponential times is 2 + 3 - 1 / (1/2 + 1/3) s."""
+    """Two runs on one device take 2 + 3 s. Without a location file both views name their
+    assumption: the runs are parallel, and the longer of two exponential times is 2 + 3 - 1 / (1/2 +
+    1/3) s."""
     monkeypatch.chdir(tmp_path)
     Path("shared.toml").write_text(SHARED, encoding="utf-8")
     found = []
@@ -394,7 +395,7 @@ def test_show_draws_svg(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_show_draws_the_stochastic_view(capsys: pytest.CaptureFixture[str]) -> None:
-    """Timed transitions are boxes with their rates; every number says where it comes from."""
+    """Timed transitions are boxes with their rates; each number has its source."""
     assert main(["show", "catch_ball", "--view", "gspn"]) == 0
     drawn = capsys.readouterr().out
     assert "transition timed" in drawn and "transition immediate" in drawn
@@ -408,7 +409,7 @@ def test_show_draws_the_stochastic_view(capsys: pytest.CaptureFixture[str]) -> N
 def test_convert_writes_the_stochastic_view(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """GreatSPN projects, PNML and Storm's chain hold the same GSPN."""
+    """The GreatSPN project, PNML and Storm's chain describe the same GSPN."""
     found = []
     for ending, more in ((".pnpro", []), (".pnml", ["--view", "gspn"])):
         target = tmp_path / f"catch{ending}"
@@ -434,7 +435,7 @@ def test_analyse_reports_measures_of_the_user(capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.processes
-def test_new_writes_what_works(tmp_path: Path) -> None:
+def test_the_skeletons_of_new_work(tmp_path: Path) -> None:
     """The skeletons' own tests pass as they are written."""
     for what, name in (("action", "wave"), ("task", "greet")):
         assert petrobot("new", what, name, cwd=tmp_path).returncode == 0
@@ -511,11 +512,11 @@ async def recover(ctx):
 """
 
 
-def test_a_run_that_was_given_up_says_why(
+def test_a_given_up_run_says_why(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An argument of a wrong type: its action, node and text stand in the terminal and in the JSON,
-    and how to keep more."""
+    """After an argument of a wrong type, the terminal and the JSON have its action, node and text,
+    and how to record more."""
     from petrobot.coordinator.cli.new import TASK
 
     monkeypatch.chdir(tmp_path)
@@ -544,7 +545,7 @@ def test_a_run_that_was_given_up_says_why(
     assert "--journal" in said.err
 
 
-def test_a_task_of_ones_own_comes_before_a_shipped_one(
+def test_the_users_task_comes_before_a_shipped_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What the page saved under `tasks` is found by its bare name."""
@@ -561,8 +562,8 @@ def test_a_task_of_ones_own_comes_before_a_shipped_one(
 def test_a_task_may_name_its_own_location_file(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """`services` of the task file is found from anywhere and gives way to --services; it survives
-    writing and reading."""
+    """`services` of the task file is found from any folder, and --services overrides it; it is kept
+    when the task is written and read."""
     from petrobot.coordinator.cli.loading import SHIPPED, cell_path
     from petrobot.coordinator.task.file import dumps, load, loads
 

@@ -1,5 +1,5 @@
-"""Every command that writes files, on a disk that is full and on one that is read-only: one line
-that says what, where and what to do, exit code 2, and no file that is empty or half written."""
+"""Every command that writes files, on a full and on a read-only disk: one line with fault, file and
+remedy, exit code 2, and no empty or half-written file."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ COMMANDS = {
     f"{SIMULATED} --report page": "page/result.json",
     f"{SIMULATED} --json out.json": "out.json",
 }
-"""What is named in the message, by command line."""
+"""Command lines, each with the file that the message must name."""
 DISKS = {
     "full": "dd if=/dev/zero of=fill bs=4k 2>/dev/null",
     "read-only": "cd /; mount -o remount,ro {disk}; cd {disk}",
@@ -44,7 +44,7 @@ LIMIT = 300.0
 
 
 def _mounts() -> bool:
-    """Whether this machine lets us have a disk of our own."""
+    """Return whether this machine lets us mount a disk in a namespace."""
     asked = ["unshare", "-rm", "mount", "-t", "tmpfs", "none", "/mnt"]
     try:
         return (
@@ -55,7 +55,7 @@ def _mounts() -> bool:
 
 
 @pytest.mark.parametrize("disk", DISKS)
-def test_a_disk_that_cannot_be_written_is_told_in_one_line(disk: str, tmp_path: Path) -> None:
+def test_a_disk_that_cannot_be_written_is_reported_in_one_line(disk: str, tmp_path: Path) -> None:
     if not _mounts():
         pytest.skip("this machine gives nobody a mount namespace of his own (unshare -rm)")
     commands = [shlex.split(command) for command in COMMANDS]

@@ -30,7 +30,7 @@ def test_a_driver_that_keeps_the_rules(
         (["arm", "--command", "{to}"], "expected JSON, got '{to}'"),
     ],
 )
-def test_what_cannot_be_tested(
+def test_devices_that_cannot_be_tested(
     given: list[str],
     text: str,
     capsys: pytest.CaptureFixture[str],

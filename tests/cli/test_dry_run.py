@@ -1,4 +1,5 @@
-"""`speed`, `workspace` and a dry run: who obeys them, who is refused, and what leaves."""
+"""`speed`, `workspace` and dry runs: drivers that obey them, drivers that are refused, and what is
+sent to the device."""
 
 from __future__ import annotations
 
@@ -150,7 +151,7 @@ def test_a_command_outside_the_workspace_ends_its_run(
     assert "x = 0.500, y = 0.000, z = 0.000 m lies outside the workspace x = [0, 0.4] m" in told
 
 
-def test_programs_of_a_dry_run_and_others_refuse_each_other(cell: Path) -> None:
+def test_dry_run_and_normal_programs_refuse_each_other(cell: Path) -> None:
     usual, dried = load("services.toml"), load("services.toml", dry_run=True)
     assert dried.dry_run and not usual.dry_run and dried.hash != usual.hash
     again = parse(dried.text, dried.source)

@@ -1,5 +1,5 @@
-"""What commands say of bad input: the file, where there is one its line, the key, and the remedy;
-never an exception's name."""
+"""Messages of commands about bad input: file, line if there is one, key and remedy; never an
+exception's name."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ Petrobot = Callable[..., tuple[int, str, str]]
 def petrobot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Petrobot:
-    """Runs a command where work.toml, services.toml and other files lie; gives code, standard
-    output and errors."""
+    """A function that runs a command in a folder with work.toml, services.toml and other files, and
+    returns exit code, standard output and standard error."""
     monkeypatch.chdir(tmp_path)
     files: dict[str, str | bytes] = {
         "work.toml": WORK,
@@ -134,7 +134,7 @@ def petrobot(
     ],
 )
 def test_bad_input_names_file_key_and_remedy(command: str, said: str, petrobot: Petrobot) -> None:
-    """Exit code 2; nothing of it on standard output, and no exception in it."""
+    """The exit code is 2, standard output is empty, and the message names no exception."""
     code, out, err = petrobot(*command.split())
     assert (code, out) == (2, "")
     assert said in err
@@ -142,8 +142,9 @@ def test_bad_input_names_file_key_and_remedy(command: str, said: str, petrobot: 
 
 
 @pytest.mark.processes
-def test_a_cell_that_was_not_given_is_named(petrobot: Petrobot) -> None:
-    """The location file beside the task, one folder above it, or here; no other cell's."""
+def test_the_location_file_in_use_is_named(petrobot: Petrobot) -> None:
+    """The location file is looked for beside the task, one folder above it, and here, and no other
+    cell's file is used."""
     assert petrobot("check", "work.toml")[0] == 0
     cell = Path("services.toml").read_text(encoding="utf-8")
     folder = Path("lab/tasks")
@@ -165,7 +166,7 @@ def test_a_cell_that_was_not_given_is_named(petrobot: Petrobot) -> None:
 
 
 @pytest.mark.processes
-def test_an_action_that_translates_another_task_is_told(petrobot: Petrobot) -> None:
+def test_an_action_for_another_primitive_task_is_a_warning(petrobot: Petrobot) -> None:
     """This is a warning; the task may still run."""
     Path("services.toml").write_text(
         CELL.replace('task = "work"', 'task = "wrok"'), encoding="utf-8"
@@ -180,8 +181,8 @@ def test_an_action_that_translates_another_task_is_told(petrobot: Petrobot) -> N
 
 
 @pytest.mark.processes
-def test_check_does_not_promise_what_analyse_does_not_do(petrobot: Petrobot) -> None:
-    """`analyse` searches longer than `check`, but not when the net is unbounded."""
+def test_check_does_not_promise_that_analyse_searches_longer(petrobot: Petrobot) -> None:
+    """`analyse` searches longer than `check`, but not if the net is unbounded."""
     endless = WORK.replace('out = ["robot_free"]', 'out = ["robot_free", "runs*2"]', 1)
     Path("work.toml").write_text(endless, encoding="utf-8")
     code, out, _ = petrobot("check", "work.toml")
@@ -190,24 +191,24 @@ def test_check_does_not_promise_what_analyse_does_not_do(petrobot: Petrobot) -> 
 
 
 @pytest.mark.processes
-def test_a_search_that_was_cut_short_may_go_on(
+def test_a_search_that_was_cut_short_may_be_continued(
     petrobot: Petrobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where a limit ended it, `analyse` has a larger one."""
+    """If a limit ended the search, `check` refers to `analyse`, which has a larger limit."""
     monkeypatch.setattr("petrobot.coordinator.analysis.may_run.BUDGET", Budget(4))
     out = petrobot("check", "work.toml")[1]
     assert "petrobot analyse continues longer" in out
 
 
 @pytest.mark.parametrize("name", [command.name for command in COMMANDS])
-def test_help_says_which_location_file(name: str, petrobot: Petrobot) -> None:
-    """The task's own comes first."""
+def test_help_says_which_location_file_is_used(name: str, petrobot: Petrobot) -> None:
+    """The location file that the task names comes first."""
     out = " ".join(petrobot(name, "--help")[1].split())
     assert "--services FILE the" not in out or "the one that the task names in its key" in out
 
 
-def test_exit_codes_are_told(petrobot: Petrobot) -> None:
-    """Also what 1 means of commands that run nothing."""
+def test_help_explains_exit_codes(petrobot: Petrobot) -> None:
+    """Help also says what 1 means for commands that run no task."""
     code, out, _ = petrobot("--help")
     assert code == 0
     told = out.partition("exit codes:")[2]
@@ -218,7 +219,7 @@ def test_exit_codes_are_told(petrobot: Petrobot) -> None:
 
 
 def no_laboratory(directory: Directory, name: str) -> Party:
-    """A laboratory whose file is gone, as that of a run whose installation is."""
+    """Return a laboratory whose file no longer exists, as after an uninstallation."""
     raise ValueError("gone.toml: cannot be read (No such file or directory)")
 
 

@@ -1,5 +1,5 @@
-"""Mistakes that a newcomer makes in his own robot, and the message that he gets for each: file and
-line, key, what was expected, what was found, what to do."""
+"""Mistakes that newcomers make in their own robot, and the message for each: file and line, key,
+what was expected, what was found, what to do."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ TASK, CELL, CODE = "arm_bot.toml", "services.toml", "arm_bot.py"
 RUN = ["run", "arm_bot.toml", "--mode", "lockstep", "--quiet", "--no-page"]
 
 Mistake = tuple[str, str, str, str]
-"""File, what stands there, what is written instead, and the message as a regular expression; LINE
-stands for the line of the mistake, or for any line where it is told of another file."""
+"""File, original text, text with the mistake, and the message as a regular expression. LINE means
+the line of the mistake, or any line if the message is about another file."""
 
 IN_THE_TASK: list[Mistake] = [
     (
@@ -308,13 +308,13 @@ ON_THE_LINE: list[tuple[list[str], str]] = [
 
 @pytest.fixture(autouse=True)
 def _one_robot(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Modules are looked up beside the location file: not beside those of other tests, too."""
+    """Modules are looked up beside the location file; remove those of earlier tests."""
     monkeypatch.setattr(sys, "path", list(sys.path))
 
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """The files of a robot without a mistake, as `petrobot new robot` writes them."""
+    """Return the files of a robot without a mistake, as `petrobot new robot` writes them."""
     folder = tmp_path_factory.mktemp("sound")
     with redirect_stdout(io.StringIO()):
         assert main(["new", "robot", "arm_bot", "--folder", str(folder)]) == 0
@@ -322,7 +322,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 def said(*arguments: str) -> tuple[int, str]:
-    """Exit code and all words of a command."""
+    """Run a command; return exit code and all its output."""
     out = io.StringIO()
     with redirect_stdout(out), redirect_stderr(out):
         code = main(list(arguments))
@@ -340,7 +340,7 @@ def damaged(sound: dict[str, str], mistakes: list[Mistake], folder: Path) -> Non
 
 
 def expect(pattern: str, arguments: list[str], code: int | None = 2) -> None:
-    """The command says so, in one message without a traceback."""
+    """Check that the command prints this as one message without a traceback."""
     found, words = said(*arguments)
     assert code is None or found == code, words
     assert re.search(pattern, words.replace("\n        ", "; ")), words
@@ -359,7 +359,7 @@ WARNINGS = (
 @pytest.mark.parametrize(
     "mistake", [*IN_THE_TASK, *IN_THE_CELL, *IN_THE_CODE], ids=lambda m: m[2][:40]
 )
-def test_each_mistake_is_told(
+def test_each_mistake_is_reported(
     sound: dict[str, str], mistake: Mistake, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name, old, _, pattern = mistake
@@ -372,7 +372,7 @@ def test_each_mistake_is_told(
 
 @pytest.mark.processes
 @pytest.mark.parametrize(("mistakes", "pattern"), BOTH, ids=["out", "prepare"])
-def test_mistakes_between_files_are_told(
+def test_mistakes_between_files_are_reported(
     sound: dict[str, str],
     mistakes: list[Mistake],
     pattern: str,
@@ -386,7 +386,7 @@ def test_mistakes_between_files_are_told(
 
 @pytest.mark.processes
 @pytest.mark.parametrize(("arguments", "pattern"), ON_THE_LINE, ids=lambda a: " ".join(a[-2:])[:40])
-def test_mistakes_on_the_command_line_are_told(
+def test_mistakes_on_the_command_line_are_reported(
     sound: dict[str, str],
     arguments: list[str],
     pattern: str,
@@ -424,7 +424,7 @@ def test_an_event_does_not_become_internal_by_its_declaration(tmp_path: Path) ->
 def test_runs_beyond_the_capacity_are_refused(
     sound: dict[str, str], runs: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A place holds at the start what it holds later."""
+    """The capacity also limits the tokens at the start."""
     damaged(sound, [(TASK, "tokens = 3", "tokens = 3, capacity = 20", "")], tmp_path)
     monkeypatch.chdir(tmp_path)
     refusal = (

@@ -1,4 +1,4 @@
-"""`petrobot new`: what it writes runs as it is."""
+"""`petrobot new`: the files that it writes run unchanged."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def on_free_port(folder: Path) -> None:
-    """Write a port that is free on this host into the location file."""
+    """Replace the port in the location file by one that is free on this host."""
     (port,) = free_ports(1)
     cell = folder / "services.toml"
     cell.write_text(cell.read_text(encoding="utf-8").replace("7501", str(port)), encoding="utf-8")
@@ -37,8 +37,8 @@ def on_free_port(folder: Path) -> None:
 
 @pytest.mark.processes
 def test_a_new_robot_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In an empty folder: it may run, its own tests pass, and it runs in real time; seeds differ,
-    and nothing that it needs lies elsewhere."""
+    """In an empty folder it may run, its own tests pass, and it runs in real time. Seeds give
+    different runs, and it needs no file from elsewhere."""
     monkeypatch.chdir(tmp_path)
     assert main(["new", "robot", "carrier"]) == 0
     folder = tmp_path / "carrier"
@@ -67,7 +67,7 @@ def test_a_new_robot_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_new_driver_can_be_placed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In place of the robot's own driver, by the table that the command prints."""
+    """It replaces the robot's own driver, with the table that the command prints."""
     monkeypatch.chdir(tmp_path)
     assert main(["new", "robot", "carrier"]) == 0
     monkeypatch.chdir(tmp_path / "carrier")
@@ -95,14 +95,14 @@ def test_a_new_driver_can_be_placed(
         (["robot", "kept"], "exists already; choose another name or --folder"),
     ],
 )
-def test_what_cannot_be_made_is_refused(
+def test_a_robot_that_cannot_be_made_is_refused(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     given: list[str],
     says: str,
 ) -> None:
-    """Nothing is written then."""
+    """Nothing is written in these cases."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "kept").mkdir()
     (tmp_path / "kept" / "kept.toml").write_text("mine")

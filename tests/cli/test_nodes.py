@@ -1,5 +1,5 @@
-"""`petrobot nodes` and `estop` against a node with a device and actions that need none: what is
-called a device, and how it is."""
+"""`petrobot nodes` and `estop` with a node that has a device and actions without one: what is
+listed as a device, and its state."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STOPPED = "arm stopped (petrobot estop --clear)"
 
 @pytest_asyncio.fixture
 async def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Directory]:
-    """The location file of a node that runs in this loop."""
+    """The location file of a node that runs in this event loop."""
     monkeypatch.setenv("COLUMNS", "200")
     directory = directory_in(tmp_path)
     clock = asyncio.get_running_loop().time
@@ -39,17 +39,18 @@ async def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIte
 
 
 async def said(directory: Directory, capsys: pytest.CaptureFixture[str], *command: str) -> str:
-    """What a command prints that does its work."""
+    """Run a command that must succeed; return its output."""
     capsys.readouterr()
     code = await asyncio.to_thread(main, [*command, "--services", str(directory.source)])
     assert code == 0, capsys.readouterr().err
     return capsys.readouterr().out
 
 
-async def test_a_node_is_no_device_of_its_own(
+async def test_a_node_is_not_listed_as_a_device(
     directory: Directory, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its actions without a device answer under its name; a table of devices leaves that out."""
+    """Actions without a device are listed under the node's name; the table of devices leaves them
+    out."""
     stopped = json.loads(await said(directory, capsys, "estop", "--json", "-"))
     assert stopped["nodes"][0]["devices"] == {"arm": "stopped"}
     status: dict[str, Any] = json.loads(await said(directory, capsys, "nodes", "--json", "-"))[
@@ -79,7 +80,7 @@ async def test_stopped_devices_are_shown_until_they_are_cleared(
 def test_the_stop_of_a_node_that_does_not_run_is_shown_too(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As this host's disk says: it would come up stopped."""
+    """The latch's file on this host says so: the node would start with its devices stopped."""
     monkeypatch.setenv("COLUMNS", "200")
     services = str(directory_in(tmp_path).source)
     assert main(["estop", "--services", services]) == 3
@@ -92,7 +93,7 @@ def test_the_stop_of_a_node_that_does_not_run_is_shown_too(
 def test_the_log_of_a_node_is_printed_by_its_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """From the folder of logs; without a file there the answer says where to look."""
+    """It comes from the folder of logs; without a file there the message says where to look."""
     services = str(directory_in(tmp_path).source)
     command = ["log", "robot", "--services", services, "--logs", str(tmp_path / "logs")]
     assert main(command) == 2

@@ -1,5 +1,5 @@
-"""The operator's commands and an active mission run: what they change, what they answer, and whom
-they refuse."""
+"""The operator's commands on an active mission run: their effects, their answers, and when they are
+refused."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ async def test_pause_reaches_the_devices_and_continue_releases_them(petrobot: Te
 
 
 async def test_a_device_that_cannot_hold_says_so(petrobot: Terminal) -> None:
-    """In words that cannot be overlooked."""
+    """The message is in capital letters."""
     petrobot.arm.holdable = False
     await petrobot.working()
     said = await petrobot("pause")
@@ -42,7 +42,7 @@ async def test_a_device_that_cannot_hold_says_so(petrobot: Terminal) -> None:
 
 
 async def test_a_node_that_is_frozen_counts_as_lost(petrobot: Terminal) -> None:
-    """A pause is answered, though the node is not heard of."""
+    """A pause is answered, though the node sends nothing."""
     await petrobot.working()
     assert petrobot.robot._pump is not None
     petrobot.robot._pump.cancel()
@@ -50,14 +50,14 @@ async def test_a_node_that_is_frozen_counts_as_lost(petrobot: Terminal) -> None:
     assert said.json["nodes"] == {"robot": "lost"}
 
 
-async def test_paused_with_nothing_under_way_the_node_is_idle(petrobot: Terminal) -> None:
-    """Nothing had to hold."""
+async def test_a_node_without_active_runs_is_idle_in_a_pause(petrobot: Terminal) -> None:
+    """No device had to hold."""
     said = await petrobot("pause", "--json", "-")
     assert said.json["nodes"] == {"robot": "idle"}
 
 
-async def test_what_was_held_is_released_by_an_abort(petrobot: Terminal) -> None:
-    """The next mission run must not find an arm that still holds."""
+async def test_an_abort_releases_held_devices(petrobot: Terminal) -> None:
+    """At the next mission run, the arm must no longer hold."""
     await petrobot.working()
     await petrobot("pause")
     assert petrobot.arm.held
@@ -67,7 +67,7 @@ async def test_what_was_held_is_released_by_an_abort(petrobot: Terminal) -> None
 
 
 async def test_step_fires_once(petrobot: Terminal) -> None:
-    """And pauses again."""
+    """Then the run pauses again."""
     await petrobot("pause")
     await petrobot("raise", "part_there")
     assert petrobot.tokens("jobs") == 2
@@ -78,7 +78,7 @@ async def test_step_fires_once(petrobot: Terminal) -> None:
 
 
 async def test_breakpoints(petrobot: Terminal) -> None:
-    """Set, told, hit, cleared."""
+    """They are set, listed, reached and removed."""
     assert "start" in (await petrobot("break", "start")).out
     await petrobot("raise", "part_there")
     await petrobot.until(lambda: petrobot.mission.executor.state.mode is Mode.PAUSED)
@@ -88,8 +88,8 @@ async def test_breakpoints(petrobot: Terminal) -> None:
     await petrobot.until(lambda: petrobot.arm.moving)
 
 
-async def test_tokens_go_into_and_out_of_control_places_only(petrobot: Terminal) -> None:
-    """Within their capacity; what is refused changes nothing and is exit code 1."""
+async def test_tokens_can_be_changed_in_control_places_only(petrobot: Terminal) -> None:
+    """Tokens stay within the capacity; a refused command changes nothing and has exit code 1."""
     assert (await petrobot("token", "jobs", "+2", "--json", "-")).json["tokens"] == 4
     assert (await petrobot("token", "jobs", "-1", "--json", "-")).json["tokens"] == 3
     full = await petrobot("token", "jobs", "+3")
@@ -99,8 +99,8 @@ async def test_tokens_go_into_and_out_of_control_places_only(petrobot: Terminal)
     assert petrobot.tokens("jobs") == 3
 
 
-async def test_a_forced_exit_leaves_an_action_that_hangs(petrobot: Terminal) -> None:
-    """The run is cancelled and counts none."""
+async def test_a_forced_transition_ends_a_hanging_action(petrobot: Terminal) -> None:
+    """The run is cancelled, and counts neither as success nor as failure."""
     await petrobot.working()
     said = await petrobot("force", "work", "done")
     assert said.code == 0, said.err
@@ -110,7 +110,7 @@ async def test_a_forced_exit_leaves_an_action_that_hangs(petrobot: Terminal) -> 
 
 
 async def test_the_operator_chooses_the_alternative(petrobot: Terminal) -> None:
-    """Until the choice is given back."""
+    """It stays chosen until the operator frees the choice."""
     assert (await petrobot("override", "work", "reach_slowly")).code == 0
     await petrobot.working()
     assert list(petrobot.mission.tally.chosen.values()) == ["reach_slowly"]
@@ -122,7 +122,7 @@ async def test_the_operator_chooses_the_alternative(petrobot: Terminal) -> None:
 
 
 async def test_abort_ends_the_run_in_error(petrobot: Terminal) -> None:
-    """With who did it."""
+    """The reason names the operator."""
     await petrobot.working("--as", "ana")
     assert (await petrobot("abort", "--as", "ana")).code == 0
     await petrobot.until(lambda: petrobot.mission.executor.finished is not None)
@@ -153,14 +153,14 @@ async def test_emergency_stop_stops_latches_and_ends_the_run(petrobot: Terminal)
 
 
 async def test_an_emergency_stop_needs_no_controls(petrobot: Terminal) -> None:
-    """Any operator may give it, whoever holds the controls."""
+    """Any operator may give it, also one without the controls."""
     assert (await petrobot("pause", "--as", "ana")).code == 0
     assert (await petrobot("estop", "--json", "-")).code == 0
 
 
 async def test_one_operator_holds_the_controls(petrobot: Terminal) -> None:
-    """A second operator is refused and told the name of the holder. After a handover he may give
-    commands."""
+    """A second operator is refused with the name of the holder, and may give commands after a
+    handover."""
     assert (await petrobot("pause", "--as", "ana")).code == 0
     refused = await petrobot("continue", "--as", "bob")
     assert refused.code == 1 and "ana" in refused.err and "holds the controls" in refused.err
@@ -170,7 +170,7 @@ async def test_one_operator_holds_the_controls(petrobot: Terminal) -> None:
     assert (await petrobot("continue", "--as", "ana")).code == 0
 
 
-async def test_controls_are_asked_for_and_handed_over(petrobot: Terminal) -> None:
+async def test_controls_are_requested_and_handed_over(petrobot: Terminal) -> None:
     """`--take` waits until the holder hands them over."""
     from petrobot.coordinator.cli.operate.hand import connect
 
@@ -185,10 +185,10 @@ async def test_controls_are_asked_for_and_handed_over(petrobot: Terminal) -> Non
         assert refused["code"] == "not_holder"
 
 
-async def test_controls_of_a_script_go_free(
+async def test_controls_of_a_silent_script_are_released(
     petrobot: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One that took them over plain HTTP and is not heard of again."""
+    """A script takes the controls over plain HTTP and sends nothing more."""
     import aiohttp
 
     monkeypatch.setattr(house, "ABSENT_S", 0.1)
@@ -203,8 +203,8 @@ async def test_controls_of_a_script_go_free(
             await beat(0.01)
 
 
-async def test_watch_tells_what_happens_until_the_end(petrobot: Terminal) -> None:
-    """As lines for people, and as JSON lines; its exit code is the run's."""
+async def test_watch_follows_the_run_until_its_end(petrobot: Terminal) -> None:
+    """It prints lines of text or JSON lines; its exit code is the run's."""
     path = petrobot.folder / "changes.jsonl"
     watching = asyncio.create_task(petrobot("watch", "--json", str(path)))
     await petrobot.until(lambda: petrobot.operation.feed.watched)
@@ -237,7 +237,7 @@ async def test_watch_tells_what_happens_until_the_end(petrobot: Terminal) -> Non
 async def test_bad_input_is_exit_code_2_and_names_the_remedy(
     petrobot: Terminal, arguments: tuple[str, ...], says: str
 ) -> None:
-    """Nothing is sent, nothing changes."""
+    """Nothing is sent and nothing changes."""
     said = await petrobot(*arguments)
     assert said.code == 2 and says in said.err
     assert petrobot.mission.executor.state.mode is Mode.RUNNING
@@ -259,15 +259,17 @@ def test_without_a_run_every_command_says_so(
     assert "is active; start one with `petrobot run`" in capsys.readouterr().err
 
 
-async def test_a_coordinator_that_is_gone_is_exit_code_3(petrobot: Terminal) -> None:
+async def test_an_unreachable_coordinator_is_exit_code_3(petrobot: Terminal) -> None:
     """Its process lives, but no server listens at its address any more."""
     await petrobot.page.close()
     said = await petrobot("pause")
     assert said.code == 3 and "cannot be reached" in said.err
 
 
-def test_the_door_is_its_owners_alone_and_gone_with_its_run(tmp_path: Path) -> None:
-    """The token in it opens everything."""
+def test_only_the_owner_can_read_the_runs_address_which_is_removed_at_its_end(
+    tmp_path: Path,
+) -> None:
+    """The token in the file permits every command."""
     import os
 
     (tmp_path / "r").mkdir()
@@ -281,7 +283,7 @@ def test_the_door_is_its_owners_alone_and_gone_with_its_run(tmp_path: Path) -> N
         find_door("r", tmp_path)
 
 
-def test_the_door_of_a_killed_coordinator_is_no_door(tmp_path: Path) -> None:
+def test_the_address_of_a_killed_coordinator_is_ignored(tmp_path: Path) -> None:
     """The door of a process that has ended does not count. The next coordinator of this run
     replaces it."""
     (tmp_path / "r").mkdir()
@@ -291,8 +293,9 @@ def test_the_door_of_a_killed_coordinator_is_no_door(tmp_path: Path) -> None:
         find_door(folder=tmp_path)
 
 
-async def test_a_host_that_was_too_busy_is_told_with_the_result(petrobot: Terminal) -> None:
-    """The loop stood still for longer than any set point lives: what failed may be due to that."""
+async def test_the_result_says_that_the_host_was_too_busy(petrobot: Terminal) -> None:
+    """The event loop did not run for longer than any set point is valid, so failures may be due to
+    that."""
     await petrobot.working()
     until = time.monotonic() + 0.2
     while time.monotonic() < until:

@@ -1,5 +1,5 @@
-"""What operators see beside the net: pictures, devices and set points of nodes, and only while an
-operator looks."""
+"""What the page shows beside the net: pictures, devices and set points of nodes, requested only
+while an operator watches."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.cli.conftest import Terminal
 
 
 def verbs(terminal: Terminal) -> list[str]:
-    """What the node has been asked beside its calls, in order."""
+    """Return the requests to the node other than calls, in order."""
     asked: list[str] = []
     place: Any = terminal.robot.node.places["arm"]
     carry_out = place.command
@@ -24,9 +24,9 @@ def verbs(terminal: Terminal) -> list[str]:
     return asked
 
 
-async def test_pictures_and_states_come_while_somebody_looks(petrobot: Terminal) -> None:
-    """The newest picture as text that a page can show, joints and values of the device, the age of
-    its set points."""
+async def test_pictures_and_states_come_while_an_operator_watches(petrobot: Terminal) -> None:
+    """The page gets the newest picture as text, joints and values of the device, and the age of its
+    set points."""
     petrobot.arm.sees, petrobot.arm.setpoint_age = b"not really a picture", 0.012
     feed = petrobot.operation.feed
     changes: list[dict[str, Any]] = []
@@ -48,8 +48,8 @@ async def test_pictures_and_states_come_while_somebody_looks(petrobot: Terminal)
     assert age == 0.012 and time > 0.0
 
 
-async def test_nobody_looks_nothing_is_asked(petrobot: Terminal) -> None:
-    """Without operators a node gets no question; it gets some again as soon as one looks."""
+async def test_without_an_operator_nothing_is_requested(petrobot: Terminal) -> None:
+    """Without operators a node gets no request; it gets requests again as soon as one watches."""
     asked = verbs(petrobot)
     feed = petrobot.operation.feed
     polled: list[dict[str, Any]] = []
@@ -61,9 +61,9 @@ async def test_nobody_looks_nothing_is_asked(petrobot: Terminal) -> None:
     stop()
 
 
-async def test_old_set_points_are_none(petrobot: Terminal) -> None:
-    """A stream without a sender does not show a set point that grows older for ever. A device that
-    sees nothing shows nothing."""
+async def test_old_set_points_are_not_shown(petrobot: Terminal) -> None:
+    """A stream without a sender does not show an old set point for ever. A device without a picture
+    shows none."""
     petrobot.arm.setpoint_age = 3.0
     stop = petrobot.operation.subscribe(lambda change: None)
     feed = petrobot.operation.feed

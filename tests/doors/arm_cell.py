@@ -1,5 +1,5 @@
 """The arm's part of the catching cell for tests of the emergency stop: simulated drives on a bus,
-the motion node, and an ear."""
+the motion node, and a bus listener."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.ports import free_ports
 ROOT = Path(__file__).parents[2]
 DRIVES = range(1, 7)
 SLOW = 0.05
-"""Share of the arm's speed: a move that takes some ten seconds."""
+"""Share of the arm's speed, for a move of about ten seconds."""
 
 SERVICES = """\
 schema = 1
@@ -118,7 +118,7 @@ out = ["out_of_order"]
 
 
 def cell_in(folder: Path, speed: float = SLOW) -> Directory:
-    """The location file on free ports, and the task `sweeping.toml` beside it."""
+    """Write the location file with free ports, and the task `sweeping.toml` beside it."""
     laboratory, motion, bus = free_ports(3)
     path = folder / "services.toml"
     text = SERVICES.format(
@@ -134,8 +134,8 @@ def cell_in(folder: Path, speed: float = SLOW) -> Directory:
 
 
 class Ear:
-    """Listens on the bus in a thread of its own: what the master orders, what the drives say, and
-    when (monotonic s)."""
+    """Listens on the bus in its own thread, and records commands of the master, states of the
+    drives, and their times (monotonic s)."""
 
     def __init__(self, directory: Directory) -> None:
         self._line = connect(directory.devices["arm"].config["channel"])
@@ -150,7 +150,7 @@ class Ear:
         self.positions: dict[int, int] = {}
         """Joint angles (micro-radians)."""
         self.energised = 0
-        """How often a drive has said since `forget` that it has power."""
+        """How often a drive has reported since `forget` that it has power."""
         self._origin: dict[int, int] = {}
         self.quick_stop_at: float | None = None
         """When a quick stop was first on the bus since `forget`."""
@@ -158,13 +158,13 @@ class Ear:
         self._thread.start()
 
     def forget(self) -> None:
-        """Await the next quick stop, and motion from here."""
+        """Forget past quick stops, and measure motion from the present position."""
         with self._changed:
             self.quick_stop_at, self.energised = None, 0
             self._origin = dict(self.positions)
 
     def until(self, holds: Callable[[Ear], bool], timeout: float = 60.0) -> None:
-        """Wait until what has been heard fits. Raises TimeoutError."""
+        """Wait until the recorded data fulfil a condition. Raises TimeoutError."""
         with self._changed:
             if not self._changed.wait_for(lambda: holds(self), timeout):
                 raise TimeoutError(
@@ -172,7 +172,7 @@ class Ear:
                 )
 
     def moving(self) -> bool:
-        """Whether the drives are enabled and have moved by 0.02 rad since `forget`."""
+        """Return whether the drives are enabled and have moved by 0.02 rad since `forget`."""
         far = [
             abs(self.positions[n] - self._origin.get(n, self.positions[n])) > 20_000
             for n in self.positions
@@ -180,7 +180,7 @@ class Ear:
         return self.all_in(DriveState.OPERATION_ENABLED) and any(far)
 
     def all_in(self, state: DriveState) -> bool:
-        """Whether all drives are in this state."""
+        """Return whether all drives are in this state."""
         return [self.states.get(n) for n in DRIVES] == [state] * len(DRIVES)
 
     def close(self) -> None:
@@ -226,7 +226,7 @@ class Ear:
 
 @contextmanager
 def ear_on(directory: Directory) -> Iterator[Ear]:
-    """An ear on the cell's bus."""
+    """Return a listener on the cell's bus."""
     ear = Ear(directory)
     try:
         yield ear

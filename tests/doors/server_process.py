@@ -1,5 +1,5 @@
-"""A server of the node protocol as a process of its own, so that its memory can be measured:
-`python server_process.py JSON`.
+"""A server of the node protocol in a separate process, so that its memory can be measured: `python
+server_process.py JSON`.
 
 Prints its port; each line on standard input is answered by one line of JSON about it.
 """
@@ -23,17 +23,17 @@ from petrobot.services.comm.tls.credentials import Credentials
 
 
 def echo(now: float, call: Call) -> Outcome:
-    """What is offered: its arguments come back."""
+    """Return the arguments (the offered action)."""
     return Outcome(call.id, "success", call.arguments)
 
 
 def big(now: float, call: Call) -> Outcome:
-    """A result of as many bytes as asked for."""
+    """Return a result of this many bytes."""
     return Outcome(call.id, "success", {"b": bytes(call.arguments["bytes"])})
 
 
 def build(settings: dict[str, Any]) -> Server:
-    """The server that the settings describe."""
+    """Return the server that the settings describe."""
     offers = {
         "echo": Offer(inline=echo),
         "big": Offer(inline=big),
@@ -50,8 +50,8 @@ def build(settings: dict[str, Any]) -> Server:
 
 
 def about(server: Server, deep: bool) -> dict[str, Any]:
-    """What a test asks for; `deep` looks for links that nobody holds on to but the garbage
-    collector."""
+    """Return the numbers that a test asks for; `deep` also counts links that only wait for the
+    garbage collector."""
     gc.collect() if deep else None
     links = [one for one in gc.get_objects() if type(one).__name__ == "_ServerLink"] if deep else []
     fds = len(list(Path("/proc/self/fd").iterdir()))

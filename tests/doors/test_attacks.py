@@ -1,5 +1,5 @@
-"""Attacks on a node's door over real sockets: refused in clear words or cut off, memory bounded, a
-good client served."""
+"""Attacks on a node's server over real sockets: they are refused with a clear message or cut off,
+memory stays bounded, and an honest client is still served."""
 
 from __future__ import annotations
 
@@ -32,36 +32,35 @@ Start = Callable[..., Victim]
 AUTH = b"\x20vision" + bytes(32)
 STRANGE = m.Hello(2, 2, "client", "mallory", "m1")
 TOLERATED = 24 * MIB
-"""By how much the victim's resident set may grow while it is attacked."""
+"""Most growth of the server's resident set under attack (bytes)."""
 
 
-# --- handshakes and frames that are no good ---------------------------------------------------
+# --- bad handshakes and frames ----------------------------------------------------------------
 
 
 async def wrong_key(stranger: Stranger) -> None:
-    """A guessed key."""
+    """Use a guessed key."""
     with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError, ProtocolError):
         await stranger.open(bytes(32), STRANGE)
 
 
 async def no_key(stranger: Stranger) -> None:
-    """No key at all."""
+    """Use no key."""
     await stranger.say(frame(STRANGE))
 
 
 async def older_version(stranger: Stranger) -> None:
-    """A version with fewer checks, if there ever was one."""
+    """Offer an older version, which might have fewer checks."""
     await stranger.say(frame(m.Hello(0, 0, "client", "mallory", "m1", auth=AUTH)))
 
 
 async def newer_version(stranger: Stranger) -> None:
-    """A version that is not spoken here."""
+    """Offer a version that the server does not know."""
     await stranger.say(frame(m.Hello(7, 9, "client", "mallory", "m1", auth=AUTH)))
 
 
 async def downgraded_version(stranger: Stranger) -> None:
-    """Somebody between the two changes the versions of an honest HELLO: the proof is of another
-    transcript."""
+    """Change the versions of an honest HELLO in transit: its proof is of another transcript."""
     honest = Connection(Side.CLIENT, "vision", key=KEY, nonce=bytes(32))
     hello = honest.send(m.Hello(1, 4, "client", "ana", "a1"))
     await stranger.say(hello.replace(struct.pack("BB", 1, 4), struct.pack("BB", 1, 2), 1))
@@ -71,33 +70,33 @@ async def downgraded_version(stranger: Stranger) -> None:
 
 
 async def old_epoch(stranger: Stranger) -> None:
-    """A coordinator of a time before, with the right key."""
+    """Connect as an earlier coordinator (an older epoch) with the right key."""
     with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError, ProtocolError):
         await stranger.open(KEY, m.Hello(2, 2, "coordinator", "coord", "c0", 2))
 
 
 async def taken_name(stranger: Stranger) -> None:
-    """Another process under the good client's name and epoch."""
+    """Connect as another process with the honest client's name and epoch."""
     with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError, ProtocolError):
         await stranger.open(KEY, m.Hello(2, 2, "coordinator", "coord", "c9", 3))
 
 
 async def repeated_frame(stranger: Stranger) -> None:
-    """The same sealed CALL twice."""
+    """Send the same sealed CALL twice."""
     connection = await stranger.open(KEY, STRANGE)
     sealed = connection.send(m.Call("m/1", "echo"))
     await stranger.say(sealed + sealed)
 
 
 async def left_out_frame(stranger: Stranger) -> None:
-    """A sealed CALL kept back, the next one passed on."""
+    """Drop a sealed CALL, and forward the next one."""
     connection = await stranger.open(KEY, STRANGE)
     connection.send(m.Call("m/1", "echo"))
     await stranger.say(connection.send(m.Call("m/2", "echo")))
 
 
 async def changed_frame(stranger: Stranger) -> None:
-    """One bit of a sealed CALL changed on its way."""
+    """Change one bit of a sealed CALL in transit."""
     connection = await stranger.open(KEY, STRANGE)
     sealed = bytearray(connection.send(m.Call("m/1", "echo", {"speed": 0.1})))
     sealed[-20] ^= 1
@@ -105,40 +104,40 @@ async def changed_frame(stranger: Stranger) -> None:
 
 
 async def unsealed_frame(stranger: Stranger) -> None:
-    """A CALL without a seal on a connection that has one."""
+    """Send a CALL without a seal on a sealed connection."""
     await stranger.open(KEY, STRANGE)
     await stranger.say(frame(m.Call("m/1", "echo", {"much": "x" * 60})))
 
 
 async def oversized_hello(stranger: Stranger) -> None:
-    """A length of 4 GiB, refused from its first six bytes."""
+    """Announce a length of 4 GiB; it is refused after its first six bytes."""
     await stranger.say(b"\xff\xff\xff\xff" + frame(STRANGE)[4:])
 
 
 async def oversized_call(stranger: Stranger) -> None:
-    """17 MiB announced on an open connection."""
+    """Announce 17 MiB on an open connection."""
     await stranger.open(KEY, STRANGE)
     await stranger.say(head(17 * MIB) + frame(m.Call("m/1", "echo"))[4:])
 
 
 async def out_of_turn(stranger: Stranger) -> None:
-    """A CALL before HELLO."""
+    """Send a CALL before HELLO."""
     await stranger.say(frame(m.Call("m/1", "echo")))
 
 
 async def sealed(stranger: Stranger, body: bytes) -> None:
-    """Any body, sealed as it should be."""
+    """Return a frame with any body, correctly sealed."""
     connection = await stranger.open(KEY, STRANGE)
     await stranger.say(connection._frame(body))
 
 
 async def deep_message(stranger: Stranger) -> None:
-    """Arguments nested 5,000 deep."""
+    """Send arguments nested 5,000 deep."""
     await sealed(stranger, b"\x94\x04\xa3m/1\xa4echo" + b"\x81\xa1a" * 5_000 + b"\xc0")
 
 
 async def many_containers(stranger: Stranger) -> None:
-    """A million empty arrays: 1 MB on the wire, 70 in memory if they were all made."""
+    """Send a million empty arrays: 1 MB as bytes, 70 MB as Python objects."""
     await sealed(
         stranger,
         b"\x94\x04\xa3m/1\xa4echo\x81\xa1a"
@@ -149,7 +148,7 @@ async def many_containers(stranger: Stranger) -> None:
 
 
 async def strange_extension(stranger: Stranger) -> None:
-    """A type that msgpack lets everybody define."""
+    """Send one of msgpack's extension types."""
     await sealed(stranger, msgpack.packb([4, "m/1", "echo", {"x": msgpack.ExtType(5, b"0" * 100)}]))
 
 
@@ -174,9 +173,9 @@ ATTACKS: list[tuple[Callable[[Stranger], Awaitable[None]], str]] = [
 ]
 
 
-async def test_every_attack_is_refused_in_clear_words(victim: Start) -> None:
-    """One after the other against one server: the code is the right one, its memory stays, the good
-    client notices nothing."""
+async def test_every_attack_is_refused_with_its_code(victim: Start) -> None:
+    """One after the other against one server: the code is right, its memory does not grow, and the
+    honest client is not affected."""
     server = victim(key=KEY.hex())
     async with server.good_client() as good:
         codes: dict[str, str] = {}
@@ -191,9 +190,9 @@ async def test_every_attack_is_refused_in_clear_words(victim: Start) -> None:
     assert server.grown() < TOLERATED
 
 
-async def test_a_recorded_session_opens_nothing(victim: Start) -> None:
-    """All that a good client said, replayed to the same server and to another boot of it: its
-    challenge is another one."""
+async def test_a_replayed_session_is_refused(victim: Start) -> None:
+    """Everything that an honest client sent is replayed to the same server, and to another boot of
+    it: the challenge differs."""
     for server in (victim(key=KEY.hex()), victim(key=KEY.hex())):
         session = await Stranger.at(server)
         connection = await session.open(KEY, STRANGE)
@@ -206,9 +205,9 @@ async def test_a_recorded_session_opens_nothing(victim: Start) -> None:
         replay.close()
 
 
-async def test_what_a_server_said_is_no_proof_of_its_key(victim: Start) -> None:
-    """A stranger who plays a recorded server to a client: the client hears another nonce's proof,
-    and trusts nothing."""
+async def test_a_replayed_server_is_not_trusted(victim: Start) -> None:
+    """A stranger replays a recorded server to a client: the proof is of another nonce, so the
+    client does not trust it."""
     server = victim(key=KEY.hex())
     session = await Stranger.at(server)
     await session.open(KEY, STRANGE)
@@ -246,8 +245,8 @@ async def test_what_a_server_said_is_no_proof_of_its_key(victim: Start) -> None:
 
 @pytest.mark.parametrize("keyed", [False, True], ids=["plain", "sealed"])
 async def test_slow_loris(victim: Start, keyed: bool) -> None:
-    """Two hundred connections that drip a HELLO byte by byte: none lasts, none keeps the good
-    client out."""
+    """Two hundred connections send a HELLO slowly, byte by byte: all are closed, and the honest
+    client is served."""
     server = victim(timing={"handshake": 0.5}, **({"key": KEY.hex()} if keyed else {}))
     hello = frame(m.Hello(2, 2, "client", "mallory", "m1", auth=AUTH if keyed else b""))
 
@@ -275,7 +274,7 @@ async def test_slow_loris(victim: Start, keyed: bool) -> None:
 
 
 def server_second(server: Victim) -> Any:
-    """Another good client, who comes while the attack goes on."""
+    """Connect another honest client during the attack."""
     return _second(server)
 
 
@@ -290,8 +289,8 @@ async def _second(server: Victim) -> Any:
 
 
 BOUNDED_FILES = 64 + 2 * 128 + 2 * 64 + 40
-"""Strangers that are waited for, those that one turn of the loop takes from the socket's queue and
-those that it closes, and what a process has open anyway."""
+"""File descriptors: connections being opened, those that one pass of the event loop accepts, those
+that it closes, and what a process always has open."""
 CROWD = """
 import json, resource, select, socket, sys
 host, port, count = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
@@ -312,7 +311,7 @@ sys.stdin.readline()
 
 @contextlib.asynccontextmanager
 async def crowd_at(server: Victim, count: int) -> Any:
-    """A process that opens so many connections and keeps them."""
+    """Start a process that opens so many connections and keeps them."""
     command = [sys.executable, "-c", textwrap.dedent(CROWD), *map(str, (*server.address, count))]
     crowd = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
@@ -326,8 +325,8 @@ async def crowd_at(server: Victim, count: int) -> Any:
 async def test_ten_thousand_connections(
     victim: Start, door: str, certificates: Path, many_files: None
 ) -> None:
-    """Connections, descriptors and memory stay bounded; who was there is served all the time, and a
-    newcomer gets in."""
+    """Connections, descriptors and memory stay bounded; connected clients are served all the time,
+    and a new one can connect."""
     how: dict[str, Any] = {
         "plain": {},
         "sealed": {"key": KEY.hex()},
@@ -349,8 +348,8 @@ async def test_ten_thousand_connections(
     assert server.grown() < (TOLERATED if door != "TLS" else 64 * MIB)
 
 
-async def test_who_fails_too_often_is_not_listened_to(victim: Start) -> None:
-    """Guessing keys from one address: after some failures it is cut before it says a word; other
+async def test_an_address_that_fails_too_often_is_cut_off(victim: Start) -> None:
+    """An address that guesses keys is, after some failures, cut before it sends anything; other
     addresses are served."""
     limits = {"handshakes": 0.001, "handshakes_at_once": 10, "spare_loopback": False}
     server = victim(key=KEY.hex(), limits=limits)
@@ -368,9 +367,9 @@ async def test_who_fails_too_often_is_not_listened_to(victim: Start) -> None:
             await second.still_served()
 
 
-async def test_a_flood_of_messages_is_held_back(victim: Start) -> None:
-    """A caller who sends far more than it may is sent away, one who sends a bit more is kept
-    waiting; the others go on."""
+async def test_a_flood_of_messages_is_limited(victim: Start) -> None:
+    """A caller that sends far more than allowed is disconnected, one that sends a little more is
+    delayed; others are not affected."""
     server = victim(limits={"messages": 500.0, "messages_at_once": 1_000})
     usual = victim(limits={"messages": 60_000.0, "messages_at_once": 1_000})
     for one, stays in ((server, False), (usual, True)):
@@ -385,13 +384,13 @@ async def test_a_flood_of_messages_is_held_back(victim: Start) -> None:
             await asyncio.gather(sending, return_exceptions=True)
             assert about["faults"].get("too_fast", 0) > 0
             assert ("mallory" in about["connected"]) is stays
-            flood.writer.transport.abort()  # not closed: what was not sent yet would be waited for
+            flood.writer.transport.abort()  # not closed: closing would wait for unsent data
             await good.still_served()
         assert one.grown() < TOLERATED
 
 
 async def _flood(stranger: Stranger, burst: bytes) -> None:
-    """Send until the connection ends: a caller that falls silent is lost for another reason."""
+    """Send until the connection ends: a silent caller would be lost for another reason."""
 
     async def swallow() -> None:
         while _swallowed := await stranger.reader.read(1 << 16):
@@ -408,9 +407,9 @@ async def _flood(stranger: Stranger, burst: bytes) -> None:
         await asyncio.gather(swallowing, return_exceptions=True)
 
 
-async def test_results_that_nobody_fetches_do_not_fill_the_memory(victim: Start) -> None:
-    """A caller who acknowledges nothing: what is kept for it is bounded by bytes, not by number
-    alone."""
+async def test_unacknowledged_results_do_not_fill_the_memory(victim: Start) -> None:
+    """A caller acknowledges nothing: the results kept for it are limited in bytes, not only in
+    number."""
     server = victim(keeping={"result_bytes": 8 * MIB})
     async with server.good_client() as good:
         stranger = await Stranger.at(server)
@@ -438,7 +437,7 @@ async def test_results_that_nobody_fetches_do_not_fill_the_memory(victim: Start)
 
 
 def random_bytes(chance: random.Random) -> bytes:
-    """A connection's worth of bytes: noise, or a good beginning with some of it changed."""
+    """Return the bytes of one connection: noise, or a valid beginning with some bytes changed."""
     good = bytearray(
         frame(STRANGE) + frame(m.Call("m/1", "echo", {"x": [1, 2, {"y": "z"}]})) + frame(m.Ping(1))
     )
@@ -464,7 +463,7 @@ async def _bombard(server: Victim, over: Callable[[int], bool], seed: int) -> in
 
 @pytest.mark.parametrize("keyed", [False, True], ids=["plain", "sealed"])
 async def test_random_bytes(victim: Start, keyed: bool) -> None:
-    """A few hundred connections full of them."""
+    """A few hundred connections send random bytes."""
     server = victim(**({"key": KEY.hex()} if keyed else {}))
     async with server.good_client() as good:
         await asyncio.gather(*(_bombard(server, lambda n: n >= 100, seed) for seed in range(4)))
@@ -489,8 +488,8 @@ async def test_random_bytes_for_minutes(victim: Start, keyed: bool) -> None:
 
 
 def feed(data: bytes) -> None:
-    """Both ends of the protocol, in every state that a stranger can reach, given these bytes;
-    nothing but ProtocolError."""
+    """Feed these bytes to both ends of the protocol, in every state that a stranger can reach; only
+    ProtocolError is allowed."""
     for key in (None, KEY):
         for side in Side:
             connection = Connection(side, "vision", key=key, nonce=bytes(32) if key else b"")
@@ -508,13 +507,13 @@ def feed(data: bytes) -> None:
 def test_arbitrary_bytes_raise_nothing_but_protocol_error(
     data: bytes, kept: int, which: int
 ) -> None:
-    """Alone, and after a good beginning."""
+    """As the first bytes, and after a valid beginning."""
     feed(data)
     feed(beginnings()[which][:kept] + data)
 
 
 def beginnings() -> list[bytes]:
-    """Good conversations to begin from: HELLO, then one message of each kind that a client may
+    """Return valid sessions to begin with: HELLO, then one message of each kind that a client may
     send."""
     said: list[m.Message] = [
         m.Call("m/1", "echo", {"x": [1, 2.5, {"y": b"z"}]}, 2.0),
@@ -555,7 +554,7 @@ atheris.Fuzz()
 
 @pytest.mark.proof
 def test_coverage_guided_bytes_for_minutes(tmp_path: Path) -> None:
-    """Three minutes of atheris, where it is installed: it looks for bytes that reach new code."""
+    """Three minutes of atheris, if it is installed: it searches for bytes that reach new code."""
     pytest.importorskip("atheris")
     script = FUZZ.format(
         root=str(Path(__file__).resolve().parents[2]), corpus=str(tmp_path), seconds=180

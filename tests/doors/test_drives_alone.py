@@ -1,5 +1,5 @@
-"""The drives are left alone: everything of the motion node is killed in mid-move, and they stop by
-themselves."""
+"""Drives without a master: all processes of the motion node are killed during a move, and the
+drives stop by themselves."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ STATUSWORD, ERROR_CODE, POSITION = 0x6041, 0x603F, 0x6064
 
 
 class Bench:
-    """An engineer's laptop on the bus: the canopen package reads the drives by SDO, with no master
-    left to send SYNC."""
+    """A second device on the bus: the canopen package reads the drives by SDO, while no master
+    sends SYNC."""
 
     def __init__(self, channel: str) -> None:
         import canopen
@@ -35,7 +35,7 @@ class Bench:
         self._drives = {n: self._network.add_node(n, DRIVE_EDS) for n in DRIVES}
 
     def read(self, index: int) -> list[int]:
-        """An object of every drive."""
+        """Read an object of every drive."""
         return [int(self._drives[n].sdo[index].raw) for n in DRIVES]
 
     def close(self) -> None:
@@ -44,10 +44,10 @@ class Bench:
 
 
 def left_alone(channel: str) -> tuple[list[DriveState], list[int], list[int], list[int]]:
-    """States and error codes once every drive has faulted, and positions at two times a quarter of
-    a second apart."""
+    """Return states and error codes once every drive is in FAULT, and the positions at two times,
+    0.25 s apart."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the canopen package's own
+        warnings.simplefilter("ignore")  # a message of the canopen package
         bench = Bench(channel)
         pause = threading.Event()
         try:
@@ -65,8 +65,8 @@ def left_alone(channel: str) -> tuple[list[DriveState], list[int], list[int], li
 
 
 async def test_drives_stop_by_themselves_when_their_master_is_killed(tmp_path: Path) -> None:
-    """kill -9 of the node, its servo process and its worker in mid-move: heartbeat lost, quick
-    stop, brake; nothing moves."""
+    """kill -9 of the node, its servo process and its worker during a move: the drives lose the
+    heartbeat, do a quick stop and brake; nothing moves."""
     directory = cell_in(tmp_path)
     async with Supervisor(
         local_programs(directory), tmp_path / "logs", respawn=False

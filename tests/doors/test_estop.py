@@ -1,5 +1,5 @@
-"""The emergency stop on real processes: coordinator or node stopped in mid-move, and still the
-drives stop, seen on their bus."""
+"""The emergency stop with real processes: coordinator or node is frozen during a move, and the
+drives still stop, as the bus shows."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from tests.waiting import Limit, beat
 pytestmark = pytest.mark.processes
 LIMIT = 60.0
 RAMP = 1.0
-"""Seconds in which a drive's quick stop and its brake are over."""
+"""Seconds after which a drive's quick stop and braking have ended."""
 
 
 def petrobot(*arguments: str, **variables: str) -> subprocess.Popen[str]:
-    """A command in a process of its own, with these environment variables."""
+    """Start a command in a separate process, with these environment variables."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
     return subprocess.Popen(
         [sys.executable, "-m", "petrobot.coordinator", *arguments],
@@ -47,13 +47,13 @@ def petrobot(*arguments: str, **variables: str) -> subprocess.Popen[str]:
 
 
 async def finished(process: subprocess.Popen[str]) -> tuple[int, str, str]:
-    """Its exit code and what it printed."""
+    """Return its exit code and output."""
     out, err = await asyncio.to_thread(process.communicate, None, LIMIT)
     return process.returncode, out, err
 
 
 class Cell:
-    """The launched nodes, an ear on the bus, and a coordinator that moves the arm."""
+    """The launched nodes, a listener on the bus, and a coordinator that moves the arm."""
 
     def __init__(
         self, folder: Path, directory: Directory, supervisor: Supervisor, ear: Ear
@@ -66,37 +66,37 @@ class Cell:
         self.coordinator: subprocess.Popen[str] | None = None
 
     async def heard(self, holds: Callable[[Ear], bool]) -> None:
-        """Wait until what is heard on the bus fits."""
+        """Wait until the data on the bus fulfil a condition."""
         await asyncio.to_thread(self.ear.until, holds, LIMIT)
 
     async def sweep(self) -> None:
-        """Let a coordinator move the arm, until it really moves."""
+        """Let a coordinator move the arm, and wait until it moves."""
         await self.heard(lambda ear: len(ear.positions) == len(DRIVES))
         self.ear.forget()
         self.coordinator = self.task()
         await self.heard(Ear.moving)
 
     def task(self, **variables: str) -> subprocess.Popen[str]:
-        """A coordinator that would move the arm."""
+        """Start a coordinator that would move the arm."""
         services = ["--services", str(self.directory.source), "--journal", str(self.runs)]
         task = str(self.folder / "sweeping.toml")
         return petrobot("run", task, "--runs", "3", *services, "--no-page", "--quiet", **variables)
 
     async def until(self, holds: Callable[[], bool]) -> None:
-        """Wait until something holds."""
+        """Wait until a condition holds."""
         async with asyncio.timeout(LIMIT):
             while not holds():
                 await beat()
 
     async def estop(self, *options: str) -> tuple[int, Any]:
-        """`petrobot estop`; its exit code and answers."""
+        """Run `petrobot estop`; return its exit code and answers."""
         services = ["--services", str(self.directory.source), "--journal", str(self.runs)]
         code, out, err = await finished(petrobot("estop", *services, "--json", "-", *options))
         assert out, err
         return code, json.loads(out)
 
     async def standing(self) -> None:
-        """Wait until the joints are where they were a ramp ago: whatever moved them is over."""
+        """Wait until the joints have not moved during the time of a braking ramp."""
         limit = Limit("joints that stand")
         while True:
             limit.left()
@@ -107,7 +107,8 @@ class Cell:
 
 
 def without_power(ear: Ear) -> bool:
-    """Whether no drive has power: a drive whose master dies is in FAULT until it is reset."""
+    """Return whether no drive has power: a drive whose master dies is in FAULT until it is
+    reset."""
     return all(
         ear.states.get(n) in (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT) for n in DRIVES
     )
@@ -115,7 +116,7 @@ def without_power(ear: Ear) -> bool:
 
 @asynccontextmanager
 async def cell_of(folder: Path, *, respawn: bool = False) -> AsyncIterator[Cell]:
-    """Laboratory and motion node as processes."""
+    """Start laboratory and motion node as processes."""
     directory = cell_in(folder)
     async with Supervisor(
         local_programs(directory), folder / "logs", respawn=respawn
@@ -133,8 +134,9 @@ async def cell_of(folder: Path, *, respawn: bool = False) -> AsyncIterator[Cell]
 
 
 async def test_estop_stops_the_drives_though_the_coordinator_is_frozen(tmp_path: Path) -> None:
-    """SIGSTOP in mid-move: quick stop on the bus, drives brake, and nothing moves them before it is
-    cleared. With `--bus` the bus itself is stopped without waiting for the node, and comes back."""
+    """SIGSTOP during a move: there is a quick stop on the bus, the drives brake, and nothing moves
+    them before the stop is cleared. With `--bus` the bus itself is stopped without waiting for the
+    node, and works again afterwards."""
     async with cell_of(tmp_path) as cell:
         await cell.sweep()
         assert cell.coordinator is not None
@@ -154,9 +156,7 @@ async def test_estop_stops_the_drives_though_the_coordinator_is_frozen(tmp_path:
         assert cell.ear.all_in(DriveState.SWITCH_ON_DISABLED), (
             "clearing alone moves and enables nothing"
         )
-        await (
-            cell.sweep()
-        )  # by way of the task's error branch: drives are reset by an action, not by themselves
+        await cell.sweep()  # through the task's error branch: an action resets the drives
         code, told = await cell.estop("--bus")
         (node,) = told["nodes"]
         assert code == 0 and node["bus"].endswith("all devices stopped by NMT") and node["devices"]
@@ -166,12 +166,12 @@ async def test_estop_stops_the_drives_though_the_coordinator_is_frozen(tmp_path:
         assert told["coordinator"].endswith(("aborted", "has ended"))
         assert (await finished(cell.coordinator))[0] == 1
         assert (await cell.estop("--clear"))[0] == 0
-        await cell.sweep()  # bus and drives are configured anew
+        await cell.sweep()  # bus and drives are configured again
 
 
 async def test_estop_reaches_the_bus_though_the_node_is_frozen(tmp_path: Path) -> None:
-    """The node does not answer: all devices of its bus are stopped by NMT, and its absence is
-    said."""
+    """The node does not answer: all devices of its bus are stopped by NMT, and the missing node is
+    reported."""
     async with cell_of(tmp_path) as cell:
         await cell.sweep()
         os.kill(cell.supervisor.process_ids()["motion"], signal.SIGSTOP)
@@ -187,9 +187,9 @@ async def test_estop_reaches_the_bus_though_the_node_is_frozen(tmp_path: Path) -
 @pytest.mark.parametrize(
     "answers", [True, False], ids=["told itself", "frozen when it was to be told"]
 )
-async def test_a_stop_outlives_its_node(tmp_path: Path, answers: bool) -> None:
-    """The node is killed (kill -9) and started again: the drives stay without power, whatever a
-    task tries, until it is cleared."""
+async def test_a_stop_remains_after_its_node_is_killed(tmp_path: Path, answers: bool) -> None:
+    """The node is killed (kill -9) and restarted: the drives stay without power, whatever a task
+    tries, until the stop is cleared."""
     async with cell_of(tmp_path, respawn=True) as cell:
         await cell.sweep()
         assert cell.coordinator is not None
@@ -219,7 +219,7 @@ async def test_a_stop_outlives_its_node(tmp_path: Path, answers: bool) -> None:
 
 
 async def test_estop_without_nodes_says_so(tmp_path: Path) -> None:
-    """Nobody is there: exit code 3, and the one who asked knows that nothing was stopped."""
+    """No node runs: exit code 3, and the message says that nothing was stopped."""
     directory = cell_in(tmp_path)
     services = ["--services", str(directory.source), "--journal", str(tmp_path)]
     code, out, _ = await finished(petrobot("estop", *services))
@@ -229,8 +229,8 @@ async def test_estop_without_nodes_says_so(tmp_path: Path) -> None:
 
 
 async def test_a_stop_is_cleared_while_its_node_does_not_run(tmp_path: Path) -> None:
-    """Where the nodes end with the run, nobody could clear it otherwise: exit code 0, and the file
-    is gone."""
+    """If the nodes end with the run, the stop could not be cleared otherwise: exit code 0, and the
+    file is removed."""
     directory = cell_in(tmp_path)
     services = ["--services", str(directory.source), "--journal", str(tmp_path)]
     code, out, _ = await finished(petrobot("estop", *services))

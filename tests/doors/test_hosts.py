@@ -1,4 +1,4 @@
-"""Doors between hosts: no listening beyond loopback without a key, local services stay local, no
+"""Security between hosts: no listening beyond loopback without a key, local services stay local, no
 output shows a secret."""
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SHARED = '\n[keys]\nfile = "cell.key"\n'
 
 
 def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """A module of ours as a process."""
+    """Start a module of petrobot as a process."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", *arguments]
     return subprocess.run(
@@ -47,7 +47,7 @@ def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess
 def test_a_node_does_not_listen_beyond_this_host_without_a_key(
     tmp_path: Path, program: str
 ) -> None:
-    """Exit code 2 and one line that says what to do; with a key the same address is taken."""
+    """Exit code 2 and one line with the remedy; with a key the same address is accepted."""
     directory = cell_in(tmp_path)
     node = "motion" if program == "services" else "laboratory"
     port = directory.nodes[node].port
@@ -94,14 +94,14 @@ asyncio.run(main())
 
 
 def ip(*arguments: str) -> None:
-    """One command of ip(8)."""
+    """Run a command of ip(8)."""
     subprocess.run(["ip", *arguments], capture_output=True, check=True)
 
 
 @pytest.fixture
 def other_host() -> Iterator[tuple[str, str]]:
-    """A network namespace with a cable to this one: its name, and this host's address on the
-    cable."""
+    """Make a network namespace that is connected to this one; yield its name, and this host's
+    address in it."""
     number = os.getpid() % 200 + 20
     name, here, there = f"pb{os.getpid()}", f"pbh{os.getpid() % 99999}", f"pbn{os.getpid() % 99999}"
     address = f"10.213.{number}.1"
@@ -123,7 +123,7 @@ def other_host() -> Iterator[tuple[str, str]]:
 def test_a_local_service_is_out_of_reach_for_another_host(
     victim: Start, other_host: tuple[str, str]
 ) -> None:
-    """With the right key, over a real cable: it is neither shown nor called; the rest is served."""
+    """Even with the right key it is neither listed nor called; everything else is served."""
     namespace, address = other_host
     server = victim(key=KEY.hex(), host=address)
     command = [
@@ -152,7 +152,7 @@ def test_a_local_service_is_out_of_reach_for_another_host(
 
 
 async def test_on_its_own_host_it_is_in_reach(victim: Start) -> None:
-    """The same service for a neighbour."""
+    """The same service for a caller on the same host."""
     server = victim()
     client = server.client()
     client.start()
@@ -165,7 +165,7 @@ async def test_on_its_own_host_it_is_in_reach(victim: Start) -> None:
 
 
 class Guarded:
-    """The arm's cell with a key or certificates, and everything that it has printed and written."""
+    """The arm's cell with a key or certificates, and all its output and files."""
 
     def __init__(self, folder: Path, how: str) -> None:
         directory = cell_in(folder, speed=1.0)
@@ -180,7 +180,7 @@ class Guarded:
         self.said: list[str] = []
 
     def secrets(self) -> dict[str, str]:
-        """What must appear nowhere, by the file that it stands in."""
+        """Return the secrets that must appear nowhere else, by the file that contains them."""
         found: dict[str, str] = {}
         for path in [*self.folder.glob("cell.key"), *self.folder.glob("keys/*.key")]:
             lines = [line for line in path.read_text().splitlines() if not line.startswith("-----")]
@@ -192,7 +192,7 @@ class Guarded:
         return found
 
     def petrobot(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """A command; what it printed is kept."""
+        """Run a command and keep its output."""
         services = (
             ["--services", str(self.directory.source)]
             if arguments[0] in ("run", "nodes", "estop")
@@ -203,7 +203,7 @@ class Guarded:
         return done
 
     def with_strange_keys(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """The same command by somebody who has made keys of his own."""
+        """Run the same command with other keys."""
         own = [*self.folder.glob("cell.key"), *self.folder.glob("keys/c*.*")]
         kept = {path: path.read_bytes() for path in own}
         for path in own:
@@ -219,8 +219,8 @@ class Guarded:
                 path.write_bytes(data)
 
     def leaks(self, more: dict[str, str]) -> list[str]:
-        """Where a secret has come out: as text or as bytes, in what was printed and in every file
-        but its own."""
+        """Return where a secret appears, as text or bytes, in the output and in every other
+        file."""
         outputs = {f"output {n}": said.encode() for n, said in enumerate(self.said)}
         own = {
             path
@@ -246,7 +246,7 @@ class Guarded:
 
 
 def _process_list() -> list[str]:
-    """Command lines and environments of every process that we may look at."""
+    """Return command lines and environments of every process that we may read."""
     found = []
     for path in [*Path("/proc").glob("[0-9]*/cmdline"), *Path("/proc").glob("[0-9]*/environ")]:
         with contextlib.suppress(OSError):
@@ -261,8 +261,8 @@ def _forms(secret: str) -> list[bytes]:
 
 @pytest.mark.parametrize("how", ["shared key", "certificates"])
 async def test_a_guarded_cell_works_and_keeps_its_secrets(tmp_path: Path, how: str) -> None:
-    """Nodes, run, nodes, log, emergency stop: all of it works with keys, and no output, log,
-    journal or report shows one."""
+    """Nodes, run, log and emergency stop work with keys, and no output, log, journal or report
+    shows one."""
     cell = Guarded(tmp_path, how)
     token: dict[str, str] = {}
 
@@ -317,7 +317,7 @@ def test_a_key_that_others_may_read_stops_every_command(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Bad input, in one line that says what to do."""
+    """Bad input, reported in one line with the remedy."""
     cell = Guarded(tmp_path, "shared key")
     (tmp_path / "cell.key").chmod(0o644)
     monkeypatch.chdir(tmp_path)

@@ -1,5 +1,5 @@
-"""The emergency stop's latch: what is kept, what counts when it cannot be read or written, and what
-a node makes of it."""
+"""The latch of the emergency stop: what is stored, what holds if it cannot be read or written, and
+how a node uses it."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ DEVICES = ("arm", "camera", "gripper")
 
 
 def latch(folder: Path) -> Latch:
-    """A latch with two places to lie in."""
+    """A latch with two folders for its file."""
     return Latch("motion", [folder / "first", folder / "second"])
 
 
-def test_what_is_stopped_stays_so_until_it_is_cleared(tmp_path: Path) -> None:
-    """Another process reads the same; stops add up; clearing some leaves the others."""
+def test_stopped_devices_stay_stopped_until_they_are_cleared(tmp_path: Path) -> None:
+    """Another process reads the same; stops are added; clearing some leaves the others."""
     assert latch(tmp_path).stopped() == frozenset()
     assert latch(tmp_path).stop(["arm"]) == tmp_path / "first" / "motion.stopped"
     latch(tmp_path).stop(["camera"])
@@ -30,7 +30,7 @@ def test_what_is_stopped_stays_so_until_it_is_cleared(tmp_path: Path) -> None:
     assert latch(tmp_path).stopped() == frozenset() and not list(tmp_path.rglob("*.stopped*"))
 
 
-def test_all_is_every_device_also_when_one_is_cleared(tmp_path: Path) -> None:
+def test_all_means_every_device_even_after_one_is_cleared(tmp_path: Path) -> None:
     latch(tmp_path).stop([ALL])
     latch(tmp_path).clear(["arm"], DEVICES)
     assert latch(tmp_path).stopped() == {"camera", "gripper"}
@@ -39,8 +39,8 @@ def test_all_is_every_device_also_when_one_is_cleared(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content", [b"", b"\n\n", b"\xff\xfe\x00", None], ids=["empty", "blank", "no text", "a folder"]
 )
-def test_whoever_is_unsure_leaves_everything_stopped(tmp_path: Path, content: bytes | None) -> None:
-    """A file that a power cut or a hand has spoilt is no permission to move."""
+def test_a_damaged_latch_stops_everything(tmp_path: Path, content: bytes | None) -> None:
+    """A file that a power cut or a user has damaged is not a permission to move."""
     path = latch(tmp_path).paths[1]
     path.parent.mkdir()
     if content is None:
@@ -52,15 +52,15 @@ def test_whoever_is_unsure_leaves_everything_stopped(tmp_path: Path, content: by
     assert stops.at_start() == list(DEVICES)
 
 
-def test_where_one_place_cannot_be_written_the_other_is(tmp_path: Path) -> None:
+def test_the_second_folder_is_used_if_the_first_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "first").mkdir()
-    (tmp_path / "first" / "motion.stopped").mkdir()  # nothing can be put in its place
+    (tmp_path / "first" / "motion.stopped").mkdir()  # nothing can replace it
     assert Latch("motion", [tmp_path / "none" / ".." / "second"]).stop(["arm"])
     assert latch(tmp_path).stop(["arm"]) == tmp_path / "second" / "motion.stopped"
 
 
-def test_a_stop_that_cannot_be_kept_is_said_and_holds_all_the_same(tmp_path: Path) -> None:
-    """Until the node's end; a clear that fails clears nothing, in memory or on disk."""
+def test_a_stop_that_cannot_be_stored_is_reported_and_still_holds(tmp_path: Path) -> None:
+    """It holds until the node ends; a clear that fails clears nothing, in memory or on disk."""
     (tmp_path / "file").write_text("")
     nowhere = Latch("motion", [tmp_path / "file" / "folder"])
     with pytest.raises(LatchError, match="Not a directory"):
@@ -76,10 +76,11 @@ def test_a_stop_that_cannot_be_kept_is_said_and_holds_all_the_same(tmp_path: Pat
     )
 
 
-def test_a_node_that_can_keep_no_latch_comes_up_stopped(
+def test_a_node_that_cannot_store_a_latch_starts_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It cannot know whether it was stopped: no file is no proof where none can be."""
+    """It cannot know whether it was stopped: where no file can be written, a missing file proves
+    nothing."""
     monkeypatch.setattr("petrobot.services.host.emergency_latch._writable", lambda folder: False)
     stops = EmergencyStops(DEVICES, latch(tmp_path))
     assert stops.at_start() == list(DEVICES)
@@ -88,8 +89,8 @@ def test_a_node_that_can_keep_no_latch_comes_up_stopped(
     )
 
 
-def test_what_another_has_latched_is_heeded_at_the_next_look(tmp_path: Path) -> None:
-    """Each device is given once to be stopped; a cell in lock step never looks."""
+def test_a_latch_of_another_process_is_seen_at_the_next_check(tmp_path: Path) -> None:
+    """Each device is returned once to be stopped; a lock-step cell never reads the latch."""
     stops = EmergencyStops(DEVICES, latch(tmp_path))
     assert stops.at_start() == [] and stops.due == LOOK
     latch(tmp_path).stop([ALL])
@@ -97,9 +98,9 @@ def test_what_another_has_latched_is_heeded_at_the_next_look(tmp_path: Path) -> 
     assert EmergencyStops(DEVICES).due == NEVER
 
 
-def test_where_it_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside services.toml, then in the user's own folder; where the environment says, there
-    alone."""
+def test_the_folders_of_the_latch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside services.toml, else in the user's folder; only in the folder of the environment
+    variable, if it is set."""
     monkeypatch.delenv(STATE, raising=False)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     beside, own = latch_of(tmp_path / "services.toml", "motion").paths

@@ -1,5 +1,5 @@
-"""Doors of a lock-step cell: sealed by the shared key; with certificates it stays on one host, and
-says so before it listens."""
+"""Security of a lock-step cell: sealed by the shared key; with certificates it runs on one host
+only, and says so before it listens."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from petrobot.services.comm.protocol.security import KeyNeededError, new_key, wr
 from tests.chaos.shuttle_cell import SERVICES, TASK
 from tests.ports import free_ports
 
-FAR = "192.0.2.7"  # RFC 5737: an address that is nobody's
+FAR = "192.0.2.7"  # RFC 5737: an address for documentation
 
 
 def cell(folder: Path, keys: str, host: str) -> Directory:
-    """The shuttle's cell with these keys, its right node at `host`."""
+    """Return the shuttle's cell with these keys, its right node at `host`."""
     text = SERVICES.format(
         *free_ports(3), log=folder / "moves.txt", fetch=0.1, carry=0.1, orphan=1.0
     )
@@ -31,11 +31,11 @@ def cell(folder: Path, keys: str, host: str) -> Directory:
     return parse(text, path)
 
 
-def test_certificates_do_not_reach_over_hosts_in_lock_step(
+def test_certificates_do_not_work_between_hosts_in_lock_step(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Members and coordinator refuse, with the member's address and what to write instead; the
-    command line gives 2."""
+    """Members and coordinator refuse, with the member's address and the remedy; the exit code is
+    2."""
     directory = cell(tmp_path, 'certificates = "keys"', FAR)
     with pytest.raises(
         KeyNeededError, match=rf"right is at {FAR}: .*file = \"cell.key\" in place of certificates"
@@ -58,7 +58,7 @@ def test_certificates_do_not_reach_over_hosts_in_lock_step(
     assert "does not use TLS" in capsys.readouterr().err
 
 
-def test_on_loopback_certificates_need_no_key_and_a_shared_key_goes_anywhere(
+def test_certificates_work_on_loopback_and_a_shared_key_everywhere(
     tmp_path: Path,
 ) -> None:
     assert cell_key(cell(tmp_path, 'certificates = "keys"', "127.0.0.1")) is None

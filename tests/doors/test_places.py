@@ -1,5 +1,5 @@
-"""Emergency stops and pauses where the processes of a device are watched: latched over their
-deaths, gone with what was held."""
+"""Emergency stops and pauses in the worker host of a device: a stop remains after its processes
+die, a hold ends with the held runs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.node.test_worker_place import Bench
 
 
 class Stopping(Driver):
-    """A driver that counts its stops; `quick` gives it a quick stop of its own."""
+    """A driver that counts its stops; with `quick` it also has a quick stop."""
 
     period = 0.004
 
@@ -34,7 +34,7 @@ class Stopping(Driver):
         self.did: list[str] = []
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Take any."""
+        """Accept any command."""
         self.did.append(str(body["do"]))
 
     def stop(self, now: float) -> None:
@@ -46,19 +46,19 @@ class QuickStopping(Stopping):
     """One with a quick stop."""
 
     def quick_stop(self, now: float) -> None:
-        """Harder than the stop routine."""
+        """Count a quick stop, which brakes harder than the stop routine."""
         self.did.append("quick stop")
 
 
 @pytest.mark.parametrize(("driver", "did"), [(Stopping(), "stop"), (QuickStopping(), "quick stop")])
-def test_an_emergency_stop_is_the_drivers_hardest(driver: Stopping, did: str) -> None:
+def test_an_emergency_stop_uses_the_drivers_hardest_stop(driver: Stopping, did: str) -> None:
     """Its quick stop if it has one, else its stop routine."""
     stop_at_once(driver, 0.0)
     assert driver.did == [did]
 
 
 def test_a_stopped_driver_takes_no_command_until_it_is_cleared() -> None:
-    """Not even `reset`; the stop routine is always taken. Clearing alone does nothing to the
+    """Not even `reset` is accepted; the stop routine always is. Clearing alone does not change the
     device."""
     driver = QuickStopping()
     cyclic = CyclicDriver(driver)
@@ -73,12 +73,12 @@ def test_a_stopped_driver_takes_no_command_until_it_is_cleared() -> None:
 
 
 def orders_to(child: Any) -> list[str]:
-    """Verbs of the operator that a process was told."""
+    """Return the operator's verbs that a process got."""
     return [item.verb for item in child.commands()]
 
 
-def test_the_driver_is_told_before_its_actions_are_stopped() -> None:
-    """The device waits for nobody; then each run ends as stopped in an emergency."""
+def test_the_driver_is_stopped_before_its_actions() -> None:
+    """The device does not wait for the actions; then each run ends as stopped in an emergency."""
     bench = Bench()
     driver, worker = bench.cyclic()
     bench.begin("r")
@@ -89,9 +89,9 @@ def test_the_driver_is_told_before_its_actions_are_stopped() -> None:
     assert stop == Cancel("r", f"{EMERGENCY_STOP}: by command")
 
 
-def test_a_driver_that_dies_comes_back_stopped() -> None:
-    """Its new process, which would enable its drives, is told at once; after clearing the next one
-    is not."""
+def test_a_restarted_driver_is_still_stopped() -> None:
+    """Its new process, which would enable its drives, gets the stop at once; after clearing, the
+    next one does not."""
     bench = Bench()
     driver, _ = bench.cyclic()
     bench.place.command(bench.clock.now, Command("e1", EMERGENCY_STOP))
@@ -111,8 +111,8 @@ def test_a_driver_that_dies_comes_back_stopped() -> None:
 
 
 def test_a_hold_ends_with_the_runs_that_it_held() -> None:
-    """The last one ended (cancelled, say): the device is released, and the next run finds its time
-    unspent."""
+    """When the last one ends (for example by a cancel), the device is released, and the next run
+    has its full time."""
     bench = Bench()
     driver, worker = bench.cyclic()
     bench.begin("one")
@@ -129,7 +129,7 @@ def test_a_hold_ends_with_the_runs_that_it_held() -> None:
 
 
 def test_a_hold_without_runs_stays_until_it_is_released() -> None:
-    """Nothing ended, so nothing lets it go."""
+    """No run ends that would release it."""
     bench = Bench()
     driver, _ = bench.cyclic()
     bench.place.command(bench.clock.now, Command("h1", "hold"))
@@ -141,8 +141,8 @@ def test_a_hold_without_runs_stays_until_it_is_released() -> None:
 
 
 def test_a_cancelled_run_of_a_held_device_calls_its_stop_routine() -> None:
-    """Held, the device looks as if it stood; released without having been stopped it would go on
-    without its run."""
+    """A held device seems to stand still; released without a stop, it would continue without its
+    run."""
     clock = Clock()
     device = Device(clock, halting=0.0)
 
@@ -169,8 +169,8 @@ def test_a_cancelled_run_of_a_held_device_calls_its_stop_routine() -> None:
 
 
 def test_a_held_run_does_not_grow_older() -> None:
-    """Its clock, its waits and its deadline stand still: an action that looks at `ctx.now` is not
-    late after a pause."""
+    """Its clock, its waits and its deadline are paused: an action that reads `ctx.now` is not late
+    after a pause."""
     clock = Clock()
     seen: list[float] = []
 

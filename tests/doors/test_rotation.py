@@ -28,8 +28,8 @@ PASSES = {
         'certificates = "new"',
     ],
 }
-"""What stands under [keys], pass by pass; each host goes on to the next when all have done the one
-before."""
+"""Contents of [keys], round by round; a host begins a round when all hosts have finished the
+previous one."""
 
 
 RETRY = 0.1
@@ -65,7 +65,7 @@ class Hosts:
         return path
 
     def restart(self, node: str, keys: str) -> None:
-        """Start a node again with other keys."""
+        """Restart a node with other keys."""
         self.stop(node)
         process = self.nodes[node] = start_node(node, self.write(node, keys))
         assert process.stdout is not None and "ready" in process.stdout.readline()
@@ -78,14 +78,13 @@ class Hosts:
             process.communicate(timeout=PATIENCE)
 
     async def works(self, keys: str) -> None:
-        """A coordinator with these keys reaches both nodes, and they each other: a call, and a
-        stream of set points."""
+        """Check that a coordinator with these keys reaches both nodes, and they each other, by a
+        call and by a stream of set points."""
         path = await asyncio.to_thread(self.write, "coordinator", keys)
         operator = GuardedOperator(parse(path.read_text(), path))
         try:
             await operator.connect("left", "right")
-            # A node that was away is tried again once a second by the other: that long the first
-            # ones may fail.
+            # A node retries the other once a second: until then the first calls may fail.
             async with asyncio.timeout(PATIENCE):
                 while (await operator.call("relay", a=3)).values.get("sum") != 5:  # node to node
                     await asyncio.sleep(RETRY)
@@ -96,7 +95,7 @@ class Hosts:
 
     @staticmethod
     async def _follows(operator: GuardedOperator) -> bool:
-        """Whether set points come from node to node."""
+        """Return whether set points arrive from node to node."""
         following = asyncio.create_task(operator.call("follow", seconds=1.0))
         await operator.call("lead", seconds=0.8)
         return bool((await following).values["count"])
@@ -130,14 +129,14 @@ async def test_keys_are_replaced_host_by_host_without_an_outage(tmp_path: Path, 
         ('file = "a"\ncertificates = "b"', "keys: a shared key and certificates; name one of them"),
     ],
 )
-def test_an_also_needs_what_it_stands_beside(keys: str, says: str) -> None:
+def test_an_also_needs_a_key_beside_it(keys: str, says: str) -> None:
     text = CELL.format(left=1001, right=1002) + f"[keys]\n{keys}\n"
     with pytest.raises(DirectoryError, match=says):
         parse(text, Path("services.toml"))
 
 
-def test_the_hash_leaves_keys_out() -> None:
-    """While they are replaced hosts name different ones; everything else must still be the same."""
+def test_the_hash_does_not_include_keys() -> None:
+    """During a replacement hosts name different keys; everything else must still be the same."""
     cell = CELL.format(left=1001, right=1002)
     hashes = {
         parse(cell + keys, Path("services.toml")).hash

@@ -1,5 +1,5 @@
-"""Set points between guarded nodes: sealed by the shared key or by what crossed TLS; a stranger's
-set points move nothing."""
+"""Set points between nodes with keys: sealed by the shared key, or by a key exchanged over TLS; a
+stranger's set points move nothing."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ class GuardedOperator(Operator):
 @pytest.mark.parametrize(
     "how", [pytest.param("shared key", marks=pytest.mark.proof), "certificates"]
 )
-async def test_set_points_cross_guarded_nodes(tmp_path: Path, how: str) -> None:
-    """An action of one node leads a device of another; a variable of a third call goes over the
-    same doors."""
+async def test_set_points_between_nodes_with_keys(tmp_path: Path, how: str) -> None:
+    """An action of one node leads a device of another; a variable crosses the same secured
+    connections."""
     if how == "certificates":
         make_certificates(tmp_path / "keys", ["coordinator", "left", "right"])
     else:
@@ -77,17 +77,17 @@ async def test_set_points_cross_guarded_nodes(tmp_path: Path, how: str) -> None:
 
 
 class Taken:
-    """A sink that keeps what it takes."""
+    """A sink that records what it receives."""
 
     def __init__(self) -> None:
         self.values: list[tuple[float, ...]] = []
 
     def take(self, values: Sequence[float], held: float = 0.0) -> None:
-        """Keep."""
+        """Record the values."""
         self.values.append(tuple(values))
 
     def withdraw(self) -> None:
-        """Nothing to forget."""
+        """Do nothing."""
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ class Taken:
     ],
 )
 def test_a_strangers_set_points_move_nothing(key: bytes | None, ticket: str, says: str) -> None:
-    """Without the key, with another key, without the ticket."""
+    """They come without the key, with another key, or without the ticket."""
     sink = Taken()
     receiver = StreamReceiver("arm", {"points": Incoming(0.02, sink, "secret.1")}, key=b"k" * 32)
     sender = StreamSender(
@@ -116,9 +116,9 @@ def test_a_strangers_set_points_move_nothing(key: bytes | None, ticket: str, say
     receiver.close()
 
 
-def test_strangers_do_not_hold_up_the_loop_that_polls() -> None:
-    """However many connect and send, one poll takes a few connections and a few bytes of each: the
-    good stream goes on."""
+def test_strangers_do_not_delay_the_polling_loop() -> None:
+    """However many connect and send, one poll accepts a few connections and reads a few bytes of
+    each: the honest stream continues."""
     sink = Taken()
     receiver = StreamReceiver("arm", {"points": Incoming(0.02, sink, "t.1")})
     good = StreamSender("vision", "points", 0.02, *receiver.address, receiver="arm", ticket="t.1")
@@ -146,7 +146,7 @@ def test_strangers_do_not_hold_up_the_loop_that_polls() -> None:
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.7.2", "::"])
 def test_unprotected_streams_stay_on_this_host(host: str) -> None:
-    """Images and CAN frames between processes have neither secrecy nor authentication: no other
+    """Images and CAN frames between processes are neither encrypted nor authenticated: no other
     host may reach them."""
     with pytest.raises(ValueError, match="images are not protected"):
         ImageServer(host, 0)
@@ -154,8 +154,8 @@ def test_unprotected_streams_stay_on_this_host(host: str) -> None:
         CanHub(f"tcp://[{host}]:0" if ":" in host else f"tcp://{host}:0")
 
 
-def test_a_crowd_at_the_camera_leaves_the_good_receiver_its_images() -> None:
-    """Receivers are bounded; who wants images stays."""
+def test_a_crowd_at_the_camera_does_not_displace_the_honest_receiver() -> None:
+    """The number of receivers is limited; connected ones stay connected."""
     camera = ImageServer("127.0.0.1", 0)
     good = StreamImages("127.0.0.1", camera.port, time.monotonic)
     good.start(50.0)
@@ -181,8 +181,8 @@ def test_a_crowd_at_the_camera_leaves_the_good_receiver_its_images() -> None:
     camera.close()
 
 
-def test_a_crowd_at_the_simulated_bus_leaves_the_good_ports_their_frames() -> None:
-    """Ports are bounded; those that are there go on."""
+def test_a_crowd_at_the_simulated_bus_does_not_displace_honest_ports() -> None:
+    """The number of ports is limited; connected ones continue."""
     hub = CanHub()
     near, far = hub.port(), StreamPort(hub.channel)
     hub.poll(1.0)

@@ -1,5 +1,5 @@
-"""Mutual TLS between real sockets: who has the cell's certificates is let in, under the name on
-them, and nobody else."""
+"""Mutual TLS between real sockets: only a party with a certificate of the cell is accepted, under
+the certificate's name."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Start = Callable[..., Victim]
 
 
 async def outcome_of(client: Client) -> m.Outcome:
-    """What becomes of one call."""
+    """Return the outcome of one call."""
     client.start()
     try:
         async with asyncio.timeout(60.0):
@@ -41,16 +41,16 @@ async def outcome_of(client: Client) -> m.Outcome:
 
 
 def context(folder: Path, party: str) -> ssl.SSLContext:
-    """What a client shows that has this party's certificate."""
+    """Return the TLS context of a client with this party's certificate."""
     made = Credentials(party, None, folder).client()
     assert made is not None
     return made
 
 
-async def test_who_has_a_certificate_of_the_cell_is_served(
+async def test_a_client_with_a_certificate_of_the_cell_is_served(
     victim: Start, certificates: Path
 ) -> None:
-    """TLS 1.3, both ends certified; a large message crosses it whole."""
+    """TLS 1.3 with certificates at both ends; a large message arrives whole."""
     server = victim(folder=str(certificates))
     client = server.client()
     client.start()
@@ -67,7 +67,7 @@ async def test_who_has_a_certificate_of_the_cell_is_served(
 async def test_a_certificate_of_another_authority_is_refused(
     victim: Start, certificates: Path, tmp_path: Path
 ) -> None:
-    """A stranger who made certificates of its own, with all the right names: neither end trusts the
+    """A stranger made its own certificates with all the right names: neither end trusts the
     other."""
     make_certificates(tmp_path / "own", ["coordinator", "vision"])
     server = victim(folder=str(certificates))
@@ -84,8 +84,8 @@ async def test_a_certificate_of_another_authority_is_refused(
         await good.still_served()
 
 
-async def test_without_a_certificate_nobody_is_let_in(victim: Start, certificates: Path) -> None:
-    """Neither plainly nor with TLS alone."""
+async def test_a_client_without_a_certificate_is_refused(victim: Start, certificates: Path) -> None:
+    """Neither a plain connection nor TLS without a certificate is accepted."""
     server = victim(folder=str(certificates))
     bare = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     bare.load_verify_locations(certificates / "ca.pem")
@@ -98,7 +98,7 @@ async def test_without_a_certificate_nobody_is_let_in(victim: Start, certificate
 
 
 async def test_older_tls_is_refused(victim: Start, certificates: Path) -> None:
-    """No way down to TLS 1.2."""
+    """TLS 1.2 is not accepted."""
     server = victim(folder=str(certificates))
     old = context(certificates, "coordinator")
     old.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -108,10 +108,10 @@ async def test_older_tls_is_refused(victim: Start, certificates: Path) -> None:
     assert "only accepts TLS 1.3" in client.trouble
 
 
-async def test_a_node_cannot_stand_in_for_another(
+async def test_a_node_cannot_impersonate_another(
     victim: Start, certificates: Path, tmp_path: Path
 ) -> None:
-    """Whoever has taken motion's key and listens at vision's address is not taken for vision."""
+    """A process with motion's key that listens at vision's address is not accepted as vision."""
     stolen = tmp_path / "stolen"
     shutil.copytree(certificates, stolen)
     for end in ("pem", "key"):
@@ -134,10 +134,10 @@ async def test_a_node_cannot_stand_in_for_another(
         ("coordinator", "node", "motion", False),
     ],
 )
-async def test_a_party_speaks_under_the_name_on_its_certificate(
+async def test_a_party_has_the_name_on_its_certificate(
     victim: Start, certificates: Path, party: str, role: str, name: str, welcome: bool
 ) -> None:
-    """A node whose key was stolen cannot give orders to the others' devices."""
+    """A stolen key of a node cannot command the devices of other nodes."""
     assert may_speak_as(party, role, name) is welcome
     server = victim(folder=str(certificates))
     client = server.client(m.Hello(2, 2, role, name, "b1"), tls=context(certificates, party))
@@ -147,7 +147,7 @@ async def test_a_party_speaks_under_the_name_on_its_certificate(
         assert "certificate" in outcome.text and server.about()["faults"] == {"certificate": 1}
 
 
-def test_nobody_certified_speaks_as_nobody() -> None:
+def test_a_certificate_without_a_name_gives_no_role() -> None:
     """Without a common name there is no role."""
     assert not may_speak_as("", "coordinator", "coordinator") and not may_speak_as("", "node", "")
 
@@ -156,7 +156,7 @@ def test_nobody_certified_speaks_as_nobody() -> None:
 
 
 def services_in(folder: Path) -> Path:
-    """Two nodes on two hosts."""
+    """Return a location file with two nodes on two hosts."""
     path = folder / "services.toml"
     nodes = "".join(
         f'[nodes.{name}]\nhost = "{host}"\nport = {port}\n'
@@ -169,8 +169,8 @@ def services_in(folder: Path) -> Path:
 def test_keys_makes_certificates_and_says_where_to_copy_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One command; keys are their owner's alone; a second time it adds what is missing and
-    overwrites nothing."""
+    """One command makes all; only the owner can read the keys; a second time it adds what is
+    missing and overwrites nothing."""
     monkeypatch.chdir(tmp_path)
     services = str(services_in(tmp_path))
     assert main(["keys", "--tls", "--services", services]) == 0
@@ -195,7 +195,7 @@ def test_keys_makes_certificates_and_says_where_to_copy_them(
 
 
 def test_keys_without_the_authoritys_key_says_where_to_go(tmp_path: Path) -> None:
-    """A host that only has copies cannot make more."""
+    """A host that has only copies cannot make more certificates."""
     make_certificates(tmp_path, ["coordinator"])
     (tmp_path / "ca.key").unlink()
     with pytest.raises(CertificateError, match="run this where the authority was made"):
@@ -221,7 +221,7 @@ def test_keys_without_the_authoritys_key_says_where_to_go(tmp_path: Path) -> Non
 def test_bad_files_give_one_clear_error(
     tmp_path: Path, spoil: Callable[[Path], Any], says: str
 ) -> None:
-    """Which file, and what to do."""
+    """The message names the file and the remedy."""
     make_certificates(tmp_path, ["vision", "motion"])
     spoil(tmp_path)
     with pytest.raises(KeyFileError, match=says):
@@ -229,8 +229,8 @@ def test_bad_files_give_one_clear_error(
 
 
 def test_stream_keys_are_of_the_ticket(tmp_path: Path) -> None:
-    """With certificates a stream is sealed by what crossed TLS; with a shared key by that; on
-    loopback by nothing."""
+    """With certificates a stream is sealed by a key sent over TLS; with a shared key by that key;
+    on loopback it is not sealed."""
     certified, keyed = Credentials("vision", None, tmp_path), Credentials("vision", b"k" * 32)
     one, two = certified.stream_key("secret.1"), certified.stream_key("secret.2")
     assert one == two and one is not None and len(one) == 32
@@ -241,10 +241,10 @@ def test_stream_keys_are_of_the_ticket(tmp_path: Path) -> None:
     )
 
 
-async def test_client_tells_why_it_is_lost(
+async def test_a_client_reports_why_its_connection_was_refused(
     victim: Start, certificates: Path, tmp_path: Path
 ) -> None:
-    """A coordinator whose certificate is refused hears of it, not of a cable."""
+    """A coordinator whose certificate is refused gets this reason, not that of a broken link."""
     make_certificates(tmp_path, ["coordinator"])
     shutil.copy(certificates / "ca.pem", tmp_path / "ca.pem")
     server = victim(folder=str(certificates))
@@ -260,8 +260,8 @@ async def test_client_tells_why_it_is_lost(
 
 
 def test_keys_makes_one_shared_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A file for its owner's eyes alone, never shown, never overwritten, with the lines for
-    services.toml."""
+    """Only its owner can read the file; it is never shown or overwritten; the output has the lines
+    for services.toml."""
     services, file = str(services_in(tmp_path)), tmp_path / "cell.key"
     assert main(["keys", "--file", str(file), "--services", services]) == 0
     said = capsys.readouterr().out

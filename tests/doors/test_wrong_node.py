@@ -1,8 +1,8 @@
-"""Whoever answers must be the node that was asked for: a man in the middle without the key, and a
-wrong port without a key.
+"""Only the intended node may answer: a man in the middle without the key, and a wrong port in a
+cell without a key.
 
-The man in the middle is a process of nobody's: it takes what comes on a node's address and carries
-it to another node.
+The man in the middle is a foreign process: it receives at one node's address and forwards to
+another node.
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ KEYS = '[keys]\nfile = "cell.key"\n'
 
 
 class Middle:
-    """Carries what comes to one port to another one, and can play what a server said in an earlier
+    """Forwards the bytes of one port to another, and can replay what a server sent in an earlier
     session."""
 
     def __init__(self, to: int) -> None:
         self.to = to
         self.port = 0
         self.recorded: list[bytes] = []
-        """What the server said in each session."""
+        """The server's bytes of each session."""
         self.replay: bytes | None = None
-        """Said in the server's place."""
+        """Bytes that are sent instead of the server's."""
         self._server: asyncio.Server | None = None
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -93,7 +93,7 @@ class Middle:
         writer.close()
 
     async def stop(self) -> None:
-        """Hang up."""
+        """Close all connections."""
         assert self._server is not None
         self._server.close()
         for task in list(self._tasks):
@@ -102,7 +102,7 @@ class Middle:
 
 
 class Deceived:
-    """Two nodes, and what their callers believe to be their addresses."""
+    """Two nodes, and the addresses at which their callers look for them."""
 
     def __init__(self, folder: Path, keyed: bool) -> None:
         self.folder = folder
@@ -113,8 +113,8 @@ class Deceived:
         self.middles: list[Middle] = []
 
     async def between(self, **to: str) -> Path:
-        """The location file of a caller whose way to these nodes leads to others; gives its
-        path."""
+        """Write the location file of a caller whose connections to these nodes lead to others;
+        return its path."""
         ports = dict(self.ports)
         for node, other in to.items():
             middle = Middle(self.ports[other])
@@ -126,7 +126,8 @@ class Deceived:
         return path
 
     async def estop(self, services: Path) -> tuple[int, dict[str, str]]:
-        """`petrobot estop`: exit code, and of each node why it did not answer (empty: it did)."""
+        """Run `petrobot estop`; return its exit code, and by node why it did not answer (empty: it
+        did)."""
         options = [
             "--services",
             str(services),
@@ -146,7 +147,7 @@ class Deceived:
 
 @asynccontextmanager
 async def deceived(folder: Path, keyed: bool) -> AsyncIterator[Deceived]:
-    """The two nodes as processes, with a shared key or without."""
+    """Start the two nodes as processes, with a shared key or without."""
     cell = Deceived(folder, keyed)
     if keyed:
         write_key(folder / "cell.key", new_key())
@@ -162,8 +163,8 @@ async def deceived(folder: Path, keyed: bool) -> AsyncIterator[Deceived]:
 
 @pytest.mark.parametrize("keyed", [True, False], ids=["shared key", "no key"])
 async def test_estop_names_each_node_that_was_not_reached(tmp_path: Path, keyed: bool) -> None:
-    """Both ways to one node, both swapped, one led astray: never exit code 0, and only who was
-    really told counts as told."""
+    """Both addresses lead to one node, both are swapped, or one leads to a wrong node: the exit
+    code is never 0, and only nodes that were really reached are reported as stopped."""
     async with deceived(tmp_path, keyed) as cell:
         straight = await cell.between(left="left", right="right")
         assert await cell.estop(straight) == (0, {"left": "", "right": ""}), (
@@ -181,8 +182,8 @@ async def test_estop_names_each_node_that_was_not_reached(tmp_path: Path, keyed:
             ), told
 
 
-async def test_a_recorded_session_stops_nobody(tmp_path: Path) -> None:
-    """What the right node said to an earlier `estop` is said again: the proof is of other
+async def test_a_replayed_session_stops_no_device(tmp_path: Path) -> None:
+    """The right node's answers to an earlier `estop` are replayed: their proof is of other
     nonces."""
     async with deceived(tmp_path, True) as cell:
         services = await cell.between(left="left", right="right")
@@ -194,8 +195,8 @@ async def test_a_recorded_session_stops_nobody(tmp_path: Path) -> None:
 
 
 async def test_nodes_shows_a_wrong_port(tmp_path: Path) -> None:
-    """Two ports mixed up in services.toml, no key: each is said to be the other, and neither counts
-    as up."""
+    """Two ports are swapped in services.toml, without a key: each node is reported as the other,
+    and neither as up."""
     async with deceived(tmp_path, False) as cell:
         services = await cell.between(left="right", right="left")
         code, out, err = await finished(

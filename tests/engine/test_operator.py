@@ -188,7 +188,7 @@ def test_a_net_taken_over_while_paused_asks_every_run_to_hold_again(play: Plays)
     assert [type(order) for order in p.engine.outstanding(p.state)] == [StartRun]
 
 
-def test_tokens_go_into_and_out_of_control_places_only(play: Plays) -> None:
+def test_tokens_can_be_changed_in_control_places_only(play: Plays) -> None:
     p = play("x/2 a! b! y r~", LINE, "e")
     p(AddTokens("x", 2))
     assert p.marked == {"x": 2} and p.of(Marked)[0].before == (0, 0, 0, 0, 0)

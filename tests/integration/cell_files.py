@@ -1,5 +1,5 @@
-"""Location files of the catching cell for tests: on free ports, or with things moved to other
-nodes."""
+"""Location files of the catching cell for tests: on free ports, or with devices and actions on
+other nodes."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ SHIPPED = (ROOT / "services.toml").read_text(encoding="utf-8")
 
 
 def services_file(folder: Path, *, edits: Mapping[str, str] | None = None, more: str = "") -> Path:
-    """The shipped services.toml on free ports, with exact lines replaced and more added at its
-    end."""
+    """Write the shipped services.toml with free ports, with exact lines replaced and others added
+    at its end."""
     text = SHIPPED.replace('"services/cell.toml"', f'"{ROOT / "services/cell.toml"}"')
     for old, new in (edits or {}).items():
         assert old in text, f"services.toml has no line {old!r} any more"

@@ -1,5 +1,5 @@
-"""Toys that hang for good, as badly as a process can: in C, with the interpreter held, so that
-nothing of Python runs any more."""
+"""Actions and a driver that hang for ever in C with the interpreter's lock held, so that no Python
+code runs in their process."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _HOLDING_THE_INTERPRETER = ctypes.PyDLL(None)
 
 
 def hang() -> None:
-    """Never come back, and let nobody else run."""
+    """Never return, and let no other thread run."""
     while True:
         _HOLDING_THE_INTERPRETER.pause()
 
@@ -28,16 +28,16 @@ class Stand:
         self._hangs = Path(str(config["hangs"]))
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Takes none."""
+        """Refuse commands."""
 
     def step(self, now: float) -> None:
-        """Hang, if it is time for that."""
+        """Hang if the file exists."""
         if self._hangs.exists():
             self._hangs.with_suffix(".hung").touch()
             hang()
 
     def state(self) -> Mapping[str, Any]:
-        """Nothing to tell."""
+        """Return nothing."""
         return {}
 
     def stop(self, now: float) -> None:
@@ -55,18 +55,18 @@ class Stand:
         """It stands."""
 
     def close(self) -> None:
-        """Nothing to let go."""
+        """Release nothing."""
 
 
 async def hang_in_action(ctx: Context, mark: str) -> Result:
-    """Say that it hangs, and hang."""
+    """Report that it hangs, then hang."""
     Path(mark).touch()
     hang()
     return success()
 
 
 def hang_in_service(ctx: Context, mark: str) -> Result:
-    """A quick service that is none: it hangs in its node's own loop."""
+    """A service that should be quick, but hangs in its node's event loop."""
     Path(mark).touch()
     hang()
     return success()

@@ -1,11 +1,11 @@
-"""The catching task in lock step with a coordinator that is killed (SIGKILL) at given places of its
-journal, and resumed each time.
+"""The catching task in lock step with a coordinator that is killed (SIGKILL) at given operations on
+its journal, and resumed each time.
 
-A process for itself, so that it forks from one thread: `mortal_cell.py FOLDER SERVICES SEED RUNS
-KILLS` with KILLS a JSON list of experiments, each a list of numbers: the first life of the
-coordinator is killed after its n-th operation on the journal (append, flush or sync), the next life
-after its own next number, the last one lives to the end. The laboratory and the nodes live in one
-process of their own, which no kill touches. Prints one JSON line for each experiment.
+This is a separate process, so that it forks from one thread: `mortal_cell.py FOLDER SERVICES SEED
+RUNS KILLS` with KILLS a JSON list of experiments, each a list of numbers: the first coordinator is
+killed after that many operations on the journal (append, flush or sync), the next one after its own
+number, and the last one runs to the end. The laboratory and the nodes are in another process, which
+is not killed. Prints one JSON line for each experiment.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ CELL = "cell"
 TASK = "catch_ball"
 SURVIVOR = 10**9
 PATIENCE = 120.0
-"""Seconds for a tick: the laboratory prepares an experiment between two of them, on a machine that
+"""Limit of a tick (s): the laboratory prepares an experiment between two of them, on a machine that
 may be busy."""
 
 
 class MortalStore(JournalStore):
-    """Kills its process at an operation."""
+    """A store that kills its process at an operation."""
 
     lives = SURVIVOR
     operations = 0
 
     @classmethod
     def count(cls) -> None:
-        """One operation more; at the last one the process is killed."""
+        """Count an operation; at the last one the process is killed."""
         cls.operations += 1
         if cls.operations == cls.lives:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -65,24 +65,24 @@ class MortalStore(JournalStore):
     def append(
         self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State
     ) -> None:
-        """An append, and perhaps the end."""
+        """Append, and count it."""
         super().append(now, stimulus, instructions, state)
         self.count()
 
     def stage(self, name: str, values: Mapping[str, Any]) -> None:
-        """A stage, and perhaps the end."""
+        """Stage, and count it."""
         super().stage(name, values)
         self.count()
 
     def flush(self) -> None:
-        """A flush, and perhaps the end: before it was the end after the append."""
+        """Flush, and count it."""
         unsaved = self.writer.unsaved
         super().flush()
         if unsaved:
             self.count()
 
     def sync(self) -> None:
-        """A sync, and perhaps the end."""
+        """Sync, and count it."""
         pending = self.writer.pending
         super().sync()
         if pending:
@@ -90,7 +90,7 @@ class MortalStore(JournalStore):
 
 
 def counting(directory: Directory, log: Path) -> dict[str, Callable[..., Any]]:
-    """Every action as it is, but that each execution leaves its call id in a file."""
+    """Wrap every action so that each execution writes its call id to a file."""
 
     def wrapped(name: str) -> Callable[..., Any]:
         action = resolve(directory.actions[name].run)
@@ -124,7 +124,7 @@ class Experiment:
         self._hosts = {**dict.fromkeys(self.directory.nodes, CELL), NAME: NAME}
 
     def run(self, kills: Sequence[int]) -> dict[str, Any]:
-        """Live through all kills; what came of it."""
+        """Run with all kills; return the outcome."""
         cell = _fork(self._cell)
         for life, lives in enumerate([*kills, SURVIVOR]):
             status = os.waitpid(_fork(functools.partial(self._coordinate, lives, life > 0)), 0)[1]
@@ -196,7 +196,7 @@ class Experiment:
         )
 
     def _outcome(self, mission: Mission) -> dict[str, Any]:
-        """What a kill must not change, and how many operations there are to be killed at."""
+        """Return what a kill must not change, and how many operations there are."""
         finished = mission.executor.finished
         assert finished is not None
         return {
@@ -211,8 +211,8 @@ class Experiment:
         }
 
     def _book(self) -> dict[str, Any]:
-        """What the journal and the nodes say of the calls: executed how often, unknown, and every
-        firing one of the net."""
+        """Return from journal and nodes how often each call was executed and which are unknown, and
+        check that every firing is one of the net."""
         executed = Counter(self._log.read_text(encoding="utf-8").split())
         found = recorded(str(self.folder))
         given = [i for step in found.steps() for i in step.instructions]
@@ -233,7 +233,7 @@ class Experiment:
 
 
 def _fork(work: Callable[[], None]) -> int:
-    """A child process that does this work; its id."""
+    """Start a child process that does this work; return its id."""
     child = os.fork()
     if child:
         return child
@@ -248,7 +248,7 @@ def _fork(work: Callable[[], None]) -> int:
 
 
 def main() -> None:
-    """All experiments, one after the other."""
+    """Run all experiments, one after the other."""
     folder, services, seed, runs, kills = sys.argv[1:]
     for number, experiment in enumerate(json.loads(kills)):
         outcome = Experiment(Path(folder) / str(number), Path(services), int(seed), int(runs)).run(

@@ -1,5 +1,5 @@
-"""Real processes: a node that other clients' calls made forget a run does not run it again for a
-resumed coordinator."""
+"""Real processes: a node that forgot a run, because of other clients' calls, does not run it again
+for a resumed coordinator."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from tests.integration.test_resume_processes import (
 pytestmark = pytest.mark.processes
 RUNS = 4
 BATCH = 1_500
-"""Calls that are under way at once: more than the results that a node keeps, so that it drops those
-of the mission run."""
+"""Calls in progress at once: more than the results that a node keeps, so that it drops those of the
+mission run."""
 
 
 async def _flood(node: str, port: int, ids: Callable[[int], str], calls: int) -> None:
-    """Another client makes so many calls, each answered."""
+    """Make so many calls as another client; each is answered."""
     over, left = asyncio.Event(), 0
 
     def count(_: float, notices: list[Notice]) -> None:
@@ -65,15 +65,15 @@ async def _flood(node: str, port: int, ids: Callable[[int], str], calls: int) ->
 
 
 def _without_accepts(path: Path) -> None:
-    """Cut the journal before the first word of a node: so it is when the kill comes between an
-    order and its ACCEPT."""
+    """Cut the journal before the node's first message, as if the kill came between a call and its
+    ACCEPT."""
     offset, raw = len(MAGIC), path.read_bytes()
     for record in [None, *read_journal(path).records]:
         if record is not None and record.data.get("stimulus", {}).get("kind") == "RunStarted":
             path.write_bytes(raw[:offset])
             return
         offset += PREFIX.size + PREFIX.unpack_from(raw, offset)[0]
-    # The kill itself came between the two.
+    # the real kill came between the two
 
 
 @pytest.mark.parametrize("accepted", [True, False], ids=["accepted", "accept lost"])
@@ -90,7 +90,7 @@ def _without_accepts(path: Path) -> None:
         ),
     ],
 )
-def test_what_a_flood_made_its_node_forget_is_not_run_again(
+def test_a_run_that_its_node_has_forgotten_is_not_run_again(
     tmp_path: Path, ids: Callable[[int], str], calls: int, accepted: bool
 ) -> None:
     services = shuttle_services(tmp_path, fetch=0.4, carry=0.4, orphan=60.0)

@@ -1,5 +1,5 @@
-"""A disk that is full in the middle of a run: one clear error, nothing done that is not kept, and a
-resume that ends the run."""
+"""A disk that becomes full during a run: one clear error, no effect without a record, and a resume
+that ends the run."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from tests.integration.test_resume_processes import (
 pytestmark = pytest.mark.processes
 RUNS = 8
 ROOM = 6
-"""Kilobytes that any file of the coordinator may have: its journal's header takes four of them
-(ulimit -f, setrlimit(2))."""
+"""Limit of each file of the coordinator (kB; ulimit -f, setrlimit(2)). The journal's header alone
+has four."""
 
 
-def test_a_full_disk_ends_the_run_in_clear_and_loses_nothing(tmp_path: Path) -> None:
+def test_a_full_disk_ends_the_run_with_a_clear_error_and_loses_nothing(tmp_path: Path) -> None:
     shuttle_services(tmp_path, fetch=0.2, carry=0.2, orphan=60.0)
     runs = tmp_path / "runs"
     given = [
@@ -71,6 +71,6 @@ def test_a_full_disk_ends_the_run_in_clear_and_loses_nothing(tmp_path: Path) -> 
     ends, made = ends_of(tmp_path), {call.rpartition("/")[2] for call in begun}
     assert len(ends) == RUNS, "no token lost or doubled"
     for call, end in ends.items():
-        # the bell may ring between a run's start and its first step: then it is told that it never
-        # began
+        # the bell may ring between a run's start and its first step: then the run is reported as
+        # not begun
         assert call in made or (end.status, end.executed) in NEVER_BEGUN, end

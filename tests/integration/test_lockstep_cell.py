@@ -1,5 +1,5 @@
-"""The whole cell in lock step: the same result in one and in several processes, and wherever things
-are placed."""
+"""The whole cell in lock step: the same result in one and in several processes, and for every
+placement."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ port = 7305
 
 
 def run(services: Path, *arguments: str, seed: int = 5, regime: str = "B") -> dict[str, Any]:
-    """Two throws; the result without its wall-clock time."""
+    """Run two throws; return the result without its wall-clock time."""
     path = services.parent / "out.json"
     given = [
         "--services",
@@ -68,7 +68,7 @@ def run(services: Path, *arguments: str, seed: int = 5, regime: str = "B") -> di
 
 @pytest.fixture(scope="module")
 def usual(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The result of the shipped placement in one process."""
+    """Return the result of the shipped placement in one process."""
     result = run(services_file(tmp_path_factory.mktemp("usual")))
     assert result["status"] == "success"
     assert result["caught"] == 2
@@ -76,15 +76,15 @@ def usual(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.processes
-def test_one_process_a_node_gives_the_same(usual: dict[str, Any], tmp_path: Path) -> None:
+def test_one_process_per_node_gives_the_same(usual: dict[str, Any], tmp_path: Path) -> None:
     """Coordinator, laboratory, vision and motion in four processes."""
     assert run(services_file(tmp_path), "--processes", "0") == usual
 
 
 @pytest.mark.processes
 def test_a_third_node_changes_nothing(usual: dict[str, Any], tmp_path: Path) -> None:
-    """Global memory and sampling tick on a node of their own: three nodes, laboratory and
-    coordinator, five processes."""
+    """Global memory and the sampling timer are on a third node: five processes with laboratory and
+    coordinator."""
     edits = {
         '[timers.image_tick]\nnode = "vision"': '[timers.image_tick]\nnode = "desk"',
         '[services.memory]\nnode = "vision"': '[services.memory]\nnode = "desk"',
@@ -102,7 +102,7 @@ def test_moving_the_camera_and_its_actions_changes_nothing(
 
 
 def test_another_seed_gives_other_throws(usual: dict[str, Any], tmp_path: Path) -> None:
-    """The seed is what decides."""
+    """Only the seed decides the throws."""
     other = run(services_file(tmp_path), seed=6)
     assert [t["speed"] for t in other["throws"]] != [t["speed"] for t in usual["throws"]]
 
@@ -118,10 +118,11 @@ def test_another_seed_gives_other_throws(usual: dict[str, Any], tmp_path: Path) 
         ("track_ball", {"lead": 3.0}, "late"),
     ],
 )
-def test_the_numbers_of_the_task_file_are_what_judges(
+def test_the_task_files_numbers_decide_success(
     place: str, asked: dict[str, float], cause: str
 ) -> None:
-    """A ball that is caught: each action met its specification, unless the task asks for more."""
+    """For a caught ball, each action meets its specification, unless the task file asks for
+    more."""
     task, directory = load_task("catch_ball"), load(ROOT / "services.toml")
     if place:
         stricter = replace(task.places[place], args={**task.places[place].args, **asked})

@@ -1,8 +1,8 @@
-"""kill -9 of the coordinator of a 4-run catching task in lock step, resumed each time: the outcome
-is that of an undisturbed run.
+"""kill -9 of the coordinator of a catching task of four runs in lock step, resumed each time: the
+outcome equals that of an undisturbed run.
 
-The nodes and the laboratory outlive it in a process of their own. Every action is rejoined
-(`on_resume`): in lock step the ball waits with everything else for the new coordinator.
+The nodes and the laboratory are in another process, which continues. Every action is rejoined
+(`on_resume`): in lock step simulated time, and so the ball, waits for the new coordinator.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SEED, RUNS = 3, 4
 
 
 def experiments(folder: Path, kills: Sequence[Sequence[int]]) -> list[dict[str, Any]]:
-    """The outcome of each experiment (tests/integration/mortal_cell.py)."""
+    """Return the outcome of each experiment (tests/integration/mortal_cell.py)."""
     folder.mkdir()
     services = services_file(folder, edits={'on_resume = "error"': 'on_resume = "rejoin"'})
     given = [str(folder / "runs"), str(services), str(SEED), str(RUNS), json.dumps(kills)]
@@ -35,7 +35,8 @@ def experiments(folder: Path, kills: Sequence[Sequence[int]]) -> list[dict[str, 
 
 
 def judge(outcome: dict[str, Any], undisturbed: dict[str, Any]) -> None:
-    """Same end, no call executed twice or left out, nothing unknown that is not said."""
+    """Check that the end is the same, no call was executed twice or left out, and every unknown
+    execution is reported."""
     assert outcome["lives"] == len(outcome["kills"]) + 1, (
         f"not killed as often as wanted: {outcome}"
     )
@@ -47,7 +48,7 @@ def judge(outcome: dict[str, Any], undisturbed: dict[str, Any]) -> None:
 
 
 def test_twenty_kills_change_nothing(tmp_path: Path) -> None:
-    """All in one mission run, at seeded places, a few operations apart."""
+    """All are in one mission run, at operations drawn from a seed, a few operations apart."""
     kills = np.random.default_rng(2).integers(1, 12, 20).tolist()
     undisturbed, killed = experiments(tmp_path / "cell", [[], kills])
     assert (

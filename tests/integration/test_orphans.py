@@ -1,5 +1,5 @@
-"""No process outlives its parent: each parent is killed (kill -9) while its children hang as badly
-as can be, and all are gone."""
+"""No process survives its parent: each parent is killed (kill -9) while its children hang with the
+interpreter's lock held, and all children end."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def until(holds: Callable[[], bool], what: str) -> None:
 
 
 async def call(folder: Path, names: tuple[str, ...]) -> None:
-    """Call these actions and services of the node, and wait until each says that it hangs."""
+    """Call these actions and services of the node, and wait until each reports that it hangs."""
     directory = load(folder / "services.toml")
     hello = Hello(
         OLDEST_VERSION, NEWEST_VERSION, "coordinator", "tester", "tester", 1, directory.hash
@@ -95,8 +95,8 @@ async def call(folder: Path, names: tuple[str, ...]) -> None:
 
 @contextmanager
 def hanging_cell(folder: Path) -> Iterator[tuple[int, int]]:
-    """`petrobot up` over a node whose servo process, workers and general worker all hang; both
-    process ids."""
+    """Start `petrobot up` with a node whose servo process, device worker and other worker all hang;
+    return both process ids."""
     (folder / "services.toml").write_text(
         SERVICES.format(port=free_ports(1)[0], folder=folder), encoding="utf-8"
     )
@@ -114,10 +114,11 @@ def hanging_cell(folder: Path) -> Iterator[tuple[int, int]]:
 
 
 def test_a_node_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
-    """Servo process, the worker at its link, a worker with its device, one without: all hang with
-    the interpreter held."""
+    """Servo process, its worker, a worker with a device in it, and one without: all hang with the
+    interpreter's lock held."""
     with hanging_cell(tmp_path) as (launcher, node):
-        os.kill(launcher, signal.SIGSTOP)  # so that it starts no other, and reaps nothing
+        # stopped, so that it starts no other process and reaps none
+        os.kill(launcher, signal.SIGSTOP)
         family = below(node)
         assert len(family) >= 2 * 4, "each of them has its keeper"
         os.kill(node, signal.SIGKILL)
@@ -125,8 +126,8 @@ def test_a_node_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
 
 
 def test_a_launcher_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
-    """Its node hangs, too, in a service of its own loop, with the interpreter held: SIGTERM does
-    nothing to it."""
+    """Its node hangs too, in a service in its event loop with the interpreter's lock held, so
+    SIGTERM has no effect."""
     with hanging_cell(tmp_path) as (launcher, node):
         asyncio.run(call(tmp_path, ("quick",)))
         family = below(launcher)

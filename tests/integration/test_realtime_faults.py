@@ -1,5 +1,5 @@
-"""The cell on the wall clock over real processes: nodes are killed in mid-task, and the task goes
-on through its error branches."""
+"""The cell in real time with real processes: nodes are killed during the task, which continues
+through its error branches."""
 
 from __future__ import annotations
 
@@ -26,18 +26,19 @@ from tests.integration.cell_files import services_file
 pytestmark = pytest.mark.processes
 LIMIT = 120.0
 PERIODS = 3
-"""Of the stream, after which the arm must hold."""
+"""Periods of the stream without a set point after which the arm must hold."""
 
 
 class When:
-    """An observer that does something once, when an action place is entered for the first time."""
+    """An observer that calls a function once, when an action place is entered for the first
+    time."""
 
     def __init__(self, place: str, do: Callable[[], None]) -> None:
         self._place, self._do = place, do
         self.done = False
 
     def instruction(self, now: float, instruction: Instruction) -> None:
-        """Look for the start of the place's first run."""
+        """Call the function if this starts the place's first run."""
         if isinstance(instruction, StartRun) and instruction.place == self._place and not self.done:
             self.done = True
             self._do()
@@ -53,7 +54,7 @@ class When:
 
 
 async def arm_state(shell: RealtimeMission) -> dict[str, Any]:
-    """What the arm's driver says of itself now."""
+    """Return the present state of the arm's driver."""
     told: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
 
     def hear(data: Mapping[str, Any]) -> None:
@@ -71,8 +72,8 @@ async def arm_state(shell: RealtimeMission) -> dict[str, Any]:
 async def run_and_kill(
     folder: Path, place: str, node: str
 ) -> tuple[Mission, list[RunRecorded], Supervisor, dict[str, Any]]:
-    """Two runs over launched nodes; a node is killed (kill -9) when the place is first entered. The
-    arm's state comes last."""
+    """Lead two runs over launched nodes; kill a node (kill -9) when the place is first entered.
+    Return the results, and the arm's state last."""
     directory, task = load(services_file(folder)), load_task("catch_ball")
     mission = realtime_mission(directory, Setting(task, runs=2, seed=3), mission_id(task))
     async with Supervisor(local_programs(directory), folder / "logs") as supervisor:
@@ -90,11 +91,11 @@ async def run_and_kill(
 
 
 @pytest.mark.parametrize(("place", "node"), [("track_ball", "vision"), ("catch_ball", "motion")])
-async def test_a_node_killed_in_mid_catch_is_an_error_and_the_task_goes_on(
+async def test_a_node_killed_during_a_catch_is_an_error_and_the_task_continues(
     tmp_path: Path, place: str, node: str
 ) -> None:
-    """kill -9: its run ends in ERROR with executed = unknown and a reason, the node is started
-    again, final is reached. Whatever befalls the sender, no set point older than three periods is
+    """kill -9: its run ends in ERROR with executed = unknown and a reason, the node is restarted,
+    and `final` is reached. Whatever happens to the sender, no set point older than three periods is
     executed."""
     mission, runs, supervisor, arm = await run_and_kill(tmp_path, place, node)
     finished = mission.executor.finished

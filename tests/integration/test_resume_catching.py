@@ -1,4 +1,4 @@
-"""kill -9 of the coordinator while the arm is about to catch, in real time over the whole cell, and
+"""kill -9 of the coordinator just before the arm catches, in real time with the whole cell, and
 resumed."""
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ RUNS = 3
 
 
 @pytest.mark.parametrize("place", ["track_ball", "catch_ball", "return_home"])
-def test_killed_in_mid_catch_the_task_goes_on_to_its_end(place: str, tmp_path: Path) -> None:
-    """The arm's action is not rejoined (the ball has long gone): ERROR with a cause, or its stored
-    result; then the rest is caught.
+def test_killed_during_a_catch_the_task_continues_to_its_end(place: str, tmp_path: Path) -> None:
+    """The arm's action is not rejoined, since the ball has passed: it ends in ERROR with a cause,
+    or with its stored result. Then the other balls are caught.
 
-    The time without a coordinator is on the mission's clock, so the referee knows every cycle, also
-    those of before the kill.
+    The mission's clock includes the time without a coordinator, so the score has every cycle, also
+    those before the kill.
     """
     services = services_file(tmp_path)
     up = nodes(tmp_path)

@@ -1,4 +1,4 @@
-"""kill -9 of the coordinator over real processes: `petrobot resume` goes on where it was, and no
+"""kill -9 of the coordinator with real processes: `petrobot resume` continues the run, and no
 action is executed twice."""
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ QUIET = ("--quiet", "--no-page")
 
 
 def petrobot(folder: Path, *arguments: str) -> subprocess.Popen[bytes]:
-    """A command of ours that runs; what it prints goes to a file."""
+    """Start a command of petrobot; its output goes to a file."""
     with (folder / f"{arguments[0]}.txt").open("ab") as out:
         return subprocess.Popen(
             [sys.executable, "-m", "petrobot.coordinator", *arguments],
@@ -51,7 +51,7 @@ def until(ready: Callable[[], Any], process: subprocess.Popen[bytes] | None = No
 
 
 def nodes(folder: Path, *options: str) -> subprocess.Popen[bytes]:
-    """`petrobot up`, ready."""
+    """Start `petrobot up`, and wait until it is ready."""
     services = str(folder / "services.toml")
     up = petrobot(folder, "up", "--services", services, "--logs", str(folder / "logs"), *options)
     until(lambda: b"Ctrl-C" in (folder / "up.txt").read_bytes(), up)
@@ -61,8 +61,8 @@ def nodes(folder: Path, *options: str) -> subprocess.Popen[bytes]:
 def killed_and_resumed(
     folder: Path, count: int, kills: list[int], first: list[str]
 ) -> dict[str, Any]:
-    """`count` runs whose coordinator is killed when so many moves have begun, and resumed each
-    time. The result."""
+    """Start `count` runs, kill the coordinator whenever so many moves have begun, and resume it
+    each time. Return the result."""
     runs = folder / "runs"
     process = petrobot(
         folder, "run", str(TASK), "--runs", str(count), "--journal", str(runs), *first
@@ -82,19 +82,19 @@ def killed_and_resumed(
 
 
 NEVER_BEGUN = {(Status.ERROR, Executed.NO), (Status.ERROR, Executed.UNKNOWN), (None, Executed.NO)}
-"""Status and whether it was executed, of runs that may have made no move; the last one is preempted
-before its first step."""
+"""Status and `executed` of runs that may have made no move; the last one is preempted before its
+first step."""
 
 
 def ends_of(folder: Path) -> dict[str, RunRecorded]:
-    """How the journal says that each fetch and carry ended, by run."""
+    """Return how each fetch and carry ended in the journal, by run."""
     [run] = (folder / "runs").iterdir()
     told = (i for step in recorded(str(run)).steps() for i in step.instructions)
     return {i.run: i for i in told if isinstance(i, RunRecorded) and i.primitive_task != "tidy"}
 
 
-def test_a_run_in_real_time_killed_twice_goes_on_where_it_was(tmp_path: Path) -> None:
-    """Runs that went on are rejoined, results that came meanwhile are fetched: every move is made
+def test_a_real_time_run_killed_twice_continues(tmp_path: Path) -> None:
+    """Active runs are rejoined, and results that came meanwhile are fetched: every move is made
     once and none is lost."""
     shuttle_services(tmp_path, fetch=0.4, carry=0.5, orphan=60.0)
     up = nodes(tmp_path)
@@ -113,15 +113,16 @@ def test_a_run_in_real_time_killed_twice_goes_on_where_it_was(tmp_path: Path) ->
     assert len(ends) == RUNS, "no token lost or doubled"
     made = {call.rpartition("/")[2] for call in begun}
     for run, end in ends.items():
-        # what the kill kept from its node (a call not sent yet, a device still leased) is said,
-        # never passed over
+        # effects of the kill (a call not sent yet, a device still leased) are reported, never
+        # ignored
         assert run in made or (end.status, end.executed) in NEVER_BEGUN, end
     journal = (tmp_path / "resume.txt").read_text()
     assert "Traceback" not in journal
 
 
-def test_a_run_in_lock_step_whose_nodes_wait_goes_on_where_it_was(tmp_path: Path) -> None:
-    """One process a node: they wait for the resumed coordinator, and simulated time with them."""
+def test_a_lock_step_run_whose_nodes_wait_continues(tmp_path: Path) -> None:
+    """One process per node: the nodes, and with them simulated time, wait for the resumed
+    coordinator."""
     shuttle_services(tmp_path, fetch=0.4, carry=0.5)
     up = nodes(tmp_path, "--lockstep")
     first = [

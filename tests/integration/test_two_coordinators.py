@@ -1,5 +1,5 @@
-"""Two coordinators want one device: its lease settles who has it, the second is refused in clear
-and nothing moves for it."""
+"""Two coordinators want one device: the lease decides which one gets it; the second is refused with
+a clear message and moves nothing."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LIMIT = 120.0
 
 
 def mission_on(directory: Directory, runs: int) -> Mission:
-    """A mission run that has not begun."""
+    """Return a mission run that has not begun."""
     task = load_task(str(TASK))
     return realtime_mission(directory, Setting(task, runs=runs), mission_id(task))
 
@@ -32,7 +32,7 @@ def mission_on(directory: Directory, runs: int) -> Mission:
 async def led(
     directory: Directory, mission: Mission, meanwhile: asyncio.Event | None = None
 ) -> None:
-    """Connect, set `meanwhile`, run to the end, leave in good order."""
+    """Connect, set `meanwhile`, run to the end, and disconnect properly."""
     shell = RealtimeMission(mission, directory)
     try:
         await shell.connect(60.0)
@@ -44,22 +44,22 @@ async def led(
 
 
 async def until_moving(folder: Path) -> None:
-    """Until a move has begun."""
+    """Wait until a move has begun."""
     async with asyncio.timeout(LIMIT):
         while not moves(folder, "begin"):
             await beat(0.005)
 
 
 def judged(mission: Mission) -> tuple[list[RunRecorded], list[RunRecorded]]:
-    """Runs of a mission run, and apart from them those without a status: on a busy host the bell
-    may preempt a run before its node's answer to the call is there, and such a run counts as what
-    it is, not begun (docs/semantics.md, records)."""
+    """Return the runs of a mission run with a status, and those without one. On a busy host the
+    bell may preempt a run before its node has answered the call; such a run has not begun
+    (docs/semantics.md, records)."""
     runs = mission.tally.runs
     return [r for r in runs if r.status is not None], [r for r in runs if r.status is None]
 
 
-async def test_the_second_coordinator_is_refused_until_the_first_has_gone(tmp_path: Path) -> None:
-    """No device is shared, no run of the first one suffers, and whoever comes after it has the
+async def test_the_second_coordinator_is_refused_until_the_first_has_ended(tmp_path: Path) -> None:
+    """No device is shared, no run of the first one is affected, and the next coordinator gets the
     hands at once."""
     directory = load(shuttle_services(tmp_path, fetch=0.8, carry=0.8))
     first, second, third = (mission_on(directory, runs) for runs in (10, 2, 2))
@@ -84,9 +84,9 @@ async def test_the_second_coordinator_is_refused_until_the_first_has_gone(tmp_pa
     assert not any(call.startswith(second.executor.mission) for call in begun)
 
 
-async def test_a_good_bye_whose_link_is_broken_is_said_over_another(tmp_path: Path) -> None:
-    """The cable is cut as the first one is done: it comes back to say so, and whoever comes next
-    has the hands at once."""
+async def test_a_goodbye_is_sent_over_a_new_link_if_the_first_breaks(tmp_path: Path) -> None:
+    """The link breaks just as the first one ends: it connects again to say goodbye, and the next
+    coordinator gets the hands at once."""
     directory = load(shuttle_services(tmp_path))
     first, second = mission_on(directory, 2), mission_on(directory, 2)
     async with Supervisor(local_programs(directory), tmp_path / "logs"):

@@ -57,9 +57,9 @@ COMMANDS = [{"to": 0.2}, {"to": 0.0}]
 
 
 def checked(kind: type[Axis], **more: Any) -> DriverCheck:
-    """Check a driver, in simulated time unless it waits."""
+    """Check a driver, in simulated time unless the driver itself waits."""
     how: dict[str, Any] = {"simulated": True}
-    if kind is Waits:  # in real time: at every step it waits too long, however busy the computer is
+    if kind is Waits:  # in real time every step waits too long, even on an idle computer
         how = {"seconds": 0.5, "within": 0.05}
     return check_driver(lambda: kind({}, cast(Ports, None)), COMMANDS, **how | more)
 
@@ -81,7 +81,7 @@ class SaysItStands(Axis):
 
 
 class RunsOnAfterStop(Axis):
-    """It says that it stands, and rolls on."""
+    """It reports that it stands still, but it rolls on."""
 
     said = False
 
@@ -198,11 +198,11 @@ def test_each_broken_rule_is_named(kind: type[Axis], fault: str) -> None:
 
 
 class Unplugged(Axis):
-    """Its step raises without the cable."""
+    """Its step raises while the cable is unplugged."""
 
 
 class NoticesNothing(Axis):
-    """It stands whatever happens to its cable."""
+    """It reports that it stands still, whatever happens to its cable."""
 
     def step(self, now: float) -> None:
         type(self).plugged = True

@@ -1,5 +1,5 @@
-"""What user code does wrong ends its own run alone: what it leaves behind, how it blocks, what it
-takes, and who is spared."""
+"""Faults of user code end only its own run: processes that it leaves behind, blocking, crashes, and
+too much memory."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ from tests.waiting import Limit
 pytestmark = pytest.mark.processes
 DEADLINE = 1.0
 LATE = 5.0
-"""Seconds after its deadline in which a run must have ended, on a host as busy as this: grace,
-kill, and a margin."""
+"""Seconds after its deadline within which a run must have ended on a busy host: grace period, kill,
+and a margin."""
 TEXT = (
     CELL.replace("worker_memory_mb = 900\n", "worker_memory_mb = 900\nworkers = 6\n")
     + """\
@@ -60,7 +60,7 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nodes]:
 
 @pytest.fixture
 def own_nodes(tmp_path: Path) -> Iterator[Nodes]:
-    """Both nodes, for one test that stops them or counts on fresh workers."""
+    """Both nodes, for one test that stops them or needs fresh workers."""
     running = Nodes(tmp_path, "left", "right", text=TEXT)
     try:
         yield running
@@ -70,7 +70,7 @@ def own_nodes(tmp_path: Path) -> Iterator[Nodes]:
 
 @pytest.fixture
 async def operator(nodes: Nodes) -> AsyncIterator[Operator]:
-    """Connected to both."""
+    """An operator's clients, connected to both nodes."""
     async with operator_of(nodes.directory, "left", "right") as one:
         yield one
 
@@ -85,7 +85,7 @@ async def gone(operator: Operator, process: int) -> None:
 
 
 @pytest.mark.parametrize("how", WAYS)
-async def test_a_deadline_holds_whatever_was_left_behind(
+async def test_a_deadline_holds_even_if_processes_were_left_behind(
     operator: Operator, tmp_path: Path, how: str
 ) -> None:
     for service in PLACES:
@@ -102,7 +102,7 @@ async def test_a_deadline_holds_whatever_was_left_behind(
 
 
 @pytest.mark.parametrize("how", WAYS)
-async def test_what_a_crashed_worker_left_ends_with_it(
+async def test_processes_left_by_a_crashed_worker_end_with_it(
     operator: Operator, tmp_path: Path, how: str
 ) -> None:
     for service in PLACES:
@@ -113,7 +113,7 @@ async def test_what_a_crashed_worker_left_ends_with_it(
 
 
 @pytest.mark.parametrize("way", ["worker killed", "node killed", "node stopped"])
-async def test_what_an_action_left_lives_as_long_as_its_worker(
+async def test_processes_left_by_an_action_end_with_its_worker(
     own_nodes: Nodes, tmp_path: Path, way: str
 ) -> None:
     nodes = own_nodes
@@ -138,7 +138,7 @@ async def test_what_an_action_left_lives_as_long_as_its_worker(
             await gone(operator, process)
 
 
-async def test_an_action_that_closes_its_pipe_ends_alone(
+async def test_an_action_that_closes_its_pipe_ends_only_its_run(
     operator: Operator, tmp_path: Path
 ) -> None:
     for then in ("block", "return"):
@@ -165,7 +165,7 @@ async def test_a_copy_that_returns_from_the_action_does_nothing_more(
 
 
 async def test_a_stopped_worker_is_killed_at_the_deadline(own_nodes: Nodes) -> None:
-    """On fresh nodes: the only worker there is the one that runs the action."""
+    """The nodes are fresh, so their only worker is the one that runs the action."""
     async with operator_of(own_nodes.directory, "left", "right") as operator:
         for service, arguments, node, device in (
             ("nap", {"seconds": 60.0}, "left", ""),
@@ -183,9 +183,8 @@ async def test_a_stopped_worker_is_killed_at_the_deadline(own_nodes: Nodes) -> N
         assert (await operator.call("go", 60.0, to=0.0, timeout=50.0)).status == "success"
 
 
-async def test_one_that_blocks_and_one_that_crashes_end_alone(operator: Operator) -> None:
-    # The workers are started beforehand: how long that takes on a busy host is not what this is
-    # about.
+async def test_a_blocking_and_a_crashing_action_end_only_their_runs(operator: Operator) -> None:
+    # The workers are started beforehand: their start on a busy host must not count.
     assert {
         run.status
         for run in await asyncio.gather(*(operator.call("nap", seconds=1.0) for _ in range(5)))
@@ -201,11 +200,11 @@ async def test_one_that_blocks_and_one_that_crashes_end_alone(operator: Operator
     assert [(await nap).status for nap in naps] == ["success"] * 3
 
 
-async def test_many_at_once_run_once_each_beside_what_blocks_crashes_and_waits(
+async def test_many_calls_at_once_run_once_each_beside_blocking_and_crashing_ones(
     operator: Operator, tmp_path: Path
 ) -> None:
-    """Calls that come together wait behind each other in few workers, and none may be lost there,
-    run twice, or end because of the one before it."""
+    """Many calls at once queue in few workers. None may be lost there, run twice, or end because of
+    the one before it."""
     file = tmp_path / "lines"
     bad: dict[int, tuple[str, float, dict[str, float]]] = {
         5: ("block", DEADLINE, {"seconds": 30.0}),
@@ -237,11 +236,11 @@ async def test_many_at_once_run_once_each_beside_what_blocks_crashes_and_waits(
     assert sorted(file.read_text().split("\n")[:-1]) == sorted(expected)
 
 
-async def test_what_a_process_sent_before_its_end_is_read_although_nothing_can_be_sent_to_it(
+async def test_messages_sent_before_a_process_ended_are_read(
     own_nodes: Nodes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The node is busy while its process ends two runs and crashes, and notices that first when it
-    sends it another call."""
+    """The node is busy while its process ends two runs and crashes; it notices this only when it
+    sends another call to the process."""
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}{os.pathsep}{OUTSIDE}")
     results: list[str] = []
     over = asyncio.Event()
@@ -268,7 +267,7 @@ async def test_what_a_process_sent_before_its_end_is_read_although_nothing_can_b
     assert child.code == -signal.SIGSEGV
 
 
-async def test_at_the_limit_a_run_is_refused_and_says_so(operator: Operator) -> None:
+async def test_a_run_beyond_the_limit_is_refused_with_the_reason(operator: Operator) -> None:
     naps = [asyncio.create_task(operator.call("nap", 60.0, seconds=8.0)) for _ in range(6)]
 
     async def full() -> bool:
@@ -290,7 +289,7 @@ async def test_at_the_limit_a_run_is_refused_and_says_so(operator: Operator) -> 
     )
 
 
-async def test_too_much_memory_ends_one_run_and_no_other(own_nodes: Nodes) -> None:
+async def test_too_much_memory_ends_only_its_run(own_nodes: Nodes) -> None:
     async with operator_of(own_nodes.directory, "left", "right") as operator:
         nap = asyncio.create_task(operator.call("nap", 20.0, seconds=4.0))
         assert (await operator.call("pid")).status == "success"

@@ -1,5 +1,5 @@
-"""What actions and drivers may use: commands that cannot be forgotten, the global memory, and
-random draws keyed by the mission run's seed."""
+"""The context of actions and drivers: commands whose refusal cannot be ignored, the global memory,
+and random draws by the mission run's seed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from petrobot.services.worker.remote import COMMAND, SEED, DeviceCommand, Remote
 
 
 class Door(Driver):
-    """Opens by `share`; `stuck` takes no command."""
+    """Opens by `share`; if `stuck`, it accepts no command."""
 
     period = 0.02
 
@@ -48,14 +48,14 @@ def door() -> Door:
     return Door({}, None)  # type: ignore[arg-type]  # a rehearsal gives it ports
 
 
-def test_an_accepted_command_has_been_taken_when_the_action_continues() -> None:
-    """The state that the action reads then is one after the command."""
+def test_an_accepted_command_has_reached_the_driver_when_the_action_continues() -> None:
+    """The action then reads a state from after the command."""
     played = rehearse(open_door, device=door(), share=0.5)
     assert played.result.status == "success" and 0.5 <= played.result.values["share"] < 0.6
 
 
-def test_a_refused_command_cannot_be_forgotten() -> None:
-    """It ends the action with the driver's words, unless the action catches it."""
+def test_a_refused_command_cannot_be_ignored() -> None:
+    """It ends the action with the driver's message, unless the action catches it."""
     ended = rehearse(open_door, device=door(), share=3).result
     assert (ended.status, ended.cause) == ("error", "command_refused")
     assert ended.text == "share: expected at most 1, found 3"
@@ -63,8 +63,8 @@ def test_a_refused_command_cannot_be_forgotten() -> None:
     assert caught.status == "success" and caught.values == {"refused": ended.text}
 
 
-def test_a_command_that_nobody_takes_is_an_error() -> None:
-    """Without a driver that takes commands, and with one that takes none in time."""
+def test_a_command_that_no_driver_accepts_is_an_error() -> None:
+    """There is no driver that accepts commands, or it accepts none in time."""
     assert "no cyclic driver" in rehearse(open_door, device=object(), share=0).result.text
 
     class Silent:
@@ -106,11 +106,11 @@ def test_the_global_memory_has_defaults_and_versions() -> None:
         "late": False,
         "swapped": True,
         "value": 9,
-        "none": [1, None],  # written as None is not the same as never written
+        "none": [1, None],  # a variable that was set to None differs from one that was never set
     }
 
 
-def test_a_drivers_draws_are_those_of_the_seed() -> None:
+def test_a_drivers_draws_depend_on_the_seed() -> None:
     shares = [rehearse(open_door, device=door(), share=0, seed=s).result.values for s in (3, 4, 3)]
     assert shares[0] == shares[2] != shares[1]
 
@@ -130,14 +130,14 @@ def test_draws_begin_again_with_another_seed() -> None:
 
 
 class Hasty(Driver):
-    """Draws while it is being made."""
+    """Draws in its constructor."""
 
     def __init__(self, config: Mapping[str, Any], ports: Any) -> None:
         super().__init__(config, ports)
         self.start = ports.random("start").random()
 
 
-def test_a_driver_that_draws_while_it_is_made_is_refused(tmp_path: Path) -> None:
+def test_a_driver_that_draws_in_its_constructor_is_refused(tmp_path: Path) -> None:
     """Every seed would give the same draw, and a campaign would run copies."""
     text = (
         'schema = 1\n[nodes.pc]\nhost = "127.0.0.1"\nport = 7501\n'
@@ -150,8 +150,8 @@ def test_a_driver_that_draws_while_it_is_made_is_refused(tmp_path: Path) -> None
         make_driver(directory, entry, ports)
 
 
-def test_a_driver_in_another_process_is_told_each_new_seed() -> None:
-    """Once, between the commands, without being counted as one."""
+def test_a_driver_in_another_process_gets_each_new_seed() -> None:
+    """It gets each seed once, between the commands, and the message is not counted as a command."""
     posted: list[DeviceCommand] = []
     remote = RemoteDriver(posted.append, lambda: 0.0)
     remote.reseed(3)
@@ -169,4 +169,5 @@ def test_a_driver_in_another_process_is_told_each_new_seed() -> None:
     def gone(command: DeviceCommand) -> None:
         raise ConnectionError
 
-    RemoteDriver(gone, lambda: 0.0).reseed(3)  # its process is made again, and is told then
+    # a new process of the driver gets the seed at its start
+    RemoteDriver(gone, lambda: 0.0).reseed(3)

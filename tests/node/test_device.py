@@ -1,4 +1,4 @@
-"""The base class of drivers: what it does by itself, and the keys of a device's table."""
+"""The base class of drivers: its default methods, and the keys of a device's table."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ port = 7300
 
 
 class Scanner(Driver):
-    """A driver without cyclic work: nothing but what it does."""
+    """A driver without cyclic work: it defines only the methods that it needs."""
 
     port: str = key(text="serial port")
     rate: float = key(9600, "baud")
@@ -34,7 +34,7 @@ class Scanner(Driver):
 
 
 class Broken(Driver):
-    """A driver whose device is not there."""
+    """A driver whose device is not connected."""
 
     def __init__(self, config: Mapping[str, Any], ports: Any) -> None:
         super().__init__(config, ports)
@@ -42,12 +42,12 @@ class Broken(Driver):
 
 
 def made(driver: str, **config: Any) -> Driver:
-    """The driver of a device with this table."""
+    """Return the driver of a device with this table."""
     cell = parse(CELL, Path("services.toml"))
     return make_driver(cell, DeviceEntry("it", "pc", f"{__name__}:{driver}", config), None)  # type: ignore[arg-type]
 
 
-def test_a_driver_needs_only_what_its_device_does() -> None:
+def test_a_driver_needs_only_the_methods_that_its_device_uses() -> None:
     scanner = made("Scanner", port="/dev/ttyUSB0", rate=19200)
     assert isinstance(scanner, Scanner) and scanner.read() == "/dev/ttyUSB0@19200.0"
     assert (scanner.tries, scanner.loud, scanner.codes) == (3, False, [])
@@ -91,10 +91,10 @@ def test_a_wrong_key_is_refused_by_name(config: dict[str, Any], words: str) -> N
         made("Scanner", **config)
 
 
-def test_keys_of_ports_are_no_faults() -> None:
+def test_keys_of_ports_are_accepted() -> None:
     assert read_keys(Scanner, {"port": "a", "source": "sim", "bitrate": 1})["port"] == "a"
 
 
-def test_a_device_that_is_not_there_is_not_a_wrong_key() -> None:
+def test_a_missing_device_is_not_reported_as_a_wrong_key() -> None:
     with pytest.raises(DirectoryError, match=r"cannot open its device.*check that it is connected"):
         made("Broken")

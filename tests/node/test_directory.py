@@ -1,4 +1,4 @@
-"""services.toml: what it gives, and every fault named with line, key and remedy."""
+"""Reading services.toml: its contents, and one message with line, key and remedy for each fault."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def good() -> Directory:
     return parse(GOOD, Path("cell/services.toml"))
 
 
-def test_what_a_good_file_gives() -> None:
+def test_a_valid_file() -> None:
     d = good()
     assert (
         d.where("look") == "vision" and d.where("add") == "motion" and d.where("where") == "motion"
@@ -232,7 +232,7 @@ def test_faults_are_named_with_their_remedy(old: str, new: str, says: str) -> No
     assert all(fault.startswith("cell/services.toml") for fault in caught.value.faults)
 
 
-def test_all_faults_are_told_at_once() -> None:
+def test_all_faults_are_reported_at_once() -> None:
     text = (
         GOOD.replace("port = 7301", "port = 0")
         .replace("deadline = 5", "deadline = -5")
@@ -243,12 +243,12 @@ def test_all_faults_are_told_at_once() -> None:
     assert len(caught.value.faults) == 4  # two numbers, an unknown key, a missing one
 
 
-def test_an_unknown_name_is_answered_with_the_nearest() -> None:
+def test_an_unknown_name_gets_the_nearest_as_a_suggestion() -> None:
     with pytest.raises(DirectoryError, match="nothing is named 'lok'; did you mean 'look'"):
         good().where("lok")
 
 
-def test_an_unreadable_file_raises_what_the_system_says(tmp_path: Path) -> None:
+def test_an_unreadable_file_raises_the_systems_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         load(tmp_path / "services.toml")
 

@@ -1,5 +1,4 @@
-"""What docs/actions.md and docs/drivers.md tell newcomers is true: their files are written out and
-run."""
+"""The examples of docs/actions.md and docs/drivers.md work: their files are written out and run."""
 
 from __future__ import annotations
 
@@ -24,7 +23,7 @@ PAGES = [ROOT / "docs" / "actions.md", ROOT / "docs" / "drivers.md"]
 
 @pytest.fixture
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with all files of the pages."""
+    """Return a folder with all files of the pages."""
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
     blocks = re.findall(r"```(?:python|toml)\n# file: (\S+)\n(.*?)```", text, re.DOTALL)
     assert len(blocks) == 7

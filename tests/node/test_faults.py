@@ -1,5 +1,5 @@
-"""A device that follows a stream from another node stands still when that node, or its worker
-alone, is killed or frozen."""
+"""A device that follows a stream from another node stops when that node, or only its worker, is
+killed or frozen."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from tests.processes import kill
 
 pytestmark = pytest.mark.processes
 PERIOD = 0.02
-"""Of the stream (s), as in the cell of test_processes."""
+"""Period of the stream (s), as in the cell of test_processes."""
 
 
 async def slide(operator: Operator) -> Mapping[str, Any]:
-    """State of the device that follows."""
+    """Return the state of the device that follows the stream."""
     answer = await operator.command("left", "status", "slide")
     state: Mapping[str, Any] = answer.data["devices"]["slide"]["state"]
     return state
@@ -32,7 +32,7 @@ async def slide(operator: Operator) -> Mapping[str, Any]:
     [("worker", signal.SIGKILL), ("node", signal.SIGKILL), ("node", signal.SIGSTOP)],
     ids=["worker killed", "node killed", "node frozen"],
 )
-async def test_a_device_stands_when_the_sender_of_its_stream_is_lost(
+async def test_a_device_stops_when_the_sender_of_its_stream_is_lost(
     tmp_path: Path, whom: str, how: signal.Signals
 ) -> None:
     running = Nodes(tmp_path, "left", "right")
@@ -42,8 +42,8 @@ async def test_a_device_stands_when_the_sender_of_its_stream_is_lost(
             if whom == "node":
                 victims.insert(0, running.processes["right"].pid)
             following = asyncio.create_task(operator.call("follow", seconds=60.0))
-            # The goal runs away faster than the device can follow: if it stands, it is because it
-            # holds.
+            # The set point moves faster than the device can follow, so the device stands still only
+            # if it stopped.
             leading = asyncio.create_task(operator.call("lead", seconds=60.0, speed=1000.0))
             await operator.until(lambda: _counted(operator, 10))
             kill(victims, how)

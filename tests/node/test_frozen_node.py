@@ -1,5 +1,5 @@
-"""A node that is frozen, or whose loop is blocked, does not keep its devices moving: their
-processes stop them themselves."""
+"""If a node is frozen, or its loop is blocked, the processes of its devices stop the devices
+themselves."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from petrobot.services.node.emergency_stops import AGAIN, BEAT, GUARD_LOOK, SILE
 from petrobot.services.worker.device_process import DeviceLoop
 from petrobot.services.worker.pipe import Pipe
 from petrobot.services.worker.remote import EMERGENCY_STOP, NODE_SILENT
-from tests.node.test_heard import OneNode, cell
+from tests.node.test_driver_faults import OneNode, cell
 from tests.node.test_parts import Moving, Process, states
 from tests.node.test_parts import Ports as NoPorts
 from tests.node.test_processes import PATIENCE, Operator, operator_of
@@ -47,8 +47,8 @@ device = "the_{name}"
 
 
 class Moved:
-    """A node with a cyclic device and one whose driver lives beside its action; both write down
-    when they stop."""
+    """A node with a cyclic device, and one whose driver is in the process of its action. Both
+    record when they stop."""
 
     def __init__(self, folder: Path) -> None:
         self.files = {name: folder / f"{name}.log" for name in ("base", "tool")}
@@ -68,7 +68,7 @@ class Moved:
         return [(float(row[0]), row[1]) for row in rows if len(row) == 2]
 
     def stopped(self, name: str) -> float:
-        """When it stopped after it had moved (s, monotonic)."""
+        """Return when the device stopped after it had moved (s, monotonic)."""
         return float(
             wait(lambda: [at for at, said in self.lines(name)[1:] if said == "stopped"])[0]
         )
@@ -81,7 +81,7 @@ class Moved:
 
 
 def wait(look: Callable[[], list[Any]], timeout: float = PATIENCE) -> list[Any]:
-    """What `look` gives as soon as it gives anything."""
+    """Return the first result of `look` that is not None."""
     until = time.monotonic() + timeout
     while not (found := look()):
         assert time.monotonic() < until, "it did not come"
@@ -106,7 +106,7 @@ async def operator(moved: Moved) -> AsyncIterator[Operator]:
 
 
 async def moving(moved: Moved, operator: Operator, name: str) -> asyncio.Task[Any]:
-    """A run that moves the device for longer than any test lasts."""
+    """Start a run that moves the device for longer than any test lasts."""
     until = time.monotonic() + PATIENCE
     while True:
         run = asyncio.create_task(operator.call(name, None, send=[{"go": True}], seconds=600.0))
@@ -115,7 +115,7 @@ async def moving(moved: Moved, operator: Operator, name: str) -> asyncio.Task[An
             await asyncio.sleep(0.005)
         if not run.done():
             return run
-        # The node may have to be heard again first.
+        # the device may first need a sign of life from its node
         assert (
             time.monotonic() < until and "silent" in f"{run.result().cause} {run.result().text}"
         ), run.result()
@@ -123,7 +123,7 @@ async def moving(moved: Moved, operator: Operator, name: str) -> asyncio.Task[An
 
 @contextmanager
 def frozen(moved: Moved) -> Iterator[float]:
-    """The node stands still meanwhile; gives since when."""
+    """Freeze the node meanwhile; yield the time of the freeze."""
     moved.send(signal.SIGSTOP)
     try:
         yield time.monotonic()
@@ -132,7 +132,7 @@ def frozen(moved: Moved) -> Iterator[float]:
 
 
 async def usable(operator: Operator, name: str) -> None:
-    """The device takes commands again, soon after its node goes on; then it is stopped."""
+    """Check that the device accepts commands again soon after its node continues; then stop it."""
     until = time.monotonic() + PATIENCE
     while (
         end := await operator.call(name, None, send=[{"go": True}], seconds=0.01)
@@ -181,7 +181,7 @@ async def test_the_emergency_stop_of_a_frozen_node(moved: Moved, operator: Opera
             await asyncio.to_thread(moved.stopped, name)
     for run in runs:
         assert (await run).status == "error"
-    # The first orders after the freeze may come before the node has looked at the latch: its device
+    # The node may send the first calls after the freeze before it has read the latch: its device
     # refuses them itself.
     assert await operator.clients["only"].connected(PATIENCE)
     end = await operator.call("base", None, send=[{"go": True}], seconds=0.05)
@@ -195,7 +195,7 @@ async def test_the_emergency_stop_of_a_frozen_node(moved: Moved, operator: Opera
 @pytest.mark.proof
 @pytest.mark.processes
 async def test_how_soon_devices_of_a_frozen_node_stop(moved: Moved, operator: Operator) -> None:
-    """30 times each: within a second of the node's last word, and within 0.25 s of the latch."""
+    """30 times each: within a second of the node's last message, and within 0.25 s of the latch."""
     latch = latch_of(moved.node.file, "only")
     for kind, limit in (("latch", 0.25), ("silence", 1.0)):
         took = {"base": list[float](), "tool": list[float]()}
@@ -206,9 +206,7 @@ async def test_how_soon_devices_of_a_frozen_node_stop(moved: Moved, operator: Op
                 run = await moving(moved, operator, name)
                 with frozen(moved) as since:
                     if kind == "latch":
-                        since = (
-                            time.monotonic()
-                        )  # the time that it takes to put it safely on disk counts
+                        since = time.monotonic()  # this includes the time to sync the latch to disk
                         await asyncio.to_thread(latch.stop, [ALL])
                     took[name].append(await asyncio.to_thread(moved.stopped, name) - since)
                 print(f"{kind}, {name}: {took[name][-1]:.3f} s", flush=True)
@@ -236,14 +234,14 @@ def latch(tmp_path: Path) -> Latch:
     return Latch("only", [tmp_path])
 
 
-def test_a_node_that_was_never_heard_is_not_silent(latch: Latch) -> None:
+def test_a_node_that_never_sent_a_heartbeat_is_not_silent(latch: Latch) -> None:
     guard = Guard("base", latch)
     for look in range(1_000):
         guard.heard(look * GUARD_LOOK, False)
     assert guard.look(1_000.0) == ""
 
 
-def test_silence_and_speech(latch: Latch) -> None:
+def test_silence_and_heartbeats(latch: Latch) -> None:
     guard, now = Guard("base", latch), 5.0
     guard.look(now)
     guard.heard(now, True)
@@ -257,9 +255,9 @@ def test_silence_and_speech(latch: Latch) -> None:
     assert guard.look(now) == ""
 
 
-def test_a_process_that_stood_still_itself_blames_nobody(latch: Latch) -> None:
-    """What the node said meanwhile has still to be read: it gets another moment, and no more than
-    that."""
+def test_a_process_that_was_frozen_itself_does_not_blame_its_node(latch: Latch) -> None:
+    """Messages that the node sent meanwhile are still unread, so the node gets a little more time,
+    once."""
     guard = Guard("base", latch)
     guard.look(0.0)
     guard.heard(0.0, True)
@@ -272,7 +270,7 @@ def test_a_process_that_stood_still_itself_blames_nobody(latch: Latch) -> None:
 
 
 @pytest.mark.parametrize(("names", "stops"), [(["base"], True), ([ALL], True), (["tool"], False)])
-def test_the_latch_is_heeded_without_the_node(latch: Latch, names: list[str], stops: bool) -> None:
+def test_the_latch_works_without_the_node(latch: Latch, names: list[str], stops: bool) -> None:
     guard = Guard("base", latch)
     assert guard.look(0.0) == ""
     latch.stop(names)
@@ -280,7 +278,7 @@ def test_the_latch_is_heeded_without_the_node(latch: Latch, names: list[str], st
 
 
 class Watched(Process):
-    """A device loop that watches latch and node, and a node that beats."""
+    """A device loop that watches the latch and the node, and a node that sends heartbeats."""
 
     def __init__(self, driver: Moving, latch: Latch) -> None:
         node, loop_end = socket.socketpair()
@@ -292,7 +290,7 @@ class Watched(Process):
         self.thread.start()
 
     def beat_until(self, link: Any, fits: Callable[[list[Any]], bool]) -> list[Any]:
-        """Beat until a state fits."""
+        """Send heartbeats until a state fulfils the condition."""
         found: list[list[Any]] = []
 
         def look() -> list[Any]:
@@ -305,8 +303,8 @@ class Watched(Process):
         return list(wait(look)[0])
 
 
-def test_a_driver_heeds_the_latch_while_its_node_beats(latch: Latch) -> None:
-    """And takes commands again when the node says so, not when the file goes."""
+def test_the_latch_stops_a_driver_while_its_node_sends_heartbeats(latch: Latch) -> None:
+    """It accepts commands again when the node says so, not when the latch's file is removed."""
     driver = Moving()
     process = Watched(driver, latch)
     link = process.link()
@@ -324,7 +322,8 @@ def test_a_driver_heeds_the_latch_while_its_node_beats(latch: Latch) -> None:
 
 
 def test_a_driver_stops_when_its_node_is_frozen_before_its_first_beat(latch: Latch) -> None:
-    """A worker was attached, so the device can move: from then on the node's silence counts."""
+    """A worker was attached, so the device can move; from then on it watches for the node's
+    heartbeats."""
     driver = Moving()
     process = Watched(driver, latch)
     link = process.link()
@@ -335,7 +334,7 @@ def test_a_driver_stops_when_its_node_is_frozen_before_its_first_beat(latch: Lat
     process.end()
 
 
-def test_a_driver_stops_when_its_node_is_silent_and_goes_on_when_it_speaks(latch: Latch) -> None:
+def test_a_driver_stops_when_its_node_is_silent_and_continues_when_it_is_not(latch: Latch) -> None:
     driver = Moving()
     process = Watched(driver, latch)
     link = process.link()

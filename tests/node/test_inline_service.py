@@ -1,5 +1,4 @@
-"""A service that is a plain function: what its caller is told, also when the function is no
-good."""
+"""A service that is a plain function: what its caller receives, also if the function is faulty."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ def _call(function: str, **arguments: Any) -> Any:
     return answer(1.5, Call("c1", "it", arguments))
 
 
-def test_its_values_are_plain_and_its_events_are_told() -> None:
+def test_its_values_are_plain_and_its_events_are_delivered() -> None:
     outcome = _call("double", numbers=[1.0, 2.0])
     assert (outcome.status, outcome.values, outcome.executed) == (
         "success",
@@ -32,8 +31,8 @@ def test_its_values_are_plain_and_its_events_are_told() -> None:
     assert [Event("doubled", "it", 0, {"count": 2})] == EVENTS
 
 
-def test_its_verdicts_are_told() -> None:
-    """A service may judge as an action may: it is on nobody's device, and sees what all of them
+def test_its_verdicts_are_delivered() -> None:
+    """A service may send verdicts like an action: it uses no device, and can see what all devices
     did."""
     assert _call("judge", run="m/pick#1").status == "success"
     judged = {"run": "m/pick#1", "status": "failure", "cause": "crooked", "text": ""}

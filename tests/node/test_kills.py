@@ -1,5 +1,5 @@
-"""Processes of a cyclic device are killed at random moments, under load: each time it is up again,
-and takes runs."""
+"""Processes of a cyclic device are killed at random moments, under load: each time the device
+starts again and accepts runs."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from tests.processes import alive
 
 pytestmark = pytest.mark.processes
 RECOVERY = 60.0
-"""Seconds within which the device must be up again, on a host as busy as this."""
+"""Seconds within which the device must be up again on a busy host."""
 HOWS = ("SIGKILL", "SIGSEGV", "SIGSTOP, then SIGKILL")
 VICTIMS = (("driver",), ("actions",), ("driver", "actions"))
 LINK = ("lost", "unreachable", "not_accepted")
 CALLS = 10
 """Calls that must succeed after each kill."""
 WRONG_HASTE = 0.3
-"""Share of kills that come while the processes are being started again after the one before."""
+"""Share of kills that come while the processes are restarting after the previous kill."""
 
 
 @contextmanager
@@ -51,18 +51,18 @@ def load() -> Iterator[None]:
 
 @dataclass
 class Tally:
-    """What was done, and what came of it."""
+    """Counts of kills and calls, and their results."""
 
     kills: dict[str, int] = field(default_factory=dict)
     calls: int = 0
     links: int = 0
-    """Calls that the link to the node was lost under: on a host so busy that this process stood
-    still for a second."""
+    """Calls during which the link to the node was lost, because the host was so busy that this
+    process did not run for a second."""
     wedged: list[str] = field(default_factory=list)
 
 
 async def up(operator: Operator, former: set[int]) -> bool:
-    """Whether the node says that the device is up, by processes that were not killed."""
+    """Return whether the node reports the device as up, with processes that were not killed."""
     answer = await operator.command("left", "status", "slide")
     found = answer.data.get("devices", {}).get("slide", {}).get("pids", {})
     return answer.data.get("answers") == {"slide": "up"} and former.isdisjoint(found.values())
@@ -89,7 +89,8 @@ async def passing(seconds: float) -> None:
 
 
 async def storm(folder: Path, seed: int, kills: int) -> Tally:
-    """So many kills, each but the hasty ones followed by calls that all must succeed."""
+    """Kill so many times. After each kill, except those during a restart, all calls must
+    succeed."""
     chance, tally = random.Random(seed), Tally()
     running = Nodes(folder, "left")
     try:
@@ -131,19 +132,19 @@ async def storm(folder: Path, seed: int, kills: int) -> Tally:
     return tally
 
 
-async def test_a_device_outlives_kills_of_its_processes(tmp_path: Path) -> None:
+async def test_a_device_survives_kills_of_its_processes(tmp_path: Path) -> None:
     tally = await storm(tmp_path, 5, 10)
     assert not tally.wedged and tally.links < CALLS and tally.calls >= 5 * CALLS, tally
 
 
 @pytest.mark.proof
-async def test_a_device_outlives_two_hundred_kills_of_its_processes(tmp_path: Path) -> None:
+async def test_a_device_survives_two_hundred_kills_of_its_processes(tmp_path: Path) -> None:
     tally = await storm(tmp_path, 11, 200)
     print(tally)
     assert not tally.wedged and tally.links < CALLS, tally
 
 
-async def test_petrobot_nodes_says_up_only_when_a_call_would_be_taken(tmp_path: Path) -> None:
+async def test_petrobot_nodes_says_up_only_if_a_call_would_be_accepted(tmp_path: Path) -> None:
     running = Nodes(tmp_path, "left")
     try:
         async with operator_of(running.directory, "left") as operator:
@@ -171,7 +172,7 @@ async def test_petrobot_nodes_says_up_only_when_a_call_would_be_taken(tmp_path: 
 
 
 def nodes_command(file: Path) -> dict[str, Any]:
-    """What `petrobot nodes` says."""
+    """Return the output of `petrobot nodes`."""
     command = [
         sys.executable,
         "-m",
@@ -191,10 +192,9 @@ def nodes_command(file: Path) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("how", ["SIGKILL", "SIGSTOP"])
-async def test_a_keeper_that_is_killed_or_frozen_costs_no_more_than_its_worker(
-    tmp_path: Path, how: str
-) -> None:
-    """The processes directly below the node: whoever looks for the node's children finds these."""
+async def test_a_killed_or_frozen_keeper_costs_only_its_worker(tmp_path: Path, how: str) -> None:
+    """The keepers are the processes directly below the node, so a tool that kills the node's
+    children kills them."""
     running = Nodes(tmp_path, "left")
     try:
         async with operator_of(running.directory, "left") as operator:

@@ -1,5 +1,5 @@
-"""Nodes in a lock-step cell: calls, devices, streams, memory and timers; and that placement shows
-nowhere."""
+"""Nodes in a lock-step cell: calls, devices, streams, memory and timers; results do not depend on
+which node runs what."""
 
 from __future__ import annotations
 
@@ -102,8 +102,8 @@ def directory(node: str = "left", **replaced: str) -> Directory:
 
 
 class World:
-    """The laboratory: answers each frame with one, sends an image every 20 ms while images are
-    wanted."""
+    """A laboratory that answers each frame with one, and sends an image every 20 ms while images
+    are wanted."""
 
     name = "world"
 
@@ -140,7 +140,8 @@ class World:
 
 
 class Coordinator:
-    """Calls by script: (tick, service, arguments), and writes down what it hears, with the tick."""
+    """Makes calls by script, (tick, service, arguments), and records what it receives, with the
+    tick."""
 
     name = "coordinator"
 
@@ -226,8 +227,8 @@ def test_an_action_on_a_cyclic_device() -> None:
 
 
 def test_a_stopped_device_starts_no_run_before_it_is_cleared() -> None:
-    """The run is refused before it begins, so nothing of it was executed. Devices of other nodes
-    work as before."""
+    """The run is refused before it begins, so none of it was executed. Devices of other nodes still
+    work."""
     bench = Bench(directory())
     assert bench.call("go", 1.0, to=0.1).status == "success"
     coordinator = bench.coordinator
@@ -292,7 +293,7 @@ def test_compare_and_set_loses_no_update() -> None:
     assert bench.nodes["right"].node.memory.values()["count"].value == 12
 
 
-def test_watched_variables_are_told() -> None:
+def test_watched_variables_are_reported() -> None:
     bench = Bench(directory())
     bench.coordinator.callers["right"].subscribe(0.0, ["memory:sum"])
     bench.call("relay", a=4)
@@ -303,7 +304,7 @@ def test_watched_variables_are_told() -> None:
     assert events[0].number == 1
 
 
-def test_timers_pulse_for_those_who_listen() -> None:
+def test_timers_send_pulses_to_their_listeners() -> None:
     bench = Bench(directory())
     bench.run(0.5)
     assert not [n for _, n in bench.coordinator.heard if isinstance(n, Event)]
@@ -353,7 +354,7 @@ def test_a_local_service_is_refused_to_another_host() -> None:
     )
 
 
-def test_one_run_a_device_and_cancel() -> None:
+def test_one_run_per_device_and_cancel() -> None:
     bench = Bench(directory())
     first = bench.coordinator.call("go", to=50.0)
     bench.run(0.1)
@@ -405,7 +406,7 @@ def test_hold_stops_the_arm_and_its_run_but_not_the_eye() -> None:
 @pytest.mark.parametrize(
     ("verb", "target", "cause"), [("dance", "", "unknown_verb"), ("hold", "foot", "unknown_device")]
 )
-def test_commands_that_mean_nothing(verb: str, target: str, cause: str) -> None:
+def test_meaningless_commands(verb: str, target: str, cause: str) -> None:
     bench = Bench(directory())
     bench.run(0.05)
     bench.coordinator.callers["left"].command(bench.cell.now, Command("x", verb, target))
@@ -476,7 +477,8 @@ def trace(
 
 
 def trace_of(coordinator: Coordinator) -> list[tuple[Any, ...]]:
-    """All that a coordinator heard, with the tick, but for what belongs to a process."""
+    """Return all that a coordinator received, with the tick, without what depends on the
+    process."""
     rows: list[tuple[Any, ...]] = []
     for tick, notice in coordinator.heard:
         if isinstance(notice, Outcome):
@@ -505,7 +507,7 @@ def trace_of(coordinator: Coordinator) -> list[tuple[Any, ...]]:
     calls=st.lists(st.tuples(st.integers(0, 60), st.sampled_from(CALLS)), min_size=2, max_size=8),
     everything_left=st.booleans(),
 )
-def test_placement_shows_nowhere(
+def test_results_do_not_depend_on_placement(
     calls: list[tuple[int, tuple[str, dict[str, Any]]]], everything_left: bool
 ) -> None:
     script = sorted(((tick, *call) for tick, call in calls), key=lambda row: row[0])

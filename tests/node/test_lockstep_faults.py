@@ -1,4 +1,4 @@
-"""Lock step hears drivers as real time does, and names what does not come back."""
+"""Lock step reports faults of drivers as real time does, and names code that does not return."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from petrobot.services.node import watchdog
 from petrobot.services.node.inline_host import InlineHost
 from petrobot.services.node.watchdog import Watchdog
 from tests.node.conftest import OUTSIDE, Clock
-from tests.node.test_heard import FAULTS
+from tests.node.test_driver_faults import FAULTS
 from tests.node.test_processes import PATIENCE, ROOT
 from tests.ports import free_ports
 
@@ -27,7 +27,7 @@ TICK = 0.004
 
 
 class Ports:
-    """No ports but for events."""
+    """Ports with events only."""
 
     now = 0.0
 
@@ -39,7 +39,7 @@ class Ports:
 
 
 class Inline:
-    """A place with a driver that breaks, in this process."""
+    """A worker in this process, with a driver that breaks."""
 
     def __init__(self, breaks: str, action: str = "order") -> None:
         from toy_cell import actions, drivers  # type: ignore[import-not-found]  # tests/node/outside
@@ -59,7 +59,7 @@ class Inline:
         self._begun = 0
 
     def run(self, **arguments: Any) -> Outcome:
-        """Begin a run, and give its end."""
+        """Begin a run, and return its end."""
         self._begun += 1
         identity = f"run{self._begun}"
         self.place.take(self.clock.now, Call(identity, "order", arguments, 5.0))
@@ -76,7 +76,7 @@ class Inline:
 @pytest.mark.parametrize(
     "breaks", [name for name in FAULTS if name not in ("surrogate", "huge", "not_plain", "state")]
 )
-def test_what_a_driver_raises_is_its_runs_error(
+def test_an_exception_of_a_driver_is_the_runs_error(
     breaks: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     inline = Inline(breaks)
@@ -94,7 +94,7 @@ def test_what_a_driver_raises_is_its_runs_error(
 
 
 @pytest.mark.parametrize("verb", ["stop", "hold", "release"])
-def test_an_order_that_the_driver_fails_on(verb: str) -> None:
+def test_a_command_of_the_node_that_fails_in_the_driver(verb: str) -> None:
     inline = Inline(verb)
     inline.place.take(
         0.0, Call("r", "order", {"send": [{"go": True}, {"break": True}], "seconds": 3.0}, 5.0)
@@ -126,7 +126,7 @@ def test_a_refused_command_in_lock_step(send: list[dict[str, Any]], seconds: flo
 
 
 def test_a_good_run_ends_in_the_tick_in_which_it_returns() -> None:
-    """That its commands are known to be taken costs no simulated time."""
+    """Waiting until its commands are accepted takes no simulated time."""
     inline = Inline("")
     end = inline.run(send=[{"go": True}])
     assert (end.status, end.seconds, inline.clock.now) == ("success", 0.0, 0.0)
@@ -179,9 +179,9 @@ RUN = textwrap.dedent("""\
 
 @pytest.mark.processes
 @pytest.mark.parametrize("stubborn", [False, True])
-def test_an_action_that_does_not_come_back_is_named(tmp_path: Path, stubborn: bool) -> None:
-    """Its run ends in ERROR, or the process where it lets nobody interrupt it; node, action, run
-    and line are said."""
+def test_an_action_that_does_not_return_is_named(tmp_path: Path, stubborn: bool) -> None:
+    """Its run ends in ERROR, or, if it cannot be interrupted, its process ends. The message names
+    node, action, run and line."""
     file = tmp_path / "services.toml"
     file.write_text(HANGING.format(port=free_ports(1)[0], stubborn=str(stubborn).lower()))
     done = subprocess.run(
@@ -201,8 +201,8 @@ def test_an_action_that_does_not_come_back_is_named(tmp_path: Path, stubborn: bo
         assert done.stdout.startswith("error hung ") and "turn_round (actions.py:" in done.stdout
 
 
-def test_a_busy_machine_does_not_trip_the_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Time that a step only waits for its turn on the processor does not count."""
+def test_a_busy_machine_does_not_trigger_the_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Time in which a step only waits for the processor is not counted."""
     dog = watchdog.Watchdog("only")
     interrupted: list[int] = []
     monkeypatch.setattr(dog, "_interrupt", interrupted.append)
@@ -210,7 +210,7 @@ def test_a_busy_machine_does_not_trip_the_watchdog(monkeypatch: pytest.MonkeyPat
     used = [0.0]
     monkeypatch.setattr(watchdog, "_processor_time", lambda thread: used[0])
     dog.begin()
-    for _ in range(10_000):  # an hour and more of looks
+    for _ in range(10_000):  # checks of more than an hour
         dog.look()
     assert not interrupted
     for _ in range(int(watchdog.LIMIT) + 2):
@@ -223,9 +223,9 @@ def test_a_busy_machine_does_not_trip_the_watchdog(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("by", ["a person", "the action"])
-def test_ctrl_c_of_a_person_is_not_taken_for_the_actions(by: str) -> None:
-    """In lock step both come as KeyboardInterrupt at the same place: the one ends the command, the
-    other the run alone."""
+def test_ctrl_c_of_the_user_is_not_confused_with_the_watchdogs(by: str) -> None:
+    """In lock step both arrive as KeyboardInterrupt at the same place: the user's ends the command,
+    the watchdog's ends only the run."""
 
     def act(ctx: Any) -> Any:
         if by == "a person":
@@ -254,8 +254,9 @@ def test_ctrl_c_of_a_person_is_not_taken_for_the_actions(by: str) -> None:
         signal.signal(signal.SIGINT, before)
 
 
-def test_a_thread_that_has_ended_crashes_nothing() -> None:
-    """The processor clock of a thread that is gone may only be read, not asked for."""
+def test_an_ended_thread_does_not_crash_the_watchdog() -> None:
+    """Asking for the processor clock of an ended thread crashes; reading one obtained before does
+    not."""
     watched = Watchdog("only")
 
     def step() -> None:

@@ -1,5 +1,4 @@
-"""The log of a node: what it holds at each level, and that no exception of the user's code is
-missing in it."""
+"""The log of a node: its contents at each level, and every exception of the user's code."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ run = "toy_cell.actions:broken"
 """
 
 
-def test_an_exception_of_an_action_is_logged_with_what_led_to_it(
+def test_an_exception_of_an_action_is_logged_with_its_cause(
     bench: Make, caplog: pytest.LogCaptureFixture
 ) -> None:
     def grasp(ctx: Context) -> Result:

@@ -1,5 +1,5 @@
-"""Thirty mistakes that a newcomer makes in the shipped services.toml: each is one line with file,
-key and remedy, exit code 2."""
+"""Thirty mistakes of newcomers in the shipped services.toml: each gives one line with file, key and
+remedy, and exit code 2."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ MISTAKES: list[tuple[str, str, str]] = [
 
 
 def told(*command: str) -> tuple[int, str]:
-    """Exit code and all that a command says."""
+    """Run a command; return its exit code and all its output."""
     said = io.StringIO()
     with redirect_stdout(said), redirect_stderr(said):
         code = main(list(command))
@@ -167,8 +167,9 @@ def told(*command: str) -> tuple[int, str]:
 @pytest.mark.parametrize(
     ("right", "wrong", "says"), MISTAKES, ids=[f"{wrong[:40]}" for _, wrong, _ in MISTAKES]
 )
-def test_one_line_says_what_is_wrong(right: str, wrong: str, says: str, tmp_path: Path) -> None:
-    """`petrobot check` refuses it, names file, line, key and remedy, and shows no traceback."""
+def test_each_mistake_gives_one_line(right: str, wrong: str, says: str, tmp_path: Path) -> None:
+    """`petrobot check` refuses the file, names file, line, key and remedy, and shows no
+    traceback."""
     text = SHIPPED.read_text(encoding="utf-8")
     assert right in text
     path = tmp_path / "services.toml"
@@ -179,8 +180,9 @@ def test_one_line_says_what_is_wrong(right: str, wrong: str, says: str, tmp_path
     assert f"{path}:" in said and "Traceback" not in said
 
 
-def test_the_shipped_files_name_nothing_that_is_not_here(tmp_path: Path) -> None:
-    """Both cells' location files; a copy elsewhere still finds the shipped numbers."""
+def test_everything_named_in_the_shipped_files_exists(tmp_path: Path) -> None:
+    """It holds for both cells' location files; a copy in another folder still finds the shipped
+    numbers."""
     track = SHIPPED.parent / "services" / "mobile" / "track.services.toml"
     for path in (SHIPPED, track):
         assert misplaced(load(path)) == misplaced(load(path), everywhere=True) == ()
@@ -193,8 +195,9 @@ def test_the_shipped_files_name_nothing_that_is_not_here(tmp_path: Path) -> None
     assert load(copy).file("services/cell.toml") == own
 
 
-def test_what_another_host_has_is_not_known_here() -> None:
-    """Only a lock-step cell launches everything here; scripted actions need no code."""
+def test_code_of_other_hosts_is_not_checked() -> None:
+    """Code of other hosts is checked only for a lock-step cell, which runs completely here;
+    scripted actions need no code."""
     text = SHIPPED.read_text(encoding="utf-8").replace(
         "actions:locate_background", "actions:elsewhere", 1
     )
@@ -206,11 +209,11 @@ def test_what_another_host_has_is_not_known_here() -> None:
     assert misplaced(here, actions=False) == ()
 
 
-def test_names_that_only_running_the_module_tells_are_let_through(
+def test_names_that_only_running_the_module_defines_are_accepted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A module that binds names under a condition, takes any keyword or is no Python source is left
-    to the node's start."""
+    """A module that defines names under a condition, accepts any keyword or is not Python source is
+    checked only when the node starts."""
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "conditional_lab.py").write_text("import sys\nif sys:\n    look = len\n")
     (tmp_path / "open_lab.py").write_text("async def look(ctx, **anything): ...\n")
@@ -227,7 +230,7 @@ def test_names_that_only_running_the_module_tells_are_let_through(
 
 
 def test_a_file_in_another_code_is_refused_with_its_line(tmp_path: Path) -> None:
-    """An editor's byte-order mark does no harm; Latin-1 is told."""
+    """A byte-order mark is accepted; Latin-1 is refused."""
     path = tmp_path / "services.toml"
     path.write_bytes(b"\xef\xbb\xbf" + SHIPPED.read_bytes())
     assert load(path).hash == load(SHIPPED).hash
@@ -250,5 +253,5 @@ def test_a_file_in_another_code_is_refused_with_its_line(tmp_path: Path) -> None
     ],
 )
 def test_loopback(host: str, here: bool) -> None:
-    """What only this host reaches."""
+    """Addresses that only this host reaches."""
     assert is_loopback(host) is here

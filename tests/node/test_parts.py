@@ -185,7 +185,7 @@ def test_timers_lie_on_an_absolute_grid(period: float, steps: list[float]) -> No
         )
 
 
-def test_timers_that_there_are_none_of() -> None:
+def test_unknown_timers_are_refused() -> None:
     timers = EventTimers({})
     assert timers.advance(1.0) == [] and timers.due() is None
 
@@ -246,7 +246,7 @@ def test_a_set_point_ages_and_goes_stale() -> None:
 
 
 class Stub(Driver):
-    """A driver that writes down what it is told."""
+    """A driver that records its commands."""
 
     period: float | None = 0.004
 
@@ -280,7 +280,7 @@ class Stub(Driver):
     def close(self) -> None: ...
 
 
-def test_commands_are_numbered_taken_in_order_and_answered_for() -> None:
+def test_commands_are_numbered_executed_in_order_and_acknowledged() -> None:
     clock, posted, driver = Clock(), list[DeviceCommand](), Stub()
     remote, cyclic = RemoteDriver(posted.append, clock), CyclicDriver(driver)
     assert remote.age == math.inf and not remote.stopped() and remote.state == {}
@@ -329,7 +329,7 @@ def test_messages_cross_a_socket(what: Any) -> None:
 
 
 @pytest.mark.parametrize("items", [[4, 1], [999, "x"], [True], [7, "r", "success", {}, "", "", 1]])
-def test_a_list_that_is_no_message_becomes_a_word_after_what_came_before(items: list[Any]) -> None:
+def test_a_list_that_is_not_a_message_is_read_in_order(items: list[Any]) -> None:
     near, far = socket.socketpair()
     a, b = Pipe(near), Pipe(far)
     a.post(["before"])
@@ -340,7 +340,7 @@ def test_a_list_that_is_no_message_becomes_a_word_after_what_came_before(items: 
     b.close()
 
 
-def test_a_pipe_keeps_what_does_not_fit() -> None:
+def test_a_pipe_buffers_what_does_not_fit() -> None:
     near, far = socket.socketpair()
     a, b = Pipe(near), Pipe(far)
     for n in range(40):
@@ -359,7 +359,7 @@ def test_a_pipe_keeps_what_does_not_fit() -> None:
     a.close()
 
 
-def test_last_words_are_read_although_the_other_end_takes_nothing_more() -> None:
+def test_last_messages_are_read_although_the_other_end_reads_no_more() -> None:
     near, far = socket.socketpair()
     a, b = Pipe(near), Pipe(far)
     b.post(["last", "words"])
@@ -369,7 +369,7 @@ def test_last_words_are_read_although_the_other_end_takes_nothing_more() -> None
     a.close()
 
 
-def test_bytes_that_are_no_record_are_refused() -> None:
+def test_bytes_that_are_not_a_record_are_refused() -> None:
     near, far = socket.socketpair()
     a = Pipe(near)
     far.send(b"\xc1")
@@ -392,10 +392,10 @@ def test_each_permit_is_taken_once_also_after_the_end_of_the_worker() -> None:
 
 @pytest.mark.processes
 @pytest.mark.parametrize("missing", [False, True])
-async def test_the_end_of_a_process_is_noticed_whoever_holds_its_pipe(
+async def test_the_end_of_a_process_is_noticed_even_if_its_pipe_stays_open(
     missing: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With the kernel's notice, and where there is none (before Linux 5.3)."""
+    """With the kernel's notification of the end, and without it (before Linux 5.3)."""
     if missing:
         monkeypatch.delattr(os, "pidfd_open")
     process = subprocess.Popen(
@@ -430,7 +430,7 @@ def test_a_hold_ends_with_runs_that_were_stopped_before_they_began(by: str) -> N
     assert ends == {"held": "error", "next": "success"}
 
 
-def test_of_states_only_the_newest_counts() -> None:
+def test_only_the_newest_state_is_kept() -> None:
     near, far = link_pair()
     driver, actions = NewestLink(near), NewestLink(far)
     for n in range(5):
@@ -509,7 +509,7 @@ def test_bad_scripts_are_refused(tmp_path: Path, text: str, says: str) -> None:
 # --- rehearsals -------------------------------------------------------------------------------
 
 
-def test_a_rehearsal_tells_all_that_an_action_did() -> None:
+def test_a_rehearsal_reports_everything_that_an_action_did() -> None:
     async def act(ctx: Context, *, n: int) -> Result:
         ctx.progress(0.5)
         ctx.publish("s", [1.0])
@@ -593,7 +593,7 @@ def test_a_rehearsal_has_a_limit() -> None:
 
 
 class Ports:
-    """Nothing around a driver."""
+    """Empty ports of a driver."""
 
     def poll(self) -> None: ...
 
@@ -623,7 +623,7 @@ class Moving(Stub):
 
 
 class Process:
-    """A device loop in a thread, with all ends of its sockets."""
+    """A device loop in a thread, with the other ends of its sockets."""
 
     def __init__(self, driver: Moving) -> None:
         node, loop_end = socket.socketpair()
@@ -634,7 +634,7 @@ class Process:
         self.thread.start()
 
     def link(self) -> NewestLink:
-        """A new worker."""
+        """Attach a new worker."""
         near, far = link_pair()
         socket.send_fds(self.descriptors, [b"."], [far.fileno()])
         far.close()
@@ -642,7 +642,7 @@ class Process:
         return NewestLink(near)
 
     def told(self) -> Answer:
-        """The next that the loop says to its node."""
+        """Return the next message of the loop to its node."""
         limit = Limit("a word of the loop")
         while True:
             limit.left()
@@ -661,7 +661,7 @@ class Process:
 
 
 def states(link: NewestLink, until: Callable[[list[Any]], bool]) -> list[Any]:
-    """Read states until one fits."""
+    """Read states until one fulfils the condition."""
     limit = Limit("a state that fits")
     while True:
         limit.left()

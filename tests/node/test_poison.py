@@ -1,5 +1,5 @@
-"""What cannot be sent ends the run that made it, alone: no value of an action costs the connection,
-a worker or another run."""
+"""A value that cannot be sent ends only the run that made it: never the connection, a worker or
+another run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from petrobot.services.comm.protocol.codec import ProtocolError, decode, encode
 from petrobot.services.worker.context import checked, checked_result
 from petrobot.services.worker.pipe import Pipe
 from tests.node.conftest import Bench
-from tests.node.test_heard import OneNode
+from tests.node.test_driver_faults import OneNode
 from tests.node.test_processes import Operator, operator_of
 from tests.ports import free_ports
 
@@ -80,7 +80,8 @@ async def operator(node: OneNode) -> AsyncIterator[Operator]:
 
 
 async def ends_alone(operator: Operator, service: str, kind: str, cause: str) -> m.Outcome:
-    """The run ends so, and an innocent one beside it and the connection know nothing of it."""
+    """Check that the run ends with this cause, and that another run and the connection are not
+    affected."""
     innocent = asyncio.create_task(operator.call("nap", None, seconds=0.1))
     end = await operator.call(service, None, kind=kind)
     assert (end.status, end.cause, end.executed) == ("error", cause, "yes"), end
@@ -92,7 +93,7 @@ async def ends_alone(operator: Operator, service: str, kind: str, cause: str) ->
 
 @pytest.mark.processes
 @pytest.mark.parametrize("kind", table("RESULTS"))
-async def test_what_an_action_returns(operator: Operator, kind: str) -> None:
+async def test_results_of_an_action(operator: Operator, kind: str) -> None:
     end = await ends_alone(operator, "give", kind, "bad_result")
     if kind == "long cause":
         assert (
@@ -103,26 +104,26 @@ async def test_what_an_action_returns(operator: Operator, kind: str) -> None:
 
 @pytest.mark.processes
 @pytest.mark.parametrize("kind", table("RAISES", "SAYS", "ASKS"))
-async def test_what_an_action_raises_says_and_asks(operator: Operator, kind: str) -> None:
+async def test_exceptions_events_and_calls_of_an_action(operator: Operator, kind: str) -> None:
     await ends_alone(operator, "give", kind, "exception")
 
 
 @pytest.mark.processes
 @pytest.mark.parametrize("kind", table("RESULTS"))
 @pytest.mark.parametrize("service", ["serve", "wait_and_give"])
-async def test_what_a_service_returns(operator: Operator, service: str, kind: str) -> None:
+async def test_results_of_a_service(operator: Operator, service: str, kind: str) -> None:
     await ends_alone(operator, service, kind, "bad_result")
 
 
 @pytest.mark.processes
 @pytest.mark.parametrize("kind", table("RAISES"))
 @pytest.mark.parametrize("service", ["serve", "wait_and_give"])
-async def test_what_a_service_raises(operator: Operator, service: str, kind: str) -> None:
+async def test_exceptions_of_a_service(operator: Operator, service: str, kind: str) -> None:
     await ends_alone(operator, service, kind, "exception")
 
 
 def test_many_large_records_at_once() -> None:
-    """Each fits; together they are more than a pipe keeps while it reads."""
+    """Each record fits; together they are larger than a pipe's buffer."""
     near, far = socket.socketpair()
     worker, node = Pipe(near), Pipe(far)
     large = bytes(15 << 20)
@@ -143,7 +144,7 @@ def test_many_large_records_at_once() -> None:
 
 
 def flush_all(pipe: Pipe) -> None:
-    """Send all that waits."""
+    """Send everything that waits."""
     until = time.monotonic() + 60.0
     while pipe.unsent and time.monotonic() < until:
         pipe.flush()
@@ -160,7 +161,7 @@ def flush_all(pipe: Pipe) -> None:
     ],
     ids=["large", "many containers", "long name", "half a letter"],
 )
-async def test_a_call_that_cannot_be_sent_never_leaves(
+async def test_a_call_that_cannot_be_encoded_is_refused_by_the_sender(
     operator: Operator, node: OneNode, service: str, arguments: Any
 ) -> None:
     client = operator.clients["only"]
@@ -217,7 +218,7 @@ CAUSES = (
 
 
 def same(one: Any, other: Any) -> bool:
-    """Whether both are the same data, NaN included."""
+    """Return whether both are the same data; NaN equals NaN."""
     if isinstance(one, float) and isinstance(other, float):
         return one == other or (math.isnan(one) and math.isnan(other))
     if isinstance(one, dict) and isinstance(other, dict):
@@ -234,10 +235,10 @@ def same(one: Any, other: Any) -> bool:
     st.text(max_size=3) | st.just("\udc00"),
 )
 @settings(suppress_health_check=[HealthCheck.too_slow], max_examples=400, deadline=None)
-def test_a_result_crosses_unchanged_or_is_refused_where_it_is_made(
+def test_a_result_arrives_unchanged_or_is_refused_in_its_worker(
     value: Any, cause: Any, status: Any, text: str
 ) -> None:
-    """Through the pipe of its worker and over the wire: never is there a third way."""
+    """Through the pipe of its worker and over the network there are only these two outcomes."""
     try:
         made = checked_result("m/p#1", Result(status, {"value": value}, cause, text))
     except ValueError as fault:
@@ -263,7 +264,7 @@ def test_a_result_crosses_unchanged_or_is_refused_where_it_is_made(
 
 @given(VALUES)
 @settings(suppress_health_check=[HealthCheck.too_slow], max_examples=200, deadline=None)
-def test_a_run_that_returns_anything_ends_once_and_alone(value: Any) -> None:
+def test_a_run_that_returns_anything_ends_once_and_affects_no_other(value: Any) -> None:
     def act(ctx: Any) -> Any:
         return success(value=value)
 
@@ -320,8 +321,9 @@ MESSAGES = (
 
 @given(MESSAGES)
 @settings(suppress_health_check=[HealthCheck.too_slow], max_examples=1_000, deadline=None)
-def test_what_is_encoded_is_decoded(message: m.Message) -> None:
-    """One table for both ways: whatever the sender lets through, the receiver takes, unchanged."""
+def test_whatever_can_be_encoded_can_be_decoded(message: m.Message) -> None:
+    """Sender and receiver use the same table: the receiver accepts everything that the sender
+    accepts, unchanged."""
     try:
         body = encode(message)
     except ProtocolError as fault:
@@ -331,7 +333,7 @@ def test_what_is_encoded_is_decoded(message: m.Message) -> None:
     assert again == body or decode(again) == decode(body)
 
 
-def test_what_passes_where_it_is_made_passes_at_the_end() -> None:
+def test_whatever_the_worker_accepts_the_coordinator_accepts() -> None:
     checked(m.Event("e" * 255, "a", 1, {"x": bytes(1 << 20)}, "r"))
     with pytest.raises(ValueError, match="name: expected at most 255 characters, found 256"):
         checked(m.Event("e" * 256, "a", 1))

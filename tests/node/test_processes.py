@@ -1,5 +1,5 @@
 """Nodes as real processes: calls, hanging and dying actions, cyclic drivers, streams, memory, and
-clean ends."""
+shutdown."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from tests.waiting import Limit
 pytestmark = pytest.mark.processes
 ROOT = Path(__file__).parents[2]
 PATIENCE = 60.0
-"""Seconds that a condition may keep one waiting on a slow machine; nothing takes them unless it is
+"""Limit (s) of each wait for a condition, for slow machines; a wait reaches it only if something is
 broken."""
 
 CELL = """\
@@ -101,7 +101,7 @@ tell = {{ run = "toy_cell.actions:tell", task = "sum", node = "left" }}
 
 
 class Operator:
-    """Clients of all nodes, under the role of a coordinator."""
+    """Clients of all nodes, with the role of a coordinator."""
 
     def __init__(self, directory: Directory) -> None:
         self.directory = directory
@@ -163,7 +163,7 @@ class Operator:
 
 
 def select_nothing() -> None:
-    """Let some milliseconds pass without taking the loop."""
+    """Let some milliseconds pass without blocking the event loop."""
     import select
 
     select.select([], [], [], 0.01)
@@ -211,7 +211,7 @@ class Nodes:
 
 @pytest.fixture(scope="module")
 def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nodes]:
-    """Both nodes, shared by the tests that leave them as they were."""
+    """Both nodes, shared by the tests that leave them unchanged."""
     running = Nodes(tmp_path_factory.mktemp("cell"), "left", "right")
     yield running
     assert running.stop() == {"left": 0, "right": 0}
@@ -229,7 +229,7 @@ async def operator_of(directory: Directory, *names: str) -> AsyncIterator[Operat
 
 @pytest.fixture
 async def operator(nodes: Nodes) -> AsyncIterator[Operator]:
-    """Connected to both."""
+    """An operator's clients, connected to both nodes."""
     async with operator_of(nodes.directory, "left", "right") as one:
         yield one
 
@@ -241,7 +241,7 @@ async def pids(operator: Operator, node: str, device: str) -> dict[str, int]:
 
 
 async def cycles(operator: Operator) -> int:
-    """How often the slide's driver has been stepped."""
+    """Return how often the slide's driver has been stepped."""
     status = await operator.command("left", "status", "slide")
     return int(status.data["devices"]["slide"]["state"]["cycles"])
 
@@ -348,7 +348,7 @@ async def test_a_dying_worker_is_reported_and_started_again(
     assert (await operator.call("add", a=1)).values == {"sum": 2}
 
 
-async def test_kill_9_of_a_worker_in_mid_run(operator: Operator) -> None:
+async def test_kill_9_of_a_worker_during_a_run(operator: Operator) -> None:
     assert (await operator.call("go", to=0.0, timeout=PATIENCE)).status == "success"
     running = asyncio.create_task(operator.call("go", to=90.0, timeout=PATIENCE))
     await operator.until(lambda: _moving(operator))
@@ -485,7 +485,7 @@ async def test_kill_9_of_a_node_ends_its_processes(tmp_path: Path) -> None:
     assert running.stop() == {"left": -9}
 
 
-def test_lock_step_in_four_processes_is_that_in_one(tmp_path: Path) -> None:
+def test_lock_step_in_four_processes_equals_that_in_one(tmp_path: Path) -> None:
     ports = dict(zip(("left", "right", "world", "coordinator"), free_ports(4), strict=True))
     text = LOCKSTEP.replace("NODE", "right").replace(
         "schema = 1\n", f"schema = 1\n[coordinator]\nport = {ports['coordinator']}\n"
@@ -518,7 +518,7 @@ def test_lock_step_in_four_processes_is_that_in_one(tmp_path: Path) -> None:
 
 
 def run_member(member: Member, ticks: int) -> None:
-    """Be one party of a lock-step cell for so many ticks."""
+    """Take part in a lock-step cell for so many ticks."""
     member.open()
     member.run(max_ticks=ticks)
 
@@ -573,8 +573,8 @@ def test_a_bad_file_ends_the_node_with_one_clear_text(
     assert ended.returncode == 2 and says in ended.stderr and "Traceback" not in ended.stderr
 
 
-def test_a_run_takes_wall_time_only_while_it_must(nodes: Nodes) -> None:
-    """An idle node and its processes burn next to nothing."""
+def test_an_idle_node_uses_almost_no_processor_time(nodes: Nodes) -> None:
+    """An idle node and its processes use almost no processor time."""
     before, began = _cpu(nodes), time.monotonic()
     while time.monotonic() < began + 1.0:
         select_nothing()

@@ -1,5 +1,5 @@
-"""Runs of actions: how each can end, what a cancel does, who guards the device, and that every run
-ends exactly once."""
+"""Runs of actions: how each can end, what a cancel does, when the device is stopped, and that every
+run ends exactly once."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ async def raises_later(ctx: Context) -> Result:
 
 
 class Foreign:
-    """Something awaitable of another framework."""
+    """An awaitable of another framework."""
 
     def __await__(self) -> Generator[object, None, None]:
         yield self
@@ -133,7 +133,7 @@ ENDINGS: list[tuple[Any, dict[str, Any], str, str, str, str]] = [
 
 @pytest.mark.parametrize("device", [False, True])
 @pytest.mark.parametrize(("action", "arguments", "status", "cause", "text", "executed"), ENDINGS)
-def test_every_way_to_end(
+def test_every_kind_of_end(
     bench: Make,
     device: bool,
     action: Any,
@@ -222,7 +222,7 @@ def test_a_cancelled_action_cleans_up_and_its_device_comes_to_rest(bench: Make, 
 
 
 @pytest.mark.parametrize("halting", [0.1, None])
-def test_an_action_that_does_not_let_go_has_its_device_stopped(
+def test_an_action_that_ignores_the_cancel_has_its_device_stopped(
     bench: Make, halting: float | None
 ) -> None:
     async def stubborn(ctx: Context) -> Result:
@@ -290,7 +290,7 @@ def test_declared_computing_is_cancelled_too(bench: Make) -> None:
     assert b.ended(run).cause == "deadline" and b.ended(run).seconds == pytest.approx(1.0, abs=TICK)
 
 
-def test_what_starts_at_once_does_not_wait_for_a_stopping_run(bench: Make) -> None:
+def test_a_run_without_waiting_starts_beside_a_stopping_one(bench: Make) -> None:
     async def slow(ctx: Context) -> Result:
         try:
             await ctx.sleep(9.0)
@@ -380,7 +380,7 @@ def _entry(name: str) -> Any:
 
 @settings(max_examples=40, deadline=None)
 @given(at=st.integers(0, 25), steps=st.integers(1, 6))
-def test_cancel_at_any_wait_is_thrown_there_once(at: int, steps: int) -> None:
+def test_a_cancel_is_raised_once_at_whichever_wait(at: int, steps: int) -> None:
     reached: list[int] = []
     thrown: list[int] = []
 
@@ -564,7 +564,7 @@ def test_random_draws_are_keyed_by_seed_run_and_purpose(bench: Make) -> None:
 # --- operator's pause -------------------------------------------------------------------------
 
 
-def test_a_held_run_stands_still_and_its_times_move(bench: Make) -> None:
+def test_a_held_run_pauses_and_its_times_are_shifted(bench: Make) -> None:
     steps: list[float] = []
 
     async def walks(ctx: Context) -> Result:

@@ -1,5 +1,5 @@
-"""How a node watches its processes: who is told what, when a hanging one is killed, and that every
-run ends once."""
+"""How a node watches its processes: which messages each one gets, when a hanging one is killed, and
+that every run ends once."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ from tests.waiting import Limit
 
 
 class FakeChild:
-    """A child process that does what the test says."""
+    """A child process that is played by the test."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class FakeChild:
         self.code: int | None = None
         self.closed = self.dead = False
         self.begun = 1 << 30
-        """How many of its runs it says to have begun: all of them, unless a test says otherwise."""
+        """How many of its runs it reports as begun; by default all."""
         self.given = 0
         self.link = link
         self.linked = link is not None
@@ -94,11 +94,11 @@ class FakeChild:
         return count
 
     def words(self) -> list[Any]:
-        """Return what it was told beside the node's messages."""
+        """Return the messages to it that are not messages of the node protocol."""
         return [item for item in self.got if isinstance(item, list)]
 
     def commands(self) -> list[Command]:
-        """Return the commands that it was told."""
+        """Return the commands that it got."""
         return [item for item in self.got if isinstance(item, Command)]
 
     def _drop(self, end: socket.socket | None) -> None:
@@ -127,19 +127,19 @@ class FakeChild:
         self.say([READY, {"period": period, "streams": streams, "fifo": False}])
 
     def orders(self) -> list[Order]:
-        """Return what it was told about runs."""
+        """Return the messages about runs that it got."""
         orders = (Call, Cancel, Outcome)
         return [item for item in self.got if isinstance(item, orders) or item in (HOLD, RELEASE)]
 
 
 class KeepingChild(FakeChild):
-    """One that keeps its ends of sockets open."""
+    """A child process that keeps its ends of sockets open."""
 
     def _drop(self, end: socket.socket | None) -> None: ...
 
 
 class HostBench:
-    """A host of runs whose processes are fake, on a clock of its own."""
+    """A worker host with fake processes and a simulated clock."""
 
     place: WorkerHost | WorkerPool
 
@@ -150,8 +150,7 @@ class HostBench:
         self.wanted: list[str] = []
         self.reports: list[Any] = []
         self.deadlines: dict[str, float] = {}
-        """When each run is over its deadline, which its node watches and the bench stands for
-        (s)."""
+        """Deadline of each run (s). A node watches deadlines; here the bench does."""
         setup = Setup("services.toml", "", "node", device)
         self.hosting = Hosting(
             setup, self.clock, lambda plain_ends: None, self.wanted.append, spawn=self._spawn
@@ -173,7 +172,7 @@ class HostBench:
                 self.place.take(self.clock.now, Cancel(run, "deadline: late"))
 
     def run(self, seconds: float = 0.0) -> list[Any]:
-        """Advance exactly when it says that it is due, as the shell does."""
+        """Advance the host exactly when it is due, as the node's shell does."""
         until, fresh = self.clock.now + seconds, []
         limit = Limit("nothing more to be due", steps=100_000)
         while limit.left():
@@ -190,7 +189,7 @@ class HostBench:
 
 
 class Bench(HostBench):
-    """A place of one device whose processes are fake."""
+    """The worker host of one device, with fake processes."""
 
     place: WorkerHost
 
@@ -200,7 +199,7 @@ class Bench(HostBench):
         self.place.start()
 
     def cyclic(self) -> tuple[FakeChild, FakeChild]:
-        """Bring up driver and actions of a cyclic device."""
+        """Start driver and actions of a cyclic device."""
         self.children[-1].ready(0.004, points=4711)
         self.children[-1].ready()
         return self.children[-2], self.children[-1]
@@ -236,7 +235,7 @@ def test_a_cyclic_device_has_two_with_a_link_between_them() -> None:
     near.close()
 
 
-def test_what_comes_up_passes_through() -> None:
+def test_messages_of_processes_are_passed_on() -> None:
     bench = Bench("")
     (child,) = bench.children
     child.ready()
@@ -308,7 +307,7 @@ def test_a_dead_driver_takes_the_actions_with_it() -> None:
     assert new_driver is not driver and bench.place.ready
 
 
-def test_one_that_keeps_dying_is_started_more_and_more_slowly() -> None:
+def test_a_process_that_keeps_dying_is_restarted_after_growing_pauses() -> None:
     bench = Bench("")
     starts = [bench.clock.now]
     for _ in range(6):
@@ -369,7 +368,7 @@ def test_stop_by_command() -> None:
     assert actions.orders()[-1] == Cancel("r", "stopped: by command")
 
 
-def test_closing_lets_all_children_go() -> None:
+def test_closing_ends_all_children() -> None:
     bench = Bench()
     driver, actions = bench.cyclic()
     bench.place.close(bench.clock.now)
@@ -379,8 +378,7 @@ def test_closing_lets_all_children_go() -> None:
 
 
 class Storm:
-    """A place under any order of what may happen to it, with the books of its runs and of its
-    processes."""
+    """A worker host under events in any order, with a record of its runs and its processes."""
 
     def __init__(self, kind: str) -> None:
         self.bench = Bench("" if kind == "none" else "arm")
@@ -392,7 +390,7 @@ class Storm:
         return [child for child in self.bench.children if not child.dead]
 
     def make_ready(self, child: FakeChild) -> None:
-        """As a real one: once, while it lives and its pipe is open."""
+        """Report ready as a real process does: once, while it lives and its pipe is open."""
         if not child.dead and not child.closed and id(child) not in self.ready_children:
             self.ready_children.add(id(child))
             child.ready(0.004 if self.kind == "cyclic" and not child.linked else None)
@@ -454,7 +452,7 @@ class Storm:
                 child.die()
 
     def settle(self) -> None:
-        """Time passes: what was killed dies, what was started becomes ready, and devices answer."""
+        """Let time pass: killed processes die, started ones become ready, and devices answer."""
         self.bench.place.command(self.bench.clock.now, Command("end of hold", "release"))
         for _ in range(20):
             self.kill_the_killed()
@@ -463,7 +461,8 @@ class Storm:
             self.bench.run(2.0)
 
     def ends_well(self) -> None:
-        """It is ready, takes a run, and every run that it has taken has ended once."""
+        """Check that the host is ready and accepts a run, and that each accepted run has ended
+        once."""
         self.settle()
         place = self.bench.place
         assert place.ready and place.condition == ("up", ""), (place.stage, place.condition)
@@ -509,7 +508,7 @@ ACTS = (
     kind=st.sampled_from(["cyclic", "device", "none"]),
     acts=st.lists(st.sampled_from(ACTS), max_size=30),
 )
-def test_whatever_happens_it_is_ready_again_and_every_run_ends_once(
+def test_after_any_events_it_is_ready_again_and_every_run_ends_once(
     kind: str, acts: list[str]
 ) -> None:
     storm = Storm(kind)
@@ -520,7 +519,7 @@ def test_whatever_happens_it_is_ready_again_and_every_run_ends_once(
 
 @pytest.mark.parametrize("kind", ["cyclic", "device", "none"])
 def test_every_order_of_deaths_and_starts_ends_well(kind: str) -> None:
-    """All sequences of five of the acts that move the place from one stage to another."""
+    """All sequences of five of the events that move the host from one stage to another."""
     for acts in product(
         ("begin", "ready", "driver dies", "actions die", "late words", "wait"), repeat=5
     ):
@@ -530,7 +529,7 @@ def test_every_order_of_deaths_and_starts_ends_well(kind: str) -> None:
         storm.ends_well()
 
 
-def test_every_stage_can_be_reached_and_left_by_the_table() -> None:
+def test_every_stage_can_be_entered_and_left_by_the_table() -> None:
     reached = {HostStage.DOWN, *NEXT.values()}
     assert reached == set(HostStage)
     for stage in set(HostStage) - {HostStage.CLOSED}:
@@ -578,7 +577,7 @@ def test_the_end_of_a_former_process_does_not_touch_the_present_one() -> None:
     assert len(bench.children) == 4
 
 
-def test_status_says_what_the_place_is_doing() -> None:
+def test_status_describes_the_stage() -> None:
     def status() -> Answer:
         bench.place.command(bench.clock.now, Command("s", "status"))
         for child in bench.children:

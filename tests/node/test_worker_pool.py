@@ -1,5 +1,5 @@
-"""Actions without a device: each run has a worker of its own, workers are started as needed and let
-go, and every run ends once."""
+"""Actions without a device: each run has its own worker, workers are started and retired as needed,
+and every run ends once."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from tests.node.test_worker_place import FakeChild, HostBench
 
 
 class OneByOne(FakeChild):
-    """A worker that begins a call when the one before it has ended, as real ones without a device
-    do."""
+    """A fake worker that begins a call when the one before it has ended, like a real worker without
+    a device."""
 
     ended = 0
     withdrawn: tuple[str, ...] = ()
@@ -57,7 +57,7 @@ class Pool(HostBench):
             child.ready()
 
     def of(self, identity: str) -> FakeChild:
-        """The worker that was given a run."""
+        """Return the worker that got a run."""
         (child,) = [
             c
             for c in self.children
@@ -67,7 +67,7 @@ class Pool(HostBench):
         return child
 
     def begin_alone(self, *identities: str) -> None:
-        """Begin runs so far apart that none waits behind another one."""
+        """Begin runs with so much time between them that none waits behind another."""
         for identity in identities:
             self.run(PATIENCE)
             self.begin(identity)
@@ -78,7 +78,7 @@ class Pool(HostBench):
         return next((report for report in self.run() if isinstance(report, Answer)), None)
 
 
-def test_runs_have_a_worker_each_and_one_more_waits() -> None:
+def test_each_run_has_a_worker_and_one_spare_worker_waits() -> None:
     bench = Pool()
     bench.make_ready()
     bench.begin("a")
@@ -92,7 +92,7 @@ def test_runs_have_a_worker_each_and_one_more_waits() -> None:
     assert bench.of("c") is bench.children[0], "the first worker is used again"
 
 
-def test_the_death_of_one_worker_ends_its_run_alone() -> None:
+def test_the_death_of_one_worker_ends_only_its_run() -> None:
     bench = Pool()
     bench.make_ready()
     bench.begin_alone("a", "b")
@@ -172,7 +172,7 @@ def test_a_command_is_answered_once_by_all_that_run() -> None:
     )
 
 
-def test_calls_at_once_wait_behind_each_other_until_one_takes_long() -> None:
+def test_calls_at_once_share_a_worker_until_one_takes_long() -> None:
     bench = Pool(most=6)
     bench.make_ready()
     bench.begin_alone("warm")
@@ -194,7 +194,7 @@ def test_calls_at_once_wait_behind_each_other_until_one_takes_long() -> None:
     assert [report.id for report in bench.reports] == ["warm", "r1", "r3"]
 
 
-def test_what_waits_behind_a_run_that_waits_or_dies_goes_to_another_worker() -> None:
+def test_a_call_behind_a_waiting_or_dead_run_goes_to_another_worker() -> None:
     bench = Pool()
     bench.make_ready()
     bench.begin_alone("warm")
@@ -247,7 +247,7 @@ def test_a_call_that_waits_behind_another_is_cancelled_at_once(begun: bool) -> N
         max_size=40,
     )
 )
-def test_every_run_ends_once_and_the_pool_takes_runs_again(acts: list[tuple[str, int]]) -> None:
+def test_every_run_ends_once_and_the_pool_accepts_runs_again(acts: list[tuple[str, int]]) -> None:
     bench = Pool()
     begun: list[str] = []
     for act, number in acts:

@@ -21,7 +21,7 @@ from petrobot.coordinator.page.access import HEADERS
 from petrobot.coordinator.page.server import Page, start_page
 from tests.operator.test_starting import Simulated
 from tests.page.stage import Stage
-from tests.page.test_doors import ask, base, bearer, port_of
+from tests.page.test_access import ask, base, bearer, port_of
 from tests.page.test_protocol import joined
 
 pytestmark = pytest.mark.processes

@@ -1,5 +1,5 @@
-"""The judged cell: picks that are provisional, and whoever judges them; in lock step and with
-processes alike."""
+"""The judged cell, for tests in lock step and with processes: provisional picks, and the actions
+that judge them."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ TRULY = {
     "pick#5": (OK, ""),
     "pick#6": (OK, ""),
 }
-"""What each pick came to: the last one was never judged, so what it said itself stands."""
+"""The final outcome of each pick. The last one is never judged, so its own result counts."""
 
 
 def sorting() -> Task:
-    """The task."""
+    """Return the task."""
     return load(FOLDER / "sort.toml")
 
 
 def directory(*ports: int) -> Directory:
-    """Two nodes, `hand` and `eye`, at these ports if any are given."""
+    """Return a directory of two nodes, `hand` and `eye`, at these ports if any are given."""
     text = (FOLDER / "services.toml").read_text(encoding="utf-8")
     for old, new in zip((7991, 7992), ports, strict=False):
         text = text.replace(str(old), str(new))
@@ -46,7 +46,7 @@ def directory(*ports: int) -> Directory:
 
 
 class Heard:
-    """An observer: corrections and notes, in order."""
+    """An observer that records corrections in order, and counts reports."""
 
     def __init__(self) -> None:
         self.corrected: list[Corrected] = []
@@ -70,12 +70,12 @@ class Heard:
 
 
 def learner(task: Task) -> LearningSelector:
-    """Left and right in turn, so odd picks are left ones."""
+    """Return a learner that chooses left and right in turn, so odd picks are left ones."""
     return LearningSelector(Learning(task, "round_robin"), seed=1)
 
 
 def learned(selector: LearningSelector) -> dict[str, tuple[dict[Any, int], int, int]]:
-    """By action: how its runs counted, how many of them were corrected, and the selector's
+    """Return by action how its runs counted, how many of them were corrected, and the selector's
     successes."""
     tallies = {
         key.action: tally
@@ -98,5 +98,5 @@ LEARNED = {
 
 
 def told(mission: Mission) -> dict[str, tuple[Status | None, str]]:
-    """What the mission's own tally says of its picks."""
+    """Return status and cause of each pick in the mission's tally."""
     return {r.run: (r.status, r.cause) for r in mission.tally.runs if r.place == "pick"}

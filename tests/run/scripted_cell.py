@@ -25,13 +25,13 @@ node = "node"
 
 
 def directory_for(task: Task, extra: str = "", every: bool = False) -> Directory:
-    """The directory of `services_text`."""
+    """Return the directory of `services_text`."""
     return parse(services_text(task, every) + extra, Path("services.toml"))
 
 
 def services_text(task: Task, every: bool = False) -> str:
-    """A services.toml that places the first alternative of each primitive task on one node; every
-    one if asked for."""
+    """Return a services.toml that places the first alternative of each primitive task on one node,
+    or all alternatives."""
     return HEAD + "".join(
         f'[actions.{alternative}]\nrun = "scripted:nothing"\ntask = "{p.name}"\nnode = "node"\n'
         for p in task.primitive_tasks.values()
@@ -40,8 +40,8 @@ def services_text(task: Task, every: bool = False) -> str:
 
 
 def scripts(task: Task, lines: Mapping[str, list[Line]]) -> dict[str, Callable[..., Any]]:
-    """A scripted action for every alternative of each primitive task; half a second of success if
-    none is given."""
+    """Return a scripted action for every alternative of each primitive task; by default, success
+    after half a second."""
     usual = [Line(seconds=(0.5, 0.5))]
     return {
         a: Scripted(lines.get(p.name, usual))

@@ -1,4 +1,4 @@
-"""Asking nodes how they are: each says so for itself, whatever becomes of the others."""
+"""Asking nodes for their status: each answers, whether or not the others do."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ port = {1}
 
 
 @pytest.mark.parametrize("mute_is_up", [True, False])
-async def test_one_that_does_not_answer_hides_no_other(tmp_path: Path, mute_is_up: bool) -> None:
+async def test_a_node_that_does_not_answer_does_not_hide_the_others(
+    tmp_path: Path, mute_is_up: bool
+) -> None:
     directory = parse(PLACES.format(*free_ports(2)), tmp_path / "services.toml")
     clock = asyncio.get_running_loop().time
     place = InlineHost(directory.actions, clock=clock)
     node = Node(directory, "well", boot="well 1", clock=clock, places={GENERAL: place})
     well = NodeInLoop(node, directory.address("well"))
-    mute = Server(
-        Callee("mute", "mute 1", {})
-    )  # welcomes, and leaves every order to an owner that it does not have
+    mute = Server(Callee("mute", "mute 1", {}))  # accepts connections, and never answers a message
     await well.start()
     if mute_is_up:
         await mute.start(*directory.address("mute"))

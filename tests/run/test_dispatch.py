@@ -1,5 +1,5 @@
-"""Runs in the hands of nodes: what is stopped, fenced, fetched, forgotten and recorded, over one
-life of the coordinator or two."""
+"""The dispatcher of runs to nodes: which runs are stopped, fenced, fetched, forgotten and recorded,
+with one coordinator process or after a resume."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ORPHAN_TIME = 1.0
 
 
 def done(call: str, status: str = "success", cause: str = "") -> m.Outcome:
-    """The node's word that a run is over."""
+    """Return the node's message that a run has ended."""
     return m.Outcome(call, status, cause=cause)
 
 
@@ -44,7 +44,7 @@ def test_nothing_starts_on_the_device_before_the_cancelled_run_is_known_to_have_
     ]
 
 
-def test_completion_crosses_with_the_cancel() -> None:
+def test_a_result_that_crosses_the_cancel_frees_the_device() -> None:
     """The result that comes after the cancel is recorded, moves nothing, and frees the device."""
     bench = Bench().begin()
     bench.ring(1.0)
@@ -59,7 +59,7 @@ def test_completion_crosses_with_the_cancel() -> None:
     assert bench.fired == ["go", "rung"] and len(bench.records) == 1 and bench.calls() == []
 
 
-def test_a_preemption_that_comes_just_after_the_end_cancels_nothing() -> None:
+def test_a_preemption_just_after_the_end_cancels_nothing() -> None:
     bench = Bench().begin()
     bench.say(1.0, done(WORK))
     bench.ring(1.0)
@@ -70,10 +70,8 @@ def test_a_preemption_that_comes_just_after_the_end_cancels_nothing() -> None:
     )
 
 
-def test_a_performer_that_never_answers_is_stuck_and_what_needs_its_device_errs_unexecuted() -> (
-    None
-):
-    """StopFailed once its own time and the escalation's are over, not before."""
+def test_a_run_that_never_stops_is_stuck_and_the_next_on_its_device_ends_unexecuted() -> None:
+    """StopFailed comes after the stop time of the action and the escalation time, not before."""
     bench = Bench().begin()
     bench.ring(1.0)
     bench.go(1.0 + WITHIN + ESCALATION - 0.01)
@@ -99,7 +97,7 @@ def test_a_late_result_of_a_stuck_run_is_recorded_and_frees_its_device() -> None
     assert m.ResultAck(WORK) in bench.sent()
 
 
-def test_a_node_cut_off_while_it_stops_a_run_has_the_device_until_its_own_lease_is_over() -> None:
+def test_a_node_cut_off_while_stopping_a_run_keeps_the_device_until_its_lease_ends() -> None:
     """The run stays stopping until orphan time and stop time have passed; only then does the next
     one begin."""
     bench = Bench().begin()
@@ -121,7 +119,8 @@ def test_a_node_cut_off_while_it_stops_a_run_has_the_device_until_its_own_lease_
 
 
 def test_the_device_of_a_lost_run_is_fenced_until_the_node_must_have_stopped_it() -> None:
-    """Frozen or cut: ERROR at once, executed unknown; the next run on the device waits."""
+    """The node is frozen or cut off: ERROR at once, executed unknown; the next run on the device
+    waits."""
     bench = Bench().begin()
     bench.caller.link_down(1.0, "silent", final=True)
     bench.go(1.0)
@@ -134,7 +133,7 @@ def test_the_device_of_a_lost_run_is_fenced_until_the_node_must_have_stopped_it(
     assert bench.calls() == [TIDY]
 
 
-def test_the_nodes_late_word_lifts_the_fence_and_moves_nothing_else() -> None:
+def test_a_late_answer_of_the_node_lifts_the_fence_and_changes_nothing_else() -> None:
     bench = Bench().begin()
     bench.caller.link_down(1.0, "silent", final=True)
     bench.link(1.2, "n1", [WORK])
@@ -145,9 +144,9 @@ def test_the_nodes_late_word_lifts_the_fence_and_moves_nothing_else() -> None:
     assert m.ResultAck(WORK) in bench.sent()
 
 
-def test_a_node_that_keeps_silent_about_a_run_although_it_is_there_fences_it_for_good() -> None:
-    """No result 5 s after the deadline: the device may move still. What waits for it errs at its
-    own deadline, unexecuted."""
+def test_a_connected_node_that_never_reports_the_end_fences_the_device_for_good() -> None:
+    """No result 5 s after the deadline: the device may still move. A run that waits for it ends in
+    ERROR at its own deadline, unexecuted."""
     bench = Bench().begin()
     bench.go(10.0)
     assert bench.records[0].cause == "no_answer"
@@ -158,7 +157,7 @@ def test_a_node_that_keeps_silent_about_a_run_although_it_is_there_fences_it_for
     assert "work#1" in bench.records[1].text and bench.executor.finished is not None
 
 
-def test_another_boot_of_the_node_ends_a_fence_when_its_devices_must_stand_still() -> None:
+def test_a_restarted_node_ends_a_fence_once_its_devices_must_stand_still() -> None:
     bench = Bench().begin()
     bench.go(10.0)
     bench.caller.link_down(10.2, "killed")
@@ -169,10 +168,10 @@ def test_another_boot_of_the_node_ends_a_fence_when_its_devices_must_stand_still
     assert bench.calls() == [TIDY]
 
 
-# --- over two lives ---------------------------------------------------------------------------
+# --- after a resume ---------------------------------------------------------------------------
 
 
-def test_a_run_that_goes_on_is_rejoined_under_its_id_at_the_boot_it_was_sent_to() -> None:
+def test_an_active_run_is_rejoined_under_its_id_at_the_boot_it_was_sent_to() -> None:
     bench = Bench().begin().resumed(2.0, runs=[WORK])
     (call,) = bench.sent(m.Call)
     assert isinstance(call, m.Call) and (call.id, call.boot, call.epoch) == (WORK, "n1", 2)
@@ -181,7 +180,7 @@ def test_a_run_that_goes_on_is_rejoined_under_its_id_at_the_boot_it_was_sent_to(
 
 
 def test_a_run_sent_to_another_boot_is_asked_for_by_that_boot_and_never_run_again() -> None:
-    """The node died with the coordinator: it answers unknown."""
+    """The node died too, so the new one answers that it does not know the run."""
     bench = Bench().begin().resumed(2.0, boot="n2")
     (call,) = bench.sent(m.Call)
     assert isinstance(call, m.Call) and (call.id, call.boot) == (WORK, "n1")
@@ -197,14 +196,14 @@ def test_a_run_sent_to_another_boot_is_asked_for_by_that_boot_and_never_run_agai
 
 
 def test_a_run_that_reached_a_later_boot_than_the_one_recorded_is_found_there() -> None:
-    """It was sent while the node was away, and taken by the process that came next."""
+    """It was sent while the node was away, and the node's next process accepted it."""
     bench = Bench().begin().resumed(2.0, boot="n2", runs=[WORK])
     (call,) = bench.sent(m.Call)
     assert isinstance(call, m.Call) and call.boot == "n2"
 
 
 @pytest.mark.parametrize("goes_on", [True, False])
-def test_on_resume_error_gives_up_a_run_that_goes_on_and_takes_the_result_of_one_that_has_ended(
+def test_on_resume_error_gives_up_active_runs_and_uses_results_of_ended_ones(
     goes_on: bool,
 ) -> None:
     bench = Bench().begin().resumed(2.0, on_resume="error", runs=[WORK])
@@ -231,9 +230,9 @@ def test_on_resume_ask_rejoins_and_pauses_for_the_operator() -> None:
     assert bench.fired == ["worked"]
 
 
-def test_what_the_node_keeps_of_a_run_is_settled() -> None:
-    """Recorded as ended by the node's word: it may forget it. Unknown to the journal: it is
-    stopped."""
+def test_runs_that_a_node_still_knows_are_acknowledged_or_stopped() -> None:
+    """A run that the journal records as ended may be forgotten by the node; a run that the journal
+    does not know is stopped."""
     first = Bench().begin()
     first.say(1.0, m.Accept(WORK), done(WORK))
     bench = Bench(epoch=2)
@@ -246,7 +245,7 @@ def test_what_the_node_keeps_of_a_run_is_settled() -> None:
     assert sent == [m.Cancel("m/work#7", "disowned"), m.ResultAck(WORK)]
 
 
-def test_a_run_given_up_in_an_earlier_life_is_stopped_its_fence_outlives_the_coordinator() -> None:
+def test_a_run_given_up_before_the_resume_is_stopped_and_its_fence_remains() -> None:
     first = Bench().begin()
     first.caller.link_down(1.0, "silent", final=True)
     first.go(1.0)
@@ -258,9 +257,9 @@ def test_a_run_given_up_in_an_earlier_life_is_stopped_its_fence_outlives_the_coo
     assert bench.calls() == [TIDY]
 
 
-def test_a_latched_event_that_came_while_nobody_coordinated_is_delivered_once() -> None:
-    """Its source keeps it until it is acknowledged; one that an earlier life took already is not
-    taken again."""
+def test_a_latched_event_that_came_without_a_coordinator_is_delivered_once() -> None:
+    """Its source keeps it until it is acknowledged; one that the killed coordinator had already
+    accepted is not accepted again."""
     first = Bench().begin()
     bench = first.resumed(2.0, runs=[WORK])
     bench.ring(2.1, number=1)
@@ -286,7 +285,7 @@ def test_a_cancelled_run_is_cancelled_again_and_waited_for() -> None:
 # --- operator ---------------------------------------------------------------------------------
 
 
-def test_a_held_run_is_not_given_up_however_long_the_pause() -> None:
+def test_a_held_run_is_not_given_up_even_in_a_long_pause() -> None:
     bench = Bench().begin()
     bench.executor.stimulate(1.0, Pause())
     (hold,) = bench.sent(m.Command)
@@ -310,8 +309,8 @@ def test_a_held_run_is_not_given_up_however_long_the_pause() -> None:
 def test_a_firing_costs_one_sync_if_it_starts_hardware_and_none_otherwise(
     tmp_path: Path, durable: bool, device: bool, per_start: int
 ) -> None:
-    """Result, firing and start of the next run share one sync; nothing else waits for any, unless
-    all shall be durable."""
+    """Result, firing and start of the next run share one sync; nothing else waits for a sync,
+    unless everything must be durable."""
     writer = JournalWriter(tmp_path / "run.journal", {})
     store = JournalStore(writer, 0.0, durable=durable)
     bench = Bench(store=store, device='device = "arm"' if device else 'node = "motion"')
@@ -331,8 +330,8 @@ def test_a_firing_costs_one_sync_if_it_starts_hardware_and_none_otherwise(
     assert writer.syncs - before <= 3
 
 
-def test_nothing_leaves_when_the_journal_cannot_be_written(tmp_path: Path) -> None:
-    """A full disk: the start is not sent on the strength of a record that is not there."""
+def test_nothing_is_sent_if_the_journal_cannot_be_written(tmp_path: Path) -> None:
+    """The disk is full: no start is sent without its record in the journal."""
     writer = JournalWriter(tmp_path / "run.journal", {})
     bench = Bench(store=JournalStore(writer, 0.0))
     bench.link(0.0)
@@ -346,9 +345,9 @@ def test_nothing_leaves_when_the_journal_cannot_be_written(tmp_path: Path) -> No
     assert bench.calls() == []
 
 
-def test_a_sync_from_outside_leaves_nothing_due(tmp_path: Path) -> None:
-    """The operator's commands are synced by whoever takes them: then there is nothing to wake up
-    for."""
+def test_after_a_sync_from_outside_no_sync_is_due(tmp_path: Path) -> None:
+    """The operator's session syncs the operator's commands itself; afterwards the executor has no
+    sync to wake up for."""
     store = JournalStore(JournalWriter(tmp_path / "run.journal", {}), 0.0)
     bench = Bench(store=store)
     bench.link(0.0)
@@ -366,8 +365,8 @@ def test_a_sync_from_outside_leaves_nothing_due(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "arguments", [{"x": {1: 2}}, {"x": [[]] * 60_000, "y": [[]] * 60_000}, {"x": 2**70}]
 )
-def test_arguments_that_no_message_carries_end_their_run_alone(arguments: dict[str, Any]) -> None:
-    """Two results, each small enough, may be too much for the one call that they are fed to."""
+def test_arguments_too_large_for_a_message_end_only_their_run(arguments: dict[str, Any]) -> None:
+    """Two results, each small enough, may be too large for one call that gets both."""
     caller = Caller("motion", m.Hello(2, 2, "coordinator", "m", "c1", 1))
     dispatch = Dispatch(directory(), {"motion": caller}, "m", 0)
     (end,) = dispatch.carry_out(0.0, StartRun("work#1", "work", "work", "do_work", arguments, 1.0))

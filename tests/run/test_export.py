@@ -26,7 +26,7 @@ def counts() -> Counter[str]:
     )
 
 
-def test_json_lines_hold_everything(tmp_path: Path) -> None:
+def test_json_lines_contain_everything(tmp_path: Path) -> None:
     out = tmp_path / "run.jsonl"
     assert main(["log", str(JOURNAL), "--format", "jsonl", "--out", str(out)]) == 0
     head, *steps = [json.loads(line) for line in out.read_text().splitlines()]
@@ -36,7 +36,7 @@ def test_json_lines_hold_everything(tmp_path: Path) -> None:
     assert [s["t"] for s in steps] == sorted(s["t"] for s in steps)
 
 
-def test_xes_has_an_event_for_each_firing_and_both_ends_of_each_run(tmp_path: Path) -> None:
+def test_xes_has_an_event_for_each_firing_start_and_end(tmp_path: Path) -> None:
     """IEEE 1849-2016: one trace; every event has a name, a time and its place in the life cycle."""
     out = tmp_path / "run.xes"
     assert main(["log", str(JOURNAL), "--format", "xes", "--out", str(out)]) == 0
@@ -54,8 +54,8 @@ def test_xes_has_an_event_for_each_firing_and_both_ends_of_each_run(tmp_path: Pa
 
 
 def test_messages_of_an_mcap_file() -> None:
-    """In order of time: each firing, both ends of each run, and the marking after each stimulus, by
-    name of place."""
+    """In order of time: each firing, start and end of each run, and the marking after each
+    stimulus, by name of place."""
     found = recorded(str(JOURNAL))
     steps = list(found.steps())
     given = list(messages(found.journal, found.engine.compiled.net, steps))
@@ -106,7 +106,7 @@ def test_an_mcap_file_is_read_back_by_its_own_library(
 @pytest.mark.skipif(
     importlib.util.find_spec("mcap") is not None, reason="the package mcap is installed"
 )
-def test_without_the_package_the_remedy_is_said(
+def test_without_the_package_the_message_names_the_remedy(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["log", str(JOURNAL), "--mcap", str(tmp_path / "run.mcap")]) == 2

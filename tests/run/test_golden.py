@@ -1,4 +1,4 @@
-"""Golden journals: runs of shipped tasks as an earlier version recorded them, derived again marking
+"""Golden journals: runs of shipped tasks that an earlier version recorded, computed again marking
 by marking."""
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ ENDS = {
 
 
 @pytest.mark.parametrize("name", sorted(STORIES))
-def test_every_marking_and_instruction_is_derived_again(name: str) -> None:
-    """`replay` fails on the first difference; the end is the one of then."""
+def test_every_marking_and_instruction_is_computed_again(name: str) -> None:
+    """`replay` fails at the first difference; the status at the end is the recorded one."""
     found = recorded(str(GOLDEN / f"{name}.journal"))
     steps = list(found.steps())
     assert len(steps) == sum(r.kind == "stimulus" for r in found.journal.records) > 10
@@ -41,9 +41,9 @@ def test_every_marking_and_instruction_is_derived_again(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(STORIES))
-def test_the_story_of_a_golden_journal_is_still_the_same(name: str, tmp_path: Path) -> None:
-    """Made again now, it has the same markings in the same order: execution in lock step has not
-    changed either."""
+def test_the_same_story_gives_the_golden_markings_today(name: str, tmp_path: Path) -> None:
+    """A run of the same story has the same markings in the same order: execution in lock step has
+    not changed either."""
     golden, now = (
         read_journal(folder / f"{name}.journal") for folder in (GOLDEN, make(name, tmp_path).parent)
     )
@@ -55,7 +55,7 @@ def test_the_story_of_a_golden_journal_is_still_the_same(name: str, tmp_path: Pa
 
 
 def test_a_changed_task_is_noticed_at_the_record_where_it_matters() -> None:
-    """The golden journal of one story does not pass for a task with another priority of events."""
+    """The journal does not replay with a task in which an event has another priority."""
     found = recorded(str(GOLDEN / "catch_ball-undisturbed.journal"))
     changed = found.journal.header["task"].replace('out = ["return_home"]', 'out = ["recover_arm"]')
     from petrobot.coordinator.launch import with_runs
@@ -68,8 +68,8 @@ def test_a_changed_task_is_noticed_at_the_record_where_it_matters() -> None:
 
 
 def test_another_instruction_with_the_same_markings_is_noticed() -> None:
-    """With another deadline all markings are the same; the first run that starts with it is
-    named."""
+    """With another deadline all markings are the same; the message names the first run that starts
+    with it."""
     from petrobot.coordinator.launch import with_runs
     from petrobot.coordinator.task.file import loads
 

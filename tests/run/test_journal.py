@@ -1,5 +1,5 @@
-"""The journal's file: what was synced is read back, a torn tail is dropped and counted, damage is
-refused."""
+"""The journal's file: records that were synced are read back, a torn tail is dropped and counted,
+damage is refused."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ RECORDS = st.lists(
 
 
 def written(folder: Path, records: list[tuple[str, dict[str, object]]]) -> Path:
-    """A closed journal with these records."""
+    """Write a journal with these records and close it."""
     path = folder / "run.journal"
     writer = JournalWriter(path, {"task": "t"})
     for kind, data in records:
@@ -53,7 +53,7 @@ def written(folder: Path, records: list[tuple[str, dict[str, object]]]) -> Path:
 
 
 @given(RECORDS)
-def test_what_was_written_is_read(records: list[tuple[str, dict[str, object]]]) -> None:
+def test_records_are_read_back(records: list[tuple[str, dict[str, object]]]) -> None:
     """Records come back in order, with their numbers."""
     with tempfile.TemporaryDirectory() as folder:
         journal = read_journal(written(Path(folder), records))
@@ -63,10 +63,11 @@ def test_what_was_written_is_read(records: list[tuple[str, dict[str, object]]]) 
 
 
 @given(RECORDS, st.data())
-def test_a_torn_tail_is_dropped_and_the_rest_goes_on(
+def test_a_torn_tail_is_dropped_and_writing_continues(
     records: list[tuple[str, dict[str, object]]], data: st.DataObject
 ) -> None:
-    """Cut anywhere: the whole records before the cut remain, and a writer goes on behind them."""
+    """Wherever the file is cut, the whole records before the cut remain, and a writer appends after
+    them."""
     with tempfile.TemporaryDirectory() as folder:
         path = written(Path(folder), records)
         raw = path.read_bytes()
@@ -95,7 +96,7 @@ def test_bytes_of_a_record(tmp_path: Path) -> None:
 
 
 def test_damage_in_the_middle_is_refused(tmp_path: Path) -> None:
-    """A flipped bit with records behind it is no torn tail."""
+    """A flipped bit followed by records is not a torn tail."""
     path = written(tmp_path, [("a", {"x": "yyyy"}), ("b", {})])
     raw = bytearray(path.read_bytes())
     raw[raw.index(b"yyyy")] ^= 1
@@ -105,7 +106,7 @@ def test_damage_in_the_middle_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_flipped_last_record_counts_as_torn(tmp_path: Path) -> None:
-    """The last record of a crash may be there in length and not in content."""
+    """After a crash the last record may have its length but not its content."""
     path = written(tmp_path, [("a", {}), ("b", {"x": "yyyy"})])
     raw = bytearray(path.read_bytes())
     raw[raw.index(b"yyyy")] ^= 1
@@ -117,8 +118,8 @@ def test_a_flipped_last_record_counts_as_torn(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content", [b"", b"hello world, no journal", MAGIC, MAGIC + b"\x10\x00\x00\x00"]
 )
-def test_what_is_no_journal_is_refused(tmp_path: Path, content: bytes) -> None:
-    """A foreign, an empty and a beheaded file."""
+def test_a_file_that_is_not_a_journal_is_refused(tmp_path: Path, content: bytes) -> None:
+    """A file of another kind, an empty one, and one whose beginning is missing."""
     path = tmp_path / "x.journal"
     path.write_bytes(content)
     with pytest.raises(JournalError, match=r"x\.journal"):
@@ -133,7 +134,8 @@ def test_never_overwritten(tmp_path: Path) -> None:
 
 
 def test_a_journal_has_one_writer_at_a_time(tmp_path: Path) -> None:
-    """A run that goes on is not resumed beside itself; once its process has let go, it is."""
+    """A run that is still active is not resumed; after its process has closed the journal, it
+    is."""
     path = tmp_path / "run.journal"
     first = JournalWriter(path, {})
     with pytest.raises(JournalError, match="another process writes it: the run is still active"):
@@ -144,8 +146,8 @@ def test_a_journal_has_one_writer_at_a_time(tmp_path: Path) -> None:
 
 
 def test_a_missing_record_is_refused(tmp_path: Path) -> None:
-    """Every record is whole, but one has gone: what follows it would be derived from a marking that
-    never was."""
+    """Every record is whole, but one is missing: later markings would be computed from a marking
+    that never existed."""
     path = written(tmp_path, [("one", {}), ("two", {}), ("three", {})])
     raw, header = path.read_bytes(), len(written(tmp_path / "empty", []).read_bytes())
     first = header + 8 + struct.unpack_from("<I", raw, header)[0]
@@ -154,11 +156,10 @@ def test_a_missing_record_is_refused(tmp_path: Path) -> None:
         read_journal(path)
 
 
-def test_what_is_synced_has_been_handed_to_the_disk(
+def test_a_sync_makes_the_file_and_its_name_durable(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The system is asked to make it durable each time, and the folder once, so that the file's
-    name survives as well."""
+    """The file is synced each time, and its folder once, so that the file's name survives too."""
     asked: list[tuple[bool, int]] = []
 
     def noted(real: Callable[[int], None]) -> Callable[[int], None]:
@@ -175,15 +176,15 @@ def test_what_is_synced_has_been_handed_to_the_disk(
     for number in range(2):
         writer.append("k", {"n": number})
         writer.sync()
-        writer.sync()  # nothing new: nothing is asked
+        writer.sync()  # nothing new was written, so nothing is synced
         sizes.append((tmp_path / "run.journal").stat().st_size)
     writer.close()
     assert [size for folder, size in asked if not folder] == sizes and len(set(sizes)) == 3
     assert [folder for folder, _ in asked].count(True) == 1
 
 
-def test_a_place_where_no_journal_can_be_is_refused(tmp_path: Path) -> None:
-    """A file stands where the folder should be."""
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    """There is a file where the folder should be."""
     (tmp_path / "runs").write_text("")
     with pytest.raises(
         JournalError, match=r"runs/a/run\.journal: Not a directory; give --journal a folder"
@@ -206,7 +207,7 @@ while True:
 
 @pytest.mark.processes
 def test_kill_9_loses_nothing_that_was_synced(tmp_path: Path) -> None:
-    """Whatever the process said was synced is there after kill -9."""
+    """Everything that the process reported as synced is there after kill -9."""
     path = tmp_path / "run.journal"
     process = subprocess.Popen(
         [sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True
@@ -224,8 +225,8 @@ def test_kill_9_loses_nothing_that_was_synced(tmp_path: Path) -> None:
     assert len(read_journal(path).records) >= max([last, *said])
 
 
-def test_the_largest_result_that_a_node_can_send_finds_room(tmp_path: Path) -> None:
-    """A journal that could not keep what was accepted would end the coordinator."""
+def test_the_largest_result_that_a_node_can_send_fits(tmp_path: Path) -> None:
+    """A journal that could not store an accepted message would end the coordinator."""
     largest = LIMITS[Outcome.KIND]
     values = {"x": bytes(largest - 200)}
     assert largest - 200 < len(encode(Outcome("mission/work#1", "success", values))) <= largest

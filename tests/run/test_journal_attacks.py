@@ -1,5 +1,5 @@
-"""The journal under attack: cut at every byte, damaged, of another version, on a disk that is full
-or may not be written."""
+"""Attacks on the journal: cut at every byte, damaged, of another version, on a disk that is full or
+read-only."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ GOLDEN = Path(__file__).parent / "golden" / "catch_ball-missed-and-recovered.jou
 
 
 def copy(folder: Path, content: bytes) -> Path:
-    """A run's folder with this journal."""
+    """Make a run's folder with this journal."""
     path = folder / "run.journal"
     path.write_bytes(content)
     return path
 
 
 def bounds(raw: bytes) -> list[int]:
-    """Where each record of a whole journal ends."""
+    """Return the offset at which each record of a whole journal ends."""
     ends, offset, limit = [], len(MAGIC), Limit("the end of the journal", steps=len(raw))
     while offset < len(raw) and limit.left():
         offset += PREFIX.size + PREFIX.unpack_from(raw, offset)[0]
@@ -46,9 +46,11 @@ def bounds(raw: bytes) -> list[int]:
     return ends
 
 
-def test_cut_at_every_byte_it_holds_what_was_whole_and_says_what_was_not(tmp_path: Path) -> None:
-    """From the last ten records, byte by byte, and inside the header: never a guess, never more
-    than the torn record lost."""
+def test_cut_at_any_byte_whole_records_are_read_and_the_torn_one_is_reported(
+    tmp_path: Path,
+) -> None:
+    """Cut at each byte of the last ten records, and inside the header: nothing is guessed, and only
+    the torn record is lost."""
     raw = GOLDEN.read_bytes()
     ends = bounds(raw)
     header, first = ends[0], ends[-11]
@@ -64,8 +66,8 @@ def test_cut_at_every_byte_it_holds_what_was_whole_and_says_what_was_not(tmp_pat
         assert len(journal.records) == len(whole) - 1
 
 
-def test_every_cut_between_records_is_derived_again(tmp_path: Path) -> None:
-    """Replay of what is left says the same as replay of all, as far as it goes."""
+def test_a_journal_cut_between_records_replays(tmp_path: Path) -> None:
+    """Replay of the part that is left gives the same markings as replay of the whole journal."""
     raw = GOLDEN.read_bytes()
     everything = list(recorded(str(copy(tmp_path, raw))).steps())
     for end in bounds(raw)[:: max(1, len(bounds(raw)) // 8)]:
@@ -75,8 +77,8 @@ def test_every_cut_between_records_is_derived_again(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("bit", [0, 7, 31])
 def test_a_bit_of_a_length_is_damage_and_not_a_torn_tail(tmp_path: Path, bit: int) -> None:
-    """A length that points behind the end must not pass for a crash: all behind it would be cut off
-    with the next append."""
+    """A length that points beyond the end must not be taken for a crash: all records after it would
+    be cut off with the next append."""
     raw = bytearray(GOLDEN.read_bytes())
     begin = bounds(bytes(raw))[4]
     raw[begin + bit // 8] ^= 1 << bit % 8
@@ -89,7 +91,8 @@ def test_a_bit_of_a_length_is_damage_and_not_a_torn_tail(tmp_path: Path, bit: in
 
 
 def test_a_tail_of_zeros_is_torn(tmp_path: Path) -> None:
-    """A file system may have made the file longer and not have written it when the power went."""
+    """The file system may have made the file longer, but not written the data before the power
+    failed."""
     raw = GOLDEN.read_bytes()
     journal = read_journal(copy(tmp_path, raw + bytes(5000)))
     assert journal.torn_bytes == 5000 and len(journal.records) == len(bounds(raw)) - 1
@@ -107,7 +110,7 @@ def test_a_tail_of_zeros_is_torn(tmp_path: Path) -> None:
     ],
 )
 def test_another_format_is_named_with_its_remedy(tmp_path: Path, magic: bytes, says: str) -> None:
-    """Replay, log and resume end with one line, and the file is as it was."""
+    """Replay, log and resume end with one line, and leave the file unchanged."""
     path = copy(tmp_path, magic + GOLDEN.read_bytes()[8:])
     before = path.read_bytes()
     with pytest.raises(CommandError, match=says):
@@ -118,22 +121,22 @@ def test_another_format_is_named_with_its_remedy(tmp_path: Path, magic: bytes, s
 
 
 def test_a_header_of_another_format_is_refused(tmp_path: Path) -> None:
-    """The header says it, too."""
+    """The header names the format, too."""
     JournalWriter(tmp_path / "run.journal", {"format": 7}).close()
     with pytest.raises(JournalError, match="format 7"):
         read_journal(tmp_path / "run.journal")
 
 
-def test_a_header_that_says_too_little_is_named(tmp_path: Path) -> None:
-    """A journal that some tool has written."""
+def test_an_incomplete_header_is_refused(tmp_path: Path) -> None:
+    """The journal was written by another tool."""
     JournalWriter(tmp_path / "run.journal", {"mission": "m"}).close()
     with pytest.raises(CommandError, match="its header has no 'mode'"):
         recorded(str(tmp_path))
 
 
-def test_a_resume_that_cannot_be_leaves_the_journal_as_it_was(tmp_path: Path) -> None:
-    """A stimulus that only a newer petrobot knows, another task: refused before anything is written
-    or cut."""
+def test_an_impossible_resume_leaves_the_journal_unchanged(tmp_path: Path) -> None:
+    """A stimulus that only a newer petrobot knows, or another task, is refused before anything is
+    written or cut."""
     raw = GOLDEN.read_bytes()
     path = copy(tmp_path, raw[: bounds(raw)[-1] - 3])
     found = recorded(str(path))
@@ -153,7 +156,7 @@ def test_a_resume_that_cannot_be_leaves_the_journal_as_it_was(tmp_path: Path) ->
     assert path.read_bytes() == raw
 
 
-def test_a_journal_that_may_not_be_written_is_said_to_be(
+def test_a_read_only_journal_is_one_error_with_its_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Read-only file system: one error with the path, no traceback."""
@@ -186,11 +189,11 @@ class SmallDisk:
 
 
 @pytest.mark.parametrize("room", [0, 1, 7, 8, 30, 45])
-def test_what_a_full_disk_has_taken_in_part_is_gone_on_with(
+def test_a_partly_written_record_is_completed_once_there_is_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
-    """Every place at which a write can stop: once there is room again, each record stands in the
-    file once and whole."""
+    """Wherever a write stops: once there is room again, each record is in the file once and
+    whole."""
     writer = JournalWriter(tmp_path / "run.journal", {})
     disk = SmallDisk(room)
     monkeypatch.setattr("petrobot.coordinator.run.journal.os.write", disk)
@@ -208,8 +211,8 @@ def test_what_a_full_disk_has_taken_in_part_is_gone_on_with(
 
 
 def full(folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Bench, Callable[[], None]]:
-    """An arm at work under a coordinator whose disk is full from now on, and what gives it room
-    again."""
+    """Return an arm at work, a coordinator whose disk is full from now on, and a function that
+    makes room again."""
     writer = JournalWriter(folder / "run.journal", {"mission": "m"})
     bench = Bench(store=JournalStore(writer, 0.0)).begin()
     disk = SmallDisk(5)
@@ -221,10 +224,10 @@ def full(folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Bench, Callable
     return bench, room
 
 
-def test_with_a_full_disk_nothing_leaves_that_is_not_kept(
+def test_with_a_full_disk_nothing_is_sent_that_is_not_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The run's end cannot be journaled: tidy is not called, the end is not acknowledged, so that
+    """The run's end cannot be journaled: tidy is not called, and the end is not acknowledged, so
     its node keeps it."""
     bench, _ = full(tmp_path, monkeypatch)
     with pytest.raises(JournalError, match="No space left"):

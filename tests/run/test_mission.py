@@ -26,7 +26,7 @@ from tests.run.toy_arm import SERVICES, TASK
 
 
 def run(task: Task, lines: dict[str, list[Line]], **given: Any) -> tuple[Mission, Timeline]:
-    """Run to the end, at most an hour of simulated time."""
+    """Run the task to its end, at most an hour of simulated time."""
     timeline = Timeline()
     cell, party = lockstep_cell(directory_for(task), Setting(task, **given), scripts(task, lines))
     party.mission.executor.observers.append(timeline)
@@ -35,7 +35,7 @@ def run(task: Task, lines: dict[str, list[Line]], **given: Any) -> tuple[Mission
 
 
 def failing(cause: str, status: ActionStatus = ActionStatus.ERROR) -> Line:
-    """A run that ends after 0.1 s with this cause."""
+    """Return a script whose run ends in ERROR after 0.1 s with this cause."""
     return Line(status, (0.1, 0.1), cause=cause)
 
 
@@ -43,7 +43,7 @@ GOOD = Line(seconds=(0.2, 0.2))
 
 
 def test_four_runs_reach_final(catch_ball: Task) -> None:
-    """The initial marking of figure 1 means four runs."""
+    """The initial marking of figure 1 has four run tokens."""
     mission, timeline = run(catch_ball, {})
     result = mission.result("lockstep", 1.0)
     assert (result["status"], result["runs"], len(mission.tally.cycles)) == ("success", 4, 4)
@@ -69,10 +69,11 @@ def test_four_runs_reach_final(catch_ball: Task) -> None:
         ),
     ],
 )
-def test_a_run_whose_token_was_taken_says_by_what(
+def test_a_preempted_run_names_the_transition_that_took_its_token(
     status: Status | None, text: str, told: str
 ) -> None:
-    """The error with which a cancelled action answers is no reason; as what it counts is told."""
+    """The reason names the preempting transition, not the cancelled action's own error, and how the
+    run counts."""
     timeline = Timeline()
     why = f"preempted {text}"
     run = RunRecorded(
@@ -86,7 +87,7 @@ def test_a_run_whose_token_was_taken_says_by_what(
 
 
 @pytest.mark.parametrize("runs", [1, 7])
-def test_number_of_runs_is_the_users(catch_ball: Task, runs: int) -> None:
+def test_the_user_sets_the_number_of_runs(catch_ball: Task, runs: int) -> None:
     """--runs puts tokens into the runs place."""
     mission, _ = run(catch_ball, {}, runs=runs)
     assert len(mission.tally.cycles) == mission.runs == runs
@@ -102,8 +103,10 @@ def test_number_of_runs_is_the_users(catch_ball: Task, runs: int) -> None:
         ("return_home", "drive_fault"),
     ],
 )
-def test_every_error_branch_comes_back(catch_ball: Task, primitive: str, cause: str) -> None:
-    """An error in the first run uses that run up; the others go on."""
+def test_every_error_branch_returns_to_the_normal_flow(
+    catch_ball: Task, primitive: str, cause: str
+) -> None:
+    """An error in the first run uses up that run; the others continue."""
     good = [GOOD] * 3
     mission, timeline = run(catch_ball, {primitive: [failing(cause), *good]})
     assert mission.executor.finished is not None
@@ -114,7 +117,7 @@ def test_every_error_branch_comes_back(catch_ball: Task, primitive: str, cause: 
 
 
 def test_an_arm_that_cannot_be_recovered_ends_the_task_in_error(catch_ball: Task) -> None:
-    """Four failed recoveries in a row: given up honestly, with runs left."""
+    """After four failed recoveries in a row the task ends with `final_error`, with runs left."""
     mission, _ = run(
         catch_ball,
         {"move_to_point": [failing("drive_fault")], "recover_arm": [failing("drive_fault")]},
@@ -126,9 +129,9 @@ def test_an_arm_that_cannot_be_recovered_ends_the_task_in_error(catch_ball: Task
     assert sum(r.place == "recover_arm" for r in mission.tally.runs) == 4
 
 
-def test_a_run_given_up_says_which_actions_erred_where_and_why(catch_ball: Task) -> None:
-    """What led there, the last one last; a run that reached its final marking has nothing of the
-    kind."""
+def test_a_given_up_run_lists_the_errors_of_its_actions(catch_ball: Task) -> None:
+    """The errors in order, the last one last; a run that reached its final marking has no such
+    list."""
     lines = {"move_to_point": [failing("bad_arguments")], "recover_arm": [failing("drive_fault")]}
     mission, _ = run(catch_ball, lines)
     told = mission.result("lockstep", 0.0)["last_errors"]
@@ -144,15 +147,15 @@ def test_a_run_given_up_says_which_actions_erred_where_and_why(catch_ball: Task)
     assert "last_errors" not in good.result("lockstep", 0.0)
 
 
-def test_failure_goes_on_along_the_normal_branch(catch_ball: Task) -> None:
-    """A ball that passes is a failure: the run was used up, nothing is recovered."""
+def test_failure_continues_on_the_normal_branch(catch_ball: Task) -> None:
+    """A ball that passes is a FAILURE: the run is used up, and no recovery starts."""
     mission, timeline = run(catch_ball, {"catch_ball": [failing("missed", ActionStatus.FAILURE)]})
     assert [c.status for c in mission.tally.cycles] == [Status.FAILURE] * 4
     assert not any(bar.place == "recover_arm" for bar in timeline.bars.values())
 
 
 def test_a_raised_deadline_is_an_error_with_a_reason(catch_ball: Task) -> None:
-    """A run that never ends is ended by its node at its deadline."""
+    """The node ends a run at its deadline."""
     mission, _ = run(catch_ball, {"locate_ball": [Line(seconds=(1e6, 1e6)), GOOD, GOOD, GOOD]})
     first = mission.tally.runs[0]
     assert (first.status, first.cause) == (Status.ERROR, "deadline")
@@ -160,7 +163,7 @@ def test_a_raised_deadline_is_an_error_with_a_reason(catch_ball: Task) -> None:
 
 
 def test_the_same_seed_gives_the_same_run(catch_ball: Task) -> None:
-    """Durations drawn by scripts are keyed by seed and run."""
+    """Scripts draw durations by seed and run."""
     lines = {"track_ball": [Line(seconds=(0.1, 2.0))]}
     one, again, other = (run(catch_ball, lines, seed=seed)[1] for seed in (5, 5, 6))
     assert one.firings == again.firings
@@ -168,7 +171,7 @@ def test_the_same_seed_gives_the_same_run(catch_ball: Task) -> None:
 
 
 def test_the_user_chooses_the_action(catch_ball: Task) -> None:
-    """A selector's choice is what runs, with its reason."""
+    """The action that the selector chose runs, and the record has the selector's reason."""
     chosen = FirstAlternative({"track_ball": "predict_kalman"})
     mission, _ = run(catch_ball, {}, selector=chosen, runs=1)
     track = next(r for r in mission.tally.runs if r.place == "track_ball")
@@ -176,9 +179,9 @@ def test_the_user_chooses_the_action(catch_ball: Task) -> None:
     assert (track.status, track.cause) == (Status.ERROR, "not_offered")
 
 
-def test_a_preparation_that_may_have_been_asked_for_before_says_so() -> None:
-    """A node that has forgotten its oldest calls does not prepare the cell a second time for a
-    resumed coordinator."""
+def test_a_repeated_preparation_says_that_it_may_be_one() -> None:
+    """The call says that it may be a repetition, so a node that has forgotten its oldest calls does
+    not prepare the cell a second time."""
     text = TASK.replace('name = "toy"', 'name = "toy"\nprepare = "lab_prepare"')
     places = parse(
         SERVICES.replace("ON_RESUME", "rejoin")

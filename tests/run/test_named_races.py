@@ -1,5 +1,5 @@
-"""The races that other coordination systems lost, by name, played against the executor over a node
-that the test speaks for.
+"""Race conditions reported for other coordination systems, replayed with our executor and a node
+whose messages the test writes.
 
 ros/executive_smach issues 53 and 98, uleroboticsgroup/yasmin issues 62 and 102,
 PlanSys2/ros2_planning_system pull requests 399 and 400.
@@ -19,14 +19,13 @@ STOPPED = "preempted by rung"
 
 
 @pytest.mark.parametrize("end_first", [True, False])
-def test_smach_53_a_preemption_that_meets_the_end_is_either_served_or_reported(
+def test_smach_53_a_preemption_at_the_end_is_either_executed_or_reported(
     end_first: bool,
 ) -> None:
-    """There a request that came as the children completed was taken for served although nobody had
-    served it.
+    """There, a request that arrived as the children completed was counted as served, but was not.
 
-    Here the order of arrival settles it: the event preempts the run, or it finds the run over and
-    is reported as early.
+    Here the order of arrival decides: the event preempts the run, or finds the run ended and is
+    reported as early.
     """
     bench = Bench().begin()
     both: list[m.Message] = [m.Outcome(WORK, "success"), m.Event("bell", "desk", 1)]
@@ -37,11 +36,11 @@ def test_smach_53_a_preemption_that_meets_the_end_is_either_served_or_reported(
 
 
 @pytest.mark.parametrize("own", ["success", "failure", "error"])
-def test_smach_98_a_preempted_run_counts_as_its_preemption_says_whatever_it_says_itself(
+def test_smach_98_a_preempted_run_counts_as_its_arc_declares_not_as_its_result(
     own: str,
 ) -> None:
-    """There a container that was ending already gave its own outcome, and the machine took the
-    wrong way."""
+    """There, a container that was already ending returned its own outcome, and the state machine
+    took the wrong transition."""
     bench = Bench().begin()
     bench.ring(1.0)
     bench.say(1.1, m.Outcome(WORK, own))
@@ -52,8 +51,8 @@ def test_smach_98_a_preempted_run_counts_as_its_preemption_says_whatever_it_says
 
 @pytest.mark.parametrize("accepted", [True, False])
 def test_yasmin_62_a_cancel_straight_after_the_start_reaches_the_run(accepted: bool) -> None:
-    """There the machine ran, its current state was still empty, and the cancel was passed on to
-    nobody."""
+    """There, the machine ran, its current state was still empty, and the cancel reached no
+    state."""
     bench = Bench()
     bench.link(0.0)
     bench.executor.stimulate(0.0, Begin())
@@ -77,7 +76,7 @@ def test_yasmin_62_a_cancel_straight_after_the_start_reaches_the_run(accepted: b
 
 
 def test_yasmin_62_a_run_cancelled_before_it_could_be_sent_is_never_sent() -> None:
-    """Its node is away: nothing leaves any more, also when the node is back."""
+    """Its node is away: the call is not sent, not even when the node is back."""
     bench = Bench()
     bench.caller.connecting(0.0)
     bench.executor.stimulate(0.0, Begin())
@@ -89,8 +88,8 @@ def test_yasmin_62_a_run_cancelled_before_it_could_be_sent_is_never_sent() -> No
 
 
 def test_yasmin_102_a_second_cancel_stops_what_came_after_the_first() -> None:
-    """There the first cancel left a mark by which later ones were ignored while the machine went on
-    with its next states."""
+    """There, the first cancel set a flag, and later cancels were ignored while the machine ran its
+    next states."""
     bench = Bench().begin()
     bench.ring(1.0)
     bench.say(1.1, m.Outcome(WORK, "error", {}, "cancelled"))
@@ -104,8 +103,8 @@ def test_yasmin_102_a_second_cancel_stops_what_came_after_the_first() -> None:
 
 
 def test_plansys2_399_a_performer_that_never_answers_does_not_block_the_task() -> None:
-    """There the executor stayed in RUNNING for ever. Here the deadline and 5 s for the stop routine
-    end the wait, honestly."""
+    """There, the executor stayed in RUNNING for ever. Here the wait ends in ERROR after the
+    deadline and 5 s for the stop routine."""
     bench = Bench().begin()
     bench.go(9.9)
     assert bench.records == []
@@ -120,7 +119,7 @@ def test_plansys2_399_a_performer_that_never_answers_does_not_block_the_task() -
     assert bench.executor.finished is not None and bench.executor.finished.status is Status.ERROR
 
 
-def test_plansys2_399_a_cancelled_performer_that_never_answers_is_said_to_be_stuck() -> None:
+def test_plansys2_399_a_cancelled_performer_that_never_answers_is_reported_stuck() -> None:
     bench = Bench().begin()
     bench.ring(1.0)
     bench.go(1.0 + 1.0 + ESCALATION)
@@ -128,8 +127,8 @@ def test_plansys2_399_a_cancelled_performer_that_never_answers_is_said_to_be_stu
 
 
 def test_plansys2_400_a_silent_performer_is_never_replaced_by_a_second_one() -> None:
-    """There, after 5 s without feedback, another performer was confirmed while the first might
-    still be at work."""
+    """There, after 5 s without feedback, another performer got the action while the first might
+    still execute it."""
     bench = Bench().begin()
     ids: list[str] = []
     for second in range(1, 60):
@@ -139,8 +138,8 @@ def test_plansys2_400_a_silent_performer_is_never_replaced_by_a_second_one() -> 
     assert bench.records[0].executed is Executed.UNKNOWN
 
 
-def test_plansys2_400_one_that_did_not_even_accept_is_not_asked_a_second_time() -> None:
-    """It may be at work all the same: its call is not made again, and the arm is nobody's until its
+def test_plansys2_400_a_performer_that_did_not_accept_is_not_called_again() -> None:
+    """It may still execute the action: its call is not repeated, and no run gets the arm until the
     node must have stopped it."""
     bench = Bench()
     bench.link(0.0)
@@ -155,7 +154,7 @@ def test_plansys2_400_one_that_did_not_even_accept_is_not_asked_a_second_time() 
     assert bench.calls() == [TIDY]
 
 
-def test_plansys2_400_nobody_gets_the_arm_before_the_first_performer_has_let_go() -> None:
+def test_plansys2_400_no_run_gets_the_arm_before_the_first_performer_releases_it() -> None:
     bench = Bench().begin()
     bench.ring(1.0)
     bench.go(3.0)
@@ -165,7 +164,7 @@ def test_plansys2_400_nobody_gets_the_arm_before_the_first_performer_has_let_go(
 
 
 def test_every_cancel_is_answered_once() -> None:
-    """Whatever the order: one `RunRecorded` for a run that was cancelled."""
+    """In any order of messages, a cancelled run has one `RunRecorded`."""
     bench = Bench().begin()
     bench.ring(1.0)
     bench.say(1.1, m.Outcome(WORK, "error", {}, "cancelled"), m.Outcome(WORK, "success"))

@@ -1,5 +1,5 @@
-"""Kills, floods, age, cut links and reboots in any order: no action runs twice, and none that ran
-is said not to have run."""
+"""Kills, floods, old calls, cut links and reboots in any order: no action runs twice, and no action
+that ran is reported as not executed."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from tests.run.toy_arm import TIDY, WORK, Bench
 
 KEEPING = Retention(results=10.0, result_count=2, id_groups=2)
 TURNS = 300
-"""Of 0.5 s each, within which every mission run of these tests ends, whatever happened before."""
+"""Steps of 0.5 s within which every mission run of these tests ends, whatever happened before."""
 
 
 class World:
-    """A coordinator whose steps are all kept, and a node whose actions end when the test says
-    so."""
+    """A coordinator whose steps are all recorded, and a node whose actions end when the test ends
+    them."""
 
     def __init__(self, keeping: Retention = KEEPING) -> None:
         self.now = 0.0
@@ -88,8 +88,7 @@ class World:
             self.bench.executor.adopt(self.now)
 
     def flood(self, calls: int) -> None:
-        """Another client calls, under ids that have nothing in common, and acknowledges or does
-        not."""
+        """Another client makes many calls under other ids, and acknowledges the results or not."""
         self.callee.link_up(self.now, "flood", m.Hello(2, 2, "client", "flood", "f1"))
         for _ in range(calls):
             self.floods += 1
@@ -99,7 +98,8 @@ class World:
                 self.callee.receive(self.now, "flood", m.ResultAck(id_))
 
     def disaster(self) -> None:
-        """What the guard is for: killed, all that it began ends meanwhile, and a flood follows."""
+        """Kill the coordinator, let all its runs end, and flood the node: the case that the guard
+        is for."""
         self.kill(True)
         self.finish()
         self.flood(15)
@@ -112,7 +112,7 @@ class World:
         self.callee = self._callee()
 
     def finish(self) -> None:
-        """The oldest run that is active ends."""
+        """End the oldest active run."""
         if self.active:
             self.callee.finish(self.now, m.Outcome(self.active.pop(0), "success"))
 
@@ -122,7 +122,7 @@ class World:
             self.bench.ring(self.now, 1)
 
     def pass_time(self, seconds: float) -> None:
-        """Nobody says anything for so long."""
+        """Let so much time pass without a message."""
         self.now += seconds
         self.callee.advance(self.now)
         self._obey()
@@ -130,7 +130,7 @@ class World:
             self.bench.go(self.now)
 
     def exchange(self) -> None:
-        """All that is on its way arrives."""
+        """Deliver all messages that are in transit."""
         for _ in range(4):
             if self.bench is None or not self.bench.caller.up:
                 return
@@ -150,10 +150,10 @@ class World:
                 self.active.remove(order.id)
                 self.callee.finish(self.now, m.Outcome(order.id, "error", cause="cancelled"))
 
-    # --- what must be -------------------------------------------------------------------------
+    # --- what must hold -----------------------------------------------------------------------
 
     def end(self) -> list[RunRecorded]:
-        """Let the mission run end, and check it; the records of its runs."""
+        """Let the mission run end, and check it. Return the records of its runs."""
         for _ in range(TURNS):
             self.resume()
             self.connect()
@@ -218,8 +218,8 @@ def test_nothing_runs_twice_in_full(operations: list[tuple[object, ...]]) -> Non
 def test_a_run_that_the_node_has_forgotten_ends_unknown_and_its_device_is_fenced(
     how: str, accepted: bool
 ) -> None:
-    """Its result is gone by number or by age, or even its id is; the coordinator's journal knows
-    that it was ordered."""
+    """The node has dropped its result (too many, or too old), or even its id; the coordinator's
+    journal knows that it was ordered."""
     world = World(
         Retention(results=10.0, result_count=2, id_groups=100_000 if how != "flood" else 2)
     )
@@ -247,7 +247,7 @@ def test_a_run_that_the_node_has_forgotten_ends_unknown_and_its_device_is_fenced
     assert bench.calls() == [TIDY]
 
 
-def test_a_run_that_was_stopping_and_is_forgotten_has_stopped_when_its_fence_is_over() -> None:
+def test_a_forgotten_run_that_was_stopping_has_stopped_when_its_fence_ends() -> None:
     world = World()
     world.exchange()
     world.ring()
@@ -261,9 +261,10 @@ def test_a_run_that_was_stopping_and_is_forgotten_has_stopped_when_its_fence_is_
     assert world.bench.calls() == [TIDY]
 
 
-def test_a_run_of_another_boot_that_is_cancelled_again_is_not_said_never_to_have_begun() -> None:
-    """Ordered, cancelled, executed for a moment; then both are killed: the new boot knows nothing
-    of it, and still says so to the process after the next kill."""
+def test_a_cancelled_run_of_an_earlier_boot_is_never_reported_as_not_executed() -> None:
+    """A run is ordered, cancelled, and executed for a moment; then both processes are killed. The
+    node's new process does not know the run, and still says so after the next kill of the
+    coordinator."""
     world = World()
     world.ring()
     world.kill(True)
@@ -276,8 +277,8 @@ def test_a_run_of_another_boot_that_is_cancelled_again_is_not_said_never_to_have
     assert record.run == "work#1" and record.cancelled and record.executed is Executed.UNKNOWN
 
 
-def test_a_call_lost_on_its_way_is_made_again_by_a_node_that_forgot_nothing() -> None:
-    """The guard costs nothing where it is not needed: a day later too."""
+def test_a_lost_call_is_executed_by_a_node_that_has_forgotten_nothing() -> None:
+    """The guard does not prevent calls where it is not needed, not even a day later."""
     world = World(Retention())
     world.kill(False)
     world.flood(2_000)

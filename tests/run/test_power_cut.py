@@ -1,4 +1,4 @@
-"""The power goes at any moment: journal, sync, effect, acknowledgement come in this order, so
+"""The power fails at any moment: journal, sync, effect and acknowledgement come in this order, so
 nothing runs twice or is lost."""
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ JOURNAL = "run/run.journal"
 
 
 def left(disk: Disk, folder: Path, engine: Engine, torn: float = 0.0) -> list[RecordedStep]:
-    """The steps that can be derived after a power cut."""
+    """Return the steps that a replay computes after a power cut."""
     image = disk.left(torn)
     if JOURNAL not in image:
         return []
@@ -40,7 +40,7 @@ def left(disk: Disk, folder: Path, engine: Engine, torn: float = 0.0) -> list[Re
 
 
 def ordered(steps: Iterable[RecordedStep], kind: type) -> set[str]:
-    """Runs that orders of this kind are for."""
+    """Return the runs of the instructions of this kind."""
     return {
         i.run
         for step in steps
@@ -50,17 +50,17 @@ def ordered(steps: Iterable[RecordedStep], kind: type) -> set[str]:
 
 
 def ended(steps: Iterable[RecordedStep]) -> set[str]:
-    """Runs whose end is kept."""
+    """Return the runs whose end is recorded."""
     return {step.stimulus.run for step in steps if isinstance(step.stimulus, RunEnded)}
 
 
 def run_of(call: str) -> str:
-    """The run that a call is for."""
+    """Return the run of a call."""
     return call.rpartition("/")[2]
 
 
 def watched(caller: Caller, name: str, look: Callable[..., None]) -> None:
-    """Have `look` called with what this method of a caller is given, before it does its work."""
+    """Make this method of a caller first call `look` with its arguments."""
     method = getattr(caller, name)
 
     def call(now: float, *given: Any) -> None:
@@ -70,11 +70,11 @@ def watched(caller: Caller, name: str, look: Callable[..., None]) -> None:
     setattr(caller, name, call)
 
 
-def test_a_device_is_moved_and_a_result_acknowledged_only_when_the_cause_is_on_the_disk(
+def test_calls_and_acknowledgements_are_sent_only_after_their_records_are_on_disk(
     tmp_path: Path,
 ) -> None:
-    """With the usual store: each call, cancel and acknowledgement, at the moment at which it is
-    handed to the connection."""
+    """With the real store: for each call, cancel and acknowledgement, when it is passed to the
+    connection."""
     seen: list[str] = []
     with power_cut(tmp_path) as disk:
         store = JournalStore(JournalWriter(tmp_path / JOURNAL, {"mission": "m"}), 0.0)
@@ -135,20 +135,20 @@ def test_a_device_is_moved_and_a_result_acknowledged_only_when_the_cause_is_on_t
 
 
 class Cellar(Laboratory):
-    """The scripted laboratory with a coordinator on a disk that loses what was not synced; its
-    nodes have another supply."""
+    """The scripted laboratory with a coordinator whose disk loses what was not synced; its nodes
+    keep their power."""
 
     acknowledged: set[str]
 
     def watch(self, mission: Mission) -> None:
-        """Note what is acknowledged."""
+        """Record what is acknowledged."""
         self.acknowledged = set()
         for caller in mission.callers.values():
             watched(caller, "acknowledge", self.acknowledged.add)
 
 
 def cut_and_resume(task: Task, folder: Path, lives: int, torn: float, expected: Any) -> None:
-    """The power goes at an operation of the journal; what is left is resumed."""
+    """Cut the power at an operation of the journal, and resume from what is left."""
     folder.mkdir()
     laboratory = Cellar(task, folder / "run")
 
@@ -180,7 +180,8 @@ def cut_and_resume(task: Task, folder: Path, lives: int, torn: float, expected: 
 
 
 def places(task: Task, folder: Path) -> tuple[Any, int]:
-    """The outcome without a power cut, and how many places there are for one."""
+    """Return the outcome without a power cut, and the number of operations at which one can
+    happen."""
     laboratory = Laboratory(task, folder / "undisturbed")
 
     def durable(*given: Any) -> Mission:
@@ -198,7 +199,7 @@ TORN = (0.0, 0.5, 1.0)
 
 
 def test_a_power_cut_anywhere_changes_nothing(catch_ball: Task, tmp_path: Path) -> None:
-    """Twenty places drawn from all; all of them in the proof."""
+    """Cuts at twenty operations drawn at random; the proof cuts at all."""
     expected, operations = places(catch_ball, tmp_path)
     drawn = np.random.default_rng(2).choice(np.arange(1, operations), 20, replace=False)
     for number, lives in enumerate(sorted(drawn)):

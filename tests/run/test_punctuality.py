@@ -1,5 +1,5 @@
-"""When a host counts as too busy: a share of late looks, or one long gap; a look that is late now
-and then is not told."""
+"""When a host counts as too busy: a share of late checks, or one long gap; a single late check is
+not reported."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from petrobot.coordinator.run.realtime import LATE, PERIOD, WORST, Punctuality
         ([0.001] * 499 + [WORST + 0.01], "more than 20 ms late 1 of 500 times, by 70 ms at most"),
     ],
 )
-def test_what_is_told(delays: list[float], told: str) -> None:
+def test_when_lateness_is_reported(delays: list[float], told: str) -> None:
     seen, due = Punctuality(), 5.0
     for delay in delays:
         now = due + delay

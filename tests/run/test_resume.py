@@ -1,5 +1,5 @@
-"""A coordinator that dies at any record of its journal: the resumed run ends as the undisturbed
-one, nothing runs twice."""
+"""A coordinator that dies at any record of its journal: the resumed run ends like the undisturbed
+one, and nothing runs twice."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ RUNS = 4
 
 
 class CrashError(Exception):
-    """The coordinator is gone."""
+    """The coordinator has died."""
 
 
 class MortalStore(JournalStore):
-    """Dies after so many operations (appends and syncs), as kill -9 would: what was not synced is
-    lost with the process."""
+    """Dies after so many operations (appends and syncs), as after kill -9: what was not synced is
+    lost."""
 
     def __init__(self, writer: JournalWriter, lives: int) -> None:
         super().__init__(writer, 0.0)
@@ -104,8 +104,7 @@ class Laboratory:
         return counting
 
     def begin(self, lives: int, *first: Stimulus) -> tuple[Mission, MortalStore]:
-        """Run until the end or the crash; `first` is what the operator says before the
-        beginning."""
+        """Run until the end or the crash; `first`: the operator's commands before the beginning."""
         header = {
             "mission": "m",
             "mode": "lockstep",
@@ -120,7 +119,7 @@ class Laboratory:
         return mission, store
 
     def resume(self) -> Mission:
-        """A new process takes the journal and goes on with the same nodes."""
+        """Continue from the journal as a new process, with the same nodes."""
         task, runs = with_runs(self.task, RUNS)
         assert runs == RUNS
         assert self.cell is not None
@@ -132,7 +131,7 @@ class Laboratory:
         return mission
 
     def go(self, mission: Mission, begin: Callable[[float], None] | None = None) -> None:
-        """Run the cell with this coordinator until it is over; raises CrashError when it dies."""
+        """Run the cell with this coordinator until the run ends. Raises CrashError when it dies."""
         party = CoordinatorParty(self.directory, mission, begin=begin)
         if self.cell is None:
             self.cell = LockStepCell([party, self.node])
@@ -142,7 +141,7 @@ class Laboratory:
 
 
 def outcome(mission: Mission) -> Mapping[str, Any]:
-    """What must not depend on a crash."""
+    """Return everything that must not depend on a crash."""
     finished = mission.executor.finished
     assert finished is not None
     return {
@@ -155,7 +154,7 @@ def outcome(mission: Mission) -> Mapping[str, Any]:
 
 
 def undisturbed(task: Task, folder: Path) -> tuple[Mapping[str, Any], int]:
-    """The outcome without a crash, and how many places there are to crash at."""
+    """Return the outcome without a crash, and the number of operations at which one can happen."""
     laboratory = Laboratory(task, folder / "undisturbed")
     mission, store = laboratory.begin(0)
     assert set(laboratory.executed.values()) == {1}
@@ -174,7 +173,7 @@ def die_and_resume(task: Task, folder: Path, lives: int, expected: Mapping[str, 
 
 
 def test_dying_anywhere_changes_nothing(catch_ball: Task, tmp_path: Path) -> None:
-    """Twenty places drawn from all; all of them in the proof."""
+    """Crashes at twenty operations drawn at random; the proof crashes at all."""
     expected, operations = undisturbed(catch_ball, tmp_path)
     assert expected["status"] is Status.SUCCESS
     assert operations > 60
@@ -192,11 +191,9 @@ def test_dying_at_every_operation_changes_nothing(catch_ball: Task, tmp_path: Pa
         die_and_resume(catch_ball, tmp_path, lives, expected)
 
 
-def test_what_the_operator_has_chosen_outlives_the_coordinator(
-    catch_ball: Task, tmp_path: Path
-) -> None:
-    """An override is a stimulus like any other: before and after the crash his alternative is run,
-    and replay says so."""
+def test_an_override_survives_a_crash_of_the_coordinator(catch_ball: Task, tmp_path: Path) -> None:
+    """An override is a stimulus like any other: before and after the crash the operator's
+    alternative runs, and a replay agrees."""
     chosen = {"locate_ball": "locate_hough", "track_ball": "predict_kalman"}
     laboratory = Laboratory(catch_ball, tmp_path)
     with pytest.raises(CrashError):
@@ -216,8 +213,9 @@ def test_what_the_operator_has_chosen_outlives_the_coordinator(
     assert steps[-1].state == mission.executor.state
 
 
-def test_replay_derives_everything_again(catch_ball: Task, tmp_path: Path) -> None:
-    """The journal alone gives every marking; a changed task is noticed at the first difference."""
+def test_replay_computes_every_marking_again(catch_ball: Task, tmp_path: Path) -> None:
+    """Every marking is computed from the journal alone; a changed task is noticed at the first
+    difference."""
     laboratory = Laboratory(catch_ball, tmp_path)
     mission, _ = laboratory.begin(0)
     task, _ = with_runs(catch_ball, RUNS)

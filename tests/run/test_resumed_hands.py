@@ -1,5 +1,5 @@
-"""A coordinator that dies under its operator's hands: in a pause, at a breakpoint, in the middle of
-a cancel or of an abort."""
+"""A coordinator that dies during an operator's command: in a pause, at a breakpoint, during a
+cancel or an abort."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.run.toy_arm import TIDY, WORK, Bench
 
 
 def held(bench: Bench, now: float) -> m.Command:
-    """The order to hold that was sent last; the node says that the arm holds."""
+    """Return the hold that was sent last, after the node answered that the arm holds."""
     order = next(c for c in bench.sent(m.Command) if isinstance(c, m.Command) and c.verb == "hold")
     bench.say(now, m.Answer(order.id, True, {"answers": {"arm": "held"}, "devices": {}}))
     return order
@@ -32,8 +32,8 @@ def held(bench: Bench, now: float) -> m.Command:
 def test_killed_in_a_pause_it_is_still_paused_and_the_arm_is_asked_to_hold_again(
     answered: bool,
 ) -> None:
-    """Whatever the node had answered: it may have been released since, or started again. Then it
-    goes on as if nothing had been."""
+    """It is asked again whatever the node had answered, since it may have been released or
+    restarted. Then the run continues as if nothing had happened."""
     bench = Bench().begin()
     bench.executor.stimulate(1.0, Pause("look"))
     if answered:
@@ -50,7 +50,7 @@ def test_killed_in_a_pause_it_is_still_paused_and_the_arm_is_asked_to_hold_again
 
 
 def test_killed_in_a_pause_of_a_node_that_cannot_hold() -> None:
-    """Its run goes on; that is said again, and nothing fires."""
+    """Its run continues; that is reported again, and nothing fires."""
     bench = Bench().begin()
     bench.executor.stimulate(1.0, Pause())
     bench.executor.stimulate(1.1, RunHeld("work#1", Hold.CANNOT))
@@ -78,9 +78,9 @@ def test_killed_with_breakpoints_set_it_stops_at_them() -> None:
 
 
 @pytest.mark.parametrize("boot", ["n1", "n2"])
-def test_killed_in_the_middle_of_a_cancel(boot: str) -> None:
-    """The cancel is given again; nothing has the arm before the run is known to have stopped, also
-    when its node is another."""
+def test_killed_during_a_cancel(boot: str) -> None:
+    """The cancel is sent again; no run gets the arm before the cancelled run is known to have
+    stopped, even if its node was restarted."""
     bench = Bench().begin()
     bench.ring(1.0)
     after = bench.resumed(1.5, boot=boot, runs=[WORK] if boot == "n1" else [])
@@ -101,9 +101,9 @@ def test_killed_in_the_middle_of_a_cancel(boot: str) -> None:
     assert record.status is Status.SUCCESS, "as the preempting event says"
 
 
-def test_killed_in_an_abort_as_after_an_emergency_stop_it_ends_and_starts_nothing() -> None:
-    """The stop was journaled as an abort: the resumed run waits for what still stops, and is
-    over."""
+def test_killed_during_an_abort_it_ends_and_starts_nothing() -> None:
+    """The stop was journaled as an abort: the resumed run waits for the actions that are stopping,
+    and ends."""
     bench = Bench().begin()
     bench.executor.stimulate(1.0, Abort("emergency stop by ana"))
     after = bench.resumed(2.0, runs=[WORK])

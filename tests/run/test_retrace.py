@@ -1,5 +1,5 @@
-"""A run in lock step whose whole cell died with its coordinator: made again from its seed,
-compared, and written on."""
+"""A lock-step run whose whole cell died with its coordinator: it is simulated again from its seed,
+compared with the journal, and continued."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TASK = Path(__file__).parents[1] / "chaos" / "shuttle.toml"
 
 @pytest.fixture
 def recorded_run(tmp_path: Path) -> Path:
-    """The folder of a run that ended."""
+    """Return the folder of a run that ended."""
     for name, text in (("services.toml", SERVICES), ("mock.toml", SCRIPT)):
         (tmp_path / name).write_text(text)
     given = ["run", str(TASK), "--mode", "lockstep", "--quiet", "--journal", str(tmp_path / "runs")]
@@ -36,7 +36,8 @@ def recorded_run(tmp_path: Path) -> Path:
 
 
 def kill_at(folder: Path, records: int) -> dict[str, Any]:
-    """Leave so many records, the next one torn, and no result; gives the result of before."""
+    """Cut the journal after so many records, within the next one, and remove the result; return
+    that result."""
     result: dict[str, Any] = json.loads((folder / RESULT).read_text())
     (folder / RESULT).unlink()
     path = folder / JOURNAL
@@ -54,7 +55,7 @@ def kill_at(folder: Path, records: int) -> dict[str, Any]:
 
 @pytest.mark.parametrize("records", [0, 1, 2, 7, 20, 10_000])
 def test_the_resumed_run_is_the_undisturbed_one(recorded_run: Path, records: int) -> None:
-    """Result and journal are those of a run that nobody killed, record by record."""
+    """Result and journal equal those of a run that was not killed, record by record."""
     path = recorded_run / JOURNAL
     before = [(r.kind, r.data) for r in read_journal(path).records]
     expected = kill_at(recorded_run, records)
@@ -69,10 +70,10 @@ def test_the_resumed_run_is_the_undisturbed_one(recorded_run: Path, records: int
     assert main(["replay", str(recorded_run)]) == 0
 
 
-def test_files_that_changed_since_are_noticed(
+def test_a_changed_script_is_noticed(
     recorded_run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Another script gives another run: it is not written over the one that was."""
+    """Another script gives another run, which does not overwrite the recorded one."""
     kill_at(recorded_run, 20)
     (recorded_run.parents[1] / "mock.toml").write_text(SCRIPT.replace("0.1", "0.2"))
     assert main(["resume", str(recorded_run), "--quiet", "--no-page"]) == 2
@@ -81,7 +82,7 @@ def test_files_that_changed_since_are_noticed(
     assert len(read_journal(recorded_run / JOURNAL).records) == 20
 
 
-def test_measured_processor_time_is_no_difference(tmp_path: Path) -> None:
+def test_measured_processor_time_is_not_compared(tmp_path: Path) -> None:
     path = tmp_path / "run.journal"
     writer = JournalWriter(path, {"mode": "lockstep"})
     writer.append("stage", {"stage": "scored", "values": {"cpu_s": 1.0}})
@@ -106,7 +107,7 @@ def test_measured_processor_time_is_no_difference(tmp_path: Path) -> None:
 
 
 def nudged(value: Any, share: float) -> Any:
-    """Plain data whose floats are larger by a share of themselves."""
+    """Return plain data with every float increased by this share."""
     if isinstance(value, dict):
         return {key: nudged(one, share) for key, one in value.items()}
     if isinstance(value, list):
@@ -115,8 +116,8 @@ def nudged(value: Any, share: float) -> Any:
 
 
 def recorded_elsewhere(folder: Path, share: float) -> list[tuple[str, Any]]:
-    """Cut the run off after 20 records, and let those from the tenth on have been computed by
-    another processor."""
+    """Cut the run off after 20 records, and change the last digits from the tenth on, as if another
+    processor had computed them."""
     kill_at(folder, 20)
     journal = read_journal(folder / JOURNAL)
     (folder / JOURNAL).unlink()
@@ -130,8 +131,8 @@ def recorded_elsewhere(folder: Path, share: float) -> list[tuple[str, Any]]:
     return [(record.kind, record.data) for record in journal.records]
 
 
-def test_a_run_of_another_processor_is_resumed_as_one_run(recorded_run: Path) -> None:
-    """Its last digits differ: the journal replays afterwards."""
+def test_a_run_of_another_processor_is_resumed(recorded_run: Path) -> None:
+    """Its last digits differ, and the journal still replays afterwards."""
     expected = json.loads((recorded_run / RESULT).read_text())
     before = recorded_elsewhere(recorded_run, 1e-12)
     assert main(["resume", str(recorded_run), "--quiet", "--no-page"]) == 0
@@ -144,7 +145,7 @@ def test_a_run_of_another_processor_is_resumed_as_one_run(recorded_run: Path) ->
     assert main(["replay", str(recorded_run)]) == 0
 
 
-def test_a_run_that_differs_by_more_than_last_digits_is_not_written_over(
+def test_a_run_that_differs_by_more_than_last_digits_is_not_overwritten(
     recorded_run: Path,
 ) -> None:
     recorded_elsewhere(recorded_run, 1e-3)
@@ -156,7 +157,7 @@ def test_a_run_that_differs_by_more_than_last_digits_is_not_written_over(
 def test_a_journal_of_a_newer_petrobot_is_refused(
     recorded_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its rules are not known here: a replay would find differences that are none."""
+    """Its semantics are not known here: a replay would report differences that are not faults."""
     journal = read_journal(recorded_run / JOURNAL)
     assert journal.header["semantics"] == SEMANTICS
     newer = tmp_path / "run.journal"
@@ -183,17 +184,18 @@ values = { code = "left" }
 
 
 def fewer_tries(task: Task) -> Task:
-    """As a petrobot would expand the sorter's task that gives up after the first try."""
+    """Return the sorter's task as a petrobot would expand it that gives up after the first try."""
     places = {name: replace(place, tries=1) for name, place in task.places.items()}
     return expand(replace(task, places=places))
 
 
 @pytest.mark.parametrize("resumed", [False, True])
-def test_a_run_keeps_the_expansion_that_it_ran_with(
+def test_a_run_keeps_the_expansion_of_its_short_forms(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, resumed: bool
 ) -> None:
-    """The header holds the flat task: a petrobot that expands short forms in another way replays
-    and resumes the run as it was; only a journal without it is expanded again."""
+    """The header has the expanded task, so a petrobot that expands short forms in another way
+    replays and resumes the run unchanged. Only a journal without the expanded task is expanded
+    again."""
     (tmp_path / "mock.toml").write_text(SLIPS)
     given = ["run", str(SORTER / "sort.toml"), "--mode", "lockstep", "--quiet", "--runs", "3"]
     given += ["--journal", str(tmp_path / "runs"), "--mock", str(tmp_path / "mock.toml")]

@@ -39,7 +39,7 @@ SCRIPT = "schema = 1\n" + "".join(
 
 
 def a_run(folder: Path, name: str, age: int, ended: bool = True) -> Path:
-    """A run's folder, so many seconds old."""
+    """Make a run's folder that is so many seconds old."""
     JournalWriter(folder / name / JOURNAL, {}).close()
     paths = [folder / name / JOURNAL]
     if ended:
@@ -50,7 +50,7 @@ def a_run(folder: Path, name: str, age: int, ended: bool = True) -> Path:
     return folder / name
 
 
-def test_the_oldest_ended_runs_go_and_one_without_result_never(tmp_path: Path) -> None:
+def test_the_oldest_ended_runs_are_removed_but_never_one_without_result(tmp_path: Path) -> None:
     for name, age in (("a", 50), ("b", 40), ("c", 30), ("d", 20)):
         a_run(tmp_path, name, age)
     a_run(tmp_path, "killed", 100, ended=False)
@@ -69,7 +69,7 @@ def test_a_run_is_found_by_id_folder_journal_or_as_the_last(tmp_path: Path, name
         journal_of("other", tmp_path)
 
 
-def test_run_keeps_as_many_as_it_is_told_in_lock_step_too(
+def test_keep_limits_the_number_of_runs_in_lock_step_too(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`petrobot run --journal FOLDER --keep 2`, four times; without `--journal` a lock-step run
@@ -92,11 +92,11 @@ def test_run_keeps_as_many_as_it_is_told_in_lock_step_too(
 
 
 @pytest.mark.parametrize(("status", "code"), [("success", 0), ("error", 1)])
-def test_resume_of_a_run_that_had_ended_says_how(
+def test_resume_of_an_ended_run_says_how_it_ended(
     status: str, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A supervisor resumes whatever went away: it is told how the run ended, and 2 when the journal
-    is damaged."""
+    """A process supervisor restarts `petrobot resume` after every exit: the command says how the
+    run ended, and returns 2 if the journal is damaged."""
     golden = Path(__file__).with_name("golden") / "catch_ball-undisturbed.journal"
     run = tmp_path / "run"
     run.mkdir()

@@ -1,5 +1,5 @@
-"""The keeper of node processes: ready in order, dead ones started again with a growing pause, none
-left behind."""
+"""The supervisor of node processes: they are ready in order, dead ones are restarted after growing
+pauses, and none is left running."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ FAULTY = "import sys; print('no device at can0', file=sys.stderr); sys.exit(2)"
 
 
 def program(name: str, source: str, first: bool = False) -> Program:
-    """A program that runs this text."""
+    """Return a program that runs this Python text."""
     return Program(name, [sys.executable, "-c", source], first)
 
 
 def deaths(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """What was logged of programs that died."""
+    """Return the log lines about programs that died."""
     return [text for text in caplog.messages if " died; " in text]
 
 
@@ -39,7 +39,7 @@ async def until_died(caplog: pytest.LogCaptureFixture, count: int) -> None:
             await beat(0.01)
 
 
-async def test_a_killed_program_is_started_again_and_all_end_with_the_supervisor(
+async def test_a_killed_program_is_restarted_and_all_end_with_the_supervisor(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with Supervisor([program("a", STEADY), program("b", STEADY)], tmp_path) as keeper:
@@ -55,20 +55,21 @@ async def test_a_killed_program_is_started_again_and_all_end_with_the_supervisor
     assert not any(map(alive, last))
 
 
-async def test_one_that_keeps_dying_is_started_more_and_more_slowly(
+async def test_a_program_that_keeps_dying_is_restarted_after_growing_pauses(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The pause doubles with each early death, so that a broken node does not eat the host."""
+    """The pause doubles with each early death, so that a broken node does not use up the host's
+    processor."""
     async with Supervisor([program("a", BRIEF)], tmp_path):
         await until_died(caplog, 3)
     pauses = [float(text.rpartition(" in ")[2].removesuffix(" s")) for text in deaths(caplog)[:3]]
     assert pauses == [0.5, 1.0, 2.0]
 
 
-async def test_without_respawn_a_dead_one_stays_dead_and_the_end_of_all_is_noticed(
+async def test_without_respawn_no_program_is_restarted_and_the_end_of_all_is_noticed(
     tmp_path: Path,
 ) -> None:
-    """As for the members of a lock-step cell."""
+    """So it is for members of a lock-step cell."""
     async with Supervisor(
         [program("a", BRIEF), program("b", BRIEF)], tmp_path, respawn=False
     ) as keeper:
@@ -77,7 +78,9 @@ async def test_without_respawn_a_dead_one_stays_dead_and_the_end_of_all_is_notic
         assert keeper.process_ids() == {} and keeper.starts("a") == 1
 
 
-async def test_one_that_does_not_come_up_is_named_with_the_end_of_its_log(tmp_path: Path) -> None:
+async def test_a_program_that_does_not_start_is_named_with_the_end_of_its_log(
+    tmp_path: Path,
+) -> None:
     with pytest.raises(
         LaunchError, match=r"node a ended; its log .*a\.log ends with:\nno device at can0"
     ):
@@ -89,14 +92,17 @@ async def test_one_that_does_not_come_up_is_named_with_the_end_of_its_log(tmp_pa
     )
 
 
-async def test_ctrl_c_in_a_terminal_ends_no_node_before_its_launcher_does(tmp_path: Path) -> None:
-    """The signal goes to the launcher's process group; a node in it would seem to have died."""
+async def test_ctrl_c_does_not_reach_the_nodes_before_the_launcher_stops_them(
+    tmp_path: Path,
+) -> None:
+    """Ctrl-C sends SIGINT to the launcher's process group; nodes are not in it, else they would end
+    at once and be reported as dead."""
     async with Supervisor([program("a", STEADY)], tmp_path) as keeper:
         assert os.getpgid(keeper.process_ids()["a"]) != os.getpgid(0)
 
 
-async def test_those_that_others_need_are_ready_first(tmp_path: Path) -> None:
-    """The laboratory's bus must be there before the node that opens it starts."""
+async def test_programs_that_others_need_are_ready_first(tmp_path: Path) -> None:
+    """The laboratory's bus must exist before the node that opens it starts."""
     mark = tmp_path / "there"
     first = program("sim", f"open({str(mark)!r}, 'w').close(); " + STEADY, first=True)
     second = program("node", f"import os; assert os.path.exists({str(mark)!r}); " + STEADY)
@@ -104,16 +110,16 @@ async def test_those_that_others_need_are_ready_first(tmp_path: Path) -> None:
         assert set(keeper.process_ids()) == {"sim", "node"}
 
 
-async def test_one_that_does_not_end_when_asked_is_killed(tmp_path: Path) -> None:
+async def test_a_program_that_does_not_end_when_asked_is_killed(tmp_path: Path) -> None:
     async with Supervisor([program("a", STUBBORN)], tmp_path) as keeper:
         process = keeper.process_ids()["a"]
     assert not alive(process)
 
 
-async def test_what_a_dead_program_has_left_running_does_not_hide_its_death(
+async def test_a_child_process_left_running_does_not_hide_its_parents_death(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Its child holds its output open, and goes on talking."""
+    """Its child process keeps its output open, and continues to write."""
     talker = "while echo alive; do sleep 0.05; done"
     leaver = (
         f"import subprocess; print(subprocess.Popen(['sh', '-c', {talker!r}]).pid, "

@@ -1,5 +1,5 @@
-"""Nodes that are not reached: those that do not run are to be launched with the file in use, those
-that refuse us are not."""
+"""Messages about unreachable nodes: those that do not run must be launched with the location file
+in use; those that refuse our key must not."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NAMES = ("left", "right")
 
 
 async def unreachable(task: Task, folder: Path, *refusing: str) -> str:
-    """What is said when all nodes but those `refusing` are away; these have another key."""
+    """Return the message when no node runs except those in `refusing`, which have another key."""
     key = folder / "cell.key"
     key.write_text(os.urandom(32).hex(), encoding="utf-8")
     key.chmod(0o600)
@@ -43,19 +43,19 @@ async def unreachable(task: Task, folder: Path, *refusing: str) -> str:
     return str(fault.value)
 
 
-async def test_nodes_that_do_not_run_are_to_be_launched_with_the_file_in_use(
+async def test_nodes_that_do_not_run_must_be_launched_with_the_file_in_use(
     catch_ball: Task, tmp_path: Path
 ) -> None:
-    """A run may have another location file than the one here."""
+    """A run may use another location file than the one in this folder."""
     said = await unreachable(catch_ball, tmp_path)
     assert f"`petrobot up --services '{tmp_path / 'my services.toml'}'`" in said
     assert "key" not in said.replace(str(tmp_path), "")
 
 
-async def test_a_node_with_another_key_is_not_to_be_launched(
+async def test_a_node_with_another_key_must_not_be_launched(
     catch_ball: Task, tmp_path: Path
 ) -> None:
-    """It runs: the remedy is about the key; the others are to be launched all the same."""
+    """It runs, so its remedy is about the key; the others must still be launched."""
     launch, _, refused = (await unreachable(catch_ball, tmp_path, "left")).partition(
         "; not let in by "
     )

@@ -1,5 +1,5 @@
-"""Deferred verdicts from the action's own words to the estimates: in lock step, with processes,
-over lost links and resumes."""
+"""Deferred verdicts, from the provisional result to the estimates: in lock step, over lost links
+and after resumes."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ class Cellar:
         return mission, store
 
     def resume(self) -> Mission:
-        """A new process: its learner and observers begin anew, and are shown what the journal
-        holds."""
+        """Resume as a new process: its learner and observers start empty, and get the journal's
+        records."""
         self.heard, self.selector = Heard(), learner(self.task)
         assert self.cell is not None
         mission, go_on = resumed_mission(
@@ -89,8 +89,8 @@ class Cellar:
 
 
 def test_verdicts_of_another_node_and_of_the_score_correct_each_run_once(tmp_path: Path) -> None:
-    """The estimates, the selector and the run's own tally hold what is true; the net went on by
-    what was said first."""
+    """The estimates, the selector and the run's tally have the verdicts; the net continued with the
+    provisional results."""
     cellar = Cellar(tmp_path)
     timeline, log = Timeline(), TrialLog(cellar.task, lambda record, values: record.seconds)
     mission, _ = cellar.begin(0, timeline, log)
@@ -114,7 +114,7 @@ def test_verdicts_of_another_node_and_of_the_score_correct_each_run_once(tmp_pat
     assert timeline.bars["pick#1"].text == "held by a corner"
 
 
-def test_the_score_is_told_what_nobody_has_judged_and_its_verdicts_are_no_result(
+def test_the_score_receives_unjudged_runs_and_its_verdicts_are_not_in_the_result(
     tmp_path: Path,
 ) -> None:
     mission, _ = Cellar(tmp_path).begin()
@@ -130,7 +130,7 @@ def test_the_score_is_told_what_nobody_has_judged_and_its_verdicts_are_no_result
     ]
 
 
-def test_the_journal_alone_gives_the_verdicts_again(tmp_path: Path) -> None:
+def test_a_replay_gives_the_same_verdicts(tmp_path: Path) -> None:
     cellar = Cellar(tmp_path)
     mission, _ = cellar.begin()
     steps = list(replay(read_journal(cellar.journal), Engine(cellar.task)))
@@ -148,8 +148,8 @@ def test_the_journal_alone_gives_the_verdicts_again(tmp_path: Path) -> None:
 
 
 def test_a_coordinator_that_dies_anywhere_counts_each_verdict_once(tmp_path: Path) -> None:
-    """Before a verdict is written down, between that and its acknowledgement, between the score's
-    verdicts and the score."""
+    """It dies before a verdict is journaled, between journal and acknowledgement, or between the
+    score's verdicts and the score."""
     whole, store = Cellar(tmp_path / "whole").begin()
     assert store.operations > 90
     verdicts = places_of_verdicts(tmp_path / "whole" / "run.journal", store.operations)
@@ -165,8 +165,8 @@ def test_a_coordinator_that_dies_anywhere_counts_each_verdict_once(tmp_path: Pat
 
 
 def places_of_verdicts(journal: Path, operations: int) -> Sequence[int]:
-    """Operations of a journal spread over the whole run, and all of the last twelve (the
-    score's)."""
+    """Return operations of the journal spread over the whole run, and the last twelve (those of the
+    score)."""
     assert (
         sum(
             isinstance(s.stimulus, Verdict)
@@ -185,7 +185,7 @@ def places_of_verdicts(journal: Path, operations: int) -> Sequence[int]:
         ({"m/pick#3": {"status": "good"}}, "expected status success, failure, error, got 'good'"),
     ],
 )
-def test_a_score_whose_verdicts_are_none_says_so(
+def test_malformed_verdicts_of_a_score_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verdicts: Any, says: str
 ) -> None:
     import judged_cell.actions as actions  # type: ignore[import-not-found]  # on the path of the cell alone
@@ -195,11 +195,11 @@ def test_a_score_whose_verdicts_are_none_says_so(
         Cellar(tmp_path).begin()
 
 
-# --- between two machines: links that break, verdicts that come early, late, twice or for nobody
+# --- over a network: links that break, verdicts that come early, late, twice or for no run
 
 
 class Judges(Bench):
-    """The toy with one arm; its node is a real callee, so that links can break."""
+    """The toy task with one arm; its node is a real callee, so that links can break."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -208,20 +208,20 @@ class Judges(Bench):
         )
 
     def connect(self, now: float) -> None:
-        """The link is there (again)."""
+        """Connect the link, or connect it again."""
         welcome = self.node.link_up(now, "m", self.caller.hello)
         assert isinstance(welcome, m.Welcome)
         self.caller.link_up(now, welcome)
         self.carry(now)
 
     def cut(self, now: float) -> None:
-        """The link breaks; what was on its way is lost."""
+        """Break the link; messages in transit are lost."""
         self.node.messages()
         self.node.link_down(now, "m")
         self.caller.link_down(now, "cut")
 
     def carry(self, now: float) -> None:
-        """All that is on its way arrives."""
+        """Deliver all messages that are in transit."""
         for _ in range(4):
             self.go(now)
             for message in self.sent():
@@ -240,20 +240,20 @@ class Judges(Bench):
     def judge(
         self, now: float, status: str, cause: str = "", run: str = WORK, **other: Any
     ) -> None:
-        """Somebody on the node says what a run came to. `other`: what stands in its data in place
-        of that."""
+        """Send a verdict on a run from the node. `other`: data of the event in place of a
+        verdict."""
         data = {**RunVerdict(run, status, cause).to_data(), **other.get("data", {})}
         self.node.raise_event(now, verdict_event("m"), data, source="judge", latched=True)
 
     @property
     def corrected(self) -> list[tuple[str, Status, Status, str]]:
-        """Corrections so far."""
+        """Return the corrections so far."""
         found = [i for step in self.steps for i in step.instructions if isinstance(i, Corrected)]
         return [(c.run, c.was, c.status, c.cause) for c in found]
 
 
 def working() -> Judges:
-    """Work goes on."""
+    """Begin work."""
     bench = Judges()
     bench.begin()
     bench.executor.subscribe(0.0)
@@ -262,7 +262,7 @@ def working() -> Judges:
 
 
 def judged() -> Judges:
-    """Work has ended provisionally; tidying goes on."""
+    """End work provisionally and begin tidy."""
     bench = working()
     bench.end(1.0, WORK, "success", deferred=True)
     assert list(bench.node.running()) == [TIDY] and bench.records[0].deferred
@@ -272,7 +272,7 @@ def judged() -> Judges:
 CROOKED = [("work#1", OK, FAIL, "crooked")]
 
 
-def test_a_link_that_breaks_between_result_and_verdict_only_delays_it() -> None:
+def test_a_link_that_breaks_between_result_and_verdict_only_delays_the_verdict() -> None:
     bench = judged()
     bench.cut(1.1)
     bench.judge(1.2, "failure", "crooked")
@@ -283,7 +283,7 @@ def test_a_link_that_breaks_between_result_and_verdict_only_delays_it() -> None:
     assert bench.node.events.waiting("m") == [], "acknowledged"
 
 
-def test_an_acknowledgement_that_is_lost_brings_it_again_and_it_counts_once() -> None:
+def test_a_verdict_whose_acknowledgement_is_lost_comes_again_and_counts_once() -> None:
     bench = judged()
     bench.judge(1.2, "failure", "crooked")
     for _, message in bench.node.messages():
@@ -296,7 +296,7 @@ def test_an_acknowledgement_that_is_lost_brings_it_again_and_it_counts_once() ->
     assert bench.node.events.waiting("m") == []
 
 
-def test_two_verdicts_on_one_run_count_as_the_first_says() -> None:
+def test_of_two_verdicts_on_one_run_the_first_counts() -> None:
     bench = judged()
     bench.judge(1.2, "failure", "crooked")
     bench.judge(1.2, "success")
@@ -304,7 +304,7 @@ def test_two_verdicts_on_one_run_count_as_the_first_says() -> None:
     assert bench.corrected == CROOKED and bench.reports == ["no_verdict_due"]
 
 
-def test_a_verdict_that_overtakes_the_result_counts() -> None:
+def test_a_verdict_that_comes_before_the_result_counts() -> None:
     """The judge's node is reached, that of the run is not yet."""
     bench = working()
     bench.judge(0.5, "failure", "crooked")
@@ -317,7 +317,7 @@ def test_a_verdict_that_overtakes_the_result_counts() -> None:
 
 
 @pytest.mark.parametrize("preempted", [False, True], ids=["sure", "preempted"])
-def test_a_verdict_that_came_early_on_a_run_that_never_says_it_was_provisional(
+def test_an_early_verdict_on_a_run_that_is_not_provisional(
     preempted: bool,
 ) -> None:
     bench = working()
@@ -336,8 +336,8 @@ def test_a_verdict_that_came_early_on_a_run_that_never_says_it_was_provisional(
 
 
 def test_a_verdict_after_a_resume() -> None:
-    """One comes while nobody coordinates, one had been written down and not acknowledged: both
-    count once."""
+    """One comes while no coordinator runs, one had been journaled but not acknowledged: each counts
+    once."""
     bench = judged()
     bench.cut(1.1)
     bench.judge(1.2, "failure", "crooked")
@@ -353,7 +353,7 @@ def test_a_verdict_after_a_resume() -> None:
     assert third.reports == ["no_verdict_due"], "the new process asked for it once more"
 
 
-def test_a_verdict_that_never_comes_leaves_what_was_said() -> None:
+def test_without_a_verdict_the_provisional_result_counts() -> None:
     bench = judged()
     bench.end(2.0, TIDY, "success")
     assert bench.executor.finished is not None
@@ -375,7 +375,7 @@ def test_a_verdict_that_never_comes_leaves_what_was_said() -> None:
         ("m/work#9", {}, ["no_verdict_due"]),
     ],
 )
-def test_what_is_no_verdict_on_a_run_of_ours_changes_nothing(
+def test_malformed_verdicts_and_unknown_runs_change_nothing(
     run: str, more: dict[str, Any], reports: list[str]
 ) -> None:
     bench = judged()
@@ -387,7 +387,7 @@ def test_what_is_no_verdict_on_a_run_of_ours_changes_nothing(
     )
 
 
-def test_a_run_that_was_sure_or_never_executed_is_not_to_be_judged() -> None:
+def test_a_final_result_or_an_unexecuted_run_cannot_be_judged() -> None:
     for deferred, executed in (
         (False, m.Executed.YES),
         (True, m.Executed.NO),
@@ -403,7 +403,7 @@ def test_a_run_that_was_sure_or_never_executed_is_not_to_be_judged() -> None:
 @pytest.mark.parametrize(
     "run", ["", "work#1", "m/work", "m/work#1/2", "m/#1", "m" * 255 + "/a#1", None, 7]
 )
-def test_what_is_no_runs_id_is_refused_where_it_is_said(run: Any) -> None:
+def test_an_invalid_run_id_is_refused_in_the_action(run: Any) -> None:
     with pytest.raises(ValueError, match=r"pass ctx\.run of the run's own context"):
         mission_of(run)
     assert mission_of("catch_ball/5/locate_ball#3") == "catch_ball/5"

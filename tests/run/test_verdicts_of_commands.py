@@ -1,5 +1,5 @@
-"""Deferred verdicts as a user meets them: run with --learn, look into the log and the report, make
-the run again."""
+"""Deferred verdicts on the command line: run with --learn, read the log and the report, replay the
+run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Petrobot = Callable[..., str]
 def petrobot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Petrobot:
-    """A command on the judged cell in a folder of its own; gives what it printed."""
+    """Run a command on the judged cell in its own folder, and return what it printed."""
     monkeypatch.chdir(tmp_path)
 
     def command(*words: str) -> str:
@@ -29,7 +29,7 @@ def petrobot(
     return command
 
 
-def test_a_run_its_log_and_what_was_learned(petrobot: Petrobot, tmp_path: Path) -> None:
+def test_a_run_its_log_and_its_estimates(petrobot: Petrobot, tmp_path: Path) -> None:
     cell = ["--services", str(FOLDER / "services.toml")]
     order = [
         "run",

@@ -1,5 +1,5 @@
-"""Deferred verdicts on the wall clock: nodes as real processes, both links cut while a run is being
-inspected."""
+"""Deferred verdicts in real time: nodes are real processes, and both links are cut during an
+inspection."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ LIMIT = 120.0
 
 
 class AtEnd:
-    """An observer that does something once, when a run has ended provisionally."""
+    """An observer that calls a function once, when this run has ended provisionally."""
 
     def __init__(self, run: str, do: Callable[[], None]) -> None:
         self._run, self._do = run, do
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
-        """Look for the end."""
+        """Call the function if this is the run's end."""
         if isinstance(stimulus, RunEnded) and stimulus.run == self._run and stimulus.deferred:
             asyncio.get_running_loop().call_soon(self._do)
 
@@ -57,7 +57,7 @@ class AtEnd:
 
 
 def services(folder: Path) -> Directory:
-    """The cell at free ports."""
+    """Return the cell's directory with free ports."""
     text = (FOLDER / "services.toml").read_text(encoding="utf-8")
     for old, new in zip(("7991", "7992"), free_ports(2), strict=True):
         text = text.replace(old, str(new))
@@ -67,7 +67,7 @@ def services(folder: Path) -> Directory:
 
 
 async def led(mission: Mission, directory: Directory, cut: str) -> int:
-    """Run to the end; both links are cut at the end of the run `cut` names. Gives how many were."""
+    """Run to the end; when the run `cut` ends, cut both links. Return how many links were cut."""
     shell, cuts = RealtimeMission(mission, directory), []
 
     def cut_links() -> None:
@@ -86,11 +86,11 @@ async def led(mission: Mission, directory: Directory, cut: str) -> int:
 
 
 @pytest.mark.parametrize("cut", ["", "pick#1"], ids=["whole links", "links cut behind the result"])
-async def test_verdicts_come_from_processes(
+async def test_verdicts_of_real_processes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cut: str
 ) -> None:
-    """One node picks, the other inspects and judges, the score has the last word: as in lock step,
-    whatever the links do."""
+    """One node picks, the other inspects and sends verdicts, the score sends the last ones: the
+    results equal those in lock step, even if links break."""
     path = [str(FOLDER), *filter(None, [os.environ.get("PYTHONPATH")])]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
     directory, task, heard = services(tmp_path), sorting(), Heard()

@@ -1,5 +1,5 @@
-"""Files that are written whole: after a power cut the old one or the new one, with its name, its
-folder and its mode."""
+"""Files that are written whole: after a power cut there is the old file or the new one, with its
+name, folder and mode."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from petrobot.services.host.whole_file import make_folder, write_whole
 from tests.power_cut import power_cut
 
 
-def test_what_was_written_is_there_after_a_power_cut(tmp_path: Path) -> None:
+def test_a_written_file_survives_a_power_cut(tmp_path: Path) -> None:
     with power_cut(tmp_path) as disk:
         make_folder(tmp_path / "new" / "folder")
         write_whole(tmp_path / "new" / "folder" / "file", "old")
@@ -26,8 +26,8 @@ def test_what_was_written_is_there_after_a_power_cut(tmp_path: Path) -> None:
         assert disk.left() == {"new/folder/file": b"new"}, "nothing else either: no draft"
 
 
-def test_a_power_cut_before_a_file_is_written_leaves_the_old_one(tmp_path: Path) -> None:
-    """At each sync on the way: the old content or the new one, never a part."""
+def test_a_power_cut_during_a_write_leaves_the_old_or_the_new_file(tmp_path: Path) -> None:
+    """After a power cut at any sync, the file has the old content or the new one, never a part."""
     with power_cut(tmp_path) as disk:
         write_whole(tmp_path / "file", "old")
         images: list[dict[str, bytes]] = []
@@ -44,7 +44,7 @@ def test_a_power_cut_before_a_file_is_written_leaves_the_old_one(tmp_path: Path)
 
 
 def test_a_name_that_is_not_synced_is_lost(tmp_path: Path) -> None:
-    """The disk of these tests does lose what it may lose."""
+    """The simulated disk really loses what a disk may lose."""
     with power_cut(tmp_path) as disk:
         draft = tmp_path / "draft"
         with draft.open("w") as file:
@@ -61,7 +61,7 @@ def test_a_name_that_is_not_synced_is_lost(tmp_path: Path) -> None:
         assert disk.left() == {"draft": b"kept"}, "a rename that is not synced is undone"
 
 
-def test_a_journal_stands_in_a_folder_that_is_there_after_a_power_cut(tmp_path: Path) -> None:
+def test_a_journals_folder_survives_a_power_cut(tmp_path: Path) -> None:
     with power_cut(tmp_path) as disk:
         writer = JournalWriter(tmp_path / "runs" / "one" / "run.journal", {"mission": "m"})
         writer.append("stimulus", {})
@@ -73,14 +73,14 @@ def test_a_journal_stands_in_a_folder_that_is_there_after_a_power_cut(tmp_path: 
     assert len(read_journal(tmp_path / name).records) == 1
 
 
-def test_an_emergency_stop_outlives_a_power_cut(tmp_path: Path) -> None:
+def test_an_emergency_stop_survives_a_power_cut(tmp_path: Path) -> None:
     with power_cut(tmp_path) as disk:
         Latch("motion", [tmp_path / "state"]).stop({"arm"})
         [content] = disk.left().values()
     assert content.split() == [b"arm"]
 
 
-def test_a_key_file_is_whole_and_for_its_owner_alone(tmp_path: Path) -> None:
+def test_a_key_file_is_written_whole_and_only_its_owner_can_read_it(tmp_path: Path) -> None:
     path, key = tmp_path / "cell.key", new_key()
     with power_cut(tmp_path) as disk:
         write_key(path, key)
@@ -89,7 +89,7 @@ def test_a_key_file_is_whole_and_for_its_owner_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("links", [True, False], ids=["links", "a file system without links"])
-def test_a_file_that_is_to_be_fresh_never_replaces_another(
+def test_a_new_file_never_replaces_another(
     tmp_path: Path, links: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not links:
@@ -105,7 +105,7 @@ def test_a_file_that_is_to_be_fresh_never_replaces_another(
     assert path.read_text() == "first" and list(tmp_path.iterdir()) == [path]
 
 
-def test_modes_links_and_pipes_stay_what_they_are(tmp_path: Path) -> None:
+def test_modes_links_and_pipes_are_kept(tmp_path: Path) -> None:
     file, link, pipe = tmp_path / "file", tmp_path / "link", tmp_path / "pipe"
     write_whole(file, "1", mode=0o640)
     link.symlink_to(file)

@@ -1,4 +1,4 @@
-"""What users have on disk still reads: files written by the program as it was at commit 1eefa30.
+"""Users' files can still be read: these were written by petrobot at commit 1eefa30.
 
 The files lie in `written_at_1eefa30/`. They were made by the commands of their names: `run` in lock
 step with learning (`lockstep`, `lab.estimates`), in real time (`realtime`), of the rover (`rover`),
@@ -24,7 +24,7 @@ FILES = Path(__file__).parent / "written_at_1eefa30"
 
 
 def given(path: Path) -> Any:
-    """The JSON in a file."""
+    """Return the JSON in a file."""
     return json.loads(path.read_text(encoding="utf-8"))
 
 
@@ -39,11 +39,11 @@ def test_a_journal_replays_without_a_difference(
 @pytest.mark.parametrize(
     ("name", "kept"), [pytest.param("killed", 1.0, marks=needs_bullet), ("rover", 0.85)]
 )
-def test_a_killed_run_resumes_to_the_end_that_it_had_without_the_kill(
+def test_a_killed_run_resumes_to_the_same_end_as_without_the_kill(
     name: str, kept: float, tmp_path: Path
 ) -> None:
-    """Also where its shipped files were in an installation that is gone, and the journal is cut off
-    within a record (`kept`: the part of it that is left)."""
+    """Also if the installation with its shipped files no longer exists, and the journal is cut off
+    within a record (`kept`: the share of it that is left)."""
     folder = tmp_path / name
     folder.mkdir()
     journal = (FILES / "runs" / name / "run.journal").read_bytes()
@@ -60,7 +60,7 @@ def test_a_killed_run_resumes_to_the_end_that_it_had_without_the_kill(
 
 
 @needs_bullet
-def test_an_estimates_file_is_shown_and_learned_into(tmp_path: Path) -> None:
+def test_an_estimates_file_is_shown_and_continued(tmp_path: Path) -> None:
     estimates = tmp_path / "lab.estimates"
     shutil.copy(FILES / "lab.estimates", estimates)
     assert main(["learned", "show", str(estimates), "--json", str(tmp_path / "before.json")]) == 0
@@ -73,7 +73,7 @@ def test_an_estimates_file_is_shown_and_learned_into(tmp_path: Path) -> None:
 
 
 def _trials(shown: Any) -> dict[str, int]:
-    """How many runs of each primitive task with alternatives the estimates were made from."""
+    """Return the number of runs behind the estimates, by primitive task with alternatives."""
     tasks = ("locate_ball", "track_ball", "move_to_point")
     return {
         name: sum(a["runs"] for a in shown["primitive_tasks"][name]["actions"]) for name in tasks
@@ -89,7 +89,7 @@ def test_a_registered_forecast_is_compared_with_a_campaign_that_ran_later(tmp_pa
     assert {row["runs"] for row in rows} == {60} and {row["regime"] for row in rows} == {"A"}
 
 
-def test_a_campaign_is_reported_on_beside_a_copy_of_itself(tmp_path: Path) -> None:
+def test_a_campaign_is_compared_with_a_copy_of_itself_in_a_report(tmp_path: Path) -> None:
     same = tmp_path / "same"
     shutil.copytree(FILES / "campaign", same)
     against = ["report", str(FILES / "campaign"), "--against", str(same)]

@@ -99,7 +99,8 @@ WORK, TIDY = "m/work#1", "m/tidy#1"
 
 
 def directory(on_resume: str = "rejoin", device: str = 'device = "arm"') -> Directory:
-    """services.toml of the toy; `device` replaces the line that binds both actions to the arm."""
+    """Return the directory of the toy task; `device` replaces the line that assigns both actions to
+    the arm."""
     return parse(
         SERVICES.replace("ON_RESUME", on_resume).replace('device = "arm"', device),
         Path("services.toml"),
@@ -107,8 +108,8 @@ def directory(on_resume: str = "rejoin", device: str = 'device = "arm"') -> Dire
 
 
 class Bench:
-    """An executor over one caller; the test is the node: it reads what was sent and says what comes
-    back."""
+    """An executor with one caller. The test plays the node: it reads what was sent and writes the
+    answers."""
 
     def __init__(
         self,
@@ -135,7 +136,7 @@ class Bench:
         self.now = 0.0
         self._out: list[Message] = []
 
-    # --- an observer: keeps what happened -----------------------------------------------------
+    # --- an observer: records what happened ---------------------------------------------------
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         self._stimulus = stimulus, []
@@ -151,7 +152,7 @@ class Bench:
             self.reports.append(instruction.key)
 
     def progress(self, now: float, run: str, notice: Feedback) -> None:
-        """Not kept."""
+        """Ignore progress."""
 
     def settled(self, now: float, state: State) -> None:
         assert self._stimulus is not None
@@ -164,19 +165,19 @@ class Bench:
     # --- the node -----------------------------------------------------------------------------
 
     def link(self, now: float, boot: str = "n1", runs: Sequence[str] = ()) -> None:
-        """The node welcomes us."""
+        """Let the node accept the connection."""
         self.boot = boot
         self.caller.link_up(now, m.Welcome(2, "motion", boot, (), tuple(runs)))
         self.go(now)
 
     def say(self, now: float, *messages: Message) -> None:
-        """The node says something."""
+        """Send a message from the node."""
         for message in messages:
             self.caller.receive(now, message)
             self.go(now)
 
     def go(self, now: float) -> None:
-        """Let time pass until `now`, at each moment in between that somebody wants a look at."""
+        """Let time pass until `now`, and advance at each moment in between that is due."""
         while True:
             dues = [d for d in (self.caller.due(), self.executor.due()) if d is not None]
             self.now = max(self.now, min([*dues, now]))
@@ -188,16 +189,16 @@ class Bench:
                 return
 
     def sent(self, *kinds: type) -> list[Message]:
-        """What was sent since the last look, of these kinds (all without any)."""
+        """Return the messages of these kinds (default: all) sent since the last call."""
         out, self._out = [*self._out, *self.caller.messages(self.now)], []
         return [message for message in out if not kinds or isinstance(message, kinds)]
 
     def calls(self) -> list[str]:
-        """Ids of the calls made since the last look."""
+        """Return the ids of the calls made since the last call of this method."""
         return [call.id for call in self.sent(m.Call) if isinstance(call, m.Call)]
 
     def begin(self) -> Bench:
-        """Work goes on since 0 s, accepted by the node."""
+        """Start `work` at 0 s, accepted by the node."""
         self.link(0.0)
         self.executor.stimulate(0.0, Begin())
         assert self.calls() == [WORK]
@@ -205,14 +206,14 @@ class Bench:
         return self
 
     def ring(self, now: float, number: int = 1) -> None:
-        """The bell preempts work."""
+        """Ring the bell, which preempts `work`."""
         self.say(now, Event("bell", "desk", number))
 
     def resumed(
         self, now: float, *, on_resume: str = "rejoin", boot: str = "n1", runs: Sequence[str] = ()
     ) -> Bench:
-        """Another process takes over what this one has recorded; `runs` is what the node still
-        keeps."""
+        """Resume in another process from what this one has recorded; `runs`: those that the node
+        still knows."""
         bench = Bench(on_resume=on_resume, epoch=2)
         for step in self.steps:
             bench.executor.relive(step.time, step)

@@ -57,14 +57,14 @@ QUICK = ("kanban-2", "philosophers-10")
 SLOW_STATES = 3_000
 """Markings after which the pure Python tools are stopped; their rate is what counts."""
 CAPACITY = 15
-"""Tokens that Storm is told a place may hold: more than any of these nets puts in one."""
+"""Largest number of tokens in one place, as given to Storm: more than any of these nets reaches."""
 NEEDS = {"numba": "numba", "snakes": "snakes", "pm4py": "pm4py", "storm": "stormpy"}
-"""Packages behind engines and other tools."""
+"""Packages that the engines and the other tools need."""
 
 
 def timed(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """CPU seconds of some work, with what it says: every tool here works in one thread, and others
-    may use the machine."""
+    """Return the CPU seconds of some work, and its result. CPU time, since other programs may use
+    the machine; every tool here works in one thread."""
     start = time.process_time()
     said = work()
     return {"seconds": time.process_time() - start, **said}
@@ -74,7 +74,7 @@ def timed(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 
 def space_ours(name: str, engine: str) -> dict[str, Any]:
-    """Our exploration by one engine."""
+    """Explore a net with one of our engines."""
     from petrobot.coordinator.analysis.net.space import explore
 
     net = SPACES[name]()
@@ -88,7 +88,7 @@ def space_ours(name: str, engine: str) -> dict[str, Any]:
 
 
 def space_snakes(name: str) -> dict[str, Any]:
-    """SNAKES, stopped after SLOW_STATES markings."""
+    """Explore a net with SNAKES; stop after SLOW_STATES markings."""
     from snakes.nets import MultiArc, PetriNet, Place, StateGraph, Transition, Value, dot  # type: ignore[import-not-found]
 
     net, model = SPACES[name](), PetriNet("net")
@@ -111,7 +111,7 @@ def space_snakes(name: str) -> dict[str, Any]:
 
 
 def space_pm4py(name: str) -> dict[str, Any]:
-    """pm4py, by its own semantics; stopped after SLOW_STATES markings."""
+    """Explore a net with pm4py's own semantics; stop after SLOW_STATES markings."""
     from pm4py.objects.petri_net import semantics  # type: ignore[import-not-found]
     from pm4py.objects.petri_net.obj import Marking, PetriNet  # type: ignore[import-not-found]
     from pm4py.objects.petri_net.utils import petri_utils  # type: ignore[import-not-found]
@@ -145,7 +145,7 @@ def space_pm4py(name: str) -> dict[str, Any]:
 
 
 def storm_model(net: Net, rates: dict[str, float]) -> Any:
-    """A GSPN in Storm."""
+    """Return a GSPN as a model of Storm."""
     from stormpy import gspn  # type: ignore[import-not-found]
 
     builder = getattr(gspn, "GspnBuilder", None) or gspn.GSPNBuilder  # renamed in stormpy 2
@@ -163,7 +163,7 @@ def storm_model(net: Net, rates: dict[str, float]) -> Any:
 
 
 def space_storm(name: str) -> dict[str, Any]:
-    """Storm: its explicit chain of the GSPN with unit rates."""
+    """Build Storm's explicit chain of the GSPN with unit rates."""
     import stormpy
 
     model = storm_jani(storm_model(SPACES[name](), {}))
@@ -176,7 +176,7 @@ def space_storm(name: str) -> dict[str, Any]:
 
 
 def storm_jani(model: Any) -> Any:
-    """Storm's symbolic description of a GSPN."""
+    """Return Storm's symbolic description of a GSPN."""
     from stormpy import gspn
 
     if hasattr(gspn, "build_jani_model"):
@@ -188,7 +188,7 @@ def storm_jani(model: Any) -> Any:
 
 
 def firings_ours(name: str, engine: str) -> dict[str, Any]:
-    """Stochastic simulation of Kanban-2 by one engine."""
+    """Simulate Kanban-2 with one of our engines."""
     import numpy as np
 
     from petrobot.coordinator.analysis.time.gspn import Gspn
@@ -213,7 +213,7 @@ def firings_ours(name: str, engine: str) -> dict[str, Any]:
 
 
 def firings_snakes(name: str) -> dict[str, Any]:
-    """The token game of SNAKES on Kanban-2."""
+    """Fire transitions of Kanban-2 with SNAKES."""
     from snakes.nets import PetriNet, Place, Transition, Value, dot
 
     net, model = kanban(2), PetriNet("net")
@@ -262,7 +262,8 @@ def long_run_ours(name: str, engine: str) -> dict[str, Any]:
 
 
 def long_run_storm(name: str) -> dict[str, Any]:
-    """Storm: the long-run share of time that a place is marked, at its default precision."""
+    """Compute with Storm the long-run share of time that a place is marked, at its default
+    precision."""
     import stormpy
 
     jani = storm_jani(storm_model(SPACES[name](), KANBAN_RATES))
@@ -283,8 +284,8 @@ def long_run_storm(name: str) -> dict[str, Any]:
 
 
 def completion_ours(name: str, engine: str) -> dict[str, Any]:
-    """Mean time to completion and reliability of the shipped catching task, phases refined as in
-    `name` (stages-N)."""
+    """Compute the mean time to completion and the reliability of the shipped catching task; `name`
+    (stages-N) says how finely phases are refined."""
     from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
     from petrobot.coordinator.analysis.time.completion import completion
     from petrobot.coordinator.analysis.time.gspn import Chain
@@ -326,8 +327,8 @@ def one(measure: str, name: str, engine: str) -> None:
 
 
 def measured(measure: str, name: str, engine: str = "") -> dict[str, Any] | None:
-    """One measurement in a process of its own; None if its tool is not installed or it failed (said
-    on the way)."""
+    """Run one measurement in a process of its own. Return None if its tool is not installed or it
+    failed; both are printed."""
     tool = NEEDS.get(measure.rpartition("-")[2]) or NEEDS.get(engine)
     if tool and find_spec(tool) is None:
         print(f"{measure} {name}: {tool} is not installed, skipped")
@@ -348,7 +349,7 @@ def measured(measure: str, name: str, engine: str = "") -> dict[str, Any] | None
 
 
 TOLD: list[str] = []
-"""What was printed, for --write."""
+"""The lines printed so far, for --write."""
 
 
 def tell(text: str) -> None:
@@ -358,7 +359,7 @@ def tell(text: str) -> None:
 
 
 def line(what: str, said: dict[str, Any], unit: str, reference: float | None) -> None:
-    """One line of the table; the ratio is against the reference rate."""
+    """Return one line of the table; the ratio is to the reference rate."""
     rate = said[unit] / said["seconds"]
     ratio = f"{reference / rate:8.1f} x" if reference else " " * 10
     tell(
@@ -368,7 +369,7 @@ def line(what: str, said: dict[str, Any], unit: str, reference: float | None) ->
 
 
 def bench_spaces(names: tuple[str, ...]) -> None:
-    """State spaces of all tools on all nets."""
+    """Measure state spaces of all nets with all tools."""
     for name in names:
         net = SPACES[name]()
         size = f"{len(net.places)} places, {len(net.transitions)} transitions"
@@ -392,7 +393,7 @@ def bench_spaces(names: tuple[str, ...]) -> None:
 
 
 def bench_stochastic(quick: bool) -> None:
-    """Firings, long runs and completion."""
+    """Measure firings, long-run figures and completion."""
     tell("stochastic simulation of kanban-2 (ratio: how many times slower than numpy)")
     reference = None
     for what, measure, engine in (
@@ -422,7 +423,7 @@ def bench_stochastic(quick: bool) -> None:
 
 
 def main() -> None:
-    """The whole table."""
+    """Measure everything and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -444,7 +445,7 @@ def main() -> None:
 
 
 def page() -> str:
-    """The figures as a page of docs/."""
+    """Return the figures as a page of docs/."""
     versions = ", ".join(
         f"{name} {version(name)}" for name in ("numpy", *NEEDS.values()) if find_spec(name)
     )

@@ -3,7 +3,7 @@ lock-step cell with the same seeds, alternating.
 
     python -m tools.bench.campaign [--trials N] [--rounds N]
 
-The first round of each fills caches and does not count.
+The first round of each fills caches and is not counted.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def bare(bench: LoadedPlan, seed: int, trials: int) -> float:
-    """CPU seconds of `petrobot run` without its terminal and report."""
+    """Return the CPU seconds of `petrobot run` without its terminal and report."""
     begun = time.process_time()
     cell, party = lockstep_cell(bench.directory, Setting(bench.task, {"regime": "B"}, trials, seed))
     cell.run(lambda: party.over, 10_000_000)
@@ -31,7 +31,7 @@ def bare(bench: LoadedPlan, seed: int, trials: int) -> float:
 
 
 def block(bench: LoadedPlan, seed: int, trials: int) -> float:
-    """CPU seconds of the same as a campaign's block."""
+    """Return the CPU seconds of the same trials as a campaign's block."""
     begun = time.process_time()
     one = replace(bench.plan.blocks[0], seed=seed, count=trials)
     run_block(bench, one, [{}] * trials)

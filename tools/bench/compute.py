@@ -3,8 +3,8 @@ it as the `compute_time` of services.toml.
 
     python -m tools.bench.compute [--balls N] [--regime NAME]
 
-Runs the cell in lock step; the alternatives take turns. What the simulated camera needs to make the
-images does not count.
+Runs the cell in lock step; the alternatives take turns. The time of the simulated camera, which
+makes the images, is not counted.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ def machine() -> str:
 
 
 def measured(balls: int, regime: str) -> dict[str, tuple[float, int]]:
-    """CPU seconds for an image of each action, the median over its runs, and how many runs."""
+    """Return for each action the median CPU seconds per image over its runs, and the number of
+    runs."""
     task = load_task("catch_ball")
     selector = LearningSelector(Learning(task, "round_robin"))
     setting = Setting(task, {"regime": regime}, balls, 1, selector)

@@ -1,13 +1,13 @@
-"""Measure what attacks cost a node: its memory, and the duration of a good client's calls
+"""Measure what attacks cost a node: its memory, and how long the calls of an honest client take
 meanwhile.
 
     python tools/bench/doors.py
     python tools/bench/doors.py --json out.json
 
 The server is a process of its own; the attackers are other processes (for connections) or this one.
-*Grown*: the increase of the server's largest resident set (VmHWM) since its start. The good client
-calls every millisecond from this process, which is also busy attacking, so its times are upper
-bounds; only the ratios to the calm row matter.
+*Grown*: the increase of the server's largest resident set (VmHWM) since its start. The honest
+client calls every millisecond from this process. This process also attacks, so the times are upper
+bounds; only the ratios to the row without an attack matter.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
+from tools.bench.processes import quantile
+
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.tls.certificates import make_certificates
@@ -35,24 +37,18 @@ from tests.doors.test_attacks import STRANGE, _bombard, _flood, crowd_at
 
 CROWD = 10_000
 LEAST = 200
-"""Calls of the good client in each row, if the attack is over before."""
+"""Fewest calls of the honest client in each row, however short the attack is."""
 Attack = Callable[[Victim], contextlib.AbstractAsyncContextManager[None]]
 
 
-def quantile(values: list[float], q: float) -> float:
-    """The q-quantile of what was measured."""
-    ordered = sorted(values)
-    return ordered[min(int(q * len(ordered)), len(ordered) - 1)]
-
-
 async def times(client: Client, until: Callable[[int], bool]) -> list[float]:
-    """How long calls take, one each millisecond (s)."""
+    """Measure how long calls take, one each millisecond (s)."""
     took: list[float] = []
     while not until(len(took)):
         begun = time.monotonic()
         outcome = await client.call("echo", {"n": len(took)})
         if outcome.status != "success":
-            raise RuntimeError(f"the good client was not served: {outcome}")
+            raise RuntimeError(f"the honest client was not served: {outcome}")
         took.append(time.monotonic() - begun)
         await asyncio.sleep(0.001)
     return took
@@ -90,8 +86,8 @@ asyncio.run(main())
 
 @contextlib.asynccontextmanager
 async def heavy(server: Victim) -> AsyncIterator[None]:
-    """One that has the key calls with what takes longest to read, two at a time, from a process of
-    its own."""
+    """A caller with the key sends the messages that take longest to read, two at a time, from a
+    process of its own."""
     command = [sys.executable, "-c", HEAVY, server.host, str(server.port), KEY.hex()]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
     process = await asyncio.create_subprocess_exec(
@@ -115,7 +111,7 @@ async def nothing(server: Victim) -> AsyncIterator[None]:
 
 @contextlib.asynccontextmanager
 async def connections(server: Victim) -> AsyncIterator[None]:
-    """Ten thousand connections of another process."""
+    """Another process opens ten thousand connections."""
     async with crowd_at(server, CROWD) as crowd:
         opened = asyncio.create_task(asyncio.to_thread(crowd.stdout.readline))
         yield
@@ -124,7 +120,7 @@ async def connections(server: Victim) -> AsyncIterator[None]:
 
 @contextlib.asynccontextmanager
 async def noise(server: Victim) -> AsyncIterator[None]:
-    """A thousand connections full of random bytes."""
+    """A thousand connections send random bytes."""
     done = asyncio.gather(*(_bombard(server, lambda n: n >= 250, seed) for seed in range(4)))
     yield
     await done
@@ -132,7 +128,7 @@ async def noise(server: Victim) -> AsyncIterator[None]:
 
 @contextlib.asynccontextmanager
 async def flood(server: Victim) -> AsyncIterator[None]:
-    """One caller that sends heartbeats as fast as it can."""
+    """One caller sends heartbeats as fast as it can."""
     stranger = await Stranger.at(server)
     await stranger.open(None, STRANGE)
     burst = b"".join(frame(m.Ping(n)) for n in range(4_000))
@@ -144,7 +140,7 @@ async def flood(server: Victim) -> AsyncIterator[None]:
 
 
 async def under(attack: Attack, server: Victim) -> dict[str, Any]:
-    """One row."""
+    """Measure one row: the honest client's calls under one attack."""
     client = server.client()
     client.start()
     assert await client.connected(20.0)

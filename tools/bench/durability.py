@@ -1,7 +1,7 @@
 """Measure what the journal costs: a token in, an action started in another process, its result, a
 firing, the next start, again and again.
 
-    python tools/bench/durability.py                    best on the disk that holds runs/
+    python tools/bench/durability.py                    run it on the disk where runs/ is
     python tools/bench/durability.py --rounds 5 --json out.json
 
 The contenders alternate within one run: the bare wire (one call after the other), the executor
@@ -42,7 +42,7 @@ from petrobot.services.comm.protocol.messages import Hello
 from tests.ports import free_ports
 
 LINES = 8
-"""Independent lines of the group task: so many starts at once."""
+"""Number of independent lines of the group task: as many actions start at once."""
 SERVICES = """
 schema = 1
 [nodes.far]
@@ -88,13 +88,14 @@ out = ["free{n}"]
 
 
 def task_text(lines: int, tokens: int) -> str:
-    """A pile of tokens worked off by so many lines."""
+    """Return a task in which so many parallel lines use up a place's tokens."""
     final = " and ".join(["runs == 0", *(f"free{n} == 1" for n in range(lines))])
     return HEAD.format(final=final, tokens=tokens) + "".join(LINE.format(n=n) for n in range(lines))
 
 
 def directory(folder: Path, lines: int, device: bool) -> Directory:
-    """A node with an action for each line, each with a device of its own or without any."""
+    """Return a cell of one node with an action for each line, each with a device of its own or
+    without one."""
     actions = "".join(
         ACTION.format(n=n, where=f'device = "hand{n}"' if device else 'node = "far"')
         for n in range(lines)
@@ -108,7 +109,7 @@ def directory(folder: Path, lines: int, device: bool) -> Directory:
 
 
 class JournalBench:
-    """Everything that is measured, by name: us per token of each round."""
+    """Measures the contenders. `us`: us per token of each round, by contender."""
 
     def __init__(self, folder: Path, tokens: int) -> None:
         self._folder = folder
@@ -118,7 +119,7 @@ class JournalBench:
         self.counts: dict[str, dict[str, float]] = {}
 
     async def wire(self, places: Directory) -> None:
-        """The same calls without a coordinator, one after the other."""
+        """Make the same calls without a coordinator, one after the other."""
         node = places.nodes["far"]
         hello = Hello(2, 99, "coordinator", f"wire{self._number}", "b", 1, places.hash)
         client = Client(node.host, node.port, Caller("far", hello))
@@ -134,7 +135,7 @@ class JournalBench:
         await client.close()
 
     async def mission(self, name: str, places: Directory, lines: int, journal: bool) -> None:
-        """A mission run that works the pile off."""
+        """Run the task until its tokens are used up."""
         self._number += 1
         task, identity = loads(task_text(lines, self._tokens), "bench"), f"bench-{self._number}"
         writer = JournalWriter(self._folder / f"{identity}.journal", {}) if journal else None
@@ -165,7 +166,7 @@ class JournalBench:
 
 
 async def measure(folder: Path, rounds: int, tokens: int) -> JournalBench:
-    """All contenders in turn, so that a busy machine is busy for all."""
+    """Measure all contenders in turn, so that other load on the machine affects them all."""
     bench = JournalBench(folder, tokens)
     plain, held, group = (
         directory(folder / "a", 1, False),

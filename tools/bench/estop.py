@@ -29,6 +29,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
+from tools.bench.processes import quantile
+
 from petrobot.coordinator.launch import local_programs
 from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, EmergencyLine
 from petrobot.coordinator.run.supervisor import Supervisor
@@ -41,18 +43,12 @@ from petrobot.services.comm.tls.credentials import Credentials
 from tests.doors.arm_cell import ROOT, Ear, cell_in, ear_on
 
 FLOOR_MS = 20.0
-"""What the 99th percentile of a warm stop must stay below on an idle machine."""
+"""Limit of the 99th percentile of a warm stop on an idle machine (ms)."""
 PATIENCE = 30.0
 
 
-def quantile(values: Sequence[float], q: float) -> float:
-    """The q-quantile of what was measured."""
-    ordered = sorted(values)
-    return ordered[min(int(q * len(ordered)), len(ordered) - 1)]
-
-
 def summary(seconds: Sequence[float]) -> dict[str, float]:
-    """p50, p99 and the largest, in ms."""
+    """Return p50, p99 and the largest value (ms)."""
     shown = {
         "p50_ms": quantile(seconds, 0.5),
         "p99_ms": quantile(seconds, 0.99),
@@ -62,7 +58,7 @@ def summary(seconds: Sequence[float]) -> dict[str, float]:
 
 
 async def enabled(client: Client, ear: Ear) -> None:
-    """Lead the drives back to where they follow set points."""
+    """Enable the drives again, until they follow set points."""
     outcome = await asyncio.wait_for(client.call("ready", deadline=PATIENCE), PATIENCE)
     if outcome.status != "success":
         raise RuntimeError(f"the drives are not ready: {outcome.cause}: {outcome.text}")
@@ -70,7 +66,7 @@ async def enabled(client: Client, ear: Ear) -> None:
 
 
 async def warm(line: EmergencyLine, client: Client, ear: Ear, stops: int) -> list[float]:
-    """Stops over a connection that stands."""
+    """Time stops over a connection that is already open."""
     took = []
     for _ in range(stops):
         await line.order(CLEAR, PATIENCE)
@@ -87,7 +83,7 @@ async def warm(line: EmergencyLine, client: Client, ear: Ear, stops: int) -> lis
 async def commands(
     directory: Directory, line: EmergencyLine, client: Client, ear: Ear, stops: int
 ) -> list[float]:
-    """Stops by the whole command."""
+    """Time stops by the whole command."""
     took = []
     command = [
         sys.executable,
@@ -115,7 +111,7 @@ async def commands(
 
 
 async def measure(folder: Path, stops: int, whole: int) -> dict[str, Any]:
-    """All figures."""
+    """Measure all figures."""
     directory = cell_in(folder)
     name = secrets.token_hex(4)
     hello = Hello(2, 2, "coordinator", "coordinator", name, 1, directory.hash)

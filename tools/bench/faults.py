@@ -42,20 +42,21 @@ from petrobot.services.comm.streams.stream import STALE_AFTER, Incoming, StreamR
 from tests.comm.fault_parts import HOST, STREAM, Cable, LinkFault, first_line, inflict, part
 
 KNOWN_WITHIN = {LinkFault.KILLED: 0.05, LinkFault.FROZEN: 1.2, LinkFault.CUT: 1.2}
-"""Floors (s), until the caller knows,"""
+"""Limits (s) until the caller knows of a fault."""
 ENDED_WITHIN = {LinkFault.KILLED: 0.3, LinkFault.FROZEN: 1.2, LinkFault.CUT: 1.2}
-"""and until its run has ended."""
+"""Limits (s) until the caller receives the end of the run."""
 WATCHED = 4
-"""Nodes that live while false alarms are counted."""
+"""Number of living nodes while false alarms are counted."""
 PERIODS = (0.004, 0.02, 0.04)
-"""Of streams (s): the servo's cycle, and the two that a catching cell could use."""
+"""Periods of the streams (s): the servo's cycle, and two that a catching cell could use."""
 LOOKS = 0.001
-"""Seconds between looks of the stream's receiver."""
+"""Seconds between two checks of the stream's receiver."""
 LIMIT = 30.0
 
 
 async def lose_a_node(fault: LinkFault) -> tuple[float, float]:
-    """Seconds from the fault until the caller knows of it, and until its run has ended."""
+    """Return the seconds from the fault until the caller knows of it, and until its run has
+    ended."""
     told: dict[type[Notice], float] = {}
     changed = asyncio.Event()
 
@@ -73,8 +74,8 @@ async def lose_a_node(fault: LinkFault) -> tuple[float, float]:
     with part("node") as process:
         cable = Cable(int(await asyncio.to_thread(first_line, process)))
         caller = Caller("motion", m.Hello(2, 2, "coordinator", "coord", "c1", 1))
-        # What is killed is reached directly: a cable's end that is held open would answer in the
-        # dead node's place.
+        # A process that is killed is connected directly. Through the simulated cable, the
+        # connection would stay open after its death.
         port = cable.far if fault is LinkFault.KILLED else cable.port
         client = Client(HOST, port, caller, on_notices=take)
         client.start()
@@ -92,7 +93,7 @@ async def lose_a_node(fault: LinkFault) -> tuple[float, float]:
 
 
 async def false_alarms(seconds: float) -> dict[str, int]:
-    """How often nodes that live were said to be lost, and how their runs ended meanwhile."""
+    """Return how often living nodes were reported lost, and how their runs ended meanwhile."""
     lost: list[PeerLost] = []
     ended: list[m.Outcome] = []
 
@@ -121,7 +122,7 @@ async def false_alarms(seconds: float) -> dict[str, int]:
 
 @contextlib.contextmanager
 def busy(wanted: bool) -> Iterator[None]:
-    """Two processes for each core that never wait."""
+    """Start two processes for each core that never wait."""
     code = "while True: pass"
     spinning = [
         subprocess.Popen([sys.executable, "-c", code])
@@ -136,7 +137,7 @@ def busy(wanted: bool) -> Iterator[None]:
 
 
 class Last:
-    """A sink that knows whether its last value counts."""
+    """A sink that knows whether its last value is still valid."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -151,8 +152,8 @@ class Last:
 
 
 def lose_a_sender(fault: LinkFault, period: float) -> tuple[float, float]:
-    """Seconds from the fault until the last set point counts no more, and the longest between two
-    looks at it."""
+    """Return the seconds from the fault until the last set point is withdrawn, and the longest time
+    between two checks."""
     last = Last()
     receiver = StreamReceiver("motion", {STREAM: Incoming(period, last)})
     cable = Cable(receiver.address[1])
@@ -180,7 +181,7 @@ def lose_a_sender(fault: LinkFault, period: float) -> tuple[float, float]:
 
 
 def row(values: Sequence[float], limit: float) -> dict[str, float]:
-    """What is shown of a fault."""
+    """Return the table row of a fault."""
     return {
         "median": quantile(values, 0.5),
         "p99": quantile(values, 0.99),
@@ -191,7 +192,7 @@ def row(values: Sequence[float], limit: float) -> dict[str, float]:
 
 
 def run(rounds: int, periods: Sequence[float]) -> dict[str, dict[str, float]]:
-    """All faults."""
+    """Measure all faults."""
     found = {}
     for fault in LinkFault:
         pairs = [asyncio.run(lose_a_node(fault)) for _ in range(rounds)]
@@ -212,7 +213,7 @@ def run(rounds: int, periods: Sequence[float]) -> dict[str, dict[str, float]]:
 
 
 def main() -> None:
-    """The command."""
+    """Read the options, measure and print."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

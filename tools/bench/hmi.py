@@ -67,7 +67,8 @@ READ = """() => ({ late: probe.late, frames: probe.frames, painted: probe.painte
 
 
 class SyntheticMission:
-    """A port without an engine: rows of action places whose tokens go round."""
+    """A mission without an engine, for the page's server: rows of action places whose tokens
+    circulate."""
 
     def __init__(self, nodes: int) -> None:
         self.feed = Feed()
@@ -82,7 +83,7 @@ class SyntheticMission:
             self.start_run(i)
 
     def start_run(self, i: int) -> None:
-        """A run that goes on for the whole measurement."""
+        """Start a run that stays active for the whole measurement."""
         run = {
             "id": f"r{i}",
             "place": self.places[i],
@@ -95,19 +96,19 @@ class SyntheticMission:
         )
 
     def snapshot(self) -> dict[str, Any]:
-        """The state."""
+        """Return the state."""
         return self.feed.snapshot()
 
     def subscribe(self, receive: Callable[[dict[str, Any]], None]) -> Callable[[], None]:
-        """Changes."""
+        """Subscribe to changes."""
         return self.feed.subscribe(receive)
 
     async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> dict[str, Any]:
-        """None here."""
+        """Refuse every command."""
         return {"ok": False, "code": "bench", "text": "a bench has no commands"}
 
     def update(self, at: float) -> None:
-        """One update as a busy mission makes them."""
+        """Send one update, as a busy mission would."""
         self.number += 1
         i = self.number % len(self.places)
         after = (i + 1) % len(self.places)
@@ -126,7 +127,7 @@ class SyntheticMission:
 
 
 def task_of(places: list[str]) -> dict[str, Any]:
-    """A drawing of places and transitions in rows of ten."""
+    """Return a task whose drawing has places and transitions in rows of ten."""
 
     def at(i: int) -> dict[str, int]:
         return {"x": 80 + (i % 10) * 200, "y": 80 + (i // 10) * 130}
@@ -174,7 +175,8 @@ def task_of(places: list[str]) -> dict[str, Any]:
 
 
 async def ticking(mission: SyntheticMission, seconds: float) -> dict[str, float]:
-    """Feed for so long; gives the loop's CPU share and how late its ticks came (ms)."""
+    """Feed updates for so long. Return the loop's share of CPU time, and how late its ticks were
+    (ms)."""
     loop = asyncio.get_running_loop()
     begun, cpu = loop.time(), time.thread_time()
     late: list[float] = []
@@ -193,7 +195,7 @@ async def ticking(mission: SyntheticMission, seconds: float) -> dict[str, float]
 
 
 async def in_browser(page: Page, mission: SyntheticMission, seconds: float) -> dict[str, float]:
-    """The page's cost in headless Chromium."""
+    """Measure the page in headless Chromium."""
     from playwright.async_api import async_playwright
 
     async with async_playwright() as driver:
@@ -224,7 +226,7 @@ async def in_browser(page: Page, mission: SyntheticMission, seconds: float) -> d
 
 
 async def busy(session: Any) -> float:
-    """Seconds that the page's main thread has worked."""
+    """Return the CPU seconds of the page's main thread."""
     metrics = (await session.send("Performance.getMetrics"))["metrics"]
     return float(next(m["value"] for m in metrics if m["name"] == "TaskDuration"))
 
@@ -242,7 +244,7 @@ async def crowd(url: str, token: str) -> None:
 
 
 async def read(socket: aiohttp.ClientWebSocketResponse, pause: float) -> None:
-    """Take messages until the server ends."""
+    """Receive messages until the server ends."""
     async for _ in socket:
         if pause:
             await asyncio.sleep(pause)
@@ -265,11 +267,11 @@ async def with_crowd(
         await process.wait()
 
 
-# --- a mission beside somebody who draws ------------------------------------------------------
+# --- a mission while a designer draws ---------------------------------------------------------
 
 
 def drawing(places: int) -> dict[str, Any]:
-    """A document of a chain of action places with an error exit each."""
+    """Return the document of a chain of action places, each with an error branch."""
     document: dict[str, Any] = {
         "schema": 1,
         "task": {"name": "drawn", "final": "done > 0"},
@@ -290,7 +292,7 @@ def drawing(places: int) -> dict[str, Any]:
 
 
 async def draw(url: str, token: str, places: int) -> None:
-    """Check three drawings at a time for ever; runs in a process of its own."""
+    """Check three drawings at a time without end, in a process of its own."""
     document = drawing(places)
     async with aiohttp.ClientSession(url, headers={"Authorization": f"Bearer {token}"}) as http:
 
@@ -308,8 +310,7 @@ async def draw(url: str, token: str, places: int) -> None:
 
 
 async def give(url: str, token: str, seconds: float) -> None:
-    """Give a command every 50 ms and print how long each took (ms); runs in a process of its
-    own."""
+    """Give a command every 50 ms and print how long each took (ms), in a process of its own."""
     late = []
     async with aiohttp.ClientSession(url, headers={"Authorization": f"Bearer {token}"}) as http:
         until = time.perf_counter() + seconds
@@ -327,7 +328,8 @@ async def give(url: str, token: str, seconds: float) -> None:
 async def beside(
     page: Page, state: Mapping[str, Any], seconds: float, places: int
 ) -> dict[str, float]:
-    """Firings a second and latencies for so long, with somebody who draws unless `places` is 0."""
+    """Measure firings per second and latencies for so long, while a designer draws unless `places`
+    is 0."""
     arguments = [sys.executable, __file__]
     drawer = None
     if places:
@@ -335,7 +337,7 @@ async def beside(
             *arguments, "--draw", page.base, page.token, str(places), stdout=subprocess.PIPE
         )
         assert drawer.stdout is not None
-        await asyncio.wait_for(drawer.stdout.readline(), 300)  # from its first answer on
+        await asyncio.wait_for(drawer.stdout.readline(), 300)  # starts with its first answer
     asker = await asyncio.create_subprocess_exec(
         *arguments, "--give", page.base, page.token, str(seconds), stdout=subprocess.PIPE
     )
@@ -358,14 +360,14 @@ async def beside(
 
 
 def mission_of(state: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Its part of the snapshot, which must say that it runs."""
+    """Return the mission's part of the snapshot, which must say that it is active."""
     mission: Mapping[str, Any] = state["mission"]
     assert mission["state"] == "running", mission
     return mission
 
 
 async def with_checks(places: int, seconds: float, rounds: int) -> dict[str, Any]:
-    """A mission with and without somebody who draws, in turns."""
+    """Measure a mission with and without a designer who draws, in turns."""
     with tempfile.TemporaryDirectory() as folder:
         cell = Cell(Path(folder), SCRIPT.replace("seconds = 0.05", "seconds = 0.01"))
         for node in cell.nodes.values():
@@ -405,7 +407,7 @@ async def with_checks(places: int, seconds: float, rounds: int) -> dict[str, Any
 
 
 async def measured(nodes: int, seconds: float) -> dict[str, Any]:
-    """All figures of one size of net."""
+    """Measure all figures for one size of net."""
     mission = SyntheticMission(nodes)
     page = await start_page(mission, tasks_folder=Path(tempfile.gettempdir()))
     alone = await ticking(mission, seconds)

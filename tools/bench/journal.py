@@ -27,14 +27,14 @@ RECORD = {
 
 
 def timed(append: Callable[[], object]) -> float:
-    """Seconds of one append."""
+    """Return the seconds of one append."""
     begun = time.perf_counter()
     append()
     return time.perf_counter() - begun
 
 
 def row(name: str, seconds: list[float]) -> str:
-    """One line of the table, in microseconds."""
+    """Return one line of the table, in microseconds."""
     return (
         f"{name:32} {statistics.median(seconds) * 1e6:9.0f} "
         f"{sorted(seconds)[int(0.99 * len(seconds))] * 1e6:9.0f}"

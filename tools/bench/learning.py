@@ -37,7 +37,7 @@ LONG_SEEDS = 16
 
 
 def free(gap: float, best: float = 0.9) -> BanditWorld:
-    """Reliability alone counts."""
+    """Return a world of four actions that cost nothing: only their reliability differs."""
     return replace(gapped(gap, best), cost=(0.0,) * 4)
 
 
@@ -61,18 +61,18 @@ NOTED: dict[str, Rule] = {
 
 
 def rules() -> dict[str, Rule]:
-    """Everything that is played."""
+    """Return all selectors of the study."""
     return {name: make() for name, make in RULES.items()} | NOTED | CONTROLS
 
 
 def at(played: PlayedTrials, values: Array, trial: int) -> Array:
-    """A figure of each seed after so many trials."""
+    """Return a figure of each seed after so many trials."""
     row: Array = values[list(played.checkpoints).index(trial)]
     return row
 
 
 def measure(rule: Rule) -> dict[str, dict[str, Any]]:
-    """One selector in every world; shares in [0, 1], regret in J."""
+    """Run one selector in every world. Shares are in [0, 1], regret in J."""
     out: dict[str, dict[str, Any]] = {}
     for number, (name, world) in enumerate(WORLDS.items()):
         played = play(rule, world, TRIALS, SEEDS, np.random.default_rng([7, number]), MARKS)
@@ -96,7 +96,7 @@ def measure(rule: Rule) -> dict[str, dict[str, Any]]:
 
 
 def table(found: dict[str, dict[str, dict[str, Any]]]) -> str:
-    """Two tables in Markdown."""
+    """Return the two tables in Markdown."""
     lines = [
         "After 500 trials, 4 actions, 1,000 seeds. *p*: share of seeds with p >= 0.95 on the "
         "optimum; *ends*: share that ends",
@@ -142,7 +142,7 @@ def _cell(figures: dict[str, Any]) -> str:
 
 
 def long_run(rule: Rule, world: BanditWorld) -> dict[str, Any]:
-    """1 - p* and the smallest number of tries of any action, by trial."""
+    """Return 1 - p* and the smallest number of tries of any action, by trial."""
     tries: list[float] = []
 
     def watch(t: int, batch: Any, action: Any) -> None:
@@ -171,7 +171,7 @@ LONG_RULES: dict[str, Rule] = {
 
 
 def draw(found: dict[str, dict[str, dict[str, Any]]], long: dict[str, Any] | None) -> None:
-    """Regret by trial, regret by gap, and the million trials."""
+    """Draw regret by trial, regret by gap, and the million trials."""
     import matplotlib
 
     matplotlib.use("svg")
@@ -211,7 +211,7 @@ def _draw_regret(found: dict[str, dict[str, dict[str, Any]]]) -> None:
 
 
 def _draw_gaps() -> None:
-    """The paper's claim: where learning is slow, little is lost by it."""
+    """Draw the paper's claim: where learning is slow, the loss is small."""
     from matplotlib import pyplot as plt
 
     gaps = [0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5]

@@ -15,9 +15,8 @@ def pin(core: int) -> bool:
     """Put this process on one core, ahead of ordinary processes. False where that is not
     permitted."""
     try:
-        os.sched_setaffinity(
-            0, range(os.cpu_count() or 1)
-        )  # a parent that is pinned itself has left it one core only
+        # A pinned parent passes on its one core, so allow all of them first.
+        os.sched_setaffinity(0, range(os.cpu_count() or 1))
         cores = sorted(os.sched_getaffinity(0))
         if len(cores) < 2:
             return False
@@ -29,8 +28,8 @@ def pin(core: int) -> bool:
 
 
 def share() -> bool:
-    """Put this process, and all that it starts from now on, on one core, as ordinary processes.
-    False where that cannot be."""
+    """Put this process and its later children on one core, as ordinary processes. False where that
+    is not permitted."""
     if not hasattr(os, "sched_setaffinity"):
         return False
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
@@ -38,7 +37,7 @@ def share() -> bool:
 
 
 def unpin() -> None:
-    """Back among ordinary processes, on all cores, as anybody's process is run."""
+    """Make this an ordinary process on all cores again."""
     if hasattr(os, "sched_setscheduler"):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.sched_setaffinity(0, range(os.cpu_count() or 1))
@@ -47,9 +46,10 @@ def unpin() -> None:
 def start(
     script: str, *arguments: str, pinned: bool, python: str = sys.executable
 ) -> subprocess.Popen[str]:
-    """A script of the benchmark again, in another part; its input and its output are pipes."""
+    """Start the benchmark's script as another process, with another role; its input and output are
+    pipes."""
     command = [python, script, *arguments, "--pin" if pinned else "--no-pin"]
-    # A checkout that is not installed as a wheel finds its own packages from its own folder.
+    # a checkout that is not installed finds its packages from its own folder
     folder = Path(script).resolve().parents[2]
     return subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=folder
@@ -57,13 +57,13 @@ def start(
 
 
 def quantile(values: Sequence[float], q: float) -> float:
-    """The q-quantile of what was measured."""
+    """Return the q-quantile of the measured values."""
     ordered = sorted(values)
     return ordered[min(int(q * len(ordered)), len(ordered) - 1)]
 
 
 def load() -> str:
-    """How busy this machine is: the load averages of 1, 5 and 15 minutes."""
+    """Return the load averages of this machine over 1, 5 and 15 minutes."""
     return " ".join(f"{one:.2f}" for one in os.getloadavg())
 
 

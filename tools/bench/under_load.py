@@ -28,12 +28,12 @@ ROOT = Path(__file__).parents[2]
 KEPT = ROOT / "reports" / "under_load"
 ROUND_LIMIT_S = 3600
 BUSY = "import os; parent = os.getppid()\nwhile os.getppid() == parent: sum(range(10_000))"
-"""A process of load: it ends by itself when its parent has gone, however that ended."""
+"""Program of a busy process; it ends by itself when its parent process has ended."""
 
 
 @contextlib.contextmanager
 def busy_cores() -> Iterator[None]:
-    """Keep every core busy, with processes of our own."""
+    """Keep every core busy."""
     burners = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(os.cpu_count() or 1)]
     try:
         yield
@@ -44,7 +44,7 @@ def busy_cores() -> Iterator[None]:
 
 
 def one_round(number: int, chosen: list[str]) -> tuple[int, list[str]]:
-    """Run the tests once; gives how many ran and the names of those that failed."""
+    """Run the tests once. Return how many ran, and the names of those that failed."""
     report = KEPT / f"round-{number}.xml"
     command = [
         sys.executable,
@@ -78,7 +78,8 @@ def one_round(number: int, chosen: list[str]) -> tuple[int, list[str]]:
 
 def main() -> int:
     """Repeat, count, report."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # ends pytest and the load, too
+    # so that pytest and the busy processes end too
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -46,25 +46,25 @@ from tools.bench.wire_streams import measure_streams
 
 IN_FLIGHT = 64
 LEAST = 50
-"""Calls of each of those in flight, at least, when calls per second are counted: a start must not
-weigh."""
+"""Fewest calls of each task in flight when calls per second are measured, so that the start has no
+weight."""
 BIG = 100_000
 GAP = 0.001
-"""Seconds between spaced calls: the other end sleeps by then."""
+"""Seconds between spaced calls: long enough for the other end to sleep."""
 ROWS = ("call", "spaced", "round p50", "spaced p50", "big", "rate")
 OURS = (Petrobot, PetrobotSealed, PetrobotWorker)
 SCRIPTS = ("tools/bench/wire.py", "tests/bench/wire.py")
 TURN = 20
 """Calls of one contender before the next has its turn."""
 NOISE = 1.15
-"""Ratios nearer to 1 than this say nothing on a machine that does other things too."""
+"""Differences of ratios below this are noise on a machine with other load."""
 PEERS = ("Pyro5", "RPyC", "pyzmq", "grpc.aio")
 PINNED, SHARED, ORDINARY = "a core each end", "one core for both ends", "as the scheduler likes it"
 """How the two ends are scheduled."""
 
 
 class ResultTable:
-    """What was measured, by contender."""
+    """The measured values by contender."""
 
     def __init__(
         self, contenders: Sequence[type[Contender]], pinned: bool, older: Path | None = None
@@ -79,8 +79,8 @@ class ResultTable:
             self._askers[f"{one.name} (older)"] = Asker(str(script), one.name, pinned, python)
 
     def measure(self, rounds: int, calls: int) -> None:
-        """Rounds of all; within a round they take turns every few calls, so that the machine is in
-        one mood for all."""
+        """Measure all contenders in rounds. Within a round they take turns every few calls, so that
+        other load on the machine affects them all."""
         for number in range(rounds):
             taken = self._take_turns(calls, 0.0)
             spaced = self._take_turns(calls // 4, GAP)
@@ -107,8 +107,8 @@ class ResultTable:
             one.close()
 
     def results(self) -> dict[str, dict[str, float]]:
-        """Microseconds and calls per second, and their ratios to the bare echo's (median, least and
-        largest of the rounds)."""
+        """Return microseconds and calls per second, and their ratios to the bare echo (median,
+        least and largest of the rounds)."""
         found = {}
         for name, row in self.rows.items():
             ratios = self.ratios(name, Bare.name, "round p50")
@@ -126,18 +126,18 @@ class ResultTable:
         return found
 
     def ratios(self, name: str, to: str, what: str) -> list[float]:
-        """Of each round: one contender's figure as a multiple of another's."""
+        """Return for each round one contender's figure as a multiple of another's."""
         return [
             own / its for own, its in zip(self.rows[name][what], self.rows[to][what], strict=True)
         ]
 
 
 Goals = dict[str, tuple[list[float], float, bool]]
-"""By goal: what the rounds gave, the limit, and whether their median keeps to it."""
+"""Results by goal: the values of the rounds, the limit, and whether their median is within it."""
 
 
 def call_goals(table: ResultTable) -> Goals:
-    """The goals of calls."""
+    """Return the goals of calls."""
     ours, sealed, bare = Petrobot.name, PetrobotSealed.name, Bare.name
     goals: Goals = {}
     for what, column in (("calls in a row", "round p50"), ("spaced calls", "spaced p50")):
@@ -158,7 +158,7 @@ def call_goals(table: ResultTable) -> Goals:
 
 
 def goals_against(table: ResultTable) -> Goals:
-    """The goals beside an older petrobot."""
+    """Return the goals beside an older petrobot."""
     goals: Goals = {}
     for one in OURS:
         older = f"{one.name} (older)"
@@ -172,7 +172,7 @@ def goals_against(table: ResultTable) -> Goals:
 
 
 def stream_goals(streams: dict[str, dict[str, float]]) -> Goals:
-    """The goals of set-point streams."""
+    """Return the goals of set-point streams."""
     return {
         f"p99 <= 1.4 x raw, {name}": _below([row["p99_to_raw"], row["round_p99_to_raw"]], 1.4)
         for name, row in streams.items()
@@ -185,7 +185,7 @@ def _below(found: list[float], limit: float) -> tuple[list[float], float, bool]:
 
 
 def scheduled(how: str, arguments: argparse.Namespace) -> dict[str, Any]:
-    """All measurements with one way of scheduling."""
+    """Run all measurements with one way of scheduling."""
     pinned = how == PINNED
     older = arguments.against
     all_of_them = [one for one in CONTENDERS if _is_installed(one)]
@@ -220,8 +220,8 @@ def _show_goals(goals: Goals) -> None:
 
 
 def measure_big(rounds: int, calls: int) -> dict[str, dict[str, float]]:
-    """How long a small call of one process takes (us) while another process sends or receives large
-    messages through the same node, without a pause; without them first."""
+    """Measure how long a small call takes (us): first alone, then while another process sends or
+    receives large messages through the same node without a pause."""
     asker = Asker(__file__, PetrobotSealed.name, False)
     taken: dict[str, list[float]] = {kind: [] for kind in ("nothing", *BIG_KINDS)}
     for _ in range(rounds):
@@ -251,7 +251,7 @@ def _is_installed(one: type[Contender]) -> bool:
 
 
 def run(arguments: argparse.Namespace) -> dict[str, Any]:
-    """All measurements, in every way of scheduling that is permitted."""
+    """Run all measurements, with every way of scheduling that is permitted."""
     missing = [one.name for one in CONTENDERS if not _is_installed(one)]
     where: dict[str, Any] = {
         "python": platform.python_version(),
@@ -285,7 +285,7 @@ def _be_one_end(arguments: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """The command."""
+    """Read the options, measure and print."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -8,5 +8,5 @@ from petrobot.services.action import Context, Result, success
 
 
 def echo(ctx: Context, **values: Any) -> Result:
-    """Gives back what it is given."""
+    """Return the arguments."""
     return success(**values)

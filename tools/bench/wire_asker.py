@@ -17,7 +17,7 @@ from tools.bench.processes import start
 from tools.bench.wire_contenders import Contender
 
 WARM_UP = 200
-"""Calls before anything is measured."""
+"""Calls that warm up before the measurement."""
 
 
 class Asker:
@@ -70,7 +70,7 @@ def ask(contender: Contender, port: int) -> None:
     contender.connect(port)
     contender.latencies(WARM_UP, 0)
     gc.collect()
-    gc.freeze()  # what has been imported is no garbage of the calls
+    gc.freeze()  # keeps the garbage collector from scanning the imported modules during the calls
     print(json.dumps("ready"), flush=True)
     for line in sys.stdin:
         what, *arguments = json.loads(line)

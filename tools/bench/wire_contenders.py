@@ -40,7 +40,7 @@ class Contender:
     needs: ClassVar[str] = ""
 
     def serve(self) -> None:
-        """Serve for ever; prints the port first."""
+        """Print the port, then serve until the process is ended."""
         raise NotImplementedError
 
     def connect(self, port: int) -> None:
@@ -51,32 +51,32 @@ class Contender:
         """Seconds of each of `count` calls, one after the other, with a record (size 0) or so many
         bytes.
 
-        With a `gap` (s) each call finds the other end asleep, as a call now and then does; without,
-        both stay awake.
+        With a `gap` (s) the other end sleeps before each call, as before an occasional call;
+        without one, both stay awake.
         """
         raise NotImplementedError
 
     def rate(self, count: int, in_flight: int) -> float:
-        """Calls per second with so many under way at once."""
+        """Return the calls per second with so many in progress at once."""
         raise NotImplementedError
 
     def close(self) -> None:
-        """Leave the service."""
+        """Disconnect from the service."""
 
 
 def payload(size: int) -> Any:
-    """What is sent there and back."""
+    """Return what is sent there and back."""
     return bytes(size) if size else RECORD
 
 
 class AsyncContender(Contender):
-    """Base of those that live in an asyncio loop."""
+    """Base of contenders that use an asyncio loop."""
 
     def __init__(self) -> None:
         self.runner = asyncio.Runner()
 
     async def start(self) -> int:
-        """Serve in this loop; gives the port."""
+        """Serve in this loop. Return the port."""
         raise NotImplementedError
 
     async def open(self, port: int) -> None:
@@ -145,7 +145,7 @@ class _Echo:
 
 
 class _Asker(_Echo):
-    """Counts the bytes that come back; knows no more of the protocol."""
+    """Counts the bytes that come back, and ignores their content."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -198,8 +198,8 @@ class _BufferedAsker(_Asker, asyncio.BufferedProtocol):
 
 
 class Bare(AsyncContender):
-    """asyncio alone: the bytes of our own frame are sent back as they came. The measure of all
-    others."""
+    """asyncio alone: the bytes of one of our frames are sent back unchanged. All others are
+    compared with it."""
 
     name = "bare asyncio echo"
     FRAME = bytes(170)
@@ -279,7 +279,7 @@ class PetrobotSealed(Petrobot):
 
 
 BIG: dict[str, Any] = {"bytes": bytes(4_000_000), "texts": ["x" * 28] * 130_000}
-"""What is sent: bytes, and as many texts as one message may hold."""
+"""The large values: bytes, and as many texts as one message may have."""
 BIG_KINDS = (
     "CALL of 4 MB, bytes",
     "CALL of 4 MB, texts",
@@ -314,7 +314,7 @@ def load_with(kind: str, port: int) -> None:
 
 
 class PetrobotWorker(Petrobot):
-    """An action in the warm worker process of its node: where every action of a robot runs."""
+    """An action in the warm worker process of its node, where every action of a robot runs."""
 
     name = "petrobot, in its worker"
     PLACES = """\
@@ -327,7 +327,8 @@ echo = {{ run = "tools.bench.wire_action:echo", task = "echo", node = "node" }}
 """
 
     async def start(self) -> int:
-        os.environ["PYTHONPATH"] = str(ROOT)  # the worker imports its action
+        # where the worker finds the module of its action
+        os.environ["PYTHONPATH"] = str(ROOT)
         with socket.create_server((HOST, 0)) as probe:
             port = int(probe.getsockname()[1])
         text = self.PLACES.format(port=port)

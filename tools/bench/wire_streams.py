@@ -28,8 +28,8 @@ HOST = "127.0.0.1"
 RAW, STREAM = "raw socket", "petrobot stream"
 REST = (0.0,) * 7
 _RECORD = struct.Struct("9d")
-"""When it was due, when it was sent, and seven numbers more: as many as a predicted catching point
-has."""
+"""Fields of a set point: when it was due, when it was sent, and as many more numbers as a predicted
+catching point has."""
 
 
 def send_both(raw_port: int, stream_port: int, rate: int, seconds: float) -> None:
@@ -53,7 +53,7 @@ def send_both(raw_port: int, stream_port: int, rate: int, seconds: float) -> Non
 
 
 class Ages:
-    """A sink that writes down how old each set point is when it is taken (s): since it was due, and
+    """A sink that records the age of each set point when it is received (s): since it was due, and
     since it was sent."""
 
     def __init__(self) -> None:
@@ -71,7 +71,7 @@ class Ages:
 
 
 def receive_both(rate: int, seconds: float, pinned: bool) -> dict[str, Ages]:
-    """Take both ways in until both have ended."""
+    """Receive both streams until both have ended."""
     ages = {RAW: Ages(), STREAM: Ages()}
     receiver = StreamReceiver("bench", {"point": Incoming(1.0 / rate, ages[STREAM])})
     with socket.create_server((HOST, 0)) as listener:
@@ -97,8 +97,8 @@ def receive_both(rate: int, seconds: float, pinned: bool) -> dict[str, Ages]:
 
 
 def measure_streams(rounds: int, seconds: float, pinned: bool) -> dict[str, dict[str, float]]:
-    """Ages (us) by rate and way, and the ratio of their p99 to the raw socket's: of all, and the
-    median of the rounds'."""
+    """Return ages (us) by rate and sender, and the ratio of their p99 to the raw socket's: over all
+    rounds, and the median of each round's."""
     found: dict[str, dict[str, float]] = {}
     for rate in RATES:
         taken = [receive_both(rate, seconds, pinned) for _ in range(rounds)]

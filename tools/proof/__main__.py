@@ -26,7 +26,7 @@ MEASURED = FIGURES.with_suffix(".json")
 
 
 def proofs() -> list[FigureProof]:
-    """All of them, in the order in which people wait for them."""
+    """Return all proofs, those with the most important figures first."""
     return [
         *catching.proofs(),
         *physics.proofs(),
@@ -39,7 +39,7 @@ def proofs() -> list[FigureProof]:
 
 
 def kept() -> dict[str, dict[str, Any]]:
-    """What was measured last, of whatever sources, by the proofs' names."""
+    """Return the last stored results by name, even if the sources have changed since."""
     if not MEASURED.exists():
         return {}
     data: dict[str, dict[str, Any]] = json.loads(MEASURED.read_text(encoding="utf-8"))
@@ -47,7 +47,7 @@ def kept() -> dict[str, dict[str, Any]]:
 
 
 def prove(proof: FigureProof) -> dict[str, Any]:
-    """Measure and judge."""
+    """Measure a figure, and check it against its floor."""
     begun, sources = time.monotonic(), proof.fingerprint()
     result = proof.measure()
     return {
@@ -59,8 +59,8 @@ def prove(proof: FigureProof) -> dict[str, Any]:
 
 
 def run(todo: Sequence[FigureProof], jobs: int) -> bool:
-    """Prove these: several at once, but those that measure speed one by one afterwards. False if
-    one does not hold."""
+    """Run these proofs: several at once, then those that measure speed one by one. False if one
+    does not hold."""
     good, done, begun = True, 0, time.monotonic()
     together, alone = [p for p in todo if not p.alone], [p for p in todo if p.alone]
     for group, workers in ((together, jobs), (alone, 1)):
@@ -88,7 +88,7 @@ def write(measured: dict[str, dict[str, Any]]) -> None:
 
 
 def main() -> int:
-    """Run what is not proved yet."""
+    """Run the proofs that have no result for the present sources."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

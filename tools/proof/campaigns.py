@@ -26,19 +26,19 @@ from petrobot.coordinator.studies.campaign.table import TABLE, read_table
 from tests.waiting import Limit
 
 FAST = 15.0
-"""Times real time a core."""
+"""Floor of the speed: simulated seconds per second and core."""
 GROWTH_MB = 5.0
-"""Memory that a worker may gain between its first blocks and its last ones."""
+"""Most memory that a worker may gain between its first blocks and its last ones (MiB)."""
 GROWTH = 0.05
-"""Share by which the largest memory of a later worker may be above that of the first ones: workers
-retire, so that what native libraries keep does not add up, however long a campaign goes on."""
+"""Share by which a later worker may need more memory than the first ones. Workers are replaced from
+time to time, so memory that native libraries never free does not add up during a long campaign."""
 
 Result = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is run; the full proof has share 1."""
+    """Sizes of the campaigns; the full proof has share 1."""
 
     share: float
     workers: int
@@ -48,7 +48,7 @@ class Sizes:
 
     @property
     def given(self) -> tuple[str, ...]:
-        """What every campaign is given."""
+        """Return the options of every campaign."""
         return (
             self.task,
             *(("--services", str(self.services)) if self.services else ()),
@@ -56,12 +56,12 @@ class Sizes:
         )
 
     def of(self, throws: int, least: int = 20) -> int:
-        """A number of throws, scaled."""
+        """Return a number of throws, scaled by the share."""
         return max(least, round(throws * self.share))
 
 
 def petrobot(*arguments: str, codes: Sequence[int] = (0,)) -> None:
-    """Run a command. Raises RuntimeError with its words when it fails."""
+    """Run a command. Raises RuntimeError with its output if it fails."""
     done = subprocess.run(
         [sys.executable, "-m", "petrobot.coordinator", *arguments],
         cwd=ROOT,
@@ -77,7 +77,7 @@ def petrobot(*arguments: str, codes: Sequence[int] = (0,)) -> None:
 
 
 def campaign(sizes: Sizes, name: str, throws: int, seed: int, regime: str, *more: str) -> Result:
-    """A campaign in its folder, or what is kept of it."""
+    """Return the result of a campaign in its folder; run it unless it is there already."""
     folder = sizes.folder / name
     path = folder / "result.json"
     if path.exists() and json.loads(path.read_text(encoding="utf-8"))["begun"]:
@@ -92,13 +92,13 @@ def campaign(sizes: Sizes, name: str, throws: int, seed: int, regime: str, *more
 
 
 def rows_of(sizes: Sizes, name: str) -> list[TrialRow]:
-    """The table of a campaign."""
+    """Return the table of a campaign."""
     return list(read_table(sizes.folder / name / TABLE))
 
 
 def speed(sizes: Sizes, options: argparse.Namespace) -> Result:
-    """Times real time a core, memory of the workers, and a campaign that is killed again and
-    again."""
+    """Measure the speed of a campaign, the memory of its workers, and whether a campaign that is
+    killed several times gives the same table."""
     found = campaign(sizes, "speed", sizes.of(1000), 80, options.regimes.split(",")[0])
     peaks = largest_memory(sizes.folder / "speed" / "times.csv")
     first, later = max(peaks[: found["workers"]]), max(peaks[found["workers"] :], default=None)
@@ -123,8 +123,8 @@ def speed(sizes: Sizes, options: argparse.Namespace) -> Result:
 
 
 def memory_gained(times: Path) -> float:
-    """The largest gain of a worker from the median of its third to eighth block to that of its last
-    six (MiB)."""
+    """Return the largest gain of a worker (MiB), from the median of its third to eighth block to
+    the median of its last six."""
     by_worker: dict[str, list[float]] = {}
     with times.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -134,7 +134,7 @@ def memory_gained(times: Path) -> float:
 
 
 def largest_memory(times: Path) -> list[float]:
-    """The largest memory of each worker (MiB), in the order in which they began."""
+    """Return the largest memory of each worker (MiB), in the order in which they began."""
     by_worker: dict[str, float] = {}
     with times.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -143,8 +143,8 @@ def largest_memory(times: Path) -> list[float]:
 
 
 def interrupted(sizes: Sizes, throws: int, regime: str) -> tuple[bool, int]:
-    """Whether a campaign that is killed several times comes to the table of one that is not; and
-    how often it was killed."""
+    """Return whether a campaign that is killed several times gives the same table as one that is
+    not, and how often it was killed."""
     chosen = ("--seed", "81", "--regime", regime, "--selector", "nikolic_fu_fast")
     given = (*sizes.given, "--runs", str(throws), *chosen)
     whole, part = sizes.folder / "whole", sizes.folder / "killed"

@@ -22,7 +22,7 @@ FLOORS = {"A": 0.98, "B": 0.94, "C": 0.89}
 
 
 def wilson_lower(successes: int, trials: int, z: float = 1.959964) -> float:
-    """Lower end of Wilson's 95 % interval for a share (Wilson 1927)."""
+    """Return the lower end of Wilson's 95 % interval of a share (Wilson 1927)."""
     if trials == 0:
         return 0.0
     share = successes / trials
@@ -32,8 +32,8 @@ def wilson_lower(successes: int, trials: int, z: float = 1.959964) -> float:
 
 
 def catching(regime: str, throws: int) -> Callable[[], Result]:
-    """Throws of a regime: caught among the reachable ones, and how far off the middle of the
-    cup."""
+    """Run throws of a regime; return how many of the reachable ones were caught, and how far from
+    the middle of the cup."""
 
     def measure() -> Result:
         given = (
@@ -52,7 +52,7 @@ def catching(regime: str, throws: int) -> Callable[[], Result]:
 
 
 def summary(result: dict[str, Any]) -> Result:
-    """What docs/figures.md says of a run."""
+    """Return the figures of a run for docs/figures.md."""
     throws = result["throws"]
     reachable = [t for t in throws if t["reachable"]]
     caught = sum(t["caught"] for t in reachable)
@@ -69,8 +69,8 @@ def summary(result: dict[str, Any]) -> Result:
 
 
 def same_file_anywhere() -> Result:
-    """One seed, one file: in one process, in one process a node, and beside a process that takes a
-    core."""
+    """Compare result files of one seed: in one process, with a process per node, and while another
+    process keeps a core busy."""
     given = ("catch_ball", "--mode", "lockstep", "--runs", "20", "--seed", str(SEED))
     alone = run_task("alone", *given)
     spread = run_task("spread", *given, "--processes", "0")
@@ -97,7 +97,7 @@ def same_file_anywhere() -> Result:
 
 
 def disturbances() -> list[str]:
-    """Every disturbed regime by name, each at every speed."""
+    """Return every disturbed regime by name, each at every speed."""
     laboratory = tomllib.loads(
         (ROOT / "sim" / "catching" / "laboratory.toml").read_text(encoding="utf-8")
     )
@@ -105,7 +105,7 @@ def disturbances() -> list[str]:
 
 
 def proofs() -> list[FigureProof]:
-    """Throws first, then what they rest on."""
+    """Return the proofs: throws first, then determinism and speed."""
     main = [
         FigureProof(
             regime,

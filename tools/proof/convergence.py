@@ -1,4 +1,5 @@
-"""How often selectors end on the best action: the study of docs/learning.md against its limits."""
+"""How often selectors end on the best action: check the study of docs/learning.md against its
+floors."""
 
 from __future__ import annotations
 
@@ -13,8 +14,8 @@ RULE = "nikolic_fu_fast"
 
 
 def study() -> Result:
-    """Shares of 1,000 seeds with p >= 0.95 on the best of 4 actions after 500 trials, for the two
-    gaps of the floor.
+    """Return the shares of 1,000 seeds with p >= 0.95 on the best of 4 actions after 500 trials,
+    for the two gaps that have a floor.
 
     Raises RuntimeError when the study fails.
     """
@@ -32,7 +33,7 @@ def study() -> Result:
 
 
 def proofs() -> list[FigureProof]:
-    """One for the study."""
+    """Return the proof of the study."""
     sources = ("coordinator/learning", "tools/bench/learning.py")
     holds = lambda r: min(r[f"{RULE}, {world}"] for world in ("easy", "middle")) >= SURE  # noqa: E731
     floor = f"fast variant >= {SURE} at gaps .4 and .2"

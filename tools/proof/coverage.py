@@ -61,7 +61,7 @@ class Column:
     second: Mask
     """It ran the second action of its primitive task."""
     on: str
-    """The transition that takes it if it does not end with ERROR."""
+    """The transition that consumes the token unless the run ends with ERROR."""
 
 
 @dataclass
@@ -155,8 +155,8 @@ Draw = Callable[[np.random.Generator, int], Drawn]
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A task and how its trials come out. `choose`: other choices of the new trials (a what-if);
-    `drawn_so`: the world with these choices."""
+    """A task and the function that draws its trials. `choose`: other choices of the new trials (a
+    what-if); `drawn_so`: draws trials with these choices."""
 
     name: str
     task: Task
@@ -164,11 +164,11 @@ class World:
     choose: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     drawn_so: Draw | None = None
     share: float = 1.0
-    """Of the training trials: how many chose as the new ones."""
+    """Share of the training trials that chose as the new ones do."""
 
     @property
     def new(self) -> Draw:
-        """How new trials come out."""
+        """Return the function that draws new trials."""
         return self.drawn_so or self.draw
 
 
@@ -337,7 +337,8 @@ QUEUE = _task(
 
 
 def race(random: np.random.Generator, n: int) -> Drawn:
-    """A run waits for a signal until its deadline of 2 s; too late means the long way."""
+    """A run waits for a signal until its deadline of 2 s; if it comes later, the trial takes the
+    longer path."""
     out, wait = Drawn.blank(n), random.exponential(1.2, n)
     late = wait > 2.0
     out.run("a", np.minimum(wait, 2.0), lost=late)
@@ -425,7 +426,7 @@ def what_if() -> World:
     )
 
 
-# --- worlds kept aside: tried after the method was fixed ---------------------------------------
+# --- worlds set aside: used only after the method was fixed ---------------------------------------
 
 
 def jam(random: np.random.Generator, n: int) -> Drawn:
@@ -627,7 +628,7 @@ def verdict(found: Sequence[Mapping[str, Any]], repetitions: int) -> list[str]:
 
 def experiment(options: argparse.Namespace) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Run it on all worlds, print a row for each, and write the page; return the results of the
-    first ten worlds, and of those that were kept aside."""
+    first ten worlds, and of those that were set aside."""
     found: list[list[dict[str, Any]]] = []
     for group in ((*worlds(), what_if()), aside()):
         found.append([])

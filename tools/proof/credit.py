@@ -1,5 +1,6 @@
-"""What judges a choice, the action's own end or the task's goal: learned, frozen, and judged on
-fresh balls beside the best fixed combination, in ten disturbed regimes of the catching cell.
+"""Compare what may judge a choice: how the action ended, or whether the task met its goal. In ten
+disturbed regimes of the catching cell each is learned, frozen, and compared on fresh balls with the
+best fixed combination.
 
     python -m tools.proof.credit                        everything (days on one core); continues
                                                         where it stopped
@@ -49,7 +50,8 @@ REGIMES = (
 )
 CREDITS = ("action", "task")
 LEARNING, SCREENING, FINAL, FRESH = 1000, 60, 400, 1000
-"""Balls: for one learner, for each combination, for each finalist, for judging."""
+"""Numbers of balls: for one learner, for the screen of each combination, for each finalist, for
+judging."""
 FINALISTS = 5
 MEAN, LOWEST = -0.02, -0.04
 """Floors of the difference in catches to the best fixed combination: of its mean over the learning
@@ -153,9 +155,9 @@ def trials_needed(seen: np.ndarray[Any, Any], most: int = 2000) -> dict[str, int
     within two points of the best, and still do so at the end; None if not within `most`.
 
     `seen`: trials and catches of each combination, shape (2, ...); the rates are drawn from their
-    posterior distributions, so that the scatter of the screen does not pass for a difference.
-    `task credit` is the rule of `--credit task`; `plain bandit` is UCB1 over combinations without
-    a prior.
+    posterior distributions, so that the scatter of the screen is not mistaken for a difference.
+    `task credit` is the rule of `--credit task`; `plain bandit` is UCB1 over combinations without a
+    prior.
     """
     rng, shape = np.random.default_rng(7), seen.shape[1:]
     rates = rng.beta(seen[1] + 0.5, seen[0] - seen[1] + 0.5, (SIMULATED, *shape))
@@ -186,7 +188,7 @@ def trials_needed(seen: np.ndarray[Any, Any], most: int = 2000) -> dict[str, int
 
 
 def page(results: Sequence[Result], study: Study, command: str) -> str:
-    """The table, with the command that remakes it."""
+    """Return the table, with the command that makes it again."""
     lines = [
         "# What judges a choice: figures",
         "",
@@ -221,7 +223,7 @@ def page(results: Sequence[Result], study: Study, command: str) -> str:
 
 
 def measured(options: argparse.Namespace) -> list[Result]:
-    """Study the regimes one after the other, and keep each result."""
+    """Study the regimes one after the other, and store each result."""
     results = []
     for regime in options.regimes.split(","):
         folder = options.folder / f"{options.share:g}"
@@ -263,7 +265,7 @@ def _floor() -> Result:
 
 
 def proofs() -> list[FigureProof]:
-    """The floor for `make proof`."""
+    """Return the proof for `make proof`."""
     return [
         FigureProof(
             "credit by the task",

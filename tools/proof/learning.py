@@ -79,7 +79,8 @@ def learn(sizes: Sizes, options: argparse.Namespace) -> Result:
 
 
 def screened(sizes: Sizes, task: Task, regime: str) -> tuple[list[TrialRow], list[dict[str, str]]]:
-    """Throws of all combinations, which take turns, and which of them each was to be."""
+    """Run throws with all combinations in turn. Return the rows, and the combination planned for
+    each."""
     count = 1
     for p in task.primitive_tasks.values():
         count *= len(p.alternatives)
@@ -96,11 +97,11 @@ def best_fixed(
     finalists: Sequence[CombinationFigures],
     weighting: Weighting,
 ) -> dict[str, str]:
-    """The combination with the lowest J: the best few of all on more throws, none of them the
-    judge's.
+    """Return the combination with the lowest J. The best few of the screen are compared on more
+    throws, none of which the judge uses.
 
-    The costs of the first table, in which every action was run, give the one rho of all J in this
-    proof.
+    All J in this proof use one rho, computed from the costs of the first table, in which every
+    action was run.
     """
     every: list[TrialRow] = []
     plans: list[dict[str, str]] = []
@@ -122,13 +123,14 @@ def judge(
     throws: int | None = None,
     seed: int = 60,
 ) -> Result:
-    """A fixed combination on fresh throws."""
+    """Run a fixed combination on fresh throws."""
     text = ",".join(f"{task}={action}" for task, action in chosen.items())
     return campaign(sizes, name, throws or sizes.of(5000), seed, regime, "--choose", text)
 
 
 def fresh(sizes: Sizes, actions: Mapping[str, str], regime: str) -> Path:
-    """The folder of a combination's throws with the judge's seeds; equal combinations share it."""
+    """Return the folder of a combination's throws with the judge's seeds; equal combinations share
+    it."""
     name = "judged_" + "_".join(actions.values())
     judge(sizes, name, actions, regime)
     return sizes.folder / name
@@ -206,7 +208,7 @@ def forecast(sizes: Sizes, options: argparse.Namespace) -> Result:
 
 
 def page(results: Mapping[str, Result], sizes: Sizes) -> str:
-    """The tables, with the command that remakes them."""
+    """Return the tables, with the command that makes them again."""
     lines = [f"# Learning and forecasting, {sizes.task}: figures", ""]
     lines += [
         "What learning and forecasts achieve on the simulated cell. The terms are explained in",
@@ -244,7 +246,7 @@ def page(results: Mapping[str, Result], sizes: Sizes) -> str:
 
 
 def _told(found: Mapping[str, Any]) -> str:
-    """What the table of learning says, in words."""
+    """Describe the table of learning in words."""
     all_j = found["J of all"]
     close, ahead = ("holds" if found[one] else "**does not hold**" for one in ("close", "ahead"))
     furthest = max(row["J beyond the best, upper 95 %"] for row in found["rows"])
@@ -267,7 +269,7 @@ def _verdict(found: Mapping[str, Any]) -> str:
 
 
 def _turned(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A table with a column for each record."""
+    """Return a table with a column for each record."""
     names = list(rows[0])
     head = (
         "| "
@@ -298,7 +300,7 @@ FULL = ROOT / "reports" / "proof" / "learning"
 
 
 def proofs() -> list[FigureProof]:
-    """The three floors for `make proof`, in full."""
+    """Return the three proofs for `make proof`, in full size."""
     options = parser().parse_args([])
     floors = {
         "learn": (
@@ -332,7 +334,7 @@ def proofs() -> list[FigureProof]:
 
 
 def _kept(step: str, options: argparse.Namespace) -> Result:
-    """Measure a step in full, and keep its result for the page."""
+    """Measure a step in full size, and store its result for the page."""
     sizes = Sizes(1.0, options.workers, FULL)
     sizes.folder.mkdir(parents=True, exist_ok=True)
     result = STEPS[step](sizes, options) | {"command": _command([step])}
@@ -424,7 +426,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the steps asked for; 1 if a floor does not hold."""
+    """Run the given steps. Return 1 if a floor does not hold."""
     options = parser().parse_args(argv)
     unknown = [step for step in options.steps if step not in STEPS]
     if unknown:

@@ -8,14 +8,14 @@ SOURCES = ("coordinator", "services", "sim", "services.toml", "tests")
 
 
 def marked_proof() -> Result:
-    """All of them, two at a time."""
+    """Run all of them, two at a time."""
     done = command("pytest", "-m", "proof", "-n", "2", "-q")
     lines = done.stdout.strip().splitlines()
     return {"exit": done.returncode, "said": lines[-1].strip("= ") if lines else ""}
 
 
 def proofs() -> list[FigureProof]:
-    """One for the lot."""
+    """Return one proof for all long tests."""
     return [
         FigureProof(
             "long tests",

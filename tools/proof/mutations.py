@@ -37,7 +37,7 @@ about the fault: the machine was too busy."""
 
 @dataclass(frozen=True)
 class Mutation:
-    """One fault: a text that stands once in a file, what replaces it, and the tests to run."""
+    """One fault: a text that occurs once in a file, what replaces it, and the tests to run."""
 
     name: str
     file: str
@@ -350,7 +350,7 @@ def fails(copy: Path, tests: Sequence[str]) -> str:
     # A process that a test starts must find the copy, not the checkout that is installed.
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(copy / "src"), str(copy)])}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)  # each process would compile the copy again
-    # Beside the copy, not in it: tests that start pytest must not find the settings of the copy.
+    # pytest's folder is beside the copy: tests that start pytest must not find the copy's settings
     given = [*command(tests), "--basetemp", str(copy.parent / "basetemp")]
     done = subprocess.run(
         given, cwd=copy, env=environment, capture_output=True, text=True, timeout=LIMIT_S

@@ -21,7 +21,7 @@ How faults that were injected on purpose ended: [figures-faults.md](figures-faul
 
 
 def figures(proofs: Sequence[FigureProof], measured: Mapping[str, Mapping[str, Any]]) -> str:
-    """The whole page; `measured` holds what is kept of each proof by its name."""
+    """Return the whole page; `measured`: the stored result of each proof by its name."""
     chapters = list(dict.fromkeys(proof.chapter for proof in proofs))
     parts = [HEAD]
     for chapter in chapters:

@@ -1,4 +1,4 @@
-"""Figures of the two back ends of the laboratory's mechanics: how far they agree on the arm, and
+"""Figures of the two physics back ends of the laboratory: how far they agree on the arm, and
 whether the same balls are caught."""
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ FLOORS = {
     "B+latency400": 0.9,
     "C+springy": 0.2,
 }
-"""Least Wilson bound of the share caught, for both back ends: nominal regimes, and those in which
-balls are missed, by errors of vision, time, and cup."""
+"""Least Wilson bound of the share caught, for both back ends: of nominal regimes, and of those with
+errors of vision, time or cup, in which balls are missed."""
 MARGIN, SPRINGY = 0.15, 0.3
 """Most by which the shares of the same balls may differ, with the interval of the difference; the
-second in `C+springy`. At the rim Bullet's decisions depend on its step and its limit on the spin,
-those of the portable contact do not (docs/physics.md, "The same balls")."""
+second in `C+springy`. What happens at the rim depends in Bullet on its step and its limit of the
+spin; in the portable contact it does not (docs/physics.md, "The same balls")."""
 
 
 def arm() -> Result:
-    """Largest differences of the back ends over random states of the arm with its cup."""
+    """Return the largest differences of the back ends over random states of the arm with its
+    cup."""
     site = read_site(ROOT / "services" / "cell.toml")
     truth = site.truth("A")
     load = CupMount(site.arm, truth).load(0.080, truth.cup.radius, truth.cup.depth)
@@ -55,7 +56,7 @@ def arm() -> Result:
 
 
 def same_balls(regime: str) -> Callable[[], Result]:
-    """The same throws of a regime with both back ends."""
+    """Run the same throws of a regime with both back ends."""
 
     def measure() -> Result:
         fates = {name: _caught(name, regime) for name in BACK_ENDS}
@@ -91,7 +92,7 @@ def paired_interval(lost: int, won: int, pairs: int) -> tuple[float, float]:
     """Return the 95 % interval of the difference of two shares of the same trials, of which one
     alone had `lost` and the other alone `won`.
 
-    Bonett and Price (2012): the one of Wald with one pair added to each kind.
+    Wald's interval with one pair added to each of the two counts (Bonett and Price 2012).
     """
     one, other, n = (lost + 1) / (pairs + 2), (won + 1) / (pairs + 2), pairs + 2
     spread = 1.959964 * math.sqrt((one + other - (other - one) ** 2) / n)
@@ -99,8 +100,8 @@ def paired_interval(lost: int, won: int, pairs: int) -> tuple[float, float]:
 
 
 def holds(regime: str) -> Callable[[Result], bool]:
-    """Return what must hold in a regime: the floor for both back ends, and the same shares but for
-    the margin."""
+    """Return the check of a regime: both back ends reach the floor, and their shares differ at most
+    by the margin."""
     margin = SPRINGY if "springy" in regime else MARGIN
 
     def good(result: Result) -> bool:
@@ -113,7 +114,7 @@ def holds(regime: str) -> Callable[[Result], bool]:
 
 
 def proofs() -> list[FigureProof]:
-    """The arm first."""
+    """Return the proofs, the arm first."""
     on_arm = FigureProof(
         "arm, both back ends",
         CHAPTER,

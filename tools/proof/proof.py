@@ -50,8 +50,8 @@ class FigureProof:
     alone: bool = False
 
     def fingerprint(self) -> str:
-        """Hash of what all sources that the figure depends on say to the interpreter: comments,
-        docstrings and layout do not count. It differs between versions of Python."""
+        """Return the hash of all sources that the figure depends on, without their comments,
+        docstrings and layout. It differs between versions of Python."""
         digest = hashlib.sha256()
         for path in sorted({p for source in self.sources for p in _files(ROOT / source)}):
             place = path.relative_to(ROOT).as_posix()
@@ -81,7 +81,7 @@ def _meaning(path: Path) -> bytes:
 
 
 def _says_nothing(one: ast.stmt) -> bool:
-    """Return whether a statement is a text alone: a docstring, of whatever it follows."""
+    """Return whether a statement is only a text, such as a docstring."""
     return (
         isinstance(one, ast.Expr)
         and isinstance(one.value, ast.Constant)
@@ -90,16 +90,16 @@ def _says_nothing(one: ast.stmt) -> bool:
 
 
 def command(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run a module of this environment from the project's folder; what it prints is kept."""
+    """Run a module of this environment from the project's folder, and capture its output."""
     return subprocess.run(
         [sys.executable, "-m", *arguments], cwd=ROOT, capture_output=True, text=True, check=False
     )
 
 
 def run_task(name: str, *arguments: str) -> dict[str, Any]:
-    """The result of a `petrobot run`, kept under a name of its own.
+    """Return the result of a `petrobot run`, stored under this name.
 
-    Raises RuntimeError when the command fails in another way than by the task's own outcome.
+    Raises RuntimeError if the command fails for another reason than the task's outcome.
     """
     path = KEPT / f"{name}.run.json"
     done = command("petrobot.coordinator", "run", *arguments, "--quiet", "--json", str(path))

@@ -1,1 +1,2 @@
-"""The net that is executed: its states, its progress, and what keeps it from its end."""
+"""Analysis of the executed net: its states, its verdicts of progress, and the causes of dead
+ends."""

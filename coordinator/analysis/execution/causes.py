@@ -1,5 +1,5 @@
-"""Why a state of the execution graph is a dead end: which place is short, which firing took from it
-last, and by which path it should have come back."""
+"""Explain a dead end of the execution graph: which place lacks a token, which firing took it last,
+and which path should have returned it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MOST = 4
 
 
 def settled(x: ExecutionGraph, state: int) -> int:
-    """Return the state in which a dead end comes to rest: the nearest one that nothing leaves."""
+    """Return the state in which a dead end stops: the nearest one without outgoing edges."""
     out = np.bincount(x.source[~x.by_hand], minlength=len(x)) == 0
     edges = x.graph.path(state, out, ~x.by_hand)
     return int(x.target[edges[-1]]) if edges else state
@@ -58,7 +58,7 @@ def explain(x: ExecutionGraph, state: int) -> str:
     for t in waiting:
         found = obstacles(draft, t)
         if not ended and any(one.kind == "short" and one.place in spent for one in found):
-            continue  # the end wants that place empty, and so it is
+            continue  # `final` asks for this place to be empty, and it is
         if ended and all(_other_end(draft, one) for one in found):
             continue
         parts = [_cause(x, draft, firings, one) for one in found if not _other_end(draft, one)]
@@ -66,7 +66,7 @@ def explain(x: ExecutionGraph, state: int) -> str:
         told.append((nearness, f"{t.name} {' and '.join(parts)}"))
     more = f"; and {len(told) - MOST} more" if len(told) > MOST else ""
     if told:
-        told.sort(key=lambda one: one[0])  # first what comes nearest to firing
+        told.sort(key=lambda one: one[0])  # the transition that lacks least comes first
         return "; ".join(text for _, text in told[:MOST]) + more
     if ended:
         return f"no transition takes what ended in {', '.join(sorted(ended))} that way"
@@ -74,8 +74,8 @@ def explain(x: ExecutionGraph, state: int) -> str:
 
 
 def _asked(x: ExecutionGraph, draft: Draft) -> tuple[str, set[int]]:
-    """Return what of the designed ends does not hold, in words, and the places that `final` wants
-    to be empty and that are."""
+    """Return in words which conditions of `final` and `final_error` do not hold, and the places
+    that `final` asks to be empty and that are empty."""
     task, index = x.engine.compiled.task, x.engine.compiled.net.place_index
     held = {name: draft.marking[p] for name, p in index.items()}
     missed, spent = list[str](), set[int]()
@@ -109,7 +109,8 @@ def _near(t: CompiledTransition, ended: set[str], marking: Sequence[int]) -> boo
 
 
 def _other_end(draft: Draft, one: Obstacle) -> bool:
-    """Whether the obstacle is only that the run there ended in another way."""
+    """Return whether the transition is blocked only because the run there ended with another
+    status."""
     if one.kind != "run" or one.place is None:
         return False
     return bool(draft.tokens.get(draft.compiled.net.places[one.place]))
@@ -122,7 +123,7 @@ def _cause(x: ExecutionGraph, draft: Draft, firings: tuple[str, ...], one: Obsta
 
 
 def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
-    """Return who took the place's tokens last, and what became of them."""
+    """Return which firing took the place's tokens last, and where they went."""
     change = [dict(changes).get(place, 0) for changes in net.compiled.changes]
     givers = [t for t, gain in enumerate(change) if gain > 0]
     order = [net.transition_index[name] for name in firings]
@@ -145,9 +146,10 @@ def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
 
 
 def _carried(net: Net, order: list[int]) -> tuple[list[int], set[int]]:
-    """Follow the tokens that the first firing gave through the others. Return the firings that
-    moved some of them on, and the places to which they came. Places with tokens at the beginning,
-    such as other resources, are not followed: what comes there is given back."""
+    """Follow the tokens that the first firing produced through the later firings. Return the
+    firings that moved some of them, and the places that they reached. Places that have tokens at
+    the beginning, such as other resources, are not followed: a token that arrives there was
+    returned."""
     given = [{p for p, _ in arcs if not net.initial[p]} for arcs in net.produce]
     movers, carried = list[int](), given[order[0]]
     for t in order[1:]:
@@ -159,7 +161,7 @@ def _carried(net: Net, order: list[int]) -> tuple[list[int], set[int]]:
 
 
 def _leads(net: Net, places: set[int], givers: set[int]) -> bool:
-    """Whether arcs lead from one of the places to a giver."""
+    """Return whether arcs lead from one of the places to a transition that fills the place."""
     reached = set(places)
     while True:
         fed = {t for t, arcs in enumerate(net.consume) if reached & {p for p, _ in arcs}}

@@ -62,9 +62,9 @@ class TooLarge(ValueError):  # noqa: N818 - a limit of the analysis
 
 @dataclass(frozen=True, slots=True)
 class _Outcome:
-    """Where a stimulus leads: the state, the number of the edge (-1 if it has none), by clock of
-    that state the clock of the state before that continues (-1 for a new one), and the share of
-    this outcome among those of the same stimulus."""
+    """One outcome of a stimulus: the next state, the number of the edge (-1 if it has none), for
+    each clock of the next state the clock of the present state that continues as it (-1: a new
+    clock), and the probability of this outcome."""
 
     state: int
     edge: int
@@ -79,16 +79,16 @@ class _Plan:
     slots: tuple[tuple[str, str], ...]
     """What has a clock: ("run", id) or ("timer", transition)."""
     at_once: tuple[_Outcome, ...]
-    """What comes first and takes no time; else what follows."""
+    """Outcomes that take no time. If there are any, they come before all others."""
     ends: dict[tuple[int, str], list[_Outcome]]
-    """By slot and what its clock ends in."""
+    """Outcomes by slot and by how its clock ends."""
     events: list[tuple[float, _Outcome]]
-    """Exponential waits: rates (1/s)."""
+    """Outcomes that come after an exponential wait, each with its rate (1/s)."""
 
 
 @dataclass(frozen=True)
 class ExecutionChain:
-    """The chain: edges with their probabilities, and mean times (s) by state."""
+    """The Markov chain: edges with their probabilities, and mean times (s) by state."""
 
     x: ExecutionGraph
     graph: Graph
@@ -104,7 +104,7 @@ class ExecutionChain:
 
     @property
     def taken(self) -> Values:
-        """How often a mission run takes each edge (in what it does not repeat for ever)."""
+        """How often a mission run takes each edge, before it repeats a part for ever."""
         return self._weights[0]
 
     @cached_property
@@ -151,7 +151,7 @@ class ExecutionChain:
         h, y = self._reach(goal)
         to = self.graph.target[taken]
         whole = float(weight.sum())
-        if not whole:  # reached with a probability too small to be computed
+        if not whole:  # the probability of reaching it is below floating-point precision
             weight, whole = np.ones(len(to)), float(len(to))
         p, time = float(weight @ h[to]) / whole, float(weight @ y[to]) / whole
         return min(p, 1.0), time / p if p else float("nan")
@@ -193,7 +193,7 @@ def chain_of(
 
 
 class _Builder:
-    """Finds the states of the chain from the beginning, breadth first."""
+    """Finds the states of the chain, breadth first from the first one."""
 
     def __init__(self, x: ExecutionGraph, measured: Measured, size: int) -> None:
         self.x, self.measured, self.size = x, measured, size
@@ -265,7 +265,7 @@ class _Builder:
         return found
 
     def leave(self, i: int) -> float:
-        """Add the edges of a state of the chain; return its mean time (s)."""
+        """Add the edges that leave a state of the chain; return its mean time (s)."""
         state, clocks = self.states[i]
         plan = self.plan(state)
         if plan.at_once:
@@ -293,7 +293,7 @@ class _Builder:
         ends: list[tuple[float, list[_Outcome]]],
         total: float,
     ) -> None:
-        """Add the edges of what ends, each with the draws of the clocks that start with it."""
+        """Add the edges of a clock that ends, each with the draws of the clocks that start then."""
         for rate, outcomes in ends:
             for one in outcomes:
                 for p, after in self.drawn(one.state, one.kept, clocks):
@@ -430,7 +430,8 @@ class _Builder:
             elif isinstance(stimulus, VariableChanged):
                 raise NoEstimate(f"no rate at which the variable `{stimulus.name}` changes")
         shared = {key: self.shares(slots[key[0]][1], given) for key, given in ends.items()}
-        for k, what in list(shared):  # without a reader, failure is told as success
+        # where no condition reads the status, the graph merges failure with success
+        for k, what in list(shared):
             if what == Status.SUCCESS:
                 shared.setdefault((k, str(Status.FAILURE)), shared[k, what])
         return _Plan(slots, (), shared, events)
@@ -444,7 +445,8 @@ class _Builder:
         ends: dict[tuple[int, str], list[_Outcome]],
         events: list[tuple[float, _Outcome]],
     ) -> None:
-        """Add an external event: as a cause that its run has drawn, or after a wait."""
+        """Add an external event: as the cause that its run has drawn for its end, or after a
+        wait."""
         compiled = self.x.engine.compiled
         kept, others = event in compiled.kept, False
         for t in compiled.waiting[event]:
@@ -460,7 +462,7 @@ class _Builder:
     def slots_of_cause(
         self, state: State, transition: str, number: dict[tuple[str, str], int]
     ) -> list[int]:
-        """Return the runs that draw whether the transition preempts them."""
+        """Return the runs that draw whether this transition will preempt them."""
         return [
             number["run", run.id]
             for run in state.runs()
@@ -468,7 +470,8 @@ class _Builder:
         ]
 
     def at_once(self, state: State, made: list[tuple[Cause, _Outcome]]) -> tuple[_Outcome, ...]:
-        """Return what takes no time: a draw by weight, else a choice of action, else a stop."""
+        """Return the outcomes that take no time: of a draw by weight, else of a choice of action,
+        else of a stop."""
         draw = state.suspended
         if draw is not None and draw.key:
             total = sum(draw.weights) or 1.0
@@ -500,8 +503,8 @@ class _Builder:
         return sum(p for other, p in shares.items() if devices.get(other, "") == mine)
 
     def shares(self, run: str, outcomes: list[_Outcome]) -> list[_Outcome]:
-        """Return what a run that ends in one status can lead to, with the shares: by the measured
-        frequencies of the conditions, else equal."""
+        """Return the outcomes of a run that ends with one status, with their shares: by the
+        measured frequencies of the conditions, else equal shares."""
         different = {(o.state, o.edge < 0 or self.fired(o)): o for o in outcomes}
         if len(different) == 1:
             return [outcomes[0]]

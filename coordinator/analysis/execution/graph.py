@@ -1,10 +1,11 @@
-"""The execution graph X: the states in which the engine rests, and what leads from one to the next.
+"""The execution graph X: the states in which the engine rests, and the stimuli that lead from one
+to the next.
 
 The successor of a state under a stimulus is what `Engine.handle` gives; there is no second firing
-rule. Two engine states are one state of X when they differ in nothing that the future depends on
+rule. Two engine states are one state of X if all parts on which the future depends are equal
 (`names.py`). States are numbered in breadth-first order, 0 is the state after `Begin`, so the path
-to a state is shortest. The first engine state found stands for all that are the same; hence each
-path along the search tree can be replayed by the engine as it is.
+to a state is shortest. The first engine state found represents all equal ones; so the engine can
+replay each path along the search tree exactly.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class Step:
 
     @property
     def reason(self) -> str:
-        """The reason of a run that ended, as it is written; empty where nothing reads it."""
+        """Return the reason of a run that ended, as text; empty where no condition reads it."""
         return self.text.partition(REASON)[2].partition(",")[0]
 
     def __str__(self) -> str:
@@ -71,9 +72,9 @@ class ExecutionGraph:
     names: Names
     states: tuple[State, ...]
     orders: tuple[Orders, ...]
-    """By state: which of its timers elapses before which."""
+    """By state: pairs of its timers of which the first elapses before the second."""
     came: tuple[tuple[int, Stimulus] | None, ...]
-    """By state: the state and the stimulus by which it was first found."""
+    """By state: the state before it on the search tree, and the stimulus that led from there."""
     source: NDArray[np.int32]
     target: NDArray[np.int32]
     label: NDArray[np.int32]
@@ -87,13 +88,13 @@ class ExecutionGraph:
     livelocks: tuple[int, ...]
     """States after which transitions fire for ever without a stimulus."""
     crowded: dict[str, int]
-    """By action place that should hold one run: a state in which it holds more."""
+    """By action place with one server: a state in which it has more tokens."""
     contests: dict[tuple[str, ...], int]
-    """Conflicts that neither priority nor weight settles: a state in which it comes to that."""
+    """By conflict that neither priority nor weight decides: a state in which it occurs."""
     index: Mapping[Hashable, int] = field(repr=False)
-    """By what the future of a state depends on: its number."""
+    """Number of each state, by the parts of it on which the future depends."""
     by_hand: Mask
-    """Which edges are commands of the operator; only `with_operator` makes such."""
+    """Which edges are commands of the operator; only `with_operator` adds them."""
 
     def __len__(self) -> int:
         return len(self.states)
@@ -137,11 +138,11 @@ class ExecutionGraph:
 
     @cached_property
     def dead(self) -> Mask:
-        """States that are no end, and from which neither a firing nor an end can be reached without
-        the operator."""
+        """States that are not an end, and from which neither a firing nor an end can be reached
+        without the operator."""
         alive = self.final | self.given_up
         alive[self.source[self.fires & ~self.by_hand]] = True
-        alive[self.expanded :] = True  # not examined
+        alive[self.expanded :] = True  # its edges were not explored
         return ~self.graph.backward(alive, ~self.by_hand)
 
     def path(self, state: int) -> list[Step]:
@@ -156,8 +157,8 @@ class ExecutionGraph:
         return found[::-1]
 
     def stimuli(self, state: int) -> list[Stimulus]:
-        """Return stimuli, `Begin` first, by which the engine comes from its initial state to
-        exactly `states[state]`."""
+        """Return stimuli, `Begin` first, that lead the engine from its initial state to exactly
+        `states[state]`."""
         found = list[Stimulus]()
         while (came := self.came[state]) is not None:
             state = came[0]
@@ -165,8 +166,8 @@ class ExecutionGraph:
         return [Begin(), *reversed(found)]
 
     def follow(self, state: int, cause: Cause) -> tuple[State, int, int]:
-        """Let the engine handle a stimulus in an expanded state. Return its state with the ids that
-        follow from there, the number of that state in the graph, and the edge; -1 if nothing
+        """Let the engine handle a stimulus in an expanded state. Return the engine's next state
+        with its own ids, the number of that state in the graph, and the edge; -1 if nothing
         changes."""
         before = self.states[state]
         after, said = self.engine.handle(before, cause.stimulus)
@@ -204,19 +205,18 @@ def execute(
 ) -> ExecutionGraph:
     """Explore the execution graph of a task, up to a limit in stimuli and firings.
 
-    With `free_choice` a conflict that neither priority nor weight settles may go either way.
-    `contests` are the transitions of each such conflict, if they are known; states then differ in
-    the order of waiting of these only.
-    Raises TooManyValues.
+    With `free_choice`, any transition may win a conflict that neither priority nor weight decides.
+    `contests` are the transitions of each such conflict, if they are known; then only their order
+    of waiting distinguishes states. Raises TooManyValues.
     """
     engine = engine or Engine(task, policy=Policy(ask_undecided=free_choice))
     return _Search(engine, Names(engine, contests)).run(limit)
 
 
 def with_operator(x: ExecutionGraph, *, limit: int = STEPS) -> ExecutionGraph:
-    """Continue a complete execution graph with the operator's commands: tokens that he puts into or
-    takes out of control places, one at a time, within their capacities (without a capacity: up to
-    one more than at the beginning).
+    """Continue a complete execution graph with the operator's commands: tokens added to or removed
+    from control places, one at a time, within their capacities (without a capacity: up to one more
+    than at the beginning).
 
     The states after one command come first, then those after two, and so on, until some are dead
     ends or conflicts. The numbers of the given states stay the same.
@@ -280,7 +280,8 @@ class _Search:
         return found
 
     def _explore(self, i: int, limit: int) -> int:
-        """Follow the stimuli of the states from i on; return the first that was left out."""
+        """Follow the stimuli of the states from number i on; return the first state that was not
+        explored."""
         while i < len(self.states) and self.handled < limit:
             self._follow(i, self._causes(i))
             i += 1

@@ -1,7 +1,8 @@
-"""What of an engine state the future depends on, up to names; and the stimuli that can come in it.
+"""The parts of an engine state on which the future depends, and the stimuli that can arrive in a
+state.
 
 A state of the execution graph keeps tokens, runs in their order, latched events, armed timers, an
-open draw, and of each variable that a condition reads only its region. It drops ids, counters,
+open draw, and for each variable that a condition reads, only its region. It drops ids, counters,
 clocks, records, reports and arguments: no firing depends on them (docs/execution-graph.md).
 """
 
@@ -41,41 +42,43 @@ from petrobot.coordinator.task.validation import is_pulse
 RUN_FIELDS = ("status", "reason", "executed")
 """What conditions may ask of a run: `PLACE.status` and so on."""
 OUTCOMES = 256
-"""The most combinations of values and reasons that one end of a run is tried with."""
+"""The most combinations of values and reasons that are tried for one end of a run."""
 
 BY_HAND = "the operator"
-"""How the operator's commands begin in words."""
+"""First words of the operator's commands in a path."""
 
 REASON = "reason "
-"""How the reason of a run begins in the words of a stimulus."""
+"""Words before the reason of a run in a path."""
 
 Orders = frozenset[tuple[str, str]]
 """Pairs of armed timers, by their transitions: the first elapses before the second."""
 
 
 class TooManyValues(ValueError):  # noqa: N818 - a limit of the analysis, not a fault of the task
-    """A run can end with more combinations of values than are tried."""
+    """A run can end with too many combinations of values to try them all."""
 
 
 @dataclass(frozen=True)
 class Cause:
-    """A stimulus in a state, and how it reads."""
+    """A stimulus that can arrive in a state, and its words in a path."""
 
     stimulus: Stimulus
     text: str
 
 
 class Names:
-    """What the conditions of a task read, and so which parts of a state count."""
+    """The names that conditions of a task read, and so the parts of a state that matter."""
 
     def __init__(self, engine: Engine, contests: Iterable[tuple[str, ...]] | None = None) -> None:
         """Collect them. `contests`: the transitions of each conflict that first come, first served
         may have to settle; None: not known. Raises TooManyValues."""
         self.engine = engine
-        if engine.policy.ask_undecided:  # each conflict may go either way, whoever waited longer
+        # any transition may win a conflict, so the order of waiting does not matter
+        if engine.policy.ask_undecided:
             contests = ()
         self._contests = None if contests is None else frozenset(contests)
-        """Conflicts in which the order of waiting counts; None: between any two transitions."""
+        """Conflicts in which the order of waiting matters; None: it matters between any two
+        transitions."""
         compiled = engine.compiled
         self.task = task = compiled.task
         conditions = [x.when for x in compiled.transitions if x.when is not None]
@@ -84,11 +87,11 @@ class Names:
         self._values = region_values(fixed, compiled.domains)
         self._literals, self._together = _compared(fixed)
         self.asked = {field: set[str]() for field in RUN_FIELDS}
-        """By what a condition asks of a run: places whose ended runs differ by it, because an arc
-        that takes them asks."""
+        """By property of a run that a condition reads: the places whose ended runs it
+        distinguishes, because an arc that takes them reads it."""
         read = {name for c in fixed for name in c.names}
         self.known = {n for n in read if n not in _run_names(task)}
-        """Names whose value counts beside the runs."""
+        """Other names whose value matters."""
         for x in compiled.transitions:
             for name in x.when.names if x.when is not None else ():
                 place, _, field = name.rpartition(".")
@@ -101,7 +104,8 @@ class Names:
         self._status_read = {n.rpartition(".")[0] for n in read if n.endswith(".status")}
         self.free = sorted(self.known & compiled.free)
         self._mixed = {a.name for x in compiled.transitions for a in x.actions if a.takes_done}
-        """Places where an arc takes ended and active runs, so that their common order counts."""
+        """Places with an arc that takes both ended and active runs, so that their common order
+        matters."""
         self._waits = {
             place: {
                 e
@@ -121,9 +125,9 @@ class Names:
                 if any(n in c.names for c in conditions)
             ]
         )
-        """What the verdicts take for granted, as clauses."""
+        """Assumptions of the verdicts, as clauses."""
 
-    # --- which states are the same -----------------------------------------------------------
+    # --- which states are equal --------------------------------------------------------------
 
     def key(self, state: State, orders: Orders) -> Hashable:
         """Return what the future of the state depends on."""
@@ -164,8 +168,8 @@ class Names:
         )
 
     def _waiting(self, state: State) -> Hashable:
-        """Return what each waiting transition waits for, and of each two that may come into one
-        conflict which has waited longer. No other order counts."""
+        """Return what each waiting transition waits for, and which of two has waited longer if they
+        may compete. No other order matters."""
         waits = state.waits
         if not waits or self._contests == frozenset():
             return ()
@@ -196,7 +200,7 @@ class Names:
         return ("done", status, told, raised, order)
 
     def region(self, name: str, value: Any) -> Hashable:
-        """Return the region of a name's value: what the comparisons can tell of it."""
+        """Return the region of a name's value: the results of all comparisons with it."""
         if name in self._together or value is MISSING:
             return (str(type(value).__name__), value if not isinstance(value, list | dict) else "")
         kind = (
@@ -212,10 +216,10 @@ class Names:
         )
         return (kind, value if kind == "bool" else None, told)
 
-    # --- what can come -----------------------------------------------------------------------
+    # --- which stimuli can arrive ------------------------------------------------------------
 
     def stimuli(self, state: State, orders: Orders) -> Iterator[Cause]:
-        """Yield every stimulus of the world that can come in the state, one of each kind."""
+        """Yield every stimulus of the world that can arrive in the state, one of each kind."""
         draw = state.suspended
         if draw is not None and draw.key:
             for name in draw.alternatives:
@@ -259,7 +263,7 @@ class Names:
             compiled, known = self.engine.compiled, set[str]()
             for action in compiled.primitives[run.place].alternatives:
                 device = compiled.devices.get(action, "")
-                if device not in known:  # actions on the same device are the same to the net
+                if device not in known:  # the net does not distinguish actions on the same device
                     known.add(device)
                     yield Cause(Chosen(run.id, action), f"{name} starts")
         elif run.phase in ACTIVE:
@@ -285,7 +289,7 @@ class Names:
                 yield Cause(EventOccurred(event.name), f"{event.name} comes")
 
     def _ends_of(self, place: str) -> list[tuple[RunEnded, str]]:
-        """Return all ends of a run that something can tell apart, and how each reads."""
+        """Return all ends of a run that some condition distinguishes, each with its words."""
         out = self.task.places[place].out
         read = {result: name for result, name in out.items() if name in self.known}
         statuses = [s for s in Status if s is not Status.FAILURE or place in self._status_read]
@@ -356,7 +360,8 @@ def _run_names(task: Any) -> set[str]:
 
 
 def _compared(conditions: list[Any]) -> tuple[dict[str, list[Any]], set[str]]:
-    """Return the literals that each name is compared with, and the names compared with others."""
+    """Return the literals that each name is compared with, and the names that are compared with
+    other names."""
     literals: dict[str, list[Any]] = {}
     together = set[str]()
     for node in (n for c in conditions for n in walk(c.tree) if isinstance(n, Compare)):

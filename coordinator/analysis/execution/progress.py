@@ -1,12 +1,12 @@
-"""Verdicts of progress, judged on the execution graph: can a task get stuck, can it always come to
-its end, does it recover from its errors.
+"""Verdicts of progress, judged on the execution graph: whether a task can get stuck, can always
+reach its end, and recovers from its errors.
 
 Notation: an *end* is a state in which the engine has finished with `final` or `final_error`; a
-*dead end* is a state that is no end and from which neither a firing nor an end can be reached. G
-are the nominal states: no place of an error branch is marked. A task ends, so live, proper, stable
-and controllable are judged with an edge from each `final` state to the first state. What
-`final_error` leaves stays: only `mended` adds edges from there too, which assumes that somebody
-mends it.
+*dead end* is a state that is not an end and from which neither a firing nor an end can be reached.
+G are the nominal states: no place of an error branch is marked. A task ends, so live, proper,
+stable and controllable are judged with an edge from each `final` state to the first state. A
+`final_error` state keeps its marking: only `mended` adds edges from there too, on the assumption
+that the operator repairs what is left.
 
 Recovery from an error exit is judged on the graph as it is, from the firings of the exit in a
 nominal state, and G absorbs. *Possible*: G can be reached from every state just after the exit.
@@ -45,7 +45,7 @@ from petrobot.coordinator.task.compiled_task import CompiledTransition
 
 FAIR = "every awaited event comes at some time, and a run may always end in each of its ways"
 """What progress needs of the world."""
-MENDED = "somebody mends what `final_error` leaves and starts the task again"
+MENDED = "the operator repairs what `final_error` leaves and starts the task again"
 AGAIN = {
     "live": "from every state every transition can fire again",
     "proper": "the next mission can begin from every state",
@@ -67,9 +67,9 @@ NAMES = (
 )
 """The verdicts that are judged here."""
 GROUPS = 20
-"""The most dead ends that are told one by one."""
+"""The most dead ends that are described one by one."""
 EXAMINED = 1_000
-"""The most states of dead ends whose end is looked for; the nearest come first."""
+"""The most dead-end states that are followed to where they stop; the nearest come first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +87,11 @@ class Recovery:
     the task has no goal transitions, or meets its goal again and again."""
     strategy: tuple[str, ...]
     """The fewest firings from a state just after the error back to the nominal flow; empty if there
-    is no way."""
+    is no such path."""
     alone: bool = True
     """Whether it can fire in the nominal flow; False: only while another error is handled."""
     cause: str = ""
-    """The cause of the error (`'lost'`), where another has other verdicts; else empty."""
+    """The cause of the error (`'lost'`) if the verdicts differ between causes; else empty."""
 
     @property
     def name(self) -> str:
@@ -106,11 +106,11 @@ class Recovery:
 
 @dataclass(frozen=True)
 class Odds:
-    """How probable the way back from each error exit is, and how long it takes."""
+    """Probability and mean time of the return to the nominal flow, for each error exit."""
 
     by_exit: Mapping[str, tuple[float, float]]
-    """By `Recovery.name`: probability, and mean time (s) given that there is a way back (nan if
-    there is none). Exits that fire with probability 0 are not in it."""
+    """By `Recovery.name`: probability of returning, and mean time (s) given a return (nan if there
+    is none). Exits that fire with probability 0 are left out."""
     stages: int
     """The most phases by which a duration is approximated."""
     assumptions: tuple[str, ...] = ()
@@ -120,12 +120,12 @@ class Odds:
 
 @dataclass(frozen=True, slots=True)
 class Contest:
-    """A conflict that neither priority nor weight settles: first come, first served."""
+    """A conflict that neither priority nor weight decides: first come, first served."""
 
     transitions: tuple[str, ...]
-    """In the order of the file, which settles a tie."""
+    """In the order of the file, which decides a tie."""
     over: tuple[str, ...]
-    """The places of which they want the same token."""
+    """The places whose token they compete for."""
     matters: Mapping[str, str]
     """The verdicts that would not hold if another fired, with their reasons."""
 
@@ -141,20 +141,20 @@ class DeadEnd:
 
 @dataclass(frozen=True)
 class Progress:
-    """The verdicts on an execution graph. If the graph is not complete, only what was found can be
-    refused; all else is unknown."""
+    """The verdicts on an execution graph. If the graph is not complete, a verdict is either refuted
+    by what was found or unknown."""
 
     x: ExecutionGraph
     view: OrdinaryView
     measured: Measured | None = None
     """Numbers for `odds`; None: those that the task declares."""
     free: Progress | None = None
-    """The same with conflicts that may go either way, where neither priority nor weight settles
-    some; else None."""
+    """Progress of the execution graph in which any transition may win a conflict that neither
+    priority nor weight decides; None if there is no such conflict."""
 
     @cached_property
     def contests(self) -> tuple[Contest, ...]:
-        """The conflicts that neither priority nor weight settles."""
+        """The conflicts that neither priority nor weight decides."""
         if self.free is None:
             return ()
         named = {t.name: t for t in self.x.engine.compiled.transitions}
@@ -168,7 +168,7 @@ class Progress:
         return tuple(Contest(rivals, self._over(rivals), matters) for rivals in order)
 
     def _over(self, rivals: Sequence[str]) -> tuple[str, ...]:
-        """Return the places and events of which the transitions want the same one."""
+        """Return the places and events for which the transitions compete."""
         compiled = self.x.engine.compiled
         wanting = [compiled.transitions[compiled.net.transition_index[name]] for name in rivals]
         shared = set.intersection(*({p for p, _ in t.needs} for t in wanting))
@@ -179,8 +179,8 @@ class Progress:
 
     def hand_notes(self, limit: int) -> list[str]:
         """Return the dead ends and conflicts that need tokens which the operator moves, in words,
-        from a second graph within a limit in stimuli and firings. Nothing is said of a task that
-        gets stuck without him."""
+        from a second graph within a limit in stimuli and firings. Empty for a task that gets stuck
+        even without the operator."""
         own = self.x if self.free is None else self.free.x
         if not own.complete or own.dead.any() or own.livelocks:
             return []
@@ -191,7 +191,7 @@ class Progress:
             for rivals, state in x.contests.items()
             if rivals not in own.contests
         ]
-        # One for the same commands and the same places: the control places are in his hand.
+        # One dead end per set of commands and places: the operator controls the control places.
         stuck: dict[tuple[str, ...], int] = {}
         control = {p.name for p in own.names.task.places.values() if p.kind is Kind.CONTROL}
         for i in sorted({settled(x, int(i)) for i in np.flatnonzero(x.dead)[:EXAMINED]}):
@@ -210,7 +210,7 @@ class Progress:
             ]
         return said
 
-    # --- stuck, or for ever on its way ------------------------------------------------------
+    # --- stuck, or active for ever ----------------------------------------------------------
 
     @cached_property
     def dead_ends(self) -> tuple[DeadEnd, ...]:
@@ -272,7 +272,7 @@ class Progress:
         return PropertyVerdict(False, "; ".join(told))
 
     def _fed_by(self, t: CompiledTransition, idle: set[int]) -> bool:
-        """Whether the transition needs a token that only transitions of `idle` give."""
+        """Return whether the transition needs a token that only transitions in `idle` produce."""
         net = self.x.engine.compiled.net
         for p, w in t.needs:
             givers = {u for u, arcs in enumerate(net.produce) if p in dict(arcs)}
@@ -281,8 +281,8 @@ class Progress:
         return False
 
     def _never(self, t: int) -> str:
-        """Return why a transition never fires, in the words of the first thing that it lacks in
-        every state."""
+        """Return in words why a transition never fires: the first requirement that fails in every
+        state."""
         from petrobot.coordinator.engine.draft import Draft
         from petrobot.coordinator.engine.firing import obstacles
 
@@ -326,8 +326,8 @@ class Progress:
 
     @cached_property
     def mended(self) -> dict[str, PropertyVerdict]:
-        """The verdicts from mission to mission that do not hold, judged again as if somebody mended
-        what `final_error` leaves and started the task again."""
+        """The verdicts from mission to mission that do not hold, judged again on the assumption
+        that the operator repairs what `final_error` leaves and starts the task again."""
         if not self.x.complete or not self.x.given_up.any():
             return {}
         again = _Again(self.x, self.x.final | self.x.given_up)
@@ -390,7 +390,7 @@ class Progress:
 
     @cached_property
     def returned(self) -> PropertyVerdict:
-        """Every resource has its first number of tokens at the end."""
+        """Every resource has its initial number of tokens at the end."""
         net = self.x.engine.compiled.net
         ends = np.flatnonzero(self.x.final)
         for place in self.x.engine.compiled.task.places.values():
@@ -410,7 +410,7 @@ class Progress:
 
     @cached_property
     def _nominal(self) -> Mask:
-        """G, without the states in which the task gave up or got stuck."""
+        """Return G without the states in which the task gave up or got stuck."""
         good = (self.view.is_nominal(s.marking) and not s.stopping for s in self.x.states)
         nominal = np.fromiter(good, np.bool_, len(self.x))
         mask: Mask = nominal & ~self.x.given_up & ~self.x.dead
@@ -418,7 +418,8 @@ class Progress:
 
     @cached_property
     def recoveries(self) -> tuple[Recovery, ...]:
-        """What happens after each error exit that can fire; empty if the graph is not complete."""
+        """Return what happens after each error exit that can fire; empty if the graph is not
+        complete."""
         if not self.x.complete:
             return ()
         nested = list(self._nested())
@@ -441,8 +442,8 @@ class Progress:
         return tuple(found)
 
     def _first_errors(self, name: str, cause: str = "") -> tuple[NDArray[np.int64], bool]:
-        """Return the edges by which an error exit fires in the nominal flow, and True; if there are
-        none, all by which it fires, and False. `cause`: only those after that cause of the
+        """Return the edges that fire an error exit in the nominal flow, and True; if there are
+        none, all edges that fire it, and False. `cause`: only edges after this cause of the
         error."""
         edges = np.flatnonzero(self.x.firing([name]))
         first = edges[self._nominal[self.x.source[edges]]]
@@ -450,7 +451,7 @@ class Progress:
         return (self._by_cause(found)[cause] if cause else found), alone
 
     def _by_cause(self, edges: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
-        """Return the edges by the cause of the error, where the conditions tell causes apart."""
+        """Return the edges by cause of the error, if conditions distinguish causes."""
         causes = np.array([self.x.steps[n].reason for n in self.x.label[edges]])
         return {str(cause): edges[causes == cause] for cause in np.unique(causes)}
 
@@ -539,8 +540,8 @@ class Progress:
 
     @cached_property
     def _goals(self) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
-        """By edge, the goals that it meets; by state, the most goals that can still be met: the
-        longest path. None without goals, or where there is no most."""
+        """Return by edge the goals that it meets, and by state the most goals that can still be met
+        (a longest path). None without goals, or if their number has no limit."""
         x, goals = self.x, set(self.view.task.goal_transitions)
         each = [sum(name in goals for name in step.firings) for step in x.steps]
         gain = np.array(each or [0], dtype=np.int64)[x.label]
@@ -556,8 +557,8 @@ class Progress:
 
     @cached_property
     def odds(self) -> Odds:
-        """How probable the way back from each error exit is, and how long it takes, by the numbers
-        that are measured or declared."""
+        """Return probability and mean time of the return from each error exit, by the measured or
+        declared numbers."""
         if not self.recoveries:
             return Odds({}, 0)
         try:
@@ -575,7 +576,7 @@ class Progress:
     # --- words -----------------------------------------------------------------------------------
 
     def verdicts(self) -> dict[str, PropertyVerdict]:
-        """Return all of them by name."""
+        """Return all verdicts by name."""
         return {name: getattr(self, name) for name in NAMES}
 
     def size(self) -> dict[str, Any]:
@@ -619,9 +620,9 @@ class Progress:
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """What is no fault but may surprise: what is assumed of variables, and places whose tokens
-        at the end depend on the path. These may be left over, lost, or a counter on purpose; only
-        the author knows."""
+        """Return notes on what is not a fault but may surprise: assumptions about variables, and
+        places whose tokens at the end depend on the path. Such a token may be left over, lost, or
+        counted on purpose; only the author knows."""
         said = [f"assumes that {text}" for text in self.x.names.assumptions]
         ends = [self.x.states[int(i)].marking for i in np.flatnonzero(self.x.final)]
         for p, place in enumerate(self.x.engine.compiled.net.places):
@@ -693,7 +694,7 @@ class _Again:
         self.steps = (*x.steps, Step(NEXT, x.first))
 
     def in_every_bottom(self) -> set[str]:
-        """Return the transitions that fire again and again whatever happened."""
+        """Return the transitions that fire again and again in every bottom component."""
         every: set[str] | None = None
         ours = self.graph.components[self.graph.source]
         for component in np.flatnonzero(self.graph.bottom).tolist():
@@ -705,8 +706,8 @@ class _Again:
     def without(
         self, wanted: Mapping[str, frozenset[str]], verb: str, nothing: str
     ) -> tuple[int, str] | None:
-        """Return a state from which some of the wanted never happen again, in words. Each wanted is
-        a name with the transitions of which one must fire."""
+        """Return a state from which one of the wanted firings never happens again, and which one,
+        in words. `wanted`: names, each with transitions of which one must fire."""
         components = self.graph.components
         ours = components[self.graph.source]
         _, entered = np.unique(components, return_index=True)
@@ -729,5 +730,5 @@ def _by(x: ExecutionGraph, state: int) -> str:
 
 
 def _lack(kind: str, text: str) -> str:
-    """What a transition lacks, without the number of tokens that a state happens to have."""
+    """Return what a transition lacks, without the number of tokens of the particular state."""
     return text.partition(", which")[0] if kind == "short" else text.partition(", which holds")[0]

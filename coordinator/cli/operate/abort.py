@@ -14,12 +14,12 @@ EXAMPLE = "petrobot abort"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     hand.add_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Abort."""
+    """Give the command, and print the answer."""
     return hand.give(options, "abort", told=_told)
 
 

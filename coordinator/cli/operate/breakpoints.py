@@ -17,7 +17,7 @@ EXAMPLE = "petrobot break start"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument("element", nargs="?", help="a transition or place of the task")
     parser.add_argument("--off", action="store_true", help="remove this breakpoint")
     hand.add_arguments(parser)

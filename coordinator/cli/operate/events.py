@@ -14,13 +14,13 @@ EXAMPLE = "petrobot raise image_tick"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument("event", help="an external event of the task")
     hand.add_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Raise."""
+    """Give the command, and print the answer."""
 
     def data(client: OperatorClient) -> dict[str, Any]:
         external = {

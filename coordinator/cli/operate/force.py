@@ -15,14 +15,14 @@ EXAMPLE = "petrobot force catch_ball missed"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument("place", help="an action place of the task")
     parser.add_argument("exit", help="an outgoing transition of that place")
     hand.add_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Force."""
+    """Give the command, and print the answer."""
 
     async def told(client: OperatorClient, answer: hand.Answer) -> str:
         return f"fired {options.exit}, and took the token out of {options.place}"

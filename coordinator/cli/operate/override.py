@@ -15,7 +15,7 @@ EXAMPLE = "petrobot override track_ball predict_kalman"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument("task", help="a primitive task")
     parser.add_argument("action", nargs="?", help="the action to use from now on")
     parser.add_argument("--free", action="store_true", help="let the run choose again")
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Override."""
+    """Give the command, and print the answer."""
     if options.free is (options.action is not None):
         raise CommandError(2, f"name an action for {options.task}, or give --free")
 

@@ -21,12 +21,12 @@ WORDS = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     hand.add_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Pause."""
+    """Give the command, and print what each node reports."""
     return hand.give(options, "pause", told=_told)
 
 

@@ -16,12 +16,12 @@ PATIENCE = 2.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     hand.add_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Step."""
+    """Give the command, and print which transition fired."""
     seen = 0
 
     def look(client: OperatorClient) -> dict[str, object]:

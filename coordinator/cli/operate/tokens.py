@@ -14,14 +14,14 @@ EXAMPLE = "petrobot token runs +2"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     parser.add_argument("place", help="a control place of the task")
     parser.add_argument("tokens", type=_change, help="how many to add (+2) or to remove (-1)")
     hand.add_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Add or remove."""
+    """Give the command, and print the answer."""
     verb = "add_tokens" if options.tokens > 0 else "remove_tokens"
 
     def data(client: OperatorClient) -> dict[str, Any]:

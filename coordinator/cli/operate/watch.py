@@ -24,7 +24,7 @@ ENDED = {"success": 0, "failure": 1, "error": 1, "aborted": 1, "stopped": 1}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Add the command's options."""
     hand.add_run_arguments(parser)
     parser.add_argument(
         "--as",
@@ -43,7 +43,8 @@ def run(options: argparse.Namespace) -> int:
         return asyncio.run(_watch(options, sys.stdout))
     path, lines = Path(options.json), io.StringIO()
     try:
-        with path.open("a", encoding="utf-8") as file:  # fails now if it cannot be written
+        # Opened before connecting, so that a file that cannot be written is reported at once.
+        with path.open("a", encoding="utf-8") as file:
             if not path.is_file():  # a pipe or a terminal: every line at once
                 return asyncio.run(_watch(options, file))
         try:

@@ -12,7 +12,7 @@ from typing import Any
 from petrobot import Cancelled, Context, Remote, Result, error, success
 
 WRITING = 5.0
-"""s for a write."""
+"""Limit of a write (s)."""
 
 
 async def write(ctx: Context[Remote], *, values: Mapping[str, Any]) -> Result:
@@ -36,10 +36,10 @@ async def handshake(
     expect: Any = True,
     timeout: float = 10.0,
 ) -> Result:
-    """Ask a machine for something: write `request` = `value`, wait until `acknowledge` becomes
+    """Request something of a machine: write `request` = `value`, wait until `acknowledge` becomes
     `expect`, withdraw the request by writing `idle`, and wait until the acknowledgement ends. Each
-    of both waits takes at most `timeout` s. The request is withdrawn, too, when nothing
-    acknowledges it and when the run is cancelled."""
+    of the two waits takes at most `timeout` s. The request is also withdrawn if nothing
+    acknowledges it, and if the run is cancelled."""
     device = ctx.device
 
     def acknowledged() -> bool:

@@ -1,7 +1,8 @@
-"""Driver of an OPC UA server: class `OpcUaSession`, one client session in a thread of its own.
+"""Driver of an OPC UA server: class `OpcUaSession`, one client session in its own thread.
 
-Its command is `{"write": {NAME: value, ...}}`. Its state has `values` by name, `up`, `faults`, and
-how many writes were asked for (`asked`) and are `done`; `write_fault` is why the last one failed.
+Its command is `{"write": {NAME: value, ...}}`. Its state has `values` by name, `up`, `faults`, the
+number of writes requested (`asked`) and finished (`done`), and `write_fault`: why the last one
+failed.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from petrobot import Driver, Ports, key
 RETRY: Final = (0.5, 8.0)
 """Shortest and longest pause between two attempts to connect (s)."""
 LOOK: Final = 0.3
-"""s between two looks whether the link lives."""
+"""Time between two checks of the connection (s)."""
 DOWN: Final = "no session yet"
 
 
 class OpcUaSession(Driver):
-    """One OPC UA server: nodes with names, events from their values."""
+    """One OPC UA server: named nodes, and events from their values."""
 
     period = 0.02
     url: str = key(text="as opc.tcp://192.168.0.10:4840")
@@ -103,7 +104,7 @@ class OpcUaSession(Driver):
         self._loop.call_soon_threadsafe(self._jobs.put_nowait, (self._asked, values))
 
     def step(self, now: float) -> None:
-        """Take what the session's thread found out; raise events of values that changed."""
+        """Take over what the session's thread has received; raise events for changed values."""
         while not self._news.empty():
             kind, name, value = self._news.get()
             if kind == "up":
@@ -116,7 +117,7 @@ class OpcUaSession(Driver):
             else:
                 known, before = name in self.values, self.values.get(name)
                 self.values[name] = value
-                # The first value of a session is no change: what happened meanwhile is unknown.
+                # The first value of a session is not a change: the value before it is unknown.
                 for event, said in self.events.items() if known and before != value else ():
                     if said["node"] == name and value == said["becomes"]:
                         self.ports.raise_event(event, value=value)
@@ -138,13 +139,13 @@ class OpcUaSession(Driver):
             self._write(dict(self.on_stop))
 
     def stopped(self) -> bool:
-        """Whether there is a session and the server reports the values of `on_stop`."""
+        """Return whether there is a session and the server reports the values of `on_stop`."""
         rest = all(self.values.get(name) == value for name, value in self.on_stop.items())
         return rest and "session" not in self.faults
 
     def close(self) -> None:
         """End the session."""
-        with contextlib.suppress(RuntimeError):  # it has ended: closed twice
+        with contextlib.suppress(RuntimeError):  # the thread has ended: closed a second time
             self._loop.call_soon_threadsafe(self._jobs.put_nowait, None)
         self._thread.join(self.patience)
 
@@ -162,13 +163,13 @@ class OpcUaSession(Driver):
             try:
                 over = await self._session()
                 pause = RETRY[0]
-            except Exception as fault:  # the library raises many kinds
+            except Exception as fault:  # the library raises many kinds of exceptions
                 text = str(fault) or type(fault).__name__
                 self._news.put(("down", "", f"{text}; trying again"))
                 pause = RETRY[0] if self._was_up else min(2 * pause, RETRY[1])
             self._drop_writes()
             if not over:
-                with contextlib.suppress(TimeoutError):  # a write in a pause has no session
+                with contextlib.suppress(TimeoutError):  # a write between two sessions fails
                     over = await asyncio.wait_for(self._jobs.get(), pause) is None
 
     def _drop_writes(self) -> None:
@@ -232,7 +233,7 @@ class OpcUaSession(Driver):
         kinds: Mapping[str, Any],
         faults: Mapping[str, str],
     ) -> str:
-        """Write nodes, none if one of the values does not fit; return what is wrong."""
+        """Write nodes, but none if one of the values does not fit; return what is wrong."""
         from asyncua import ua
         from asyncua.ua.ua_binary import variant_to_binary
 
@@ -255,6 +256,6 @@ class OpcUaSession(Driver):
         return ""
 
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
-        """Take a notification (called by asyncua, in the session's thread)."""
+        """Receive a notification (called by asyncua, in the session's thread)."""
         plain = value if isinstance(value, bool | int | float | str | bytes | list) else str(value)
         self._news.put(("value", self._by_id[node.nodeid], plain))

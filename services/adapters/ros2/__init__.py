@@ -1,1 +1,1 @@
-"""ROS 2 through rosbridge, without ROS on this side (docs/robots/ros2.md)."""
+"""ROS 2 through rosbridge, without ROS on the host of petrobot (docs/robots/ros2.md)."""

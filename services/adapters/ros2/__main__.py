@@ -1,4 +1,4 @@
-"""OfferedTask a task to ROS 2 as an action: a goal starts a run, as an operator would start it.
+"""Offer a task to ROS 2 as an action: a goal starts a run, as an operator would start it.
 
     petrobot serve --up                                   prints the page's address, with its token
     python -m petrobot.services.adapters.ros2 deliver --page ADDRESS --url ws://ROBOT:9090
@@ -27,9 +27,9 @@ from petrobot.services.adapters.ros2.link import WebSocketLink
 
 _log = logging.getLogger(__name__)
 LOOK = 0.2
-"""Seconds between two looks at the run."""
+"""Time between two checks of the run (s)."""
 LATE = 10
-"""Looks after the end until the result is given up."""
+"""Checks after the end of the run, before the wait for its result is given up."""
 SUCCEEDED, CANCELLED, ABORTED = 4, 5, 6
 """action_msgs/msg/GoalStatus."""
 ENDS = ("success", "failure", "error", "aborted", "stopped")
@@ -82,7 +82,8 @@ class OfferedTask:
         self._goal = ""
         """Id of the active goal."""
         self._why = ""
-        """Why it is to be aborted: "cancelled" by its client, or "lost" with the link."""
+        """Why the run must be aborted: "cancelled" by the goal's client, or "lost" with the
+        link."""
         self._runs = set[asyncio.Task[None]]()
 
     async def serve(self, stop: asyncio.Event) -> None:
@@ -119,12 +120,12 @@ class OfferedTask:
             run.add_done_callback(self._runs.discard)
 
     async def _run(self, goal: str, args: Any) -> None:
-        """Start a run, follow it to its end, and tell both."""
+        """Start a run, follow it to its end, and report to ROS 2."""
         try:
             await self._follow(goal, await self._start(args))
         except (OSError, ValueError) as fault:
             self._result(goal, ABORTED, "refused", str(fault))
-        except Exception as fault:  # its client must not wait for ever
+        except Exception as fault:  # answer at once, so that the client does not wait for ever
             _log.exception("goal %s", goal)
             self._result(goal, ABORTED, "refused", f"{type(fault).__name__}: {fault}")
         finally:
@@ -163,7 +164,7 @@ class OfferedTask:
         while True:
             seen = await self._page.snapshot()
             if seen["mission"]["id"] == run and seen["mission"]["state"] in ENDS:
-                looks += 1  # its result comes a moment later
+                looks += 1  # the result comes shortly after the end
                 if seen["result"] is not None or looks > LATE:
                     break
             feedback = {
@@ -201,7 +202,7 @@ class OfferedTask:
 
 
 async def main(arguments: list[str]) -> int:
-    """The command."""
+    """Read the options and serve."""
     parser = argparse.ArgumentParser(prog="python -m petrobot.services.adapters.ros2")
     parser.description = "OfferedTask a task to ROS 2 as an action."
     parser.add_argument("task", help="name of a task that the page offers")

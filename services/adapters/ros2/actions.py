@@ -1,9 +1,9 @@
 """Primitive actions of a robot behind rosbridge; their device is a `bridge.Bridge`.
 
-All take a request in two parts: what is always the same (`goal`, `request`, `message`, written as
-in ROS) and, by `fields`, the paths at which the task's own arguments are put. `values` picks what
-the result has, by name and path (without it: all fields); a goal that succeeds with values other
-than those of `expect` is a FAILURE, cause `unexpected`.
+Their request has two parts: the constant part (`goal`, `request` or `message`, written as in ROS),
+and `fields`, the paths at which the task's arguments are inserted. `values` selects the values of
+the result, by name and path (default: all fields). A goal that succeeds with other values than
+those of `expect` is a FAILURE, cause `unexpected`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from petrobot.services.adapters.ros2.topics import fits
 
 Paths = Mapping[str, str]
 CONNECT, CANCEL = 5.0, 2.0
-"""Seconds that an action waits for the connection, and for the answer to its own cancel."""
+"""Limit of the wait for the connection, and of the wait for the answer to a cancel (s)."""
 
 
 async def goal(
@@ -43,7 +43,7 @@ async def goal(
     names variables of the global memory, `to_streams` streams of set points, with the paths of
     their values. Causes of ERROR: `link_down`, `bad_goal`, `rejected` (nothing was executed);
     `aborted`, `cancelled` (by another client), `timeout`, `bad_result`; `link_lost`, `unanswered`
-    (nobody knows what was executed).
+    (it is unknown what was executed).
     """
     try:
         args = _request(goal, fields, arguments)
@@ -67,7 +67,7 @@ async def call(
     expect: Mapping[str, Any] | None = None,
     **arguments: Any,
 ) -> Result:
-    """Call a service and return its response. Causes of ERROR: as of `goal`, and `failed`.
+    """Call a service and return its response. Causes of ERROR: those of `goal`, and `failed`.
     `service_type` is only used to check the request against its definition."""
     try:
         args = _request(request, fields, arguments)
@@ -87,7 +87,7 @@ async def wait_for(
     values: Paths | None = None,
 ) -> Result:
     """Wait for a message on a subscribed topic (its name in the device's table) with these values;
-    a list of two numbers is a range. `newest`: at most so old (s). ERROR `timeout`."""
+    a list of two numbers is a range. `newest`: greatest age of the message (s). ERROR `timeout`."""
 
     def found() -> bool:
         told = ctx.device.state["topics"][topic]
@@ -123,8 +123,8 @@ async def publish(
 async def drive(
     ctx: Context[Remote], *, streams: Sequence[str], seconds: float | None = None
 ) -> Result:
-    """Let the set points of these streams through to their topics, for so long or until cancelled;
-    then the set point of rest is sent."""
+    """Forward the set points of these streams to their topics, for so long or until cancelled; then
+    send the set point of rest."""
     if refused := await _command(ctx, {"drive": list(streams)}):
         return refused
     try:
@@ -218,11 +218,11 @@ async def follow_joint_trajectory(
     return await goal(ctx, action=action, action_type=name, goal=args, **options)
 
 
-# --- what they share ----------------------------------------------------------------------------
+# --- shared by the actions ----------------------------------------------------------------------
 
 
 class _Feedback:
-    """What becomes of a goal's feedback."""
+    """Passes on a goal's feedback: as progress, variables and set points."""
 
     def __init__(
         self, ctx: Context, remaining: str, memory: Paths, streams: Mapping[str, Sequence[str]]
@@ -231,7 +231,7 @@ class _Feedback:
         self.whole = 0.0
 
     async def take(self, feedback: Mapping[str, Any]) -> None:
-        """Pass one feedback message on. Raises ValueError for a path that is not in it."""
+        """Pass on one feedback message. Raises ValueError for a path that is not in it."""
         fraction = 0.0
         if self.remaining:
             left = float(pick(feedback, self.remaining))
@@ -255,14 +255,15 @@ def _not_executed(cause: str, text: str) -> Result:
 
 
 async def _command(ctx: Context[Remote], body: Mapping[str, Any]) -> Result | None:
-    """Send a command as soon as there is a connection; why it could not be, None if it was."""
+    """Send a command as soon as there is a connection. Return why that failed; None if it was
+    sent."""
     if not await ctx.wait(lambda: ctx.device.state.get("connected", False), CONNECT):
         return _not_executed("link_down", str(ctx.device.state.get("down", "no state yet")))
     try:
         await ctx.command(body)
     except CommandRefused as refusal:
         if not ctx.device.refused:
-            raise  # not taken in time
+            raise  # not accepted in time
         return _not_executed("bad_goal", str(refusal))
     return None
 
@@ -323,7 +324,7 @@ def _result(
     service: bool,
     timeout: float | None,
 ) -> Result:
-    """The result of a run whose goal or call ended in a phase, or is `late`."""
+    """Return the result of a run whose goal or call ended in a phase, or is `late`."""
     text, given = end.get("text", ""), end.get("values", {})
     if phase is ExchangePhase.SUCCEEDED:
         if end["fault"]:

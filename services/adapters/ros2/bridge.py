@@ -37,7 +37,7 @@ class Bridge(TopicDriver):
         return bool(self.epoch)
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """`goal` or `call` (a request, with `run` and `keep`), `cancel`, `forget`; as well as the
+        """Obey `goal` or `call` (a request, with `run` and `keep`), `cancel`, `forget`, and the
         commands of topics."""
         if "cancel" in body:
             self._send(now, self.exchanges.cancel(now, body["cancel"]))
@@ -59,7 +59,7 @@ class Bridge(TopicDriver):
             super().command(now, body)
 
     def step(self, now: float) -> None:
-        """Take what has come in, send what is due."""
+        """Process received messages, and send those that are due."""
         for kind, item in self.link.poll(now):
             if kind == "up":
                 self.epoch = item
@@ -67,7 +67,7 @@ class Bridge(TopicDriver):
             elif kind == "down":
                 self.epoch, self.down = 0, str(item)
                 self.advertised.clear()
-                self.topics.clear()  # what was true then
+                self.topics.clear()  # values from before the link was lost
                 self.exchanges.link(now, False)
             elif kind == "refused":
                 self.refuse(item)
@@ -97,7 +97,8 @@ class Bridge(TopicDriver):
             self.link.send(now, self.epoch, messages)
 
     def state(self) -> Mapping[str, Any]:
-        """That of topics, why the link is `down`, and goals and calls by run (`exchanges`)."""
+        """Return the state of topics, why the link is `down`, and goals and calls by run
+        (`exchanges`)."""
         exchanges = {
             name: {
                 "phase": str(one.phase),
@@ -119,8 +120,8 @@ class Bridge(TopicDriver):
         super().stop(now)
 
     def stopped(self) -> bool:
-        """Whether no goal is known to be active, as far as rosbridge tells, and no set point but
-        that of rest was sent."""
+        """Return whether rosbridge reports no active goal, and the last set points sent are those
+        of rest."""
         goals = (one for one in self.exchanges.open.values() if "action" in one.request)
         return super().stopped() and not any(one.phase in MOVING for one in goals)
 

@@ -1,7 +1,7 @@
 """Topics of ROS 2 directly over DDS, without rosbridge: needs the extra `ros2-dds`.
 
-Types are made from the user's .msg files. Only topics: services and actions are identified in ways
-that the Python binding of Cyclone DDS cannot write.
+Types are made from the user's .msg files. It supports topics only: the Python binding of Cyclone
+DDS cannot write the request ids of services and actions.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _ZERO: Mapping[str, Any] = {"float32": 0.0, "float64": 0.0, "bool": False, "stri
 EMPTY = "structure_needs_at_least_one_member"
 """The field that ROS 2 gives to a message without one."""
 DEPTH = 10
-"""Messages that are kept for a reader that is slow, as in ROS 2."""
+"""Messages that are kept for a slow reader, as in ROS 2."""
 
 
 class Types:
@@ -120,7 +120,7 @@ class Topics(TopicDriver):
             for name, interface in sorted(topics)
         ]
         for out in self.setpoints.values():
-            self._writer(out["topic"], out["type"])  # discovery takes a moment
+            self._writer(out["topic"], out["type"])  # discovery takes a short time
 
     def _topic(self, name: str, interface: str) -> Topic[Any]:
         return Topic(self._participant, f"rt/{name.lstrip('/')}", self._types.of(interface))
@@ -136,7 +136,7 @@ class Topics(TopicDriver):
         self._writer(topic, interface).write(self._types.make(interface, message))
 
     def step(self, now: float) -> None:
-        """Take what has come in, send the set points that are due."""
+        """Process received messages, and send the set points that are due."""
         for topic, reader in self._readers:
             for sample in reader.take(DEPTH):
                 if sample.sample_info.valid_data:

@@ -18,23 +18,23 @@ from petrobot.services.adapters.ros2.protocol import Message, parse
 
 _log = logging.getLogger(__name__)
 WAITING = 1000
-"""Most messages that wait in either direction: beyond it nothing is read, and a server that does
-not read is disconnected."""
+"""Most messages that wait in each direction. With so many received ones the link stops reading;
+with so many unsent ones it disconnects."""
 LARGEST = 4 << 20
 """Bytes of the largest message that is received."""
 FIRST_PAUSE, LONGEST_PAUSE = 0.2, 5.0
 """Seconds between two attempts to connect: doubled each time."""
 
 Item = tuple[str, Any]
-"""What a link reports, in order: ("up", number of the connection), ("down", why), ("message", it)
-or ("refused", why)."""
+"""One report of a link: ("up", number of the connection), ("down", reason), ("message", message) or
+("refused", reason)."""
 
 
 class WebSocketLink:
     """Keeps one connection to `url` (ws:// or wss://) open, and connects again when it breaks."""
 
     def __init__(self, url: str, heartbeat: float) -> None:
-        """After `heartbeat` s without a message the server must answer a ping (0: never asked)."""
+        """After `heartbeat` s without a message the server must answer a ping (0: no pings)."""
         self._url, self._heartbeat = url, heartbeat or None
         self._inbox: deque[Item] = deque()
         self._epoch = 0
@@ -47,18 +47,18 @@ class WebSocketLink:
         self._thread.start()
 
     def poll(self, now: float) -> list[Item]:
-        """Return what has come in since the last call."""
+        """Return the reports since the last call, in order."""
         return [self._inbox.popleft() for _ in range(len(self._inbox))]
 
     def send(self, now: float, epoch: int, messages: Iterable[Message]) -> None:
-        """Send messages over a connection, if it still is the newest. Never waits."""
+        """Send messages over a connection, if it is still the newest. Never waits."""
         texts = [json.dumps(message, allow_nan=False) for message in messages]
         if texts and self._loop is not None:
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._loop.call_soon_threadsafe(self._put, epoch, texts)
 
     def close(self) -> None:
-        """End the connection and its thread, after what was sent has gone out."""
+        """End the connection and its thread, after all messages were sent."""
         self._closed = True
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):  # the loop is closed
@@ -113,7 +113,7 @@ class WebSocketLink:
             try:
                 await self._read(socket)
             finally:
-                if self._closed:  # cancels of the last moment
+                if self._closed:  # messages that were sent just before, such as cancels
                     with contextlib.suppress(Exception):
                         while not outbox.empty():
                             await asyncio.wait_for(socket.send_str(outbox.get_nowait()), 0.5)
@@ -145,7 +145,7 @@ class WebSocketLink:
 
 
 class SimulatedLink:
-    """A robot of the user's own in the place of rosbridge: a class with `receive(now, message)` and
+    """Replaces rosbridge by a simulated robot of the user: a class with `receive(now, message)` and
     `step(now)`, which return the messages that rosbridge would send."""
 
     def __init__(self, path: str) -> None:
@@ -160,12 +160,12 @@ class SimulatedLink:
         return items
 
     def send(self, now: float, epoch: int, messages: Iterable[Message]) -> None:
-        """Give the robot messages."""
+        """Pass messages to the robot."""
         for message in messages:
             self._take(self._robot.receive(now, json.loads(json.dumps(message, allow_nan=False))))
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing."""
 
     def _take(self, messages: Iterable[Message]) -> None:
         self._inbox += [

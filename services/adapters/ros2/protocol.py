@@ -1,5 +1,5 @@
-"""The rosbridge protocol (version 2) without a socket: what a message may hold, and the life of a
-goal or service call as a table of phases."""
+"""The rosbridge protocol (version 2), sans-I/O: checks of messages, and the phases of a goal or
+service call as a table."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import Any
 
 Message = dict[str, Any]
 DEPTH, ITEMS, TABLES = 16, 20_000, 1_000
-"""Deepest nesting of the values of a message, most items, and most lists and tables among them:
-what a driver's state can carry several times."""
+"""Limits of a message: deepest nesting, most items, and most lists and tables. A driver's state can
+contain several such messages."""
 ENDED_KEPT = 5
 """Ended goals and calls that are kept for actions which have not read them."""
 REPEAT = 1.0
@@ -79,7 +79,7 @@ def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
 
 
 def pick(values: Any, path: str) -> Any:
-    """Return what stands at a path such as "pose.position.x" or "points.0". Raises ValueError."""
+    """Return the value at a path such as "pose.position.x" or "points.0". Raises ValueError."""
     found = values
     for name in path.split("."):
         try:
@@ -108,14 +108,14 @@ def filled(base: Mapping[str, Any], values: Mapping[str, Any]) -> Message:
 
 
 class ExchangePhase(StrEnum):
-    """Where a goal or a service call is."""
+    """Phase of a goal or a service call."""
 
     PENDING = "pending"
     ACTIVE = "active"
     """The server has sent feedback: it has accepted the goal."""
     CANCELLING = "cancelling"
     LOST = "lost"
-    """The link broke: nobody knows what became of it."""
+    """The link broke: it is unknown what was executed."""
     RECALLED = "recalled"
     """After LOST: its cancel was sent over the next link."""
     SUCCEEDED = "succeeded"
@@ -124,13 +124,13 @@ class ExchangePhase(StrEnum):
     REJECTED = "rejected"
     """Refused before anything began."""
     UNANSWERED = "unanswered"
-    """Cancelled, and the server has said nothing for too long."""
+    """Cancelled, but the server has not answered for too long."""
     GONE = "gone"
-    """After LOST: the server has ended it, or had time enough to."""
+    """After LOST: the server has ended it, or had enough time to do so."""
 
 
 class Word(StrEnum):
-    """What happens to a goal."""
+    """Event in the life of a goal."""
 
     FEEDBACK = "feedback"
     SUCCEEDED = "succeeded"
@@ -146,7 +146,7 @@ class Word(StrEnum):
 
 RUNNING = frozenset({ExchangePhase.PENDING, ExchangePhase.ACTIVE, ExchangePhase.CANCELLING})
 MOVING = RUNNING | {ExchangePhase.LOST, ExchangePhase.RECALLED}
-"""Phases in which the robot may be moving for it."""
+"""Phases in which the robot may move because of it."""
 
 _ENDS = {
     Word.SUCCEEDED: ExchangePhase.SUCCEEDED,
@@ -171,7 +171,7 @@ TABLE: Mapping[tuple[ExchangePhase, Word], ExchangePhase] = {
         for word in (Word.SUCCEEDED, Word.CANCELLED, Word.ABORTED, Word.REFUSED)
     },
 }
-"""What is not listed changes nothing."""
+"""Next phase by phase and event; a pair that is not listed changes nothing."""
 
 _STATUS: Mapping[float, Word] = {4: Word.SUCCEEDED, 5: Word.CANCELLED, 6: Word.ABORTED}
 """action_msgs/msg/GoalStatus."""
@@ -179,31 +179,31 @@ _STATUS: Mapping[float, Word] = {4: Word.SUCCEEDED, 5: Word.CANCELLED, 6: Word.A
 
 @dataclass
 class Exchange:
-    """A goal, or a service call: what was sent, and what came back."""
+    """A goal or a service call: the request, and the answers so far."""
 
     request: Message
     """The operation that began it; its `id` names it."""
     keep: frozenset[str] | None
-    """Fields of its result that are kept, None for all of them."""
+    """Fields of its result that are kept; None: all."""
     heard: float
-    """When the server last said something of it, or was last asked to end it (s)."""
+    """Time of the server's last message about it, or of the last cancel (s)."""
     asked: float = math.inf
     """When its cancel was last sent (s)."""
     phase: ExchangePhase = ExchangePhase.PENDING
     feedback: Message = field(default_factory=dict)
     count: int = 0
-    """Feedback messages so far."""
+    """Number of feedback messages so far."""
     values: Message = field(default_factory=dict)
     text: str = ""
     fault: str = ""
     """Why the values of its result cannot be used."""
     read: bool = False
-    """Whether its action needs it no more."""
+    """Whether its action no longer needs it."""
 
 
 class Exchanges:
-    """The goals and calls of one client, by a name that the client chooses. Ids on the wire are
-    unique in the world: all clients of a rosbridge server share one table of them."""
+    """The goals and calls of one client, by a name that the client chooses. Ids in messages are
+    globally unique, since all clients of a rosbridge server share one table of ids."""
 
     def __init__(self, patience: float) -> None:
         self.open: dict[str, Exchange] = {}
@@ -211,10 +211,10 @@ class Exchanges:
         self._own = uuid.uuid4().hex
 
     def begin(self, now: float, name: str, request: Message, keep: Any = None) -> Message:
-        """Begin a goal or a call; return what is to be sent."""
+        """Begin a goal or a call; return the messages to send."""
         message = {**request, "id": f"petrobot:{self._own}:{name}:{uuid.uuid4().hex[:8]}"}
         kept = None if keep is None else frozenset(keep)
-        if name in self.open:  # an earlier goal of the same run, which may still move
+        if name in self.open:  # an earlier goal of the same run, which may still move the robot
             earlier = self.open.pop(name)
             self.open[earlier.request["id"]] = earlier
         ended = [name for name, one in self.open.items() if one.phase not in MOVING]
@@ -224,7 +224,8 @@ class Exchanges:
         return message
 
     def cancel(self, now: float, name: str) -> list[Message]:
-        """Cancel a goal, or forget a call, which cannot be cancelled; return what is to be sent."""
+        """Cancel a goal, or forget a call, which cannot be cancelled; return the messages to
+        send."""
         one = self.open.get(name)
         if one is None or one.phase not in RUNNING:
             return []
@@ -237,12 +238,14 @@ class Exchanges:
         return [self._cancel(now, one)]
 
     def forget(self, name: str) -> None:
-        """The client needs a goal or call no more; it is kept while it may move."""
+        """Forget a goal or call that the client no longer needs; it is kept while the robot may
+        move."""
         if name in self.open:
             self.open[name].read = True
 
     def link(self, now: float, up: bool) -> list[Message]:
-        """The link came or went; return what is to be sent: cancels of goals that were lost."""
+        """Note that the link was made or lost; return the messages to send: cancels of lost
+        goals."""
         sent = []
         for one in self.open.values():
             before = self._move(one, Word.UP if up else Word.DOWN)
@@ -253,7 +256,7 @@ class Exchanges:
         return sent
 
     def advance(self, now: float) -> list[Message]:
-        """Repeat cancels that were not answered, and give them up in the end."""
+        """Repeat cancels that were not answered, and give up after some time."""
         sent = []
         for name in [n for n, one in self.open.items() if one.read and one.phase not in MOVING]:
             del self.open[name]
@@ -269,8 +272,8 @@ class Exchanges:
         return sent
 
     def receive(self, now: float, message: Message) -> str:
-        """Take feedback, a result, a response, or rosbridge's word that an operation failed; return
-        why it cannot be used, "" if it can."""
+        """Process feedback, a result, a response, or rosbridge's report that an operation failed;
+        return why it cannot be used, "" if it can."""
         identity = message.get("id")
         one = next((e for e in self.open.values() if e.request["id"] == identity), None)
         if one is None or one.phase not in MOVING:

@@ -1,5 +1,5 @@
-"""What drivers of ROS 2 topics share: topics as external events and as values that actions wait
-for, and streams of set points that go to topics."""
+"""Base class of drivers with ROS 2 topics: topics as external events and as values that actions
+wait for, and streams of set points that are sent to topics."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from petrobot.services.adapters.ros2 import definitions
 from petrobot.services.adapters.ros2.protocol import Message, filled, pick, unfit, words
 
 LARGEST_VALUE = 65_536
-"""Characters of the largest topic message that is kept for actions: all of them are published each
+"""Largest topic message that is kept for actions (characters): all kept messages are published each
 cycle."""
 
 
 class TopicDriver(Driver):
-    """Topics of a robot. A subclass connects them: `transmit` sends, `arrive` is told what came."""
+    """Topics of a robot. A subclass connects them: it implements `transmit`, and calls `arrive` for
+    each received message."""
 
     period = 0.02
     definitions: dict[str, str] = key({}, "file of each type's .msg, .srv or .action, by type")
@@ -39,13 +40,13 @@ class TopicDriver(Driver):
             out["rest"] = [float(value) for value in out.get("rest", [0.0] * len(out["fields"]))]
             self.check(filled({}, dict(zip(out["fields"], out["rest"], strict=True))), out["type"])
         self.refused, self.fault = 0, ""
-        """Messages that could not be used, and what was wrong with the last one."""
+        """Number of messages that could not be used, and what was wrong with the last one."""
         self.topics: dict[str, Message] = {}
         self.arrived: dict[str, float] = {}
         self.held: dict[str, bool] = {}
         """Whether the condition of an event's topic held in its newest message."""
         self.open, self.paused = set[str](), False
-        """Streams whose set points an action lets through; whether the operator holds them."""
+        """Streams whose set points an action forwards, and whether the operator holds them."""
         self.streams = {name: ports.stream(name) for name in self.setpoints}
         self.sent: dict[str, tuple[int, bool]] = {}
         """By stream: number of the last set point sent, and whether it was that of rest."""
@@ -60,7 +61,7 @@ class TopicDriver(Driver):
         raise NotImplementedError
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """`publish` (topic, type, msg), or `drive` (the streams to let through)."""
+        """Obey `publish` (topic, type, msg) or `drive` (the streams to forward)."""
         if "drive" in body:
             if unknown := set(body["drive"]) - set(self.setpoints):
                 raise ValueError(f"no setpoints {sorted(unknown)}; expected {list(self.setpoints)}")
@@ -79,11 +80,11 @@ class TopicDriver(Driver):
             raise ValueError(f"{interface}: {wrong}")
 
     def refuse(self, fault: str) -> None:
-        """Note a message that cannot be used."""
+        """Count a message that cannot be used."""
         self.refused, self.fault = self.refused + 1, words(fault)[:300]
 
     def arrive(self, now: float, topic: Any, message: Any) -> None:
-        """Take a message of a topic."""
+        """Process a message of a topic."""
         fault = unfit(message)
         if not fault and len(str(message)) > LARGEST_VALUE:
             fault = f"is longer than {LARGEST_VALUE} characters"
@@ -107,7 +108,7 @@ class TopicDriver(Driver):
             self._steer(now, name, out)
 
     def _steer(self, now: float, name: str, out: Message) -> None:
-        """Send the newest set point of a stream; once that of rest when there is none."""
+        """Send the newest set point of a stream; if there is none, once that of rest."""
         port = self.streams[name]
         count, resting = self.sent.get(name, (0, True))
         values = port.values if name in self.open and not self.paused else None
@@ -123,8 +124,8 @@ class TopicDriver(Driver):
         self.transmit(now, out["topic"], out["type"], message)
 
     def state(self) -> Mapping[str, Any]:
-        """`connected`, and the newest message of each topic with its `count` and `age` (s),
-        None before the first and after a lost link."""
+        """Return `connected`, and the newest message of each topic with its `count` and `age` (s);
+        None before the first message and after a lost link."""
         now = self.ports.now
         return {
             "connected": self.connected,
@@ -144,7 +145,7 @@ class TopicDriver(Driver):
         TopicDriver.step(self, now)
 
     def stopped(self) -> bool:
-        """Whether no set point but that of rest was sent."""
+        """Return whether the last set points sent are those of rest."""
         return all(rest for _, rest in self.sent.values())
 
     def hold(self, now: float) -> str:
@@ -154,7 +155,7 @@ class TopicDriver(Driver):
         return super().hold(now)
 
     def release(self, now: float) -> None:
-        """Let set points through again."""
+        """Forward set points again."""
         self.paused = False
 
 
@@ -166,7 +167,8 @@ def _table(config: Mapping[str, Any], where: str, needed: set[str], other: set[s
 
 
 def fits(message: Message, when: Mapping[str, Any]) -> bool:
-    """Whether a message has all these values at their paths. A list of two numbers is a range."""
+    """Return whether a message has all these values at their paths. A list of two numbers is a
+    range."""
     for path, wanted in when.items():
         try:
             found = pick(message, path)

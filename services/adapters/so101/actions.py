@@ -15,13 +15,13 @@ from petrobot.services.adapters.so101.kinematics import forward, inverse
 
 State = Mapping[str, Any]
 STARTING = 1.0
-"""s that the driver may need to find the servos and to switch them on."""
+"""Time in which the driver must find the servos and switch them on (s)."""
 
 
 async def move_joints(
     ctx: Context[Remote], *, joints: Sequence[float], speed: float = 1.0, timeout: float = 10.0
 ) -> Result:
-    """Bring the five joints to these angles (rad), with this share of the arm's speed."""
+    """Move the five joints to these angles (rad), with this share of the arm's speed."""
     command = {"do": "move", "joints": list(joints), "speed": speed}
     return await _do(ctx, command, lambda state: state["at_goal"], timeout) or success()
 
@@ -37,9 +37,9 @@ async def move_to(
     speed: float = 1.0,
     timeout: float = 10.0,
 ) -> Result:
-    """Bring the gripper's tip to a point (m, frame of `kinematics`). `pitch` is the gripper's angle
-    above the horizontal, `roll` that of its last joint (rad). The joints move together, the tip not
-    on a line."""
+    """Move the gripper's tip to a point (m, frame of `kinematics`). `pitch` is the gripper's angle
+    above the horizontal, `roll` the angle of its last joint (rad). The joints arrive together; the
+    tip does not move on a straight line."""
     try:
         joints = inverse(x, y, z, pitch, roll)
     except ValueError as fault:
@@ -52,8 +52,8 @@ async def move_to(
 async def grasp(
     ctx: Context[Remote], *, squeeze: float = 0.25, thinnest: float = 0.02, timeout: float = 4.0
 ) -> Result:
-    """Close the gripper until it holds something with this share of its stall torque; `angle`
-    (rad) is how far it is open then. FAILURE `empty` if it closed to less than `thinnest` rad."""
+    """Close the gripper until it holds something with this share of its stall torque; the result
+    `angle` (rad) is its final opening. FAILURE `empty` if it closed to less than `thinnest` rad."""
     ends = ("holding", "closed")
     command = {"do": "close", "squeeze": squeeze}
     fault = await _do(ctx, command, lambda state: any(state["gripper"][e] for e in ends), timeout)
@@ -70,12 +70,12 @@ async def release(ctx: Context[Remote], *, angle: float = 1.0, timeout: float = 
 
 
 async def reset(ctx: Context[Remote]) -> Result:
-    """Forget faults and switch torque on where the arm is."""
+    """Clear faults and switch torque on at the present position."""
     return await _do(ctx, {"do": "reset"}, lambda state: state["ready"], 2.0) or success()
 
 
 async def calibrate(ctx: Context[Remote], *, pose: Sequence[float] = (0.0,) * 6) -> Result:
-    """Say that the arm, held by hand, is in this pose (six angles, rad); its zero positions are
+    """Declare that the arm, held by hand, is in this pose (six angles, rad); its zero positions are
     written to the device's calibration file."""
     await ctx.command({"do": "calibrate", "pose": list(pose)}, timeout=5.0)
     return success()
@@ -84,7 +84,8 @@ async def calibrate(ctx: Context[Remote], *, pose: Sequence[float] = (0.0,) * 6)
 async def _do(
     ctx: Context[Remote], command: State, done: Callable[[State], bool], timeout: float
 ) -> Result | None:
-    """Send a command and wait until it is done; None if it was."""
+    """Send a command and wait until it is done. Return the result of an error, None if there was
+    none."""
     device = ctx.device
     await ctx.wait(lambda: bool(device.state["ready"] or device.state["faults"]), STARTING)
     await ctx.command(command)

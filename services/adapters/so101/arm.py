@@ -3,11 +3,11 @@ and angle. Commands are plain data; the key `do` names them:
 
     {"do": "move", "joints": five angles (rad), "speed": share}   all joints arrive together
     {"do": "open", "angle": rad}        open the gripper
-    {"do": "close", "squeeze": share}   close it until its motor's duty is so high, and keep it
+    {"do": "close", "squeeze": share}   close it until its motor's duty is this high, and keep it
     {"do": "calibrate", "pose": six angles (rad)}   the arm is in this pose now (default: all 0);
                                         the zero positions are written to the calibration file
-    {"do": "free"}                      torque off: the arm falls unless somebody holds it
-    {"do": "reset"}                     forget faults, torque on where the arm is
+    {"do": "free"}                      torque off: the arm falls unless it is held
+    {"do": "reset"}                     clear faults, torque on at the present position
 """
 
 from __future__ import annotations
@@ -23,25 +23,26 @@ from petrobot.services.adapters.so101 import bus
 from petrobot.services.adapters.so101.kinematics import JOINTS
 
 LOST: Final = 0.3
-"""s without an answer after which a servo is missing."""
+"""Time without an answer after which a servo counts as missing (s)."""
 STILL, CREEP = 5, 5
-"""Readings without a change after which a servo stands, unless it is faster (steps/s)."""
+"""Number of equal readings after which a servo stands still, and the speed above which it does not
+(steps/s)."""
 RETRY: Final = (0.2, 3.2)
 """Shortest and longest time between two attempts to open the port (s)."""
 TRIM_RATE, DEAD = 6.0, 0.004
-"""The set point of a loaded joint is moved until the joint is where it shall be: share of the error
-per second, and the error that is left alone (rad): friction."""
+"""The set point of a loaded joint is corrected until the joint is at its goal: share of the error
+per second, and the error that is tolerated because of friction (rad)."""
 NEAR: Final = 0.3
-"""rad between a servo and its goal that its load explains."""
+"""Largest distance between a servo and its set point that its load can explain (rad)."""
 REACHED: Final = 0.015
-"""rad between a joint and its goal that count as reached."""
+"""Distance to its goal within which a joint has reached it (rad)."""
 STRAIN_TIME: Final = 0.5
-"""s of overload until a joint gives way."""
+"""Time of overload after which a joint gives way (s)."""
 GIVE: Final = 1.25
-"""Speed with which the gripper, touching something, gives way to a load above the wanted one or
-closes further (rad/s, for a difference of the stall torque)."""
+"""Speed with which the gripper, touching something, opens at a load above the wanted one, or closes
+at a load below it (rad/s per share of the stall torque)."""
 GRASP_TIME: Final = 0.1
-"""s for which the gripper must squeeze at a standstill."""
+"""Time for which the gripper must squeeze at a standstill (s)."""
 
 
 UNREAD: Final = bus.Reading(False, 2048, 2048, 0, 0.0, 0.0, 0)
@@ -49,7 +50,7 @@ UNREAD: Final = bus.Reading(False, 2048, 2048, 0, 0.0, 0.0, 0)
 
 @dataclass
 class Joint:
-    """One servo: what it reported last, and where it shall be (rad)."""
+    """One servo: its last report, and its set point (rad)."""
 
     name: str
     servo: int
@@ -61,23 +62,23 @@ class Joint:
     heard: float = -math.inf
     read: bus.Reading = UNREAD
     rest: int = 0
-    """Position that it has not left for `still` readings (steps)."""
+    """Position at which it has been for `still` readings (steps)."""
     still: int = 0
     started: bool = False
     """Whether torque and limits have been written."""
     ready: bool = False
-    """Whether they are in effect: it can be moved."""
+    """Whether they are in effect, so that the servo can be moved."""
     aim: float = 0.0
     velocity: float = 0.0
     goal: float = 0.0
     fastest: float = 0.0
     trim: float = 0.0
     strained: float = 0.0
-    """s of overload."""
+    """Duration of the present overload (s)."""
 
     @property
     def stands(self) -> bool:
-        """Whether the servo has stood still for some readings."""
+        """Return whether the servo has stood still for some readings."""
         return self.still >= STILL and abs(self.read.speed) <= CREEP
 
     @property
@@ -99,27 +100,27 @@ class Joint:
         return min(bus.STEPS - 1, max(0, self.zero + self.sign * round(q / bus.RAD)))
 
     def take(self, now: float, read: bus.Reading) -> None:
-        """Take what the servo reports."""
+        """Store what the servo reports."""
         moved = abs(read.position - self.rest) > 1
         self.rest, self.still = (read.position, 0) if moved else (self.rest, self.still + 1)
         self.heard, self.read = now, read
 
     def settle(self) -> None:
-        """Stay where it is; with torque on at the servo's own goal, if it is near: so it carries
-        its load, or squeezes, as before."""
+        """Stay at the present position. With torque on, keep the servo's goal if it is near, so
+        that it still carries its load, or squeezes."""
         servo = self.angle(self.read.goal)
         near = self.read.torque and abs(servo - self.q) < NEAR
         self.aim = self.goal = servo if near else self.q
         self.velocity = self.trim = self.strained = 0.0
 
     def brake(self, dt: float, acceleration: float) -> None:
-        """Take as goal where it can stand."""
+        """Set as goal the nearest position at which it can stop."""
         step = acceleration * dt
         way = self.velocity * max(0.0, abs(self.velocity) - step) * dt / (2 * step)
         self.goal = min(self.high, max(self.low, self.aim + way))
 
     def lead(self, dt: float, acceleration: float, held: bool) -> None:
-        """Move the set point one period towards the goal."""
+        """Move the set point by one period towards the goal."""
         left, step = self.goal - self.aim, acceleration * dt
         # The speed from which `periods` of braking, one step of speed each, end on the goal.
         periods = max(1, math.ceil(math.sqrt(0.25 + 2 * abs(left) / (step * dt)) - 0.5))
@@ -166,14 +167,14 @@ class Arm(Driver):
         self._calibrated = self._read_calibration()
         self._on, self._held = self.enable, False
         self._task = ""
-        """"move" until the arm is stopped: its goal is the one commanded."""
+        """"move" while the commanded goal is followed; else empty."""
         self._hand = ""
-        """"open", "close", or "keep": stopped while it held something."""
+        """"open", "close", or "keep" (it was stopped while it held something)."""
         self._grip = self._gripped = 0.0
-        """Load with which the gripper closes; s for which it has squeezed."""
+        """Load with which the gripper closes, and how long it has squeezed (s)."""
         self._order = list(self.joints)
-        """In which the servos are asked: those that do not answer last, each in turn first among
-        them, so that none hides another."""
+        """Order in which the servos are asked. Those that do not answer come last, each in turn
+        first among them, so that a missing servo does not hide another."""
         self._split = bus.PacketSplitter()
         self._lost, self._retry, self._pause = "", 0.0, RETRY[0]
         self._begun = ports.now
@@ -199,7 +200,7 @@ class Arm(Driver):
             raise ValueError(f'on_estop: expected "hold" or "off", found {self.on_estop!r}')
 
     def _read_calibration(self) -> bool:
-        """Take the zero positions from the file; False if there is none yet."""
+        """Read the zero positions from the file. Return False if there is none yet."""
         if not self.calibration:
             return True  # as LeRobot leaves the servos: 2048 in the middle
         try:
@@ -223,7 +224,7 @@ class Arm(Driver):
     # --- commands -------------------------------------------------------------------------------
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Take a command. Raises ValueError for one that the arm must not follow."""
+        """Obey a command. Raises ValueError for one that the arm must not follow."""
         do = body.get("do")
         known = {
             "move": self._move, "open": self._open, "close": self._close, "free": self._free,
@@ -256,7 +257,7 @@ class Arm(Driver):
         peak = min(fastest, math.sqrt(far * rate))
         time = far / peak + peak / rate if peak > 0.0 else 0.0
         for joint, goal in zip(self.arm, goals, strict=True):
-            # The speed with which its trapezoid takes as long as the slowest joint's.
+            # the speed with which this joint takes as long as the slowest one
             root = math.sqrt(max(0.0, (rate * time) ** 2 - 4 * rate * abs(goal - joint.aim)))
             joint.goal, joint.fastest = goal, max((rate * time - root) / 2, 1e-3)
         self._task = "move"
@@ -383,13 +384,15 @@ class Arm(Driver):
                     joint.trim = min(0.1, max(-0.1, joint.trim + change))
 
     def _untrimmed(self, joint: Joint) -> bool:
-        """Whether its load keeps a joint from its goal, and its set point is still being moved."""
+        """Return whether a joint's load keeps it from its goal, and its set point is still being
+        corrected."""
         if joint is self.gripper or self._task != "move" or joint.aim != joint.goal:
             return False
         return abs(joint.aim - joint.q) > DEAD and abs(joint.trim) < 0.1
 
     def _squeeze(self) -> None:
-        """Close the gripper as long as its load is below the wish; see whether it holds."""
+        """Close the gripper while its load is below the wanted one, and find out whether it holds
+        something."""
         joint = self.gripper
         if self._hand == "close" and not self._held:
             excess = -joint.load - self._grip
@@ -406,7 +409,8 @@ class Arm(Driver):
         return self._hand in ("close", "keep") and self._gripped >= GRASP_TIME
 
     def _packets(self, now: float) -> bytes:
-        """What to send: set points, torque where it is not as it shall be, and the question."""
+        """Return the packets to send: set points, torque where it must change, and the next
+        request."""
         goals, start, free = {}, {}, {}
         for joint in self.joints:
             if joint.heard == -math.inf:
@@ -425,7 +429,7 @@ class Arm(Driver):
         out += bus.sync_write(bus.TORQUE, free) if free else b""
         return out + bus.read_state(joint.servo for joint in self._order)
 
-    # --- what the node asks ---------------------------------------------------------------------
+    # --- called by the node ---------------------------------------------------------------------
 
     def stop(self, now: float) -> None:
         """Brake; the gripper keeps what it holds."""
@@ -445,7 +449,7 @@ class Arm(Driver):
         self._on = self._on and self.on_estop == "hold"
 
     def stopped(self) -> bool:
-        """Whether every servo answers and stands, and nothing will move it."""
+        """Return whether every servo answers and stands still, and no motion is left."""
         if self._missing(self.ports.now):
             return False
         going = not self._held and any(
@@ -454,7 +458,7 @@ class Arm(Driver):
         return not going and all(joint.velocity == 0.0 and joint.stands for joint in self.joints)
 
     def hold(self, now: float) -> str:
-        """Brake, and keep the goal for `release`."""
+        """Brake, and keep the goal until `release`."""
         if self._missing(now):
             return "cannot hold"
         self._held = True
@@ -504,7 +508,7 @@ class Arm(Driver):
 
 
 def _numbers(value: Any, count: int) -> TypeGuard[list[float]]:
-    """Whether it is a list of so many finite numbers."""
+    """Return whether the value is a list of so many finite numbers."""
     return (
         isinstance(value, list | tuple)
         and len(value) == count
@@ -513,7 +517,7 @@ def _numbers(value: Any, count: int) -> TypeGuard[list[float]]:
 
 
 def _within(joint: Joint, angle: float) -> None:
-    """Raise ValueError for an angle that a joint must not have."""
+    """Raise ValueError for an angle outside a joint's limits."""
     ends = sorted(joint.sign * (end - joint.zero) * bus.RAD for end in (0, bus.STEPS - 1))
     low, high = max(joint.low, ends[0]), min(joint.high, ends[1])
     if not low <= angle <= high:

@@ -1,8 +1,8 @@
-"""The bus of Feetech's STS3215 servos, sans-I/O: packets to servos, and what they answer.
+"""The bus of Feetech's STS3215 servos, sans-I/O: packets to servos, and their answers.
 
 A packet is FF FF, servo, length, instruction, content, checksum; an answer has the servo's error
-bits in place of the instruction. Numbers are little endian; a sign is a bit above the magnitude
-(STS memory table of Feetech).
+bits instead of the instruction. Numbers are little endian; a sign is a bit above the magnitude (STS
+memory table of Feetech).
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import Final, NamedTuple
 PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 0x01, 0x02, 0x03, 0x82, 0x83
 BROADCAST: Final = 0xFE
 TORQUE, GOAL = 40, 42
-"""Registers: torque enable, from which on `setup` writes; goal position."""
+"""Registers: torque enable (the first that `setup` writes), and goal position."""
 STEPS: Final = 4096
 RAD: Final = 2 * math.pi / STEPS
-"""rad of one step."""
+"""One step of a servo (rad)."""
 LONGEST: Final = 64
 """Largest length byte of an answer: a longer one is noise."""
 ERRORS: Final = {1: "voltage", 2: "sensor", 4: "heat", 8: "current", 32: "overload"}
@@ -85,7 +85,7 @@ class ServoAnswer(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """What a servo says of itself, in its units."""
+    """The report of a servo, in its own units."""
 
     torque: bool
     goal: int
@@ -103,7 +103,7 @@ class Reading(NamedTuple):
 
 
 def read_state(servos: Iterable[int]) -> bytes:
-    """Ask servos for what `reading` reads."""
+    """Return the request for the registers that `reading` reads."""
     return sync_read(TORQUE, _STATE.size, servos)
 
 
@@ -141,9 +141,9 @@ class PacketSplitter:
             if servo >= BROADCAST or not 2 <= length <= LONGEST:
                 at += 1
             elif len(buffer) < end:
-                break  # the rest may come
+                break  # the rest may still come
             elif sum(buffer[at + 2 : end]) & 0xFF != 0xFF:
-                at += 1  # broken: its bytes may hold the begin of another
+                at += 1  # broken: its bytes may contain the beginning of another
             else:
                 answers.append(ServoAnswer(servo, buffer[at + 4], bytes(buffer[at + 5 : end - 1])))
                 at = end

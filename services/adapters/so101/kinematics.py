@@ -22,7 +22,7 @@ JOINTS: Final = {
 """Joints with their limits (rad), of the same file."""
 LIMITS: Final = tuple(JOINTS.values())[:5]
 SLACK: Final = 1e-6
-"""What rounding may add to an angle (rad) or a cosine."""
+"""Tolerance for rounding of an angle (rad) or a cosine."""
 SHOULDER: Final = (0.0303992, 0.0948817 + 0.0542)
 """Lift axis: forward, up."""
 UPPER: Final = (math.hypot(0.028, 0.11257), math.atan2(0.11257, 0.028))
@@ -63,8 +63,8 @@ def forward(q: Sequence[float]) -> tuple[float, float, float, float]:
 
 
 def inverse(x: float, y: float, z: float, pitch: float, roll: float) -> list[float]:
-    """Return the five angles that bring the tip there, elbow up and facing it if that is possible.
-    `roll` is the angle of the joint wrist_roll.
+    """Return the five angles that bring the tip there: with the elbow up, and the arm facing the
+    point if possible. `roll` is the angle of the joint wrist_roll.
 
     Raises ValueError if it is out of reach, or only with angles outside `JOINTS`.
     """

@@ -1,1 +1,1 @@
-"""Universal Robots e-Series arms over RTDE, without anything installed beside petrobot."""
+"""Universal Robots e-Series arms over RTDE; no other package is needed."""

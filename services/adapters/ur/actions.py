@@ -1,8 +1,8 @@
 """Actions of a UR arm: enable, moves, digital outputs, a gripper on an output.
 
 Causes of an ERROR: `refused` (the text says why), `protective_stop`, `emergency_stop`,
-`safeguard_stop`, `link_lost`, `program_lost`, `power_off`, `stopped` (it rests elsewhere) and
-`late`.
+`safeguard_stop`, `link_lost`, `program_lost`, `power_off`, `stopped` (it stopped at another place)
+and `late`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ async def _move(ctx: Context[Remote], command: Mapping[str, Any], timeout: float
     ended = await ctx.wait(
         lambda: device.state["in_place"] or device.state["mode"] != "move", timeout
     )
-    # The arm follows its last set points a little later.
+    # the arm follows the last set points with a small delay
     await ctx.wait(lambda: device.state["in_place"] or device.state["mode"] == "off", 1.0)
     state = device.state
     if state["in_place"]:
@@ -71,7 +71,7 @@ async def set_digital_out(ctx: Context[Remote], *, bit: int, value: bool) -> Res
 async def gripper(
     ctx: Context[Remote], *, close: bool, bit: int = 0, seconds: float = 0.5, holds: int = -1
 ) -> Result:
-    """Close or open a gripper on a digital output; `holds` is the digital input that says that it
+    """Close or open a gripper on a digital output; `holds` is the digital input that shows that it
     holds something (-1: none). FAILURE `empty`: it closed on nothing."""
     done = await set_digital_out(ctx, bit=bit, value=close)
     if done.status != "success":

@@ -1,16 +1,16 @@
 """Driver of a UR3e, UR5e or UR10e over RTDE.
 
-The driver plans each motion itself, checks its whole way, and streams joint set points at 125 Hz to
-a short program on the controller. That program stops the arm when they cease. Commands:
+The driver plans each motion itself, checks its whole path, and streams joint set points at 125 Hz
+to a short program on the controller. That program stops the arm if they stop coming. Commands:
 
     {"do": "enable"}     power on, release brakes, start the program; unlocks a protective stop
     {"do": "move", "q": six angles (rad), "speed": 0 to 1}            all joints arrive together
-    {"do": "linear", "pose": x, y, z (m), rotation vector (rad), "speed": 0 to 1}     straight way
+    {"do": "linear", "pose": x, y, z (m), rotation vector (rad), "speed": 0 to 1}     straight line
     {"do": "output", "bit": 0 to 7, "value": true or false}           digital output
-    {"do": "rest"}       come to rest and stay there
+    {"do": "rest"}       stop and stay there
 
-The workspace bounds the tool point in the base frame. Nothing moves again by itself after a fault:
-it takes `enable` and a new command.
+The workspace limits the tool point in the base frame. After a fault nothing moves again before
+`enable` and a new command.
 """
 
 from __future__ import annotations
@@ -39,17 +39,18 @@ SAFETY = {1: "normal", 2: "reduced", 3: "protective_stop", 4: "recovery", 5: "sa
           6: "emergency_stop", 7: "emergency_stop", 8: "violation", 9: "fault"}  # fmt: skip
 MAY_MOVE = (1, 2)
 STANDING = 0.01
-"""rad/s below which a joint stands."""
+"""Speed below which a joint stands still (rad/s)."""
 IN_PLACE = 0.003
-"""rad by which a joint may miss the end of a motion."""
+"""Tolerance of a joint at the end of a motion (rad)."""
 STALE = 0.15
-"""Seconds without data, or without an echo of the program, after which link or program is lost."""
+"""Time without data, or without an echo of the program, after which link or program counts as lost
+(s)."""
 ASK_AGAIN = 1.0
-"""Seconds between two orders on the way to enabled drives."""
+"""Time between two requests while the drives are being enabled (s)."""
 BY_ITSELF = 1.0
-"""Seconds in which the program has stopped the arm after the set points ceased."""
+"""Time within which the program stops the arm after the last set point (s)."""
 PART = 0.02
-"""rad between two checked places of a motion, and 4 mm of a straight one."""
+"""Distance of two checked points of a joint motion (rad); on a straight line it is 4 mm."""
 PROGRAM = """\
 def petrobot():
   patience = 0.1
@@ -121,7 +122,7 @@ class Arm(Driver):
     # Commands
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Take a command. Raises ValueError if it is unknown or cannot be obeyed now."""
+        """Obey a command. Raises ValueError if it is unknown or cannot be obeyed now."""
         what = body.get("do")
         if what == "enable":
             self._wanted, self._fault, self._reason, self._ask_at = True, "", "", now
@@ -146,7 +147,7 @@ class Arm(Driver):
         self._outputs.append(dict(zip(DIGITAL, (1 << bit, value << bit), strict=True)))
 
     def _straight(self, pose: list[float]) -> list[list[float]]:
-        """Joint poses along the straight way of the tool from where the arm rests."""
+        """Return joint poses along the tool's straight line from where the arm stands."""
         begin, way = self._arm.tool(self._commanded), [self._commanded]
         length = math.dist(begin[:3], pose[:3])
         parts = max(2, math.ceil(length / 0.004), math.ceil(math.dist(begin[3:], pose[3:]) / PART))
@@ -162,7 +163,7 @@ class Arm(Driver):
         return way
 
     def _go(self, way: list[list[float]], body: Mapping[str, Any]) -> None:
-        """Begin a motion, after its whole way was checked."""
+        """Begin a motion, after checking its whole path."""
         share = body.get("speed", 1.0)
         if isinstance(share, bool) or not isinstance(share, int | float) or not 0.0 < share <= 1.0:
             raise ValueError(f"speed: expected a number above 0 and at most 1, got {share!r}")
@@ -188,7 +189,7 @@ class Arm(Driver):
     # The cycle
 
     def step(self, now: float) -> None:
-        """Receive, move on, send; nothing here waits."""
+        """Receive, move the set point, send. Never waits."""
         self._now = now
         self._advance(now)
         self._receive(now)
@@ -212,14 +213,14 @@ class Arm(Driver):
             self._count, self._seen = self._rtde.count, now
             echo = self._rtde.data["output_int_register_24"]
             if echo != self._echo and 0 <= self._beat - echo < 100 and self._count > 1:
-                self._echoed = now  # the program has read what was sent just before
+                self._echoed = now  # the program has read the set point sent just before
             self._echo = echo
         for other in (self._dashboard, self._program):
-            if other.poll(now):  # what they say is not needed: RTDE tells it all
+            if other.poll(now):  # their answers are not needed: RTDE reports the same
                 other.settled()
 
     def _look(self, now: float) -> None:
-        """Enabled or not, and why not."""
+        """Find out whether the drives are enabled, and if not, why."""
         fresh, data = now - self._seen < STALE and self._link.up, self._rtde.data
         safety = data.get("safety_mode", 0) if fresh else 0
         powered = fresh and safety in MAY_MOVE and data["robot_mode"] == RUNNING
@@ -240,7 +241,7 @@ class Arm(Driver):
                 self._ask(now, safety, data["robot_mode"])
 
     def _ask(self, now: float, safety: int, mode: int) -> None:
-        """Give the next order on the way to enabled drives."""
+        """Send the next request for enabling the drives."""
         if safety == 3:
             self._dashboard.send(now, b"close safety popup\nunlock protective stop\n")
         elif safety not in MAY_MOVE:
@@ -251,7 +252,7 @@ class Arm(Driver):
             self._dashboard.send(now, b"power on\n" if mode == POWER_OFF else b"brake release\n")
 
     def _lose(self, fault: str) -> None:
-        """A fault: nothing moves until it is enabled again."""
+        """Note a fault: nothing moves until the arm is enabled again."""
         if self._enabled and fault in ("link_lost", "program_lost"):
             self._unseen_until = self._now + BY_ITSELF
         self._enabled = self._wanted = False
@@ -262,7 +263,7 @@ class Arm(Driver):
         self._way, self._far, self._rate, self._goal = [], [], 0.0, None
 
     def _move(self) -> None:
-        """Move the set point along its way."""
+        """Move the set point along the path."""
         self._check_workspace()
         if not self._way:
             return
@@ -283,7 +284,7 @@ class Arm(Driver):
             self._rest()
 
     def _check_workspace(self) -> None:
-        """Stop where the tool leaves the workspace, whoever moves it."""
+        """Stop if the tool leaves the workspace, whatever moves it."""
         if self.workspace.bounds:
             outside = self.workspace.outside(self._arm.tool(self._q())[:3])
             if outside and self._inside and self._way:
@@ -308,7 +309,8 @@ class Arm(Driver):
         return list(self._commanded if pretends else self._rtde.data.get("actual_q", (0.0,) * 6))
 
     def state(self) -> Mapping[str, Any]:
-        """Return what actions, operator and report see; docs/robots/ur.md explains the keys."""
+        """Return the state for actions, operator and report; docs/robots/ur.md explains the
+        keys."""
         data, q = self._rtde.data, self._q()
         goal = self._goal
         return {
@@ -328,7 +330,7 @@ class Arm(Driver):
         }
 
     def stop(self, now: float) -> None:
-        """Brake on the way, and stay there."""
+        """Brake along the path, and stay there."""
         self._goal = None
         if not self._way or self._rate <= 0.0:
             self._rest()
@@ -339,14 +341,15 @@ class Arm(Driver):
         self._lose("emergency_stop")
 
     def stopped(self) -> bool:
-        """Return whether the arm is known to stand still: seen, or by its own program."""
+        """Return whether the arm is known to stand still: by its measured speeds, or because its
+        program has stopped it."""
         if not self._link.up or self._now - self._seen > STALE:
             return self._now >= self._unseen_until and not self._enabled
         still = all(abs(v) < STANDING for v in self._rtde.data["actual_qd"])
         return still and not self._way and self._now >= self._unseen_until
 
     def hold(self, now: float) -> str:
-        """Pause: brake on the way, and go on along it after `release`."""
+        """Pause: brake along the path, and continue on it after `release`."""
         self._paused = True
         return "held"
 

@@ -1,4 +1,4 @@
-"""Where the tool of a UR arm is, and the joints for a place of the tool.
+"""Forward and inverse kinematics of UR arms.
 
 Denavit-Hartenberg parameters: Universal Robots, "DH Parameters for calculations of kinematics and
 dynamics" (support article 16538). A robot's own calibration differs by a few tenths of a
@@ -23,7 +23,7 @@ MODELS = {
 }
 TWISTS = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
 CLOSE = 1e-7
-"""m and rad by which a solution may miss its pose."""
+"""Tolerance of a solution (m and rad)."""
 
 
 class Geometry:
@@ -70,7 +70,7 @@ class Geometry:
 
 
 def between(start: Sequence[float], end: Sequence[float], share: float) -> list[float]:
-    """Return the pose at a share (0 to 1) of the straight way from one pose to another."""
+    """Return the pose at a share (0 to 1) of the straight line from one pose to another."""
     place = [a + share * (b - a) for a, b in zip(start[:3], end[:3], strict=True)]
     first = _matrix(start[3:])
     turn = _vector(_matrix(end[3:]) @ first.T)
@@ -78,7 +78,7 @@ def between(start: Sequence[float], end: Sequence[float], share: float) -> list[
 
 
 def _matrix(vector: Sequence[float]) -> Array:
-    """The rotation of a rotation vector (Rodrigues)."""
+    """Return the rotation matrix of a rotation vector (Rodrigues)."""
     x, y, z = vector
     angle = math.sqrt(x * x + y * y + z * z)
     if angle < 1e-12:
@@ -89,7 +89,7 @@ def _matrix(vector: Sequence[float]) -> Array:
 
 
 def _vector(rotation: Any) -> Array:
-    """The rotation vector of a rotation, of at most pi rad."""
+    """Return the rotation vector of a rotation matrix, of at most pi rad."""
     r = np.asarray(rotation)
     axis = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
     sine, cosine = 0.5 * float(np.linalg.norm(axis)), 0.5 * (float(np.trace(r)) - 1.0)

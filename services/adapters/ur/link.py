@@ -13,7 +13,8 @@ FIRST_PAUSE, LONGEST_PAUSE = 0.25, 4.0
 CONNECTING = 2.0
 """Seconds that an attempt may take."""
 UNSENT = 1 << 16
-"""Bytes that may wait to be sent: then the other end does not read, and the link is given up."""
+"""Most bytes that may wait to be sent: with more, the other end does not read, and the link is
+closed."""
 
 
 class Link:
@@ -33,11 +34,11 @@ class Link:
         self._unsent = bytearray()
         self.up = False
         self.connections = 0
-        """How many were made."""
+        """How many connections were made."""
         self.why = "not connected yet"
 
     def poll(self, now: float) -> bytes:
-        """Connect if needed; return what has come."""
+        """Connect if needed; return the bytes received."""
         received = bytearray()
         try:
             if self._socket is None:
@@ -65,7 +66,7 @@ class Link:
         self._socket.connect(self._address)
 
     def _look(self, now: float) -> None:
-        """See whether a connection that was begun is there."""
+        """Check whether a connection that was begun is complete."""
         assert self._socket is not None
         if fault := self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
             raise OSError(fault, f"{self._address[0]}:{self._address[1]} refuses (errno {fault})")
@@ -96,11 +97,11 @@ class Link:
             self.drop(now, str(fault))
 
     def settled(self) -> None:
-        """The connection serves: the next one is tried at once again when it breaks."""
+        """Note that the connection works: when it breaks, the next attempt follows at once."""
         self._pause = FIRST_PAUSE
 
     def drop(self, now: float, why: str) -> None:
-        """Give the connection up, and try another one later."""
+        """Close the connection, and try another one later."""
         self.close()
         self.why, self._next = why, now + self._pause
         self._pause = min(LONGEST_PAUSE, 2.0 * self._pause)
@@ -122,7 +123,7 @@ class LoopbackLink:
         self.up, self.connections, self.why = False, 0, ""
 
     def poll(self, now: float) -> bytes:
-        """Return what has come."""
+        """Return the bytes received."""
         if self._session is None or self._session.closed:
             self._session, self.up = self._controller.connect(self._port), True
             self.connections += 1
@@ -134,7 +135,7 @@ class LoopbackLink:
             self._session.receive(data)
 
     def settled(self) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
     def drop(self, now: float, why: str) -> None:
         """Connect again."""
@@ -151,8 +152,8 @@ class LoopbackLink:
 def links(
     host: str, ports: list[int], usual: list[int]
 ) -> tuple[list[Link | LoopbackLink], Callable[[float], None]]:
-    """Return the links to the ports of a controller, and what lets its time pass: `host` is an IP
-    address, or `module:Class` of a simulated one."""
+    """Return the links to the ports of a controller, and a function that lets its time pass: `host`
+    is an IP address, or `module:Class` of a simulated controller."""
     module, colon, name = host.partition(":")
     if not colon or "." not in module or name[:1].isdigit() or not name.isidentifier():
         return [Link(host, port) for port in ports], lambda now: None

@@ -29,7 +29,7 @@ FORMS: Mapping[str, str] = {
 
 
 class RtdeError(ValueError):
-    """The other end does not speak this protocol, or refuses; the text says what."""
+    """The other end does not follow the protocol, or refuses a request; the text says which."""
 
 
 def package(letter: str, payload: bytes = b"") -> bytes:
@@ -38,7 +38,8 @@ def package(letter: str, payload: bytes = b"") -> bytes:
 
 
 def packages(buffer: bytearray) -> Iterator[tuple[str, bytes]]:
-    """Take the complete packages out of a buffer. Raises RtdeError for what cannot be one."""
+    """Remove the complete packages from a buffer and return them. Raises RtdeError for malformed
+    ones."""
     while len(buffer) >= 3:
         size, letter = struct.unpack_from(">HB", buffer)
         if size < 3 or chr(letter) not in LETTERS:
@@ -82,8 +83,8 @@ class Recipe:
 
 
 class Rtde:
-    """One connection, from its first byte: asks for version and recipes, starts, then receives
-    data. `receive` takes bytes, `drain` gives those to send."""
+    """One connection, from its first byte: requests version and recipes, starts, then receives
+    data. `receive` processes bytes, `drain` returns those to send."""
 
     def __init__(self, outputs: Sequence[str], inputs: Sequence[Sequence[str]], rate: float):
         """`outputs` are received `rate` times a second; each of `inputs` may be sent."""
@@ -101,7 +102,7 @@ class Rtde:
         self._out = [package(REQUEST_VERSION, struct.pack(">H", VERSION))]
 
     def receive(self, data: bytes) -> None:
-        """Take what has come. Raises RtdeError."""
+        """Process received bytes. Raises RtdeError."""
         self._buffer += data
         for letter, payload in packages(self._buffer):
             try:
@@ -110,12 +111,12 @@ class Rtde:
                 raise RtdeError(f"package {letter!r} cannot be read: {fault}") from fault
 
     def drain(self) -> bytes:
-        """Return what is to be sent."""
+        """Return the bytes to send."""
         out, self._out = b"".join(self._out), []
         return out
 
     def send(self, number: int, values: Mapping[str, Any]) -> None:
-        """Send the values of an input recipe (counted from 0); nothing before the start."""
+        """Send the values of an input recipe (counted from 0); do nothing before the start."""
         if self.running:
             identity, recipe = self._sent[number]
             self._out.append(package(DATA, bytes((identity,)) + recipe.pack(values)))
@@ -155,5 +156,5 @@ class Rtde:
 
 
 def _types(payload: bytes) -> list[str]:
-    """The types of a recipe's reply; the list may end with a comma."""
+    """Return the types of a recipe's reply; the list may end with a comma."""
     return payload[1:].decode("ascii").removesuffix(",").split(",")

@@ -1,9 +1,9 @@
-"""Makes the golden journals anew: `python -m tests.run.golden.make`. Do it only when the
-semantics are meant to change.
+"""Make the golden journals again: `python -m tests.run.golden.make`. Run it only after an intended
+change of the semantics.
 
-Each is a mission run of a shipped task in lock step with scripted actions. The tests derive every
-marking and instruction of them again (tests/run/test_golden.py), so a change that no version of
-petrobot may make by accident is noticed.
+Each is a mission run of a shipped task in lock step with scripted actions. The tests compute every
+marking and instruction again (tests/run/test_golden.py), so they notice an unintended change of the
+semantics.
 """
 
 from __future__ import annotations
@@ -75,11 +75,11 @@ STORIES: Mapping[str, tuple[str, int, Mapping[str, list[Line]]]] = {
         },
     ),
 }
-"""Name of a journal: task, runs, and what its actions do."""
+"""Journals by name: task, number of runs, and scripts of its actions."""
 
 
 def make(name: str, folder: Path) -> Path:
-    """Run a story; gives its journal."""
+    """Run a story and return its journal."""
     task_name, runs, lines = STORIES[name]
     task, path = load_task(task_name), folder / f"{name}.journal"
     text = services_text(task)
@@ -110,7 +110,7 @@ def make(name: str, folder: Path) -> Path:
 
 
 def main() -> None:
-    """All of them."""
+    """Make all journals."""
     for name in STORIES:
         (FOLDER / f"{name}.journal").unlink(missing_ok=True)
         print(make(name, FOLDER))

@@ -1,2 +1,1 @@
-"""A laboratory's own package, outside of petrobot: drivers and actions for the tests of the
-node."""
+"""A package as a laboratory would write it: drivers and actions for the tests of the node."""

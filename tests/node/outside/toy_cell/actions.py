@@ -1,4 +1,4 @@
-"""Actions and services of the toy cell: good ones, slow ones, and ones that hang, crash or eat
+"""Actions and services of the toy cell: good ones, slow ones, and ones that hang, crash or use up
 memory."""
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from petrobot.services.action import Cancelled, Context, Result, Status, error, 
 
 
 def add(ctx: Context, *, a: int, b: int = 1) -> Result:
-    """The sum."""
+    """Return the sum."""
     return success(sum=a + b)
 
 
@@ -33,7 +33,7 @@ async def nap(ctx: Context, *, seconds: float) -> Result:
 
 
 async def go(ctx: Context, *, to: float, timeout: float = 5.0) -> Result:
-    """Send the slide somewhere and wait until it is there."""
+    """Send the slide to a position and wait until it is there."""
     number = ctx.device.send({"to": to})
     await ctx.wait(lambda: ctx.device.handled >= number, 1.0)
     if ctx.device.refused:
@@ -55,7 +55,7 @@ async def follow(ctx: Context, *, seconds: float) -> Result:
 
 
 async def lead(ctx: Context, *, seconds: float, speed: float = 0.5) -> Result:
-    """Publish set points on the way, one every 8 ms."""
+    """Publish set points along a line, one every 8 ms."""
     begun = ctx.now
     while ctx.now < begun + seconds:
         ctx.publish("points", [speed * (ctx.now - begun)])
@@ -65,7 +65,7 @@ async def lead(ctx: Context, *, seconds: float, speed: float = 0.5) -> Result:
 
 
 async def look(ctx: Context, *, images: int) -> Result:
-    """Take so many images; gives their sequence numbers, ages and sums."""
+    """Take so many images; return their sequence numbers, ages and sums."""
     source = ctx.device.images
     source.start(50.0)
     seen: list[list[float]] = []
@@ -86,20 +86,20 @@ async def look(ctx: Context, *, images: int) -> Result:
 
 
 async def relay(ctx: Context, *, a: int) -> Result:
-    """Call another action's node, and the memory, by name alone."""
+    """Call an action of another node, and the global memory, by name."""
     result = await ctx.call("sum_service", a=a, b=2)
     version = await ctx.put("sum", result.values.get("sum"))
     return success(sum=await ctx.get("sum"), version=version, pid=os.getpid())
 
 
 async def delegate(ctx: Context, *, service: str) -> Result:
-    """Hand back what a service answered."""
+    """Return what a service answered."""
     result = await ctx.call(service, 1.0)
     return success(status=str(result.status), cause=result.cause, text=result.text)
 
 
 async def swap(ctx: Context, *, times: int) -> Result:
-    """Count up a shared variable, so many times, against whoever else does."""
+    """Increment a shared variable so many times, while other actions do the same."""
     for _ in range(times):
         while True:
             seen = await ctx.call("memory.get", name="count")
@@ -121,7 +121,7 @@ async def slow_service(ctx: Context, *, seconds: float) -> Result:
 
 
 def hang(ctx: Context) -> Result:
-    """Never come back, and never give the interpreter a chance to ask why."""
+    """Never return, in a C call that Python cannot interrupt."""
     while True:
         pass
 
@@ -135,7 +135,7 @@ async def hang_moving(ctx: Context) -> Result:
 
 
 def segfault(ctx: Context) -> Result:
-    """Read what is not there."""
+    """Read an invalid address."""
     ctypes.string_at(8)
     return success()
 
@@ -146,13 +146,13 @@ def leave(ctx: Context) -> Result:
 
 
 def eat(ctx: Context, *, megabytes: int) -> Result:
-    """Take much memory."""
+    """Allocate much memory."""
     block = bytearray(megabytes << 20)
     return success(bytes=len(block))
 
 
 def keep_memory(ctx: Context) -> Result:
-    """Take all memory there is, bit by bit, and keep it."""
+    """Allocate more and more memory, and keep it."""
     while True:
         kept.append(bytearray(1 << 16))
 
@@ -161,12 +161,12 @@ kept: list[bytearray] = []
 
 
 def pid(ctx: Context) -> Result:
-    """Which process runs this."""
+    """Return the id of the process that runs this."""
     return success(pid=os.getpid())
 
 
 async def tell(ctx: Context, *, name: str) -> Result:
-    """Raise an event, tell progress, wait a bit."""
+    """Raise an event, report progress, wait a little."""
     ctx.raise_event(name, run=ctx.run)
     ctx.progress(0.5, note="half")
     await ctx.sleep(0.1)
@@ -174,36 +174,36 @@ async def tell(ctx: Context, *, name: str) -> Result:
 
 
 def twisted(ctx: Context) -> Result:
-    """Returns what no message can carry."""
+    """Return what no message can contain."""
     return success(rows=[{"key": {1: 2}}])
 
 
 def double(ctx: Context, *, numbers: tuple[float, ...]) -> Result:
-    """Returns a tuple, and says so in an event."""
+    """Return a tuple, and send one in an event."""
     ctx.raise_event("doubled", count=len(numbers))
     return success(numbers=tuple(2.0 * n for n in numbers))
 
 
 def broken(ctx: Context) -> Result:
-    """Fails as programs do."""
+    """Raise an exception."""
     raise ZeroDivisionError("nothing is divided by nothing")
 
 
 def judge(ctx: Context, *, run: str) -> Result:
-    """Say what an earlier run really came to."""
+    """Send a verdict on an earlier run."""
     ctx.verdict(run, Status.FAILURE, "crooked")
     return success()
 
 
 def block(ctx: Context, *, seconds: float) -> Result:
-    """Hold the interpreter's only thread, as a driver's library may."""
+    """Block the interpreter's only thread, as a driver's library may."""
     time.sleep(seconds)
     return success(slept=seconds)
 
 
 def leave_behind(ctx: Context, *, how: str, mark: str, then: str = "return") -> Result:
-    """Start something that lives on, in one of many ways; `mark` gets its process id. Then return,
-    block, crash or leave."""
+    """Start a process that survives this action, in one of several ways; its process id is written
+    to `mark`. Then return, block, crash or exit."""
     LEAVERS[how](mark)
     while not (Path(mark).exists() and Path(mark).read_text()):
         time.sleep(0.005)
@@ -224,7 +224,7 @@ def _fork(mark: str) -> None:
 
 
 def _daemon(mark: str) -> None:
-    """Fork twice into a session of its own: its parent is gone, and so is all that tells where it
+    """Fork twice into a new session: the process has no parent any more, and nothing shows where it
     comes from."""
     if os.fork() == 0:
         os.setsid()
@@ -241,7 +241,7 @@ def _program(mark: str) -> None:
 
 
 def _program_with_sockets(mark: str) -> None:
-    """A program that is given every descriptor of this process that it can have."""
+    """Start a program that inherits every file descriptor of this process."""
     open_ones = [int(one.name) for one in Path("/proc/self/fd").iterdir() if int(one.name) > 2]
     passed = [one for one in open_ones if Path(f"/proc/self/fd/{one}").exists()]
     left.append(subprocess.Popen(["sleep", "3600"], pass_fds=passed, start_new_session=True))
@@ -249,13 +249,13 @@ def _program_with_sockets(mark: str) -> None:
 
 
 def _no_pipe(mark: str) -> None:
-    """Close every descriptor, the pipe to the node among them."""
+    """Close every file descriptor, also the pipe to the node."""
     os.closerange(3, 1000)
     Path(mark).write_text(str(os.getpid()))
 
 
 def _fork_that_returns(mark: str) -> None:
-    """A copy of the worker that comes back from the action as if it were the worker."""
+    """Fork a copy of the worker that returns from the action as if it were the worker."""
     if os.fork() == 0:
         return
     Path(mark).write_text(str(os.getpid()))
@@ -280,7 +280,8 @@ async def order(
     look: bool = False,
     ends: str = "success",
 ) -> Result:
-    """Send commands, wait a bit, and end as asked, whatever the driver made of the commands."""
+    """Send commands, wait a little, and end as requested, even if the driver failed on the
+    commands."""
     for body in send:
         ctx.device.send(body)
     if seconds:
@@ -301,7 +302,7 @@ async def order_directly(ctx: Context, *, send: list[dict[str, Any]], seconds: f
 
 
 async def spin(ctx: Context, *, stubborn: bool = False) -> Result:
-    """Go round and round, and let nobody stop that if `stubborn`."""
+    """Loop without end; if `stubborn`, ignore every interruption."""
     await ctx.sleep(0.02)
     while True:
         try:
@@ -312,6 +313,6 @@ async def spin(ctx: Context, *, stubborn: bool = False) -> Result:
 
 
 def turn_round() -> None:
-    """Never come back."""
+    """Loop without end."""
     while True:
         pass

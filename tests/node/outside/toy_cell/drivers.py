@@ -12,7 +12,8 @@ from petrobot.services.device import Ports
 
 
 class Slide:
-    """A cyclic driver: goes to a place at a speed, follows the stream `points`, or stands."""
+    """A cyclic driver: moves to a position at a speed, follows the stream `points`, or stands
+    still."""
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         self.period: float | None = float(config["period"])
@@ -42,7 +43,7 @@ class Slide:
             self._following = bool(body["follow"])
 
     def step(self, now: float) -> None:
-        """Move a bit."""
+        """Move by one cycle."""
         self._cycles += 1
         if self._bus is not None:
             self._heard += len(self._bus.receive())
@@ -59,7 +60,7 @@ class Slide:
             self.position += max(-most, min(most, self._goal - self.position))
 
     def state(self) -> Mapping[str, Any]:
-        """Where it is."""
+        """Return the position."""
         age = self._stream.age if self._stream is not None else 0.0
         return {
             "position": self.position,
@@ -76,7 +77,7 @@ class Slide:
         self._stops += 1
 
     def stopped(self) -> bool:
-        """Whether it stands."""
+        """Return whether it stands still."""
         return self._goal == self.position and not self._following
 
     def hold(self, now: float) -> str:
@@ -89,11 +90,11 @@ class Slide:
         self._held = False
 
     def close(self) -> None:
-        """Nothing to let go."""
+        """Release nothing."""
 
 
 class Eye:
-    """A driver without cyclic duty: hands out images of its source."""
+    """A driver without cyclic work: returns images of its source."""
 
     period: float | None = None
 
@@ -103,35 +104,35 @@ class Eye:
         self.stops = 0
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """It takes none."""
+        """Refuse every command."""
         raise ValueError("an eye takes no commands")
 
     def step(self, now: float) -> None:
-        """It has no cycle."""
+        """Do nothing: it has no cycle."""
 
     def state(self) -> Mapping[str, Any]:
-        """How often it was stopped."""
+        """Return how often it was stopped."""
         return {"stops": self.stops}
 
     def stop(self, now: float) -> None:
-        """No more images."""
+        """Return no more images."""
         self.stops += 1
         if self.images is not None:
             self.images.stop()
 
     def stopped(self) -> bool:
-        """It never moves."""
+        """Return True: it never moves."""
         return True
 
     def hold(self, now: float) -> str:
-        """Images may go on."""
+        """Continue to return images."""
         return "cannot hold"
 
     def release(self, now: float) -> None:
-        """It was not held."""
+        """Do nothing: it was not held."""
 
     def close(self) -> None:
-        """Let the source go."""
+        """Close the source."""
         if self.images is not None:
             self.images.close()
 
@@ -140,8 +141,8 @@ class Broken:
     """A cyclic device whose driver raises where its key `breaks` says, once an action has sent it
     `{"break": true}`.
 
-    `sees` is what its `state` and `picture` tell; it counts as moving from `{"go": true}` until it
-    is stopped.
+    `sees` is what its `state` and `picture` return; it counts as moving from `{"go": true}` until
+    it is stopped.
     """
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
@@ -173,7 +174,7 @@ class Broken:
         self._note()
 
     def step(self, now: float) -> None:
-        """Write down whether it moves."""
+        """Record whether it moves."""
         self._fail("step")
         if self._armed and self._breaks == "event":
             self._ports.raise_event("e" * 300)
@@ -187,7 +188,7 @@ class Broken:
                 log.write(f"{time.monotonic()} {said}\n")
 
     def state(self) -> Mapping[str, Any]:
-        """Plain data, as long as it is whole."""
+        """Return plain data, unless it is broken."""
         self._fail("state")
         if self._armed and self._breaks == "not_plain":
             return {"arm": {"pose": object()}}
@@ -204,7 +205,7 @@ class Broken:
         self._fail("stop")
 
     def stopped(self) -> bool:
-        """Whether it stands."""
+        """Return whether it stands still."""
         self._fail("stopped")
         return not self._moving
 
@@ -218,10 +219,10 @@ class Broken:
         self._fail("release")
 
     def picture(self) -> Mapping[str, Any]:
-        """What it sees."""
+        """Return what it sees."""
         self._fail("picture")
         return {"mime": "image/png", "data": b"", "width": 0, "height": 0, "age": 0.0}
 
     def close(self) -> None:
-        """Let it go."""
+        """Close the device."""
         self._fail("close")

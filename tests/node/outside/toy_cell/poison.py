@@ -1,4 +1,4 @@
-"""Actions and a service that make what no message can carry, each in one way."""
+"""Actions and a service that produce values that no message can contain, each in one way."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from petrobot.services.action import Context, Result, Status, error, failure, su
 
 
 class OwnEnd(BaseException):
-    """An exception that no `except Exception` sees."""
+    """An exception that `except Exception` does not catch."""
 
 
 class Mute(Exception):  # noqa: N818 - not a name of ours
@@ -116,7 +116,7 @@ RESULTS: Mapping[str, Callable[[], Any]] = {
     "a dict": lambda: {"x": 1},
     "a cause without words": lambda: error(Mute()),  # type: ignore[arg-type]
 }
-"""What an action returns that must end its run as `bad_result`."""
+"""Values that an action returns; each must end its run as `bad_result`."""
 RAISES: Mapping[str, Callable[[], BaseException]] = {
     "KeyboardInterrupt": KeyboardInterrupt,
     "SystemExit": lambda: SystemExit(3),
@@ -128,7 +128,7 @@ RAISES: Mapping[str, Callable[[], BaseException]] = {
     "one with many words": lambda: ValueError("x" * 20_000_000),
     "one with half a letter": lambda: ValueError("\ud800"),
 }
-"""What it raises, which must end its run as `exception`."""
+"""Exceptions that it raises; each must end its run as `exception`."""
 SAYS: Mapping[str, Callable[[Context], Any]] = {
     "an event with a long name": lambda ctx: ctx.raise_event("e" * 256),
     "an event with half a letter": lambda ctx: ctx.raise_event("\ud800"),
@@ -144,7 +144,7 @@ SAYS: Mapping[str, Callable[[Context], Any]] = {
     "a verdict with half a letter": lambda ctx: ctx.verdict("m/p#1", Status.FAILURE, "x", "\ud800"),
     "a verdict on much": lambda ctx: ctx.verdict("m" * 250 + "/p#1", Status.FAILURE),
 }
-"""What it says in between, which must end its run as `exception`."""
+"""Events and progress that it sends; each must end its run as `exception`."""
 ASKS: Mapping[str, Callable[[Context], Any]] = {
     "a service with a long name": lambda ctx: ctx.call("s" * 256),
     "a service with half a letter": lambda ctx: ctx.call("\ud800"),
@@ -158,7 +158,7 @@ ASKS: Mapping[str, Callable[[Context], Any]] = {
     "a bomb in the memory": lambda ctx: ctx.put("v", _bomb()),
     "a long name in the memory": lambda ctx: ctx.put("v" * 300, 1),
 }
-"""What it calls, which must end its run as `exception`."""
+"""Calls that it makes; each must end its run as `exception`."""
 
 
 def _made(kind: str) -> Any:
@@ -166,7 +166,7 @@ def _made(kind: str) -> Any:
 
 
 async def give(ctx: Context, *, kind: str) -> Result:
-    """Do it."""
+    """Return, raise, send or call the value of this name."""
     await ctx.sleep(0.01)
     if kind in SAYS:
         SAYS[kind](ctx)
@@ -180,7 +180,7 @@ async def give(ctx: Context, *, kind: str) -> Result:
 
 
 def serve(ctx: Context, *, kind: str) -> Result:
-    """Do it on the spot."""
+    """Do the same as a service."""
     if kind in SAYS:
         SAYS[kind](ctx)
         return success()
@@ -189,5 +189,5 @@ def serve(ctx: Context, *, kind: str) -> Result:
 
 
 def echo(ctx: Context, *, value: Any) -> Result:
-    """Give back what it is given."""
+    """Return the argument."""
     return success(value=value)

@@ -1,5 +1,5 @@
 """Actions of a cell whose picks are judged later: by an inspection on another node, by the score,
-or by nobody."""
+or not at all."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ from petrobot.services.action import Context, Result, Status, provisional, succe
 
 
 def number(run: str) -> int:
-    """How many picks there had been, this one included."""
+    """Return the number of the pick, counted from 1."""
     return int(run.rpartition("#")[2])
 
 
 async def pick(ctx: Context, *, side: str) -> Result:
-    """Pick a part. Whether it is held well shows later, so its run's id goes along with it."""
+    """Pick a part. Whether it is held well is known only later, so the result contains the run's
+    id."""
     await ctx.sleep(0.05)
     return provisional(success(held=ctx.run, side=side))
 
 
 async def inspect(ctx: Context, *, run: str) -> Result:
-    """Look at what was picked: the first and fourth are crooked (the first is said twice), the
-    third and sixth hidden."""
+    """Inspect a picked part: the first and fourth are crooked (the first gets two verdicts), the
+    third and sixth cannot be seen."""
     await ctx.sleep(0.05)
     if number(run) in (1, 4):
         ctx.verdict(run, Status.FAILURE, "crooked", "held by a corner")

@@ -1,5 +1,5 @@
-"""Drivers are heard: what one raises, refuses or misses is in the run's error, in `petrobot nodes`
-and in the node's log."""
+"""Faults of drivers are reported: exceptions, refusals and late cycles appear in the run's error,
+in `petrobot nodes` and in the node's log."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FAULTS = {
     "huge": "do not fit into one datagram",
     "event": "expected at most 255 characters, found 300",
 }
-"""What a driver does wrong once an action has moved it, and the words that a person is to find."""
+"""Faults of a driver once an action has moved it, and the words that the user must find."""
 DEVICE = """\
 [devices.the_{name}]
 node = "only"
@@ -93,8 +93,8 @@ def cell(*devices: str) -> str:
 
 @pytest.fixture(scope="module")
 def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OneNode]:
-    """A node with a device for each fault, and with some that are told to fail by the node
-    itself."""
+    """A node with a device for each fault, and devices on which a command of the node itself
+    fails."""
     names = [*FAULTS, "stop", "hold", "picture", "command", "good"]
     direct = device("plain_stop", "order_directly", "").replace(
         'breaks = "plain_stop"', 'breaks = "stop"'
@@ -112,7 +112,7 @@ async def operator(node: OneNode) -> AsyncIterator[Operator]:
 
 
 async def works(operator: Operator, name: str) -> None:
-    """The device takes runs again, as soon as its driver comes back to take them."""
+    """Check that the device accepts runs again as soon as its driver has returned."""
     until = time.monotonic() + PATIENCE
     while (end := await operator.call(name, None, send=[], seconds=0.01)).cause == "fenced":
         assert time.monotonic() < until, end
@@ -121,11 +121,11 @@ async def works(operator: Operator, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FAULTS)
-async def test_what_a_driver_raises_is_its_runs_error(
+async def test_an_exception_of_a_driver_is_the_runs_error(
     node: OneNode, operator: Operator, name: str
 ) -> None:
-    """The run ends at once with the driver's words, the log has them with a traceback, an innocent
-    run goes on, and the device comes back."""
+    """The run ends at once with the driver's message, the log has it with a traceback, another run
+    continues, and the device works again."""
     innocent = asyncio.create_task(operator.call("good", None, send=[{"go": True}], seconds=0.5))
     end = await operator.call(name, None, send=[{"go": True}, {"break": True}], seconds=15.0)
     assert (end.status, end.cause, end.executed) == ("error", "device_died", "unknown"), end
@@ -203,7 +203,7 @@ async def test_a_picture_that_raises_stops_nothing(node: OneNode, operator: Oper
     ids=["refused", "refused, then another", "KeyError", "any exception"],
 )
 @pytest.mark.parametrize("seconds", [0.0, 0.1], ids=["returns at once", "waits"])
-async def test_a_refusal_that_the_action_does_not_look_at(
+async def test_a_refusal_that_the_action_does_not_check(
     node: OneNode, operator: Operator, send: list[dict[str, Any]], says: str, seconds: float
 ) -> None:
     name = "command" if "break" in send[0] else "good"
@@ -213,7 +213,7 @@ async def test_a_refusal_that_the_action_does_not_look_at(
     assert says in node.log.read_text()
 
 
-async def test_an_action_that_looks_decides_itself(operator: Operator) -> None:
+async def test_an_action_that_checks_the_refusal_decides_itself(operator: Operator) -> None:
     end = await operator.call("good", None, send=[{"odd": 5}], seconds=0.1, look=True)
     assert end.status == "success" and end.values == {"refused": "the base takes no odd numbers: 5"}
     own = await operator.call("good", None, send=[{"odd": 7}], seconds=0.1, ends="error")
@@ -222,13 +222,14 @@ async def test_an_action_that_looks_decides_itself(operator: Operator) -> None:
     assert again.status == "success", "what an earlier run was refused is not this one's"
 
 
-async def test_nodes_shows_what_was_refused_and_missed(
+async def test_nodes_shows_refusals_and_missed_cycles(
     node: OneNode,
     operator: Operator,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "400")  # no line of the table is broken, whatever the counts
+    # no line of the table is wrapped, however large the counts
+    monkeypatch.setenv("COLUMNS", "400")
     for number in range(3):
         await operator.call("good", None, send=[{"odd": number}], seconds=0.05, look=True)
     slow = await operator.call("good", None, send=[{"block": 1.3}], seconds=2.0)
@@ -261,7 +262,7 @@ async def test_a_driver_that_blocks_is_named_at_the_deadline(
 
 
 async def test_a_driver_that_takes_no_commands(operator: Operator) -> None:
-    """The action returns at once; whether its last command is refused cannot be known in time."""
+    """The action returns at once, before the driver could refuse its last command."""
     end = await operator.call("good", None, send=[{"block": 4.0}, {"go": True}])
     assert (end.status, end.cause) == ("error", "command_not_taken"), end
     await asyncio.sleep(3.0)
@@ -269,7 +270,7 @@ async def test_a_driver_that_takes_no_commands(operator: Operator) -> None:
 
 @pytest.mark.parametrize("breaks", ["constructor", "not_plain", "state", "step"])
 def test_a_driver_that_is_broken_from_the_beginning(tmp_path: Path, breaks: str) -> None:
-    """The node says so at once, and does not wait until its devices could have come up."""
+    """The node says so at once, without waiting for its devices to start."""
     text = cell(device(breaks).replace("\nbreaks", "\nat_once = true\nbreaks"))
     one = OneNode(tmp_path, text)
     out, _ = one.process.communicate(timeout=PATIENCE)

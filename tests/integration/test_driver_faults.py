@@ -1,5 +1,5 @@
-"""What a driver or an action does wrong, as the person at the coordinator finds it: exit code,
-journal and log."""
+"""Faults of drivers and actions as the user of the coordinator sees them: exit code, journal and
+log."""
 
 from __future__ import annotations
 
@@ -138,7 +138,9 @@ def petrobot(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         "event",
     ],
 )
-def test_the_words_reach_the_person(tmp_path: Path, services: str, cause: str, words: str) -> None:
+def test_the_drivers_message_reaches_the_user(
+    tmp_path: Path, services: str, cause: str, words: str
+) -> None:
     (tmp_path / "services.toml").write_text(services.replace("{port}", str(free_ports(1)[0])))
     (tmp_path / "driving.toml").write_text(TASK)
     ran = petrobot(tmp_path, "run", "driving.toml", "--up")
