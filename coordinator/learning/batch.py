@@ -123,6 +123,16 @@ class Batch:
         added: Array = np.clip(out, 0.0, 1.0).reshape(self.successes.shape)
         return added
 
+    def neighbours(self) -> Array:
+        """Return equal shares, shape (rows, n), of the combinations that differ from the likeliest
+        one of the row in one action. What they show says most about where the row is now, and
+        trying them costs little."""
+        actions = np.indices(self.shape).reshape(len(self.shape), -1).T
+        differ = (actions != actions[self.p.argmax(axis=1)][:, None, :]).sum(axis=2)
+        near = (differ == 1).astype(float)
+        shares: Array = near / near.sum(axis=1, keepdims=True)
+        return shares
+
     def availability(self) -> Array:
         """A of each action; 1 where nothing is known."""
         started = self.runs + self.missing
@@ -143,8 +153,11 @@ class Batch:
         return np.where(largest > 0, 1.0 / np.where(largest > 0, largest, 1.0), 0.0)
 
     def objective(self) -> Array:
-        """J = 1 - A R + rho C of each action; inf where it was never tried."""
+        """J = 1 - A R + rho C of each action; inf where it was never tried, unless a prior
+        estimates it."""
         j = 1.0 - self.availability() * self.reliability() + self.weight() * self.mean_cost()
+        if self.shape:
+            return j
         return np.where(self.runs + self.missing > 0, j, np.inf)
 
     def spread(self) -> Array:

@@ -462,6 +462,10 @@ class Tracking:
     test on success and cost of each action ignores changes below `slack`, adds up what exceeds it
     and raises an alarm at `threshold`; it starts after `settle` runs. An alarm restarts the
     estimates.
+
+    Of many combinations, floors for each would leave nearly all trials to chance. There the share
+    `explore` of the trials goes to other combinations: a fifth of it to any, the rest to those that
+    differ from the likeliest one in one action.
     """
 
     name: str = "tracking"
@@ -469,6 +473,7 @@ class Tracking:
     exponent: float = 0.7
     gain_floor: float = 0.04
     probability_floor: float = 0.02
+    explore: float = 0.1
     trials: int = 5
     slack: float = 0.15
     threshold: float = 8.0
@@ -485,8 +490,13 @@ class Tracking:
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
         """Return p raised to its floor; 1 for the action that still needs one of its first trials
         since the last restart."""
-        floor = min(self.probability_floor, 1.0 / batch.n)
-        mixed = restricted((1 - floor * batch.n) * batch.p + floor, offered)
+        if batch.shape:
+            other = 0.8 * batch.neighbours() + 0.2 / batch.n
+            raised = (1 - self.explore) * batch.p + self.explore * other
+        else:
+            floor = min(self.probability_floor, 1.0 / batch.n)
+            raised = (1 - floor * batch.n) * batch.p + floor
+        mixed = restricted(raised, offered)
         owed, least = forced(batch, offered, self.trials)
         return np.where(owed[:, None], one_hot(least, batch.n), mixed)
 

@@ -92,6 +92,42 @@ def test_any_rule_learns_over_combinations(rule: str) -> None:
     assert together(table, 300, rule) == 0.0
 
 
+def regret(rule: str, tables: list[Table], each: int, seed: int) -> float:
+    """Return how many goals fewer than with the best combination are met while the tables take
+    turns, each for so many trials."""
+    rng, tasks, lost = np.random.default_rng(seed), names(tables[0].shape), 0.0
+    selector = CombinationSelector(rule, tasks, Question(), "task")
+    for table in tables:
+        for _ in range(each):
+            actions: dict[str, str] = {}
+            for task, alternatives in tasks.items():
+                actions[task], _ = selector.choose(task, "", alternatives, rng)
+                selector.chosen(task, "", actions[task])
+            chance = table[place(tasks, actions)]
+            lost += table.max() - chance
+            selector.update("", actions, ended(rng.random() < chance))
+    return lost
+
+
+def test_tracking_follows_changes_of_the_world() -> None:
+    """One action gets worse, then another. A rule that tries everything anew would lose most of
+    the trials of each phase: there are thirty combinations and a hundred trials."""
+    lost: dict[str, list[float]] = {"tracking": [], "nikolic_fu_fast": []}
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        shares = [rng.uniform(0.75, 1.0, n) for n in (5, 3, 2)]
+        tables = []
+        for worse in (None, 0, 2):
+            now = [one.copy() for one in shares]
+            if worse is not None:
+                now[worse][now[worse].argmax()] *= 0.4
+            tables.append(np.einsum("i,j,k->ijk", *now))
+        for rule, found in lost.items():
+            found.append(regret(rule, tables, 100, seed))
+    assert np.mean(lost["tracking"]) < 0.8 * np.mean(lost["nikolic_fu_fast"]), lost
+    assert np.mean(lost["tracking"]) < 55.0, lost
+
+
 def test_choices_follow_the_probabilities_over_combinations() -> None:
     """Though they are drawn one after the other; of what is not offered nothing is chosen."""
     tasks = names((2, 3))
