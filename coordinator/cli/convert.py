@@ -25,7 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "target",
         type=Path,
-        help="the file to write: .pnml, .net (TINA), .pnpro (GreatSPN, Storm), .dot, .drn (Storm)",
+        help="the file to write: .pnml, .net (TINA), .pnpro (GreatSPN, Storm), .lola, .dot, "
+        ".drn (Storm)",
     )
     parser.add_argument(
         "--view",

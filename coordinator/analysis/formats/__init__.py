@@ -120,6 +120,15 @@ FORMATS: Mapping[str, Format] = {
         },
         greatspn.IDENTIFIER,
     ),
+    ".lola": Format(
+        exports.write_lola,
+        {
+            Feature.UNTIMED: KEPT,
+            Feature.INHIBITORS: "kept where the place has a capacity, left out elsewhere",
+            Feature.CAPACITIES: "written as complementary places with the same effect",
+        },
+        exports.LOLA_NAME,
+    ),
     ".dot": Format(
         exports.write_dot,
         {
