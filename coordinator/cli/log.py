@@ -148,14 +148,18 @@ def _text(found: Recorded) -> Iterator[str]:
         RunRecorded,
         StartRun,
     )
+    from petrobot.coordinator.run.recording import Remark, with_remarks
 
     header, net = found.journal.header, found.engine.compiled.net
     yield f"{header['mission']}  {header['date']}  {header['mode']}  seed {header['seed']}"
     if found.journal.torn_bytes:
         yield f"(a torn tail of {found.journal.torn_bytes} bytes was dropped)"
-    for step in found.steps():
+    for step in with_remarks(found.journal, found.steps()):
+        when = f"{step.number:5} {step.time:10.3f} s  "
+        if isinstance(step, Remark):
+            yield f"{when}remarked {step.author:20} {step.text}"
+            continue
         for one in step.instructions:
-            when = f"{step.number:5} {step.time:10.3f} s  "
             if isinstance(one, Fired):
                 yield f"{when}fired    {one.transition:20} {net.describe(one.after)}"
             elif isinstance(one, StartRun):

@@ -8,7 +8,7 @@ from typing import Any
 
 from petrobot.coordinator.operator.feed import Feed
 
-FREE = frozenset({"estop", "take_controls", "ask_controls", "release_controls"})
+FREE = frozenset({"estop", "remark", "take_controls", "ask_controls", "release_controls"})
 """Commands for every client, with or without the controls."""
 
 Answer = dict[str, Any]

@@ -25,6 +25,7 @@ VERBS = frozenset(
         "remove_tokens",
         "raise_event",
         "force_exit",
+        "remark",
         "abort",
         "estop",
         "clear_estop",
@@ -34,7 +35,7 @@ VERBS = frozenset(
         "override_selector",
     }
 )
-"""All commands. Every client may give `estop`, `take_controls`, `ask_controls` and
+"""All commands. Every client may give `estop`, `remark`, `take_controls`, `ask_controls` and
 `release_controls` (which does nothing without the controls); the others need the controls."""
 
 

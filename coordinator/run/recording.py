@@ -4,17 +4,19 @@ it.
 Kinds of records after the header: `stimulus` (seconds since the origin, the stimulus, the marking
 after it, a digest of the instructions), `node` (which boot of a node is used from here on), `stage`
 (the mission run was prepared or scored, with the result), `epoch` (a coordinator took over the
-run).
+run), `remark` (an operator's text). The engine knows nothing of `epoch` and `remark`: a replay, and
+a run that is derived again, pass over them.
 """
 
 from __future__ import annotations
 
+import heapq
 import logging
 import math
 import time
 import zlib
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,7 +41,29 @@ STIMULUS = "stimulus"
 NODE = "node"
 EPOCH = "epoch"
 STAGE = "stage"
+REMARK = "remark"
+_ASIDE = frozenset((EPOCH, REMARK))
+"""Kinds of records that do not follow from the engine."""
 PREPARED, SCORED = "prepared", "scored"
+
+
+LONGEST_REMARK = 1_000
+"""Longest remark (characters)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """What an operator remarked: number of the record, time since the journal's origin (s)."""
+
+    number: int
+    time: float
+    author: str
+    text: str
+
+    @property
+    def told(self) -> str:
+        """The remark with its author."""
+        return f"{self.author} remarked: {self.text}"
 
 
 def digest(instructions: Sequence[Instruction]) -> int:
@@ -86,6 +110,18 @@ class JournalStore:
         """Write that the mission run has completed a stage: it is not repeated after a resume."""
         self._write(STAGE, {"stage": name, "values": dict(values)})
 
+    def remark(self, now: float, author: str, text: str) -> Remark:
+        """Write a remark with the next sync. Raises ValueError for a text that is not one line of 1
+        to `LONGEST_REMARK` characters."""
+        if not isinstance(text, str) or not text.strip().isprintable() or not text.strip():
+            raise ValueError(f"text: expected one line of plain text, got {text!r:.80}")
+        if len(text) > LONGEST_REMARK:
+            found = f"found {len(text):,}"
+            raise ValueError(f"text: expected at most {LONGEST_REMARK:,} characters, {found}")
+        remark = Remark(self.writer.next_number, round(now - self._origin, 6), author, text.strip())
+        self.writer.append(REMARK, {"t": remark.time, "author": author, "text": remark.text})
+        return remark
+
     def flush(self) -> None:
         """Make all that was appended survive the end of this process."""
         self.writer.flush()
@@ -118,10 +154,25 @@ class RetracingStore(JournalStore):
     def __init__(self, writer: JournalWriter, journal: Journal) -> None:
         super().__init__(writer, 0.0)
         self._path = journal.path
-        self._expected = deque(record for record in journal.records if record.kind != EPOCH)
+        self._expected = deque(journal.records)
         self._rewritten_from = 0
         """Number of the first record with other last digits; 0 if there is none."""
         self._rewritten: list[tuple[str, Mapping[str, Any]]] = []
+        self._pass_over()
+
+    def _pass_over(self) -> None:
+        """Pass over the records that no derivation writes; they keep their place."""
+        while self._expected and self._expected[0].kind in _ASIDE:
+            then = self._expected.popleft()
+            if self._rewritten_from:
+                self._rewritten.append((then.kind, then.data))
+
+    def remark(self, now: float, author: str, text: str) -> Remark:
+        """As in any run, once what the journal holds has been derived again. Raises ValueError
+        before."""
+        if self._expected:
+            raise ValueError("the run is being derived again; remark on it when it has caught up")
+        return super().remark(now, author, text)
 
     def _write(self, kind: str, data: Mapping[str, Any]) -> None:
         if not self._expected:
@@ -141,8 +192,9 @@ class RetracingStore(JournalStore):
                     "differently; run it again from the beginning"
                 )
             self._rewritten.append((kind, data))
-            if not self._expected:
-                self._rewrite()
+        self._pass_over()
+        if self._rewritten_from and not self._expected:
+            self._rewrite()
 
     def _rewrite(self) -> None:
         _log.warning(
@@ -258,6 +310,22 @@ def _compare(
         raise ReplayError(
             f"{where}: the instructions differ from those of then; now they are: {now}"
         )
+
+
+def remarks(journal: Journal) -> list[Remark]:
+    """Return the operators' remarks, in order."""
+    return [
+        Remark(r.number, r.data["t"], r.data["author"], r.data["text"])
+        for r in journal.records
+        if r.kind == REMARK
+    ]
+
+
+def with_remarks(
+    journal: Journal, steps: Iterable[RecordedStep]
+) -> Iterator[RecordedStep | Remark]:
+    """Return the steps of a replay with the operators' remarks between them."""
+    return heapq.merge(steps, remarks(journal), key=lambda one: one.number)
 
 
 def stages(journal: Journal) -> dict[str, Mapping[str, Any]]:
