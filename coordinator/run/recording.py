@@ -1,11 +1,8 @@
 """Mission runs in the journal: what is written for each stimulus, and how a run is replayed from
 it.
 
-Kinds of records after the header: `stimulus` (seconds since the origin, the stimulus, the marking
-after it, a digest of the instructions), `node` (which boot of a node is used from here on), `stage`
-(the mission run was prepared or scored, with the result), `epoch` (a coordinator took over the
-run), `remark` (an operator's text). The engine knows nothing of `epoch` and `remark`: a replay, and
-a run that is derived again, pass over them.
+The constants below are the kinds of records after the header; docs/journal.md has their data. A
+replay reads stimuli and boots of nodes alone, so a new kind needs no reader there.
 """
 
 from __future__ import annotations
@@ -38,13 +35,19 @@ from petrobot.coordinator.run.journal import Journal, JournalError, JournalWrite
 _log = logging.getLogger(__name__)
 
 STIMULUS = "stimulus"
+"""What the engine received, the marking after it, a digest of the instructions that followed."""
 NODE = "node"
-EPOCH = "epoch"
+"""Which boot of a node is used from here on: after a resume, no call is repeated at another one."""
 STAGE = "stage"
-REMARK = "remark"
-_ASIDE = frozenset((EPOCH, REMARK))
-"""Kinds of records that do not follow from the engine."""
+"""The mission run was prepared or scored, with the result: not repeated after a resume."""
 PREPARED, SCORED = "prepared", "scored"
+EPOCH = "epoch"
+"""A coordinator took over the run."""
+REMARK = "remark"
+"""What an operator remarked."""
+_ASIDE = frozenset((EPOCH, REMARK))
+"""Kinds that do not follow from the seed: a lock-step run that is derived again does not write
+them, and they keep their place."""
 
 
 LONGEST_REMARK = 1_000
@@ -96,19 +99,11 @@ class JournalStore:
             "marking": list(state.marking),
             "instructions": digest(instructions),
         }
-        self._write(STIMULUS, data)
+        self.record(STIMULUS, data)
 
-    def _write(self, kind: str, data: Mapping[str, Any]) -> None:
+    def record(self, kind: str, data: Mapping[str, Any]) -> None:
+        """Write a record of any kind with the next sync."""
         self.writer.append(kind, data)
-
-    def node(self, name: str, boot: str) -> None:
-        """Write which boot of a node is used: after a resume, a call is never repeated at another
-        boot."""
-        self._write(NODE, {"node": name, "boot": boot})
-
-    def stage(self, name: str, values: Mapping[str, Any]) -> None:
-        """Write that the mission run has completed a stage: it is not repeated after a resume."""
-        self._write(STAGE, {"stage": name, "values": dict(values)})
 
     def remark(self, now: float, author: str, text: str) -> Remark:
         """Write a remark with the next sync. Raises ValueError for a text that is not one line of 1
@@ -119,7 +114,7 @@ class JournalStore:
             found = f"found {len(text):,}"
             raise ValueError(f"text: expected at most {LONGEST_REMARK:,} characters, {found}")
         remark = Remark(self.writer.next_number, round(now - self._origin, 6), author, text.strip())
-        self.writer.append(REMARK, {"t": remark.time, "author": author, "text": remark.text})
+        self.record(REMARK, {"t": remark.time, "author": author, "text": remark.text})
         return remark
 
     def flush(self) -> None:
@@ -167,17 +162,14 @@ class RetracingStore(JournalStore):
             if self._rewritten_from:
                 self._rewritten.append((then.kind, then.data))
 
-    def remark(self, now: float, author: str, text: str) -> Remark:
-        """As in any run, once what the journal holds has been derived again. Raises ValueError
-        before."""
-        if self._expected:
-            raise ValueError("the run is being derived again; remark on it when it has caught up")
-        return super().remark(now, author, text)
-
-    def _write(self, kind: str, data: Mapping[str, Any]) -> None:
+    def record(self, kind: str, data: Mapping[str, Any]) -> None:
+        """Compare a record with the next one of the journal, or write it behind the last. Raises
+        ReplayError, and ValueError for a kind that is not compared, before all have been."""
         if not self._expected:
-            super()._write(kind, data)
+            super().record(kind, data)
             return
+        if kind in _ASIDE:
+            raise ValueError("the run is being derived again; try again when it has caught up")
         then = self._expected.popleft()
         was, now = unmeasured(then.data), unmeasured(data)
         if not self._rewritten_from and (then.kind, was) != (kind, now):
@@ -205,7 +197,7 @@ class RetracingStore(JournalStore):
         )
         self.writer.cut(self._rewritten_from)
         for kind, data in self._rewritten:
-            super()._write(kind, data)
+            super().record(kind, data)
         self._rewritten.clear()
 
 

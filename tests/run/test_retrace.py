@@ -91,19 +91,21 @@ def test_measured_processor_time_is_no_difference(tmp_path: Path) -> None:
     )
     writer.close()
     store = RetracingStore(JournalWriter(path), read_journal(path))
-    store.stage("scored", {"cpu_s": 2.0})
-    store._write(
+    with pytest.raises(ValueError, match="try again when it has caught up"):
+        store.remark(0.0, "ana", "too early")
+    store.record("stage", {"stage": "scored", "values": {"cpu_s": 2.0}})
+    store.record(
         "stimulus", {"t": 1.0, "stimulus": {"kind": "RunEnded", "run": "a#1", "cpu_seconds": 0.5}}
     )
     compared = store.safe
-    store.stage("other", {})
+    store.record("stage", {"stage": "other", "values": {}})
     assert (compared, store.safe) == (True, False), (
         "what is there is compared, what comes after it is written"
     )
     store.writer.close()
     again = RetracingStore(JournalWriter(path), read_journal(path))
     with pytest.raises(ReplayError, match="record 1 was stage"):
-        again.stage("prepared", {})
+        again.record("stage", {"stage": "prepared", "values": {}})
 
 
 def nudged(value: Any, share: float) -> Any:

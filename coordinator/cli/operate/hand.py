@@ -86,7 +86,7 @@ async def _give(
     told: Callable[[OperatorClient, Answer], Awaitable[str]] | None,
 ) -> int:
     from petrobot.coordinator.operator.client import OperatorError
-    from petrobot.coordinator.operator.controls import FREE
+    from petrobot.coordinator.operator.port import FREE
 
     door = find(options)
     try:
