@@ -32,6 +32,11 @@ def test_its_values_are_plain_and_its_events_are_told() -> None:
     assert [Event("doubled", "it", 0, {"count": 2})] == EVENTS
 
 
+def test_it_may_say_that_it_is_unknown_what_was_executed() -> None:
+    outcome = _call("unsure")
+    assert (outcome.status, outcome.cause, outcome.executed) == ("error", "lost", Executed.UNKNOWN)
+
+
 def test_its_verdicts_are_told() -> None:
     """A service may judge as an action may: it is on nobody's device, and sees what all of them
     did."""
