@@ -135,8 +135,8 @@ def _ended(run: RunRecorded) -> str:
     status = run.status.value.upper() if run.status else ""
     if run.cancelled:
         return f"{status or '-'}  {run.taken_away}"
-    why = f"  {run.cause}: {run.text}" if run.cause else ""
-    return "provisional " * run.deferred + status + why
+    why = ": ".join(filter(None, (run.cause, run.text)))
+    return "provisional " * run.deferred + f"{status}  {why}".rstrip()
 
 
 def _text(found: Recorded) -> Iterator[str]:

@@ -519,7 +519,7 @@ class Node:
         self._now = now
         result = self.memory.call(call.service, call.arguments)
         executed = Executed.NO if result.status is Status.ERROR else Executed.YES
-        return Outcome(call.id, result.status, result.values, result.cause, result.text, executed)
+        return outcome_of(call.id, replace(result, executed=executed))
 
     def _memory_changed(self, name: str, value: Any, version: int) -> None:
         data = {"name": name, "value": value, "version": version}
