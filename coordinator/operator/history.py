@@ -11,7 +11,7 @@ from typing import Any
 
 from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.engine import Engine, Fired, Phase, Report, RunRecorded, StartRun
-from petrobot.coordinator.operator.event_texts import reason_recorded, told
+from petrobot.coordinator.operator.event_texts import firing_of, reason_recorded, told
 from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.run.folder import JOURNAL, RESULT
 from petrobot.coordinator.run.journal import Journal, JournalError, read_journal
@@ -178,7 +178,8 @@ class _Teller:
             elif isinstance(instruction, Report) and instruction.severity.value != "note":
                 notes.append(instruction.text)
             elif isinstance(instruction, Fired):
-                firings.append(self._firing(step, instruction))
+                firing = firing_of(instruction, step.stimulus, self._ends, self._actions)
+                firings.append({**firing, "error": instruction.transition in self._errors})
         after = step.state.marking
         changed = {self._places[i]: n for i, n in enumerate(after) if n != self._marking[i]}
         self._marking = after
@@ -207,21 +208,6 @@ class _Teller:
             "notes": [],
             "error": False,
             "going": self._going,
-        }
-
-    def _firing(self, step: RecordedStep, fired: Fired) -> dict[str, Any]:
-        ends = [self._ends[run] for run in fired.runs if run in self._ends]
-        worst = max(
-            ends,
-            key=lambda end: ("none", "success", "failure", "error").index(end["status"]),
-            default=None,
-        )
-        return {
-            "transition": fired.transition,
-            "cause": told(step.stimulus, fired.cause),
-            "error": fired.transition in self._errors,
-            "reason": worst if worst and worst["status"] in ("failure", "error") else None,
-            "action": self._actions.get(fired.runs[0], "") if fired.runs else "",
         }
 
 
