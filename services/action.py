@@ -48,7 +48,8 @@ class Result:
     """What an action returns: its status, its values, and the reason if it is not SUCCESS.
 
     `values` are plain data; the task file's `out` says which of them go to which variable. `cause`
-    is a short code that programs compare (`"ball_lost"`), `text` is for people.
+    is a short code that programs compare (`"ball_lost"`), `text` is for people: the page and
+    `petrobot log` show it beside the run, also of a SUCCESS.
     """
 
     status: Status

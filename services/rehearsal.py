@@ -15,7 +15,7 @@ from petrobot.services.comm.protocol.messages import Call, Cancel, Event, Feedba
 from petrobot.services.device import Driver
 from petrobot.services.node.inline_host import InlineHost
 from petrobot.services.node.memory import GlobalMemory
-from petrobot.services.worker.context import Draws, Report
+from petrobot.services.worker.context import Draws, Report, outcome_of, result_of
 from petrobot.services.worker.outlets import Sent
 
 NAME, RUN = "action", "rehearsal/action#1"
@@ -156,14 +156,7 @@ class _Stage:
     def _note(self, report: Report) -> None:
         played = self.played
         if isinstance(report, Outcome):
-            played.result = Result(
-                Status(report.status),
-                report.values,
-                report.cause,
-                report.text,
-                report.deferred,
-                report.executed,
-            )
+            played.result = result_of(report)
             played.seconds = report.seconds
         elif isinstance(report, Sent):
             played.published.append((self.now, report.stream, report.values))
@@ -177,8 +170,7 @@ class _Stage:
         elif isinstance(report, Call):
             played.calls.append((self.now, report.service, report.arguments))
             result = self._answer(report)
-            answer = Outcome(report.id, result.status, result.values, result.cause, result.text)
-            self.place.take(self.now, answer)
+            self.place.take(self.now, outcome_of(report.id, result))
 
     def _answer(self, asked: Call) -> Result:
         if asked.service in self._services:

@@ -2,17 +2,22 @@
 
     python -m tools.house                 of this checkout
     python -m tools.house REVISION ...    of revisions beside it (read from git's history)
+    python -m tools.house --walk          which files one run of an action really passes
 
 Code lines are lines that are neither blank, comment nor docstring. A file serves one other file if
 exactly one module imports it; commands of the command line, `__main__` and package files, which are
 found by their names, are left out. The main path is what one action passes from the token that
-enters its place to the firing that follows: its files are listed in docs/life-of-a-run.md.
+enters its place to the firing that follows: its files are listed in docs/life-of-a-run.md. The walk
+runs the robot that `petrobot new robot` writes, in real time, and notes every function call in each
+process between two firings.
 """
 
 from __future__ import annotations
 
 import ast
 import io
+import itertools
+import os
 import re
 import statistics
 import subprocess
@@ -23,6 +28,7 @@ import tokenize
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 ROOT = Path(__file__).parents[1]
 TOPS = ("coordinator", "services", "sim")
@@ -130,13 +136,74 @@ def imports(tree: ast.Module) -> set[str]:
     return found
 
 
-def main_path() -> int:
-    """Return how many files docs/life-of-a-run.md names between the token and the firing."""
+def main_path() -> set[str]:
+    """Return the files that docs/life-of-a-run.md names between the token and the firing."""
     page = ROOT / "docs" / "life-of-a-run.md"
     if not page.exists():
-        return 0
+        return set()
     walked = page.read_text(encoding="utf-8").split("\n## ")[1]
-    return len(set(re.findall(r"`((?:coordinator|services)/[\w/]+\.py)", walked)))
+    return set(re.findall(r"`((?:coordinator|services)/[\w/]+\.py)", walked))
+
+
+NOTE_CALLS = """
+import os, sys, threading, time
+
+root, notes, files = os.environ["WALK_ROOT"] + "/", {}, {}
+
+def note(frame, event, _):
+    if event == "call":
+        name = frame.f_code.co_filename
+        if name not in files:
+            files[name] = os.path.realpath(name).removeprefix(root)
+        if files[name].startswith(("coordinator/", "services/")):
+            if os.getpid() not in notes:
+                notes[os.getpid()] = open(f"{os.environ['WALK_NOTES']}/{os.getpid()}", "w", 1)
+            called = f"{time.monotonic()} {files[name]} {frame.f_code.co_name}"
+            notes[os.getpid()].write(called + chr(10))
+
+sys.setprofile(note)
+threading.setprofile(note)
+"""
+"""Lies on the path as `sitecustomize`, so every Python process of the walk begins with it."""
+FIRING = ("coordinator/engine/firing.py", "fire")
+ACTION_TAKES: Final = 0.1
+"""Least time between two firings with a run between them (s)."""
+
+
+def walk() -> int:
+    """Print the files that one run of an action passes, by process."""
+    with tempfile.TemporaryDirectory() as folder:
+        home = Path(folder)
+        (home / "sitecustomize.py").write_text(NOTE_CALLS, encoding="utf-8")
+        (home / "notes").mkdir()
+        petrobot = [sys.executable, "-m", "petrobot.coordinator"]
+        command = [*petrobot, "new", "robot", "walker"]
+        subprocess.run(command, cwd=home, check=True, capture_output=True, timeout=60)
+        of_walk = {"PYTHONPATH": folder, "WALK_ROOT": str(ROOT), "WALK_NOTES": f"{home}/notes"}
+        command = [*petrobot, "run", "walker.toml", "--up", "--no-page", "--quiet"]
+        subprocess.run(
+            command, cwd=home / "walker", env={**os.environ, **of_walk}, check=False, timeout=120
+        )
+        calls = [
+            [
+                (float(when), file, function)
+                for when, file, function in map(str.split, path.read_text().splitlines())
+            ]
+            for path in sorted((home / "notes").iterdir())
+        ]
+    firings = sorted(when for process in calls for when, *what in process if tuple(what) == FIRING)
+    begun, ended = next(
+        pair for pair in itertools.pairwise(firings) if pair[1] - pair[0] > ACTION_TAKES
+    )
+    named, passed = main_path(), set[str]()
+    for process in calls:
+        here = dict.fromkeys(file for when, file, _ in process if begun <= when <= ended)
+        if here:
+            print("\nA process:", *(f"{'*' * (file in named):2}{file}" for file in here), sep="\n")
+        passed |= here.keys()
+    both = len(named & passed)
+    print(f"\n{len(passed)} files; * {both} of the {len(named)} in docs/life-of-a-run.md")
+    return 0
 
 
 def at_revision(revision: str) -> Measures:
@@ -150,7 +217,9 @@ def at_revision(revision: str) -> Measures:
 
 
 def main() -> int:
-    """Print the table."""
+    """Print the table, or the walk."""
+    if sys.argv[1:] == ["--walk"]:
+        return walk()
     columns = {revision: at_revision(revision).rows() for revision in sys.argv[1:]}
     columns["now"] = measure(ROOT).rows()
     print("| | " + " | ".join(columns) + " |")
@@ -158,7 +227,7 @@ def main() -> int:
     for number, (title, _) in enumerate(columns["now"]):
         print(f"| {title} | " + " | ".join(rows[number][1] for rows in columns.values()) + " |")
     if path := main_path():
-        print(f"\nFiles from the token to the firing (docs/life-of-a-run.md): {path}")
+        print(f"\nFiles from the token to the firing (docs/life-of-a-run.md): {len(path)}")
     return 0
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.coordinator.analysis.formats import read_net, written
+from petrobot.coordinator.analysis.formats import FORMATS, read_net, written
 from petrobot.coordinator.analysis.formats.netfile import (
     NetFile,
     NetFileError,
@@ -439,8 +439,8 @@ def convert_command(
 ) -> CommandResult:
     """Run `petrobot convert`: formats follow from the file endings; losses are listed.
 
-    `view` of a task: "ordinary" or "gspn" (default: gspn for `.drn` and `.pnpro`, which are for
-    chains and GSPNs, or if there is `measure`). `exact` writes the ends net in place of the
+    `view` of a task: "ordinary" or "gspn" (default: gspn for formats that are for rates, or
+    if there is `measure`). `exact` writes the ends net in place of the
     ordinary one.
     """
     assumed: list[str] = []
@@ -451,7 +451,8 @@ def convert_command(
             told = "the ends net of a task without times; leave out --view and --estimates"
             raise NetFileError("--exact", str(source), f"expected {told}", "or leave out --exact")
         if isinstance(model, Task):
-            timed = target.suffix.lower() in (".drn", ".pnpro") or measure is not None
+            form = FORMATS.get(target.suffix.lower())
+            timed = measure is not None or (form is not None and form.timed)
             wanted = view or ("exact" if exact else "gspn" if timed else "ordinary")
             cell = _cell(model, cell_of if wanted == "gspn" else None)
             known = _measured(model, measure, cell)

@@ -80,6 +80,7 @@ COMMANDS = (
         "force", "take a token out of an action place, whatever its run does", "operate.force"
     ),
     Subcommand("override", "choose the action of a primitive task by hand", "operate.override"),
+    Subcommand("remark", "write a remark into the journal of the active run", "operate.remark"),
     Subcommand("abort", "abort the active run", "operate.abort"),
     Subcommand("estop", "emergency stop: stop all devices through their nodes and their bus"),
     Subcommand("log", "print or export a recorded run"),

@@ -19,19 +19,23 @@ EXAMPLE = "petrobot convert catch_ball catch_ball.pnml"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
+    from petrobot.coordinator.analysis.formats import FORMATS
+
+    endings = (e + f" ({form.tool})" * bool(form.tool) for e, form in FORMATS.items())
+    timed = " and ".join(ending for ending, form in FORMATS.items() if form.timed)
     parser.add_argument(
         "source", help="a net or task file, or the name of a task that comes with petrobot"
     )
     parser.add_argument(
         "target",
         type=Path,
-        help="the file to write: .pnml, .net (TINA), .pnpro (GreatSPN, Storm), .dot, .drn (Storm)",
+        help=f"the file to write: {', '.join(endings)}",
     )
     parser.add_argument(
         "--view",
         choices=("ordinary", "gspn"),
         help="which net of a task: the ordinary one, or the stochastic view with rates (default: "
-        "gspn for .pnpro, .drn and with --estimates, else ordinary)",
+        f"gspn for {timed} and with --estimates, else ordinary)",
     )
     parser.add_argument(
         "--exact",

@@ -135,8 +135,8 @@ def _ended(run: RunRecorded) -> str:
     status = run.status.value.upper() if run.status else ""
     if run.cancelled:
         return f"{status or '-'}  {run.taken_away}"
-    why = f"  {run.cause}: {run.text}" if run.cause else ""
-    return "provisional " * run.deferred + status + why
+    why = ": ".join(filter(None, (run.cause, run.text)))
+    return "provisional " * run.deferred + f"{status}  {why}".rstrip()
 
 
 def _text(found: Recorded) -> Iterator[str]:
@@ -148,14 +148,18 @@ def _text(found: Recorded) -> Iterator[str]:
         RunRecorded,
         StartRun,
     )
+    from petrobot.coordinator.run.recording import Remark, with_remarks
 
     header, net = found.journal.header, found.engine.compiled.net
     yield f"{header['mission']}  {header['date']}  {header['mode']}  seed {header['seed']}"
     if found.journal.torn_bytes:
         yield f"(a torn tail of {found.journal.torn_bytes} bytes was dropped)"
-    for step in found.steps():
+    for step in with_remarks(found.journal, found.steps()):
+        when = f"{step.number:5} {step.time:10.3f} s  "
+        if isinstance(step, Remark):
+            yield f"{when}remarked {step.author:20} {step.text}"
+            continue
         for one in step.instructions:
-            when = f"{step.number:5} {step.time:10.3f} s  "
             if isinstance(one, Fired):
                 yield f"{when}fired    {one.transition:20} {net.describe(one.after)}"
             elif isinstance(one, StartRun):

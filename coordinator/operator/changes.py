@@ -59,9 +59,7 @@ def _append(state: State, key: str, entry: Any, kept: int) -> None:
 def _ended(state: State, change: Change) -> None:
     run = state["runs"].pop(change["id"], None)
     if run is not None:
-        extra = {
-            key: change[key] for key in ("status", "ended", "reason", "counts") if key in change
-        }
+        extra = {key: change[key] for key in ("status", "ended", "reason") if key in change}
         _append(state, "ended", {**run, **extra}, ENDED_KEPT)
 
 

@@ -44,6 +44,7 @@ from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Mission, Stage
 from petrobot.coordinator.run.realtime import credentials_of
+from petrobot.coordinator.run.recording import JournalStore
 from petrobot.services.comm.protocol.messages import Feedback
 
 _log = logging.getLogger(__package__)
@@ -250,6 +251,25 @@ class Operation:
                 f"{action} is not an alternative of {task}: {', '.join(primitive.alternatives)}",
             )
         return self._order(Override(task, action or ""))
+
+    async def _do_remark(self, who: str, data: Mapping[str, Any]) -> Answer:
+        store, now = self.executor.store, self.shell.now()
+        if self.mission.stage is Stage.OVER:
+            return refusal("idle", "the mission run is over")
+        if not isinstance(store, JournalStore):
+            return refusal(
+                "no_journal", "this run keeps no journal; start it with --journal FOLDER"
+            )
+        try:
+            remark = store.remark(now, who, data["text"])
+            store.sync()
+        except JournalError as fault:
+            self.shell.fail(fault)
+            return refusal("journal", str(fault))
+        time = round(now - self.narrator.origin, 4)
+        notice = {"level": "info", "text": remark.told, "at": time}
+        self.feed.emit("notice", time=time, notice=notice)
+        return {"ok": True}
 
     def _order(self, stimulus: Stimulus) -> Answer:
         early = self.mission.stage in _BEFORE and isinstance(stimulus, _MAY_COME_EARLY)

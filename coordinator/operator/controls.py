@@ -7,9 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from petrobot.coordinator.operator.feed import Feed
-
-FREE = frozenset({"estop", "take_controls", "ask_controls", "release_controls"})
-"""Commands for every client, with or without the controls."""
+from petrobot.coordinator.operator.port import FREE
 
 Answer = dict[str, Any]
 

@@ -11,6 +11,7 @@ from petrobot.coordinator.engine import (
     Begin,
     Chosen,
     EventOccurred,
+    Fired,
     ForceExit,
     Override,
     Pause,
@@ -119,6 +120,32 @@ def reason_recorded(run: RunRecorded) -> dict[str, Any]:
     if run.cancelled:
         return reason_of(run.status, "", run.taken_away, run.executed)
     return reason_of(run.status, run.cause, run.text, run.executed)
+
+
+def firing_of(
+    fired: Fired,
+    stimulus: Stimulus | None,
+    ends: Mapping[str, dict[str, Any]],
+    actions: Mapping[str, str],
+) -> dict[str, Any]:
+    """Return {transition, cause, reason, run, action} of a firing. Of several runs that it took, it
+    is the one that ended worst; `ends` are their reasons and `actions` their actions."""
+    run = max(
+        fired.runs,
+        key=lambda run: _BY_BADNESS.index(ends[run]["status"]) if run in ends else -1,
+        default="",
+    )
+    end = ends.get(run)
+    return {
+        "transition": fired.transition,
+        "cause": told(stimulus, fired.cause),
+        "reason": end if end is not None and end["status"] in ("failure", "error") else None,
+        "run": run,
+        "action": actions.get(run, ""),
+    }
+
+
+_BY_BADNESS = ("none", "success", "failure", "error")
 
 
 def plain_value(value: Any, depth: int = 4) -> Any:

@@ -11,11 +11,17 @@ from typing import Any
 
 from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.engine import Engine, Fired, Phase, Report, RunRecorded, StartRun
-from petrobot.coordinator.operator.event_texts import reason_recorded, told
+from petrobot.coordinator.operator.event_texts import firing_of, reason_recorded, told
 from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.run.folder import JOURNAL, RESULT
 from petrobot.coordinator.run.journal import Journal, JournalError, read_journal
-from petrobot.coordinator.run.recording import RecordedStep, ReplayError, replay
+from petrobot.coordinator.run.recording import (
+    RecordedStep,
+    Remark,
+    ReplayError,
+    replay,
+    with_remarks,
+)
 from petrobot.coordinator.task import End, Task
 from petrobot.coordinator.task.file import TaskFileError, loads
 
@@ -83,8 +89,8 @@ def opened(path: Path, run: str) -> dict[str, Any]:
         f"a torn tail of {journal.torn_bytes} bytes was dropped" if journal.torn_bytes else ""
     )
     try:
-        for step in replay(journal, engine):
-            records.append(teller.record(step))
+        for step in with_remarks(journal, replay(journal, engine)):
+            records.append(teller.remark(step) if isinstance(step, Remark) else teller.record(step))
             if len(records) >= RECORDS_AT_MOST:
                 fault_text = f"only the first {RECORDS_AT_MOST} records are shown"
                 break
@@ -148,6 +154,7 @@ class _Teller:
     def __init__(self, task: Task) -> None:
         self._places = task.net.places
         self._marking = task.net.initial
+        self._going: list[str] = []
         self._actions: dict[str, str] = {}
         self._ends: dict[str, dict[str, Any]] = {}
         self._errors = {
@@ -171,10 +178,14 @@ class _Teller:
             elif isinstance(instruction, Report) and instruction.severity.value != "note":
                 notes.append(instruction.text)
             elif isinstance(instruction, Fired):
-                firings.append(self._firing(step, instruction))
+                firing = firing_of(instruction, step.stimulus, self._ends, self._actions)
+                firings.append({**firing, "error": instruction.transition in self._errors})
         after = step.state.marking
         changed = {self._places[i]: n for i, n in enumerate(after) if n != self._marking[i]}
         self._marking = after
+        self._going = sorted(
+            {run.place for run in step.state.runs() if run.phase is not Phase.DONE}
+        )
         return {
             "number": step.number,
             "t": round(step.time, 4),
@@ -183,24 +194,20 @@ class _Teller:
             "marking": changed,
             "notes": notes,
             "error": any(f["error"] for f in firings),
-            "going": sorted(
-                {run.place for run in step.state.runs() if run.phase is not Phase.DONE}
-            ),
+            "going": self._going,
         }
 
-    def _firing(self, step: RecordedStep, fired: Fired) -> dict[str, Any]:
-        ends = [self._ends[run] for run in fired.runs if run in self._ends]
-        worst = max(
-            ends,
-            key=lambda end: ("none", "success", "failure", "error").index(end["status"]),
-            default=None,
-        )
+    def remark(self, remark: Remark) -> dict[str, Any]:
+        """Return a remark as a record that changes nothing."""
         return {
-            "transition": fired.transition,
-            "cause": told(step.stimulus, fired.cause),
-            "error": fired.transition in self._errors,
-            "reason": worst if worst and worst["status"] in ("failure", "error") else None,
-            "action": self._actions.get(fired.runs[0], "") if fired.runs else "",
+            "number": remark.number,
+            "t": round(remark.time, 4),
+            "text": remark.told,
+            "firings": [],
+            "marking": {},
+            "notes": [],
+            "error": False,
+            "going": self._going,
         }
 
 

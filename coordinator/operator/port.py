@@ -13,29 +13,25 @@ from typing import Any, Protocol
 PROTOCOL = 1
 """Version of docs/operator-protocol.md, in every snapshot."""
 
-VERBS = frozenset(
-    {
-        "load",
-        "start",
-        "pause",
-        "resume",
-        "step",
-        "breakpoint",
-        "add_tokens",
-        "remove_tokens",
-        "raise_event",
-        "force_exit",
-        "abort",
-        "estop",
-        "clear_estop",
-        "take_controls",
-        "ask_controls",
-        "release_controls",
-        "override_selector",
-    }
-)
-"""All commands. Every client may give `estop`, `take_controls`, `ask_controls` and
-`release_controls` (which does nothing without the controls); the others need the controls."""
+FREE = frozenset({"estop", "remark", "take_controls", "ask_controls", "release_controls"})
+"""Commands for every client. `release_controls` does nothing without the controls."""
+VERBS = FREE | {
+    "load",
+    "start",
+    "pause",
+    "resume",
+    "step",
+    "breakpoint",
+    "add_tokens",
+    "remove_tokens",
+    "raise_event",
+    "force_exit",
+    "abort",
+    "clear_estop",
+    "override_selector",
+}
+"""All commands; those that are not in `FREE` need the controls. `Operation._do_VERB`
+(commands.py) carries one out; the station those about the next run."""
 
 
 class MissionPort(Protocol):

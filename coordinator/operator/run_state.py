@@ -35,10 +35,10 @@ from petrobot.coordinator.engine import (
 from petrobot.coordinator.engine.state import ACTIVE
 from petrobot.coordinator.operator.changes import empty_state
 from petrobot.coordinator.operator.event_texts import (
+    firing_of,
     plain_value,
     reason_of,
     reason_recorded,
-    told,
 )
 from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.net_state import picture
@@ -220,25 +220,12 @@ class Narrator:
     # --- in the terms of the protocol ---------------------------------------------------------
 
     def _fired(self, time: float, fired: Fired) -> None:
-        ends = [self._ends[run] for run in fired.runs if run in self._ends]
-        worst = max(
-            ends, key=lambda end: ("success", "failure", "error").index(end["status"]), default=None
-        )
-        run = next(
-            (r for r in fired.runs if self._ends.get(r) is worst),
-            fired.runs[0] if fired.runs else "",
-        )
-        action = self._actions.get(run, "")
-        firing = {
+        firing = firing_of(fired, self._stimulus, self._ends, self._actions)
+        firing |= {
             "number": fired.number,
-            "transition": fired.transition,
             "at": round(time, 4),
-            "cause": told(self._stimulus, fired.cause),
-            "reason": worst if worst is not None and worst["status"] != "success" else None,
             "error": fired.transition in self._error_exits,
-            "run": run,
-            "action": action,
-            "node": self._where.get(action, ""),
+            "node": self._where.get(firing["action"], ""),
         }
         self.feed.emit("fired", time=time, firing=firing)
         self._marking(time, fired.before, fired.after)

@@ -21,19 +21,23 @@ from petrobot.coordinator.engine import (
     to_plain,
 )
 from petrobot.coordinator.run.journal import Journal
-from petrobot.coordinator.run.recording import RecordedStep
+from petrobot.coordinator.run.recording import RecordedStep, Remark, with_remarks
 from petrobot.coordinator.task.net import Net
 from petrobot.services.host.json_text import json_text
 from petrobot.services.host.whole_file import write_whole
 
 
 def jsonl(journal: Journal, steps: Iterator[RecordedStep]) -> Iterator[str]:
-    """One line for the header, then one for each stimulus with the instructions that followed."""
+    """One line for the header, then one for each stimulus with the instructions that followed, or
+    for a remark."""
     yield json_text({"kind": "header", **journal.header}, ensure_ascii=False)
-    for step in steps:
-        line = {
-            "number": step.number,
-            "t": step.time,
+    for step in with_remarks(journal, steps):
+        line: dict[str, Any] = {"number": step.number, "t": step.time}
+        if isinstance(step, Remark):
+            remark = {"author": step.author, "text": step.text}
+            yield json_text({**line, "remark": remark}, ensure_ascii=False)
+            continue
+        line |= {
             "stimulus": to_plain(step.stimulus),
             "instructions": [to_plain(instruction) for instruction in step.instructions],
             "marking": list(step.state.marking),

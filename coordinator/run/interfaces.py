@@ -32,11 +32,9 @@ class Store(Protocol):
     ) -> None:
         """Store a stimulus and its instructions with the next sync."""
 
-    def node(self, name: str, boot: str) -> None:
-        """Store which boot of a node this run uses."""
-
-    def stage(self, name: str, values: Mapping[str, Any]) -> None:
-        """Store that the mission run reached a stage (prepared, scored)."""
+    def record(self, kind: str, data: Mapping[str, Any]) -> None:
+        """Store a record that is no stimulus, with the next sync
+        (`coordinator/run/recording.py` has the kinds)."""
 
     def flush(self) -> None:
         """Make all that was appended survive the end of this process."""
@@ -81,10 +79,7 @@ class Forgetful:
     ) -> None:
         """Keep nothing."""
 
-    def node(self, name: str, boot: str) -> None:
-        """Keep nothing."""
-
-    def stage(self, name: str, values: Mapping[str, Any]) -> None:
+    def record(self, kind: str, data: Mapping[str, Any]) -> None:
         """Keep nothing."""
 
     def flush(self) -> None:

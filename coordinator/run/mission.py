@@ -21,7 +21,7 @@ from petrobot.coordinator.engine.instructions import (
 )
 from petrobot.coordinator.engine.stimuli import Begin, Point, Stimulus
 from petrobot.coordinator.run.executor import Executor
-from petrobot.coordinator.run.recording import PREPARED, SCORED, RecordedStep
+from petrobot.coordinator.run.recording import NODE, PREPARED, SCORED, STAGE, RecordedStep
 from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.net import Marking
 from petrobot.services.comm.calls.caller import Caller, Notice, PeerLost
@@ -383,7 +383,7 @@ class Mission:
             )
         store = self.executor.store
         if self.stage is Stage.PREPARING:
-            store.stage(PREPARED, {})
+            store.record(STAGE, {"stage": PREPARED, "values": {}})
             store.sync()
             self._begin(now)
         elif self.stage is Stage.SCORING:
@@ -391,7 +391,7 @@ class Mission:
             self.executor.stimulate(
                 now, *map(self.executor.verdict, _verdicts(outcome.values.get(VERDICTS, {})))
             )
-            store.stage(SCORED, score)
+            store.record(STAGE, {"stage": SCORED, "values": dict(score)})
             store.sync()
             self.score, self.stage = score, Stage.OVER
 
@@ -401,7 +401,7 @@ class Mission:
                 self.lost[node] = notice.reason
             elif isinstance(notice, Welcome):
                 self.lost.pop(node, None)
-                self.executor.store.node(node, notice.boot)
+                self.executor.store.record(NODE, {"node": node, "boot": notice.boot})
 
 
 def _verdicts(said: Any) -> list[RunVerdict]:

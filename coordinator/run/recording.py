@@ -1,20 +1,19 @@
 """Mission runs in the journal: what is written for each stimulus, and how a run is replayed from
 it.
 
-Kinds of records after the header: `stimulus` (seconds since the origin, the stimulus, the marking
-after it, a digest of the instructions), `node` (which boot of a node is used from here on), `stage`
-(the mission run was prepared or scored, with the result), `epoch` (a coordinator took over the
-run).
+The constants below are the kinds of records after the header; docs/journal.md has their data. A
+replay reads stimuli and boots of nodes alone, so a new kind needs no reader there.
 """
 
 from __future__ import annotations
 
+import heapq
 import logging
 import math
 import time
 import zlib
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,10 +35,38 @@ from petrobot.coordinator.run.journal import Journal, JournalError, JournalWrite
 _log = logging.getLogger(__name__)
 
 STIMULUS = "stimulus"
+"""What the engine received, the marking after it, a digest of the instructions that followed."""
 NODE = "node"
-EPOCH = "epoch"
+"""Which boot of a node is used from here on: after a resume, no call is repeated at another one."""
 STAGE = "stage"
+"""The mission run was prepared or scored, with the result: not repeated after a resume."""
 PREPARED, SCORED = "prepared", "scored"
+EPOCH = "epoch"
+"""A coordinator took over the run."""
+REMARK = "remark"
+"""What an operator remarked."""
+_ASIDE = frozenset((EPOCH, REMARK))
+"""Kinds that do not follow from the seed: a lock-step run that is derived again does not write
+them, and they keep their place."""
+
+
+LONGEST_REMARK = 1_000
+"""Longest remark (characters)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """What an operator remarked: number of the record, time since the journal's origin (s)."""
+
+    number: int
+    time: float
+    author: str
+    text: str
+
+    @property
+    def told(self) -> str:
+        """The remark with its author."""
+        return f"{self.author} remarked: {self.text}"
 
 
 def digest(instructions: Sequence[Instruction]) -> int:
@@ -72,19 +99,23 @@ class JournalStore:
             "marking": list(state.marking),
             "instructions": digest(instructions),
         }
-        self._write(STIMULUS, data)
+        self.record(STIMULUS, data)
 
-    def _write(self, kind: str, data: Mapping[str, Any]) -> None:
+    def record(self, kind: str, data: Mapping[str, Any]) -> None:
+        """Write a record of any kind with the next sync."""
         self.writer.append(kind, data)
 
-    def node(self, name: str, boot: str) -> None:
-        """Write which boot of a node is used: after a resume, a call is never repeated at another
-        boot."""
-        self._write(NODE, {"node": name, "boot": boot})
-
-    def stage(self, name: str, values: Mapping[str, Any]) -> None:
-        """Write that the mission run has completed a stage: it is not repeated after a resume."""
-        self._write(STAGE, {"stage": name, "values": dict(values)})
+    def remark(self, now: float, author: str, text: str) -> Remark:
+        """Write a remark with the next sync. Raises ValueError for a text that is not one line of 1
+        to `LONGEST_REMARK` characters."""
+        if not isinstance(text, str) or not text.strip().isprintable() or not text.strip():
+            raise ValueError(f"text: expected one line of plain text, got {text!r:.80}")
+        if len(text) > LONGEST_REMARK:
+            found = f"found {len(text):,}"
+            raise ValueError(f"text: expected at most {LONGEST_REMARK:,} characters, {found}")
+        remark = Remark(self.writer.next_number, round(now - self._origin, 6), author, text.strip())
+        self.record(REMARK, {"t": remark.time, "author": author, "text": remark.text})
+        return remark
 
     def flush(self) -> None:
         """Make all that was appended survive the end of this process."""
@@ -118,15 +149,27 @@ class RetracingStore(JournalStore):
     def __init__(self, writer: JournalWriter, journal: Journal) -> None:
         super().__init__(writer, 0.0)
         self._path = journal.path
-        self._expected = deque(record for record in journal.records if record.kind != EPOCH)
+        self._expected = deque(journal.records)
         self._rewritten_from = 0
         """Number of the first record with other last digits; 0 if there is none."""
         self._rewritten: list[tuple[str, Mapping[str, Any]]] = []
+        self._pass_over()
 
-    def _write(self, kind: str, data: Mapping[str, Any]) -> None:
+    def _pass_over(self) -> None:
+        """Pass over the records that no derivation writes; they keep their place."""
+        while self._expected and self._expected[0].kind in _ASIDE:
+            then = self._expected.popleft()
+            if self._rewritten_from:
+                self._rewritten.append((then.kind, then.data))
+
+    def record(self, kind: str, data: Mapping[str, Any]) -> None:
+        """Compare a record with the next one of the journal, or write it behind the last. Raises
+        ReplayError, and ValueError for a kind that is not compared, before all have been."""
         if not self._expected:
-            super()._write(kind, data)
+            super().record(kind, data)
             return
+        if kind in _ASIDE:
+            raise ValueError("the run is being derived again; try again when it has caught up")
         then = self._expected.popleft()
         was, now = unmeasured(then.data), unmeasured(data)
         if not self._rewritten_from and (then.kind, was) != (kind, now):
@@ -141,8 +184,9 @@ class RetracingStore(JournalStore):
                     "differently; run it again from the beginning"
                 )
             self._rewritten.append((kind, data))
-            if not self._expected:
-                self._rewrite()
+        self._pass_over()
+        if self._rewritten_from and not self._expected:
+            self._rewrite()
 
     def _rewrite(self) -> None:
         _log.warning(
@@ -153,7 +197,7 @@ class RetracingStore(JournalStore):
         )
         self.writer.cut(self._rewritten_from)
         for kind, data in self._rewritten:
-            super()._write(kind, data)
+            super().record(kind, data)
         self._rewritten.clear()
 
 
@@ -258,6 +302,22 @@ def _compare(
         raise ReplayError(
             f"{where}: the instructions differ from those of then; now they are: {now}"
         )
+
+
+def remarks(journal: Journal) -> list[Remark]:
+    """Return the operators' remarks, in order."""
+    return [
+        Remark(r.number, r.data["t"], r.data["author"], r.data["text"])
+        for r in journal.records
+        if r.kind == REMARK
+    ]
+
+
+def with_remarks(
+    journal: Journal, steps: Iterable[RecordedStep]
+) -> Iterator[RecordedStep | Remark]:
+    """Return the steps of a replay with the operators' remarks between them."""
+    return heapq.merge(steps, remarks(journal), key=lambda one: one.number)
 
 
 def stages(journal: Journal) -> dict[str, Mapping[str, Any]]:

@@ -52,7 +52,7 @@ from petrobot.services.worker.callables import (
     from_outside,
     log_fault,
 )
-from petrobot.services.worker.context import Report, RunContext, checked_result
+from petrobot.services.worker.context import Report, RunContext, checked_result, outcome_of
 from petrobot.services.worker.outlets import Outlets, Sent
 from petrobot.services.worker.remote import CLEAR_EMERGENCY, EMERGENCY_STOP, IN_EMERGENCY
 from petrobot.services.worker.runner import Hung, stop_reason
@@ -134,9 +134,7 @@ def inline_service(service: ServiceEntry, raised: Callable[[Event], None]) -> In
                 call.id, Status.ERROR, {}, "bad_result", f"what it returned cannot be sent: {fault}"
             )
         cpu = time.process_time() - before
-        return Outcome(
-            call.id, result.status, result.values, result.cause, result.text, cpu_seconds=cpu
-        )
+        return outcome_of(call.id, result, cpu_seconds=cpu)
 
     return answer
 
@@ -521,7 +519,7 @@ class Node:
         self._now = now
         result = self.memory.call(call.service, call.arguments)
         executed = Executed.NO if result.status is Status.ERROR else Executed.YES
-        return Outcome(call.id, result.status, result.values, result.cause, result.text, executed)
+        return outcome_of(call.id, replace(result, executed=executed))
 
     def _memory_changed(self, name: str, value: Any, version: int) -> None:
         data = {"name": name, "value": value, "version": version}

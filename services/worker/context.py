@@ -49,6 +49,35 @@ def checked(message: Message) -> None:
         raise ValueError(fault.text) from None
 
 
+def outcome_of(
+    identity: str, result: Result, seconds: float = 0.0, cpu_seconds: float = 0.0
+) -> Outcome:
+    """Return the result of a call as the message that carries it."""
+    return Outcome(
+        identity,
+        result.status,
+        result.values,
+        result.cause,
+        result.text,
+        Executed(result.executed),
+        seconds,
+        cpu_seconds,
+        result.deferred,
+    )
+
+
+def result_of(outcome: Outcome) -> Result:
+    """Return the result that a message carries."""
+    return Result(
+        Status(outcome.status),
+        outcome.values,
+        outcome.cause,
+        outcome.text,
+        outcome.deferred,
+        outcome.executed,
+    )
+
+
 def checked_result(identity: str, returned: Any, where: str = "result") -> Result:
     """Return what an action or a service returned, as plain data that can be sent. Raises
     ValueError if that is impossible; `where` names the values in its text."""
@@ -63,11 +92,7 @@ def checked_result(identity: str, returned: Any, where: str = "result") -> Resul
         result = Result(
             Status(returned.status), values, *said, executed=Executed(returned.executed)
         )
-        checked(
-            Outcome(
-                identity, result.status, values, result.cause, result.text, deferred=result.deferred
-            )
-        )
+        checked(outcome_of(identity, result))
     except (TypeError, ValueError, MemoryError) as fault:
         raise ValueError(words_of(fault) or type(fault).__name__) from None
     except Exception as fault:  # the value's own code: an object may raise whatever is asked of it
@@ -272,7 +297,6 @@ class RunContext:
         it."""
         if outcome.id not in self._waiting:
             return False
-        self._answers[outcome.id] = Result(
-            Status(outcome.status), outcome.values, outcome.cause, outcome.text
-        )
+        # A verdict on a provisional answer names the run that gave it, never this one.
+        self._answers[outcome.id] = replace(result_of(outcome), deferred=False)
         return True

@@ -15,8 +15,7 @@ import os
 import socket
 import time
 
-from petrobot.services.comm.protocol.codec import ProtocolError
-from petrobot.services.comm.protocol.messages import Answer, Command, Event, Message
+from petrobot.services.comm.protocol.messages import Answer, Command, Event
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import PICTURE, Driver, picture_of, stop_at_once
 from petrobot.services.node.emergency_stops import BEAT, Guard
@@ -53,19 +52,6 @@ def take_priority() -> bool:
     except (PermissionError, OSError):
         return False
     return True
-
-
-def post_report(node: Pipe, report: Message) -> None:
-    """Send a report to the node. An answer that cannot be sent is replaced by the reason: the state
-    that a driver returns must not end its process."""
-    try:
-        node.post(report)
-    except ProtocolError as fault:
-        if not isinstance(report, Answer):
-            raise
-        _log.warning("the answer to a command cannot be sent: %s", fault)
-        word = report.data.get("answer")
-        node.post(Answer(report.id, True, {"answer": word, "text": fault.text}))
 
 
 class DeviceError(Exception):
@@ -253,9 +239,8 @@ class DeviceLoop:
             self._driver.release(now)
             self._tell(id_, "released")
         elif verb == PICTURE:
-            post_report(
-                self._node, Answer(id_, True, {"answer": PICTURE, **picture_of(self._driver)})
-            )
+            data = {"answer": PICTURE, **picture_of(self._driver)}
+            self._node.report(Answer(id_, True, data))
         else:
             self._tell(id_, "up")
 
@@ -275,4 +260,4 @@ class DeviceLoop:
             "overruns": self._overruns,
             "refused": self._cyclic.refused,
         }
-        post_report(self._node, Answer(id_, True, {"answer": answer, **data}))
+        self._node.report(Answer(id_, True, {"answer": answer, **data}))

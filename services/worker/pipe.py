@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import logging
 import os
 import socket
 import weakref
@@ -17,7 +18,9 @@ from typing import Any
 import msgpack
 
 from petrobot.services.comm.protocol.codec import ProtocolError, encode, read_fields
-from petrobot.services.comm.protocol.messages import Message
+from petrobot.services.comm.protocol.messages import Answer, Message
+
+_log = logging.getLogger(__name__)
 
 Item = Message | list[Any]
 """A message, or a list of plain data whose first item is a word."""
@@ -82,6 +85,19 @@ class Pipe:
     def unsent(self) -> bool:
         """Whether something waits until the other end reads."""
         return bool(self._unsent)
+
+    def report(self, report: Message) -> None:
+        """Post what a worker or driver tells its node. An answer that cannot be sent is replaced by
+        the reason: the state that a driver returns must not end its process. Raises ProtocolError
+        for any other message."""
+        try:
+            self.post(report)
+        except ProtocolError as fault:
+            if not isinstance(report, Answer):
+                raise
+            _log.warning("the answer to a command cannot be sent: %s", fault)
+            word = report.data.get("answer")
+            self.post(Answer(report.id, True, {"answer": word, "text": fault.text}))
 
     def post(self, item: Item) -> None:
         """Send an item, or keep what does not fit for `flush`. Raises ProtocolError for a message

@@ -46,7 +46,6 @@ from petrobot.services.scripted import load as load_script
 from petrobot.services.worker.device_process import (
     DeviceError,
     DeviceLoop,
-    post_report,
     take_priority,
 )
 from petrobot.services.worker.outlets import Sent, StreamOutlets
@@ -256,7 +255,7 @@ class Worker:
         for report in self._place.reports():
             if not isinstance(report, Sent):
                 self._spent |= isinstance(report, Outcome) and report.cause == OUT_OF_MEMORY
-                post_report(self._node, report)
+                self._node.report(report)
             elif self._outlets.send(now, report):
                 self._node.post([WANTED, report.stream])
         self._connecting = self._place.runs != () and self._outlets.advance()

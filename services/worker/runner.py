@@ -24,7 +24,7 @@ from petrobot.services.worker.callables import (
     from_outside,
     log_fault,
 )
-from petrobot.services.worker.context import Report, RunContext, checked_result, never
+from petrobot.services.worker.context import Report, RunContext, checked_result, never, outcome_of
 from petrobot.services.worker.outlets import Outlets
 from petrobot.services.worker.remote import Refusing
 
@@ -584,11 +584,9 @@ class Runner:
         identity = run.call.id
         self._outlets.close(identity)
         del self._runs[identity]
-        executed = Executed(result.executed)
-        said = (result.status, result.values, result.cause, result.text, executed)
         # Not `now`: the action may have blocked since this step began.
         took = self._clock() - run.started
-        self._reports.append(Outcome(identity, *said, took, run.cpu, result.deferred))
+        self._reports.append(outcome_of(identity, result, took, run.cpu))
 
     def _hold(self, now: float, frozen: bool) -> None:
         """Freeze the runs, or let them continue with all their times shifted by the pause."""

@@ -543,6 +543,82 @@ def test_dot_and_drn() -> None:
     assert sum(rates) == pytest.approx(float(chain.amount.sum()))
 
 
+def lola_net(text: str) -> Net:
+    """Read a LoLA file as its grammar says, with none of the writer's code."""
+    net = r"PLACE ([^;]+);\s+MARKING ([^;]*);\s+((?:TRANSITION[^;]+;[^;]+;\s+)+)"
+    transition = r"TRANSITION (\S+)\s+CONSUME ([^;]*);\s+PRODUCE ([^;]*);\s+"
+    whole = re.fullmatch(net, text)
+    assert whole is not None
+
+    def numbers(body: str) -> dict[str, int]:
+        parts = [part.partition(": ") for part in body.split(", ")] if body else []
+        assert len({name for name, _, _ in parts}) == len(parts)
+        assert all(number.isdigit() for _, colon, number in parts if colon)
+        return {name: int(number or 1) for name, _, number in parts}
+
+    places = dict.fromkeys(whole[1].split(", "), 0)
+    marked = numbers(whole[2])
+    assert marked.keys() <= places.keys()
+    found = re.findall(transition, whole[3])
+    assert re.sub(transition, "", whole[3]) == ""
+    return Net.build(places | marked, {n: (numbers(i), numbers(o)) for n, i, o in found})
+
+
+@settings(max_examples=80, deadline=None)
+@given(nets(priorities=False, inhibitors=False), st.data())
+def test_a_net_for_lola_has_the_same_graph(net: Net, data: st.DataObject) -> None:
+    """With capacities, and with inhibitor arcs on places that have one."""
+    bars = [
+        (p, st.integers(1, most + 2)) for p, most in enumerate(net.capacity) if most is not None
+    ]
+    some = st.tuples(*(st.none() | least for _, least in bars))
+    inhibit = tuple(
+        tuple((p, k) for (p, _), k in zip(bars, data.draw(some), strict=True) if k is not None)
+        for _ in net.transitions
+    )
+    net = replace(net, inhibit=inhibit)
+    again = lola_net(FORMATS[".lola"].write(NetFile(net)))
+    one, two = (explore(n, limits=SearchLimits(states=200)) for n in (net, again))
+    assert len(one) == len(two) and one.edges == two.edges
+
+
+@settings(max_examples=40, deadline=None)
+@given(nets())
+def test_lola_explores_at_least_what_can_happen(net: Net) -> None:
+    """Whatever is left out only forbids."""
+    again = lola_net(FORMATS[".lola"].write(NetFile(net)))
+    one, two = (explore(n, limits=SearchLimits(states=100)) for n in (net, again))
+    if two.complete:
+        width = len(net.places)
+        reached = {two.marking(i)[:width] for i in range(len(two))}
+        assert {one.marking(i) for i in range(len(one))} <= reached
+
+
+@pytest.mark.parametrize(
+    ("net", "said"),
+    [
+        (Net.build({}, {"t": ({}, {})}), "lola: places: the net has none; LoLA reads no net"),
+        (Net.build({"p": 1}, {}), "lola: transitions: the net has none"),
+        (
+            Net.build({"p": 2}, {"t": ({"p": 1}, {})}, capacity={"p": 1}),
+            "place p: 2 tokens are more than its capacity 1; raise the capacity",
+        ),
+    ],
+)
+def test_a_net_that_lola_cannot_hold_is_refused(net: Net, said: str) -> None:
+    with pytest.raises(NetFileError, match=said):
+        FORMATS[".lola"].write(NetFile(net))
+
+
+@pytest.mark.parametrize("name", ["PLACE", "a b", "1", "p-1", "SAFE"])
+def test_names_that_lola_does_not_allow_are_replaced(name: str) -> None:
+    text, lost = written(
+        NetFile(Net.build({name: 1, "p.free": 0}, {"t": ({name: 1}, {})}, capacity={name: 1})),
+        Path("net.lola"),
+    )
+    assert name not in lola_net(text).places and any("ids that the format" in what for what in lost)
+
+
 def test_a_net_without_namespace_is_written_with_it() -> None:
     text = write_pnml(parse_pnml(arc_file("")))
     assert ElementTree.fromstring(text).tag == f"{{{NAMESPACE}}}pnml"

@@ -20,8 +20,10 @@ from petrobot.coordinator.operator.door_file import Door, door_open
 from petrobot.coordinator.page.server import Page, start_page
 from petrobot.coordinator.run.folder import JOURNAL
 from petrobot.coordinator.run.interfaces import FirstAlternative
+from petrobot.coordinator.run.journal import JournalWriter
 from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.run.realtime import RealtimeMission
+from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task.file import loads
 from tests.cli.cell import TASK, Arm, RobotNode, directory_in
 from tests.waiting import beat
@@ -104,18 +106,19 @@ async def cell_of(folder: Path, read: Callable[[], Any]) -> AsyncIterator[Termin
     robot = RobotNode(directory)
     await robot.start()
     selector = FirstAlternative()
+    journal = folder / "runs" / RUN / JOURNAL
+    writer = JournalWriter(journal, {"mode": "realtime"})
+    store = JournalStore(writer, asyncio.get_running_loop().time())
     mission = realtime_mission(
-        directory, Setting(loads(TASK, "reaching.toml"), selector=selector), RUN
+        directory, Setting(loads(TASK, "reaching.toml"), selector=selector), RUN, store
     )
     shell = RealtimeMission(mission, directory)
     await shell.connect()
     operation = Operation(shell, selector)
     page = await start_page(operation, tasks_folder=folder, page=False)
-    (folder / "runs" / RUN).mkdir(parents=True)
-    (folder / "runs" / RUN / JOURNAL).touch()
     running = asyncio.create_task(shell.run())
     door = Door(RUN, page.base, page.token, os.getpid(), str(directory.source))
-    with door_open(folder / "runs" / RUN, door):
+    with door_open(journal.parent, door):
         yield Terminal(operation, shell, page, robot, folder, read)
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
@@ -123,6 +126,7 @@ async def cell_of(folder: Path, read: Callable[[], Any]) -> AsyncIterator[Termin
     await operation.close()
     await shell.close()
     await robot.close()
+    writer.close()
 
 
 @pytest_asyncio.fixture

@@ -88,7 +88,7 @@ def petrobot(
         (
             "convert work.toml x.foo",
             "x.foo: file: no writer for the ending .foo; end its name in .pnml, .net, .pnpro, "
-            ".dot, .drn",
+            ".lola, .dot, .drn",
         ),
         ("new action class", "'class' is a keyword of Python"),
         ("new action Fast", "use small letters, digits and _"),

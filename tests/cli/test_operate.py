@@ -16,6 +16,8 @@ from petrobot.coordinator.engine import Mode
 from petrobot.coordinator.operator.door_file import DOOR, Door, door_open, find_door
 from petrobot.coordinator.page import app_state as house
 from petrobot.coordinator.run.folder import JOURNAL, NoRunError
+from petrobot.coordinator.run.journal import read_journal
+from petrobot.coordinator.run.recording import remarks
 from tests.cli.conftest import RUN, Terminal
 from tests.waiting import beat
 
@@ -119,6 +121,29 @@ async def test_the_operator_chooses_the_alternative(petrobot: Terminal) -> None:
     await petrobot.until(lambda: petrobot.tokens("arm_free") == 1)
     await petrobot.working()
     assert list(petrobot.mission.tally.chosen.values()) == ["reach_slowly", "reach"]
+
+
+async def test_a_remark_is_kept_and_changes_nothing(petrobot: Terminal) -> None:
+    """Without the controls; with its author, in the journal's order."""
+    await petrobot.working()
+    assert (await petrobot("pause")).code == 0
+    before = petrobot.mission.executor.state
+    assert (await petrobot("remark", " the table was moved ", "--as", "ben")).code == 0
+    assert petrobot.mission.executor.state is before
+    [remark] = remarks(read_journal(petrobot.runs / RUN / JOURNAL))
+    assert remark.author.startswith("ben ") and remark.text == "the table was moved"
+    notices = petrobot.operation.feed.state["notices"]
+    assert (notices[-1]["level"], notices[-1]["text"]) == ("info", remark.told)
+    await petrobot("abort")
+    later = read_journal(petrobot.runs / RUN / JOURNAL).records[remark.number]
+    assert later.data["stimulus"]["kind"] == "Abort", "what comes later is written behind it"
+
+
+@pytest.mark.parametrize("text", ["", "  ", "two\nlines", "\x1b[2J", "x" * 1_001])
+async def test_a_remark_is_one_plain_line(petrobot: Terminal, text: str) -> None:
+    said = await petrobot("remark", text)
+    assert said.code == 2 and "text: expected" in said.err
+    assert remarks(read_journal(petrobot.runs / RUN / JOURNAL)) == []
 
 
 async def test_abort_ends_the_run_in_error(petrobot: Terminal) -> None:
@@ -254,6 +279,7 @@ def test_without_a_run_every_command_says_so(
         "raise": ["e"],
         "force": ["p", "t"],
         "override": ["t", "a"],
+        "remark": ["seen"],
     }
     assert main([name, *arguments.get(name, []), "--journal", str(tmp_path)]) == 2
     assert "is active; start one with `petrobot run`" in capsys.readouterr().err

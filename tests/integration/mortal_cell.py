@@ -35,7 +35,7 @@ from petrobot.coordinator.run.folder import header
 from petrobot.coordinator.run.journal import JournalWriter, read_journal
 from petrobot.coordinator.run.lockstep import NAME, CoordinatorParty
 from petrobot.coordinator.run.mission import Mission
-from petrobot.coordinator.run.recording import JournalStore
+from petrobot.coordinator.run.recording import STAGE, JournalStore
 from petrobot.services.comm.location_file import Directory, load, resolve
 from petrobot.services.comm.lockstep.cell import Delays
 from petrobot.services.comm.lockstep.mesh import Member
@@ -69,10 +69,11 @@ class MortalStore(JournalStore):
         super().append(now, stimulus, instructions, state)
         self.count()
 
-    def stage(self, name: str, values: Mapping[str, Any]) -> None:
-        """Stage, and count it."""
-        super().stage(name, values)
-        self.count()
+    def record(self, kind: str, data: Mapping[str, Any]) -> None:
+        """Write a record, and count it if it is a stage; others are written with a stimulus."""
+        super().record(kind, data)
+        if kind == STAGE:
+            self.count()
 
     def flush(self) -> None:
         """Flush, and count it."""

@@ -31,6 +31,11 @@ def test_its_values_are_plain_and_its_events_are_delivered() -> None:
     assert [Event("doubled", "it", 0, {"count": 2})] == EVENTS
 
 
+def test_it_may_say_that_it_is_unknown_what_was_executed() -> None:
+    outcome = _call("unsure")
+    assert (outcome.status, outcome.cause, outcome.executed) == ("error", "lost", Executed.UNKNOWN)
+
+
 def test_its_verdicts_are_delivered() -> None:
     """A service may send verdicts like an action: it uses no device, and can see what all devices
     did."""

@@ -4,6 +4,7 @@ run ends exactly once."""
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,14 @@ from hypothesis import strategies as st
 
 from petrobot.services.action import CallFailed, Cancelled, Context, Result, error, failure, success
 from petrobot.services.comm.lockstep.party import TICK
-from petrobot.services.comm.protocol.messages import Call, Cancel, Event, Feedback, Outcome
+from petrobot.services.comm.protocol.messages import (
+    Call,
+    Cancel,
+    Event,
+    Executed,
+    Feedback,
+    Outcome,
+)
 from petrobot.services.node.inline_host import HOLD, RELEASE
 from petrobot.services.worker.outlets import Sent
 from petrobot.services.worker.runner import GRACE, STOP_LIMIT, Runner
@@ -430,6 +438,23 @@ def test_calls_go_out_with_child_ids_and_come_back(bench: Make) -> None:
     b.answer(f"{run}/2", sum=3)
     b.tick()
     assert b.ended(run).values == {"sum": 3}
+
+
+def test_the_result_of_a_call_is_its_outcome_in_every_field(bench: Make) -> None:
+    """An action that passes it on says what the far side said, also what was executed; whether it
+    is provisional concerns the far run alone."""
+
+    async def passes_on(ctx: Context) -> Result:
+        return await ctx.call("far")
+
+    b = bench(act=passes_on)
+    run = b.begin("act")
+    b.tick()
+    far = Outcome(f"{run}/1", "error", {"n": 1}, "lost", "no link", Executed.UNKNOWN, deferred=True)
+    b.take(far)
+    b.tick()
+    end = b.ended(run)
+    assert replace(end, id=far.id, seconds=0.0, cpu_seconds=0.0) == replace(far, deferred=False)
 
 
 def test_open_calls_are_dropped_with_their_run(bench: Make) -> None:

@@ -43,6 +43,7 @@ from petrobot.coordinator.engine import (
     TimerFired,
 )
 from petrobot.coordinator.operator.feed import Feed
+from petrobot.coordinator.operator.port import FREE
 from petrobot.coordinator.operator.run_state import Narrator
 from petrobot.coordinator.run.folder import JOURNAL, header
 from petrobot.coordinator.run.journal import JournalWriter
@@ -51,7 +52,6 @@ from petrobot.coordinator.task import Executed, Status, Task
 from petrobot.coordinator.task.file import TaskFileError, loads
 from petrobot.services.comm.protocol.messages import Feedback
 
-FREE = frozenset({"estop", "take_controls", "ask_controls", "release_controls"})
 BEAT_S = 0.02
 
 

@@ -15,7 +15,9 @@ from petrobot.coordinator.cli import main
 from petrobot.coordinator.cli.recorded_runs import recorded
 from petrobot.coordinator.engine import Fired, RunRecorded
 from petrobot.coordinator.run.export import messages
+from tests.run.test_runfolder import SCRIPT, SERVICES
 
+SHUTTLE = Path(__file__).parents[1] / "chaos" / "shuttle.toml"
 JOURNAL = Path(__file__).parent / "golden" / "catch_ball-missed-and-recovered.journal"
 
 
@@ -24,6 +26,21 @@ def counts() -> Counter[str]:
     return Counter(
         type(i).__name__ for step in recorded(str(JOURNAL)).steps() for i in step.instructions
     )
+
+
+def test_the_log_shows_the_text_of_any_result(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "services.toml").write_text(SERVICES)
+    said = 'text = "3 of 5 parts found"\n'
+    (tmp_path / "mock.toml").write_text(SCRIPT.replace("seconds = 0.1\n", "seconds = 0.1\n" + said))
+    given = ["run", str(SHUTTLE), "--mode", "lockstep", "--quiet", "--journal", str(tmp_path / "r")]
+    given += ["--services", str(tmp_path / "services.toml"), "--mock", str(tmp_path / "mock.toml")]
+    assert main(given) == 0
+    [folder] = (tmp_path / "r").iterdir()
+    capsys.readouterr()
+    assert main(["log", str(folder)]) == 0
+    assert "SUCCESS  3 of 5 parts found\n" in capsys.readouterr().out
 
 
 def test_json_lines_contain_everything(tmp_path: Path) -> None:

@@ -12,9 +12,10 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.cli import main
+from petrobot.coordinator.operator.history import opened
 from petrobot.coordinator.run.folder import JOURNAL, RESULT, SEMANTICS
 from petrobot.coordinator.run.journal import JournalWriter, read_journal
-from petrobot.coordinator.run.recording import ReplayError, RetracingStore, unmeasured
+from petrobot.coordinator.run.recording import ReplayError, RetracingStore, remarks, unmeasured
 from petrobot.coordinator.task import Task, model
 from petrobot.coordinator.task.expansion import expand
 from petrobot.coordinator.task.file import load, loads
@@ -91,19 +92,21 @@ def test_measured_processor_time_is_not_compared(tmp_path: Path) -> None:
     )
     writer.close()
     store = RetracingStore(JournalWriter(path), read_journal(path))
-    store.stage("scored", {"cpu_s": 2.0})
-    store._write(
+    with pytest.raises(ValueError, match="try again when it has caught up"):
+        store.remark(0.0, "ana", "too early")
+    store.record("stage", {"stage": "scored", "values": {"cpu_s": 2.0}})
+    store.record(
         "stimulus", {"t": 1.0, "stimulus": {"kind": "RunEnded", "run": "a#1", "cpu_seconds": 0.5}}
     )
     compared = store.safe
-    store.stage("other", {})
+    store.record("stage", {"stage": "other", "values": {}})
     assert (compared, store.safe) == (True, False), (
         "what is there is compared, what comes after it is written"
     )
     store.writer.close()
     again = RetracingStore(JournalWriter(path), read_journal(path))
     with pytest.raises(ReplayError, match="record 1 was stage"):
-        again.stage("prepared", {})
+        again.record("stage", {"stage": "prepared", "values": {}})
 
 
 def nudged(value: Any, share: float) -> Any:
@@ -143,6 +146,45 @@ def test_a_run_of_another_processor_is_resumed(recorded_run: Path) -> None:
         (kind, unmeasured(data)) for kind, data in before
     ]
     assert main(["replay", str(recorded_run)]) == 0
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-12], ids=["same", "other last digits"])
+def test_remarks_keep_their_place_when_a_run_is_derived_again(
+    recorded_run: Path, share: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The engine does not write them again, and they are not lost where records are."""
+    recorded_elsewhere(recorded_run, share)
+    path = recorded_run / JOURNAL
+    journal = read_journal(path)
+    path.unlink()
+    said = {0: "first", 9: "before", 15: "between", len(journal.records): "last"}
+    with closing(JournalWriter(path, journal.header)) as writer:
+        for place, record in enumerate((*journal.records, None)):
+            if place in said:
+                writer.append("remark", {"t": 0.0, "author": "ana", "text": said[place]})
+            if record is not None:
+                writer.append(record.kind, record.data)
+    before = [(r.number, r.text) for r in remarks(read_journal(path))]
+    assert [text for _, text in before] == list(said.values())
+    assert main(["resume", str(recorded_run), "--quiet", "--no-page"]) == 0
+    assert [(r.number, r.text) for r in remarks(read_journal(path))] == before
+    assert main(["replay", str(recorded_run)]) == 0
+    capsys.readouterr()
+    assert main(["log", str(recorded_run)]) == 0
+    told = [line.split() for line in capsys.readouterr().out.splitlines()[1:]]
+    numbers = [int(words[0]) for words in told]
+    assert numbers == sorted(numbers)
+    shown = [(int(words[0]), words[5]) for words in told if words[3] == "remarked"]
+    assert shown == before
+    assert main(["log", str(recorded_run), "--format", "jsonl"]) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [
+        (line["number"], line["remark"]["text"]) for line in lines if "remark" in line
+    ] == before
+    records = opened(path, "r")["records"]
+    assert [(r["number"], r["text"]) for r in records if "remarked" in r["text"]] == [
+        (number, f"ana remarked: {text}") for number, text in before
+    ]
 
 
 def test_a_run_that_differs_by_more_than_last_digits_is_not_overwritten(

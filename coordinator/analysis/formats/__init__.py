@@ -69,9 +69,13 @@ class Format:
     """What a file format can say: `says` maps a feature to KEPT or to the form it is written in."""
 
     write: Callable[[NetFile], str]
+    tool: str = ""
+    """The tools that it is for."""
     says: Mapping[Feature, str] = field(default_factory=dict)
     names: Pattern[str] | None = None
     """The names that the format allows; others are replaced."""
+    timed: bool = False
+    """Whether it is for rates: a task is written as its stochastic view."""
     instead: str = ""
     """What is written, if it is not the net at all."""
 
@@ -79,6 +83,7 @@ class Format:
 FORMATS: Mapping[str, Format] = {
     ".pnml": Format(
         pnml.write_pnml,
+        "",
         {
             Feature.NAME: KEPT,
             Feature.LABELS: KEPT,
@@ -96,6 +101,7 @@ FORMATS: Mapping[str, Format] = {
     ),
     ".net": Format(
         tina.write_tina,
+        "TINA",
         {
             Feature.NAME: KEPT,
             Feature.LABELS: KEPT,
@@ -108,6 +114,7 @@ FORMATS: Mapping[str, Format] = {
     ),
     ".pnpro": Format(
         greatspn.write_pnpro,
+        "GreatSPN, Storm",
         {
             Feature.NAME: KEPT,
             Feature.POSITIONS: KEPT,
@@ -119,9 +126,21 @@ FORMATS: Mapping[str, Format] = {
             Feature.UNTIMED: "written as immediate transitions of weight 1",
         },
         greatspn.IDENTIFIER,
+        timed=True,
+    ),
+    ".lola": Format(
+        exports.write_lola,
+        "LoLA",
+        {
+            Feature.UNTIMED: KEPT,
+            Feature.INHIBITORS: "kept where the place has a capacity, left out elsewhere",
+            Feature.CAPACITIES: "written as complementary places with the same effect",
+        },
+        exports.LOLA_NAME,
     ),
     ".dot": Format(
         exports.write_dot,
+        "Graphviz",
         {
             Feature.NAME: KEPT,
             Feature.LABELS: KEPT,
@@ -131,10 +150,12 @@ FORMATS: Mapping[str, Format] = {
     ),
     ".drn": Format(
         lambda model: exports.write_drn(Chain.of(_timed(model))),
+        "Storm",
+        timed=True,
         instead="the net itself: only its chain over the tangible markings is written",
     ),
 }
-"""Formats that can be written, by ending."""
+"""Formats that can be written, by ending; `petrobot convert` has them all from here."""
 
 READ: Mapping[str, Callable[[bytes, str], NetFile]] = {
     ".pnml": pnml.parse_pnml,

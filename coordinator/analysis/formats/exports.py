@@ -1,14 +1,19 @@
-"""Formats that are only written: Graphviz DOT, and DRN for the model checker Storm.
+"""Formats that are only written: Graphviz DOT, the net files of the model checker LoLA, and DRN for
+the model checker Storm.
 
-DOT shows a net or its reachability graph. DRN ("direct encoding", see Storm's documentation of its
+DOT shows a net or its reachability graph. LoLA (its grammar: `ParserPTNetLoLA.yy` of LoLA 2) has
+places, weighted arcs and tokens alone. DRN ("direct encoding", see Storm's documentation of its
 explicit input) holds the chain of a GSPN over its tangible markings as a CTMC.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
+
 import numpy as np
 
-from petrobot.coordinator.analysis.formats.netfile import NetFile, NetFileError
+from petrobot.coordinator.analysis.formats.netfile import NetFile, NetFileError, unused
 from petrobot.coordinator.analysis.net.space import Space
 from petrobot.coordinator.analysis.time.gspn import Chain
 from petrobot.coordinator.analysis.time.markov import Generator
@@ -69,6 +74,56 @@ def write_space_dot(space: Space) -> str:
     ):
         lines.append(f"  m{i} -> m{j} [label={_quoted(space.net.transitions[t])}];")
     return "\n".join([*lines, "}"]) + "\n"
+
+
+LOLA_NAME = re.compile(
+    r"(?!(?:PLACE|SAFE|MARKING|TRANSITION|WEAK|STRONG|FAIR|CONSUME|PRODUCE)\Z)[A-Za-z_][A-Za-z0-9_.]*"
+)
+"""Names that both the net files and the formulas of LoLA allow, and no keyword of the net files."""
+
+
+def write_lola(model: NetFile) -> str:
+    """Return a net for LoLA. Raises NetFileError.
+
+    LoLA's `SAFE k` is a promise, not a rule, so a place of capacity c gets a complementary place
+    that holds c minus its tokens, which loses no behaviour (Murata 1989, section II). On it stand
+    the inhibitor arcs of that place, too: fewer than k tokens are at least c - k + 1 free ones.
+    """
+    model, _ = model.with_names(LOLA_NAME)
+    net = model.net
+    if not net.places or not net.transitions:
+        what = "transitions" if net.places else "places"
+        raise NetFileError("lola", what, "the net has none", "LoLA reads no net without any")
+    taken, free = {*net.places, *net.transitions}, dict[int, str]()
+    for p, most in enumerate(net.capacity):
+        if most is not None:
+            if net.initial[p] > most:
+                found = f"{net.initial[p]} tokens are more than its capacity {most}"
+                raise NetFileError("lola", f"place {net.places[p]}", found, "raise the capacity")
+            free[p] = unused(f"{net.places[p]}.free", taken)
+            taken.add(free[p])
+    tokens = dict(zip(net.places, net.initial, strict=True))
+    tokens |= {name: (net.capacity[p] or 0) - net.initial[p] for p, name in free.items()}
+    lines = [f"PLACE {', '.join(tokens)};", f"MARKING {_lola_list(tokens)};"]
+    for t, name in enumerate(net.transitions):
+        taking = {net.places[p]: w for p, w in net.consume[t]}
+        giving = {net.places[p]: w for p, w in net.produce[t]}
+        below = dict(net.inhibit[t])
+        for p, other in free.items():
+            gain = giving.get(net.places[p], 0) - taking.get(net.places[p], 0)
+            most = net.capacity[p] or 0
+            needed = max(gain, most + 1 - below.get(p, most + 1), 0)
+            taking[other], giving[other] = needed, needed - gain
+        lines += [
+            f"TRANSITION {name}",
+            f"  CONSUME {_lola_list(taking)};",
+            f"  PRODUCE {_lola_list(giving)};",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _lola_list(numbers: Mapping[str, int]) -> str:
+    return ", ".join(f"{name}: {number}" for name, number in numbers.items() if number)
 
 
 def write_drn(chain: Chain) -> str:

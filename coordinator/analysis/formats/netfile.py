@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from itertools import chain, count
@@ -99,7 +99,11 @@ class NetFile:
 def _unused(name: str, legal: re.Pattern[str], taken: set[str], letter: str) -> str:
     """Return a legal name like `name` that is not taken."""
     stem = re.sub(r"\W", "_", name, flags=re.ASCII)
-    stem = stem if legal.fullmatch(stem) else f"{letter}_{stem}"
+    return unused(stem if legal.fullmatch(stem) else f"{letter}_{stem}", taken)
+
+
+def unused(stem: str, taken: Container[str]) -> str:
+    """Return the name, with a number behind it if it is taken."""
     return next(one for one in chain([stem], (f"{stem}_{i}" for i in count(2))) if one not in taken)
 
 

@@ -38,8 +38,11 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that name the run and the operator, and say how the answer is printed."""
+def add_arguments(parser: argparse.ArgumentParser, *, controls: bool = True) -> None:
+    """Add the options that name the run and the operator, and say how the answer is printed.
+
+    `controls` tells whether the command needs the controls.
+    """
     add_run_arguments(parser)
     parser.add_argument(
         "--as",
@@ -47,15 +50,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="your name as other operators see it (default: your user name)",
     )
-    parser.add_argument(
-        "--take",
-        metavar="S",
-        nargs="?",
-        type=float,
-        const=30.0,
-        help="ask the operator who holds the controls to hand them over, and wait up to S seconds "
-        "(default: %(const)g)",
-    )
+    if controls:
+        parser.add_argument(
+            "--take",
+            metavar="S",
+            nargs="?",
+            type=float,
+            const=30.0,
+            help="ask the operator who holds the controls to hand them over, and wait up to "
+            "S seconds (default: %(const)g)",
+        )
     parser.add_argument(
         "--json", metavar="FILE", help="write the answer as JSON (- for standard output)"
     )
@@ -82,12 +86,14 @@ async def _give(
     told: Callable[[OperatorClient, Answer], Awaitable[str]] | None,
 ) -> int:
     from petrobot.coordinator.operator.client import OperatorError
+    from petrobot.coordinator.operator.port import FREE
 
     door = find(options)
     try:
         async with connect(door, options.name) as hand:
             given = data(hand) if data is not None else {}
-            await take_controls(hand, options.take)
+            if verb not in FREE:
+                await take_controls(hand, options.take)
             answer = await hand.command(verb, given)
             if not answer.get("ok"):
                 raise CommandError(

@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import subprocess
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -176,6 +177,11 @@ async def tell(ctx: Context, *, name: str) -> Result:
 def twisted(ctx: Context) -> Result:
     """Return what no message can contain."""
     return success(rows=[{"key": {1: 2}}])
+
+
+def unsure(ctx: Context) -> Result:
+    """Lost its link on the way."""
+    return replace(error("lost", "no answer"), executed="unknown")
 
 
 def double(ctx: Context, *, numbers: tuple[float, ...]) -> Result:
