@@ -88,12 +88,6 @@ ARM_FAULTS: Final = FaultKinds(
 )
 
 
-def read_fault(now: float, kind: str, arguments: Mapping[str, Any]) -> InjectedFault:
-    """Return the fault of the catching cell that a caller asks for. Raises ValueError that says
-    what is wrong and what is expected."""
-    return ARM_FAULTS.read(now, kind, arguments)
-
-
 def _number(
     arguments: Mapping[str, Any], key: str, default: float | None, low: float, high: float
 ) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 
 from petrobot.services.action import Context
-from petrobot.services.comm.streams.image import Image
+from petrobot.services.comm.streams.image import Image, RequestedImages
 from petrobot.services.device import Driver, Ports
 from petrobot.services.mobile.model import NOMINAL, nominal_rover, read_rover
 from petrobot.services.mobile.watching import FloorWatch
@@ -31,7 +31,7 @@ class FloorCamera(Driver):
         name = str(config.get("rover", ""))
         rover = read_rover(ports.file(name).decode(), name) if name else nominal_rover()
         cv2.setNumThreads(int(config.get("threads", 1)))
-        self._images = ports.images()
+        self._images = RequestedImages(ports.images())
         self.floor = FloorWatch.of(rover)
         self.usual_rate = float(config.get("rate", rover.camera.rate))
         if not 0.0 < self.usual_rate <= 1000.0:
@@ -39,35 +39,29 @@ class FloorCamera(Driver):
                 "camera: rate: expected images/s above 0 and at most 1000, such as 25, got "
                 f"{self.usual_rate}"
             )
-        self._rate = 0.0
         self._count = 0
-        self._newest: Image | None = None
 
     # For actions
 
     @property
     def rate(self) -> float:
         """Images/s requested now, 0 when none."""
-        return self._rate
+        return self._images.rate
 
     def start(self) -> None:
         """Request images. Raises ConnectionError when the source cannot be opened."""
-        if not self._rate:
-            self._newest = None
+        if not self.rate:
             self._images.start(self.usual_rate)
-            self._rate = self.usual_rate
 
     def end(self) -> None:
         """Take no more images."""
-        if self._rate:
-            self._images.stop()
-        self._rate, self._newest = 0.0, None
+        self._images.end()
 
     async def read(self, ctx: Context, timeout: float) -> Image | None:
         """Return the newest image that was not read yet, None when none arrives for `timeout` s.
         Raises FloorCameraError for an image of another size."""
-        await ctx.wait(self._arrived, timeout)
-        image, self._newest = self._newest, None
+        await ctx.wait(self._images.arrived, timeout)
+        image = self._images.take()
         if image is None:
             return None
         view = self.floor.view
@@ -81,19 +75,13 @@ class FloorCamera(Driver):
         self._count += 1
         return image
 
-    def _arrived(self) -> bool:
-        newest = self._images.newest()
-        if newest is not None:
-            self._newest = newest
-        return self._newest is not None
-
     # For the node
 
     def state(self) -> Mapping[str, Any]:
         """Return plain data for operator and report."""
         return {
-            "rate": self._rate,
-            "source": self._images.condition or "ok",
+            "rate": self.rate,
+            "source": self._images.condition,
             "images": self._count,
         }
 
@@ -103,7 +91,7 @@ class FloorCamera(Driver):
 
     def stopped(self) -> bool:
         """Return whether no images are taken; a camera never moves."""
-        return self._rate == 0.0
+        return self.rate == 0.0
 
     def hold(self, now: float) -> str:
         """Accept a pause: images may continue, since the rover itself stops."""
@@ -111,5 +99,4 @@ class FloorCamera(Driver):
 
     def close(self) -> None:
         """Stop the images and close the source."""
-        self.end()
         self._images.close()

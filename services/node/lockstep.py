@@ -31,22 +31,20 @@ from petrobot.services.comm.protocol.messages import (
     Refuse,
     Welcome,
 )
-from petrobot.services.comm.protocol.plain import plain
-from petrobot.services.comm.streams.camera import MemoryImages, open_images
+from petrobot.services.comm.streams.camera import MemoryImages
 from petrobot.services.comm.streams.image import ImageSource
 from petrobot.services.comm.streams.serial_line import SerialLine
-from petrobot.services.host.whole_file import write_whole
 from petrobot.services.node.drivers import make_driver
 from petrobot.services.node.inline_host import Host, InlineHost
 from petrobot.services.node.node import GENERAL, Node
+from petrobot.services.node.ports import DevicePorts
 from petrobot.services.node.watchdog import Watchdog
 from petrobot.services.worker.callables import describe
-from petrobot.services.worker.context import Draws, checked
 from petrobot.services.worker.runner import Hung
 from petrobot.services.worker.setpoints import SetpointReceiver
 
 if TYPE_CHECKING:
-    import numpy as np
+    pass
 
 # What a driver may reach in a lock-step cell: bus, images and streams in memory, on the other side
 # envelopes.
@@ -102,7 +100,7 @@ class MemorySerial(SerialLine):
         self.out = self.arrived = b""
 
 
-class LockstepPorts:
+class LockstepPorts(DevicePorts):
     """Implements `services.device.Ports` for one device; `post` sends to the laboratory."""
 
     def __init__(
@@ -112,23 +110,14 @@ class LockstepPorts:
         clock: Callable[[], float],
         post: Callable[[Envelope], None],
     ) -> None:
-        self._directory = directory
-        self._device = device
-        self._clock = clock
+        super().__init__(directory, device, clock)
         self._post = post
         self._can: MemoryCan | None = None
         self._serial: MemorySerial | None = None
         self._images: MemoryImages | None = None
         self._wish = 0
         self._streams: dict[str, SetpointReceiver] = {}
-        self._raised: list[tuple[str, Mapping[str, Any]]] = []
-        self.draws = Draws(device.name)
         self._lives_at = ""
-
-    @property
-    def now(self) -> float:
-        """The cell's clock (s)."""
-        return self._clock()
 
     def can(self) -> MemoryCan:
         """The laboratory's CAN bus."""
@@ -148,7 +137,7 @@ class LockstepPorts:
         """Return the laboratory's camera if the device has `source = "sim"`, otherwise the source
         that it names (a file)."""
         if self._device.config.get("source") != "sim":
-            return open_images(self._device.config, self._clock)
+            return self._open_images()
         if self._images is None:
             self._laboratory()
             self._images = MemoryImages(self._want_images)
@@ -157,30 +146,8 @@ class LockstepPorts:
     def stream(self, name: str) -> SetpointReceiver:
         """Return the receiving end of a stream that services.toml directs to this device. Raises
         ValueError for any other."""
-        entry = self._directory.streams.get(name)
-        if entry is None or entry.to != self._device.name:
-            raise ValueError(
-                f"no stream {name!r} leads here; write [streams.{name}] to = {self._device.name!r}"
-            )
+        entry = self._stream_entry(name)
         return self._streams.setdefault(name, SetpointReceiver(entry.period, self._clock))
-
-    def raise_event(self, name: str, **data: Any) -> None:
-        """Raise an external event."""
-        raised = plain(name, "name"), plain(data, "data")
-        checked(Event(raised[0], self._device.name, 1, raised[1]))
-        self._raised.append(raised)
-
-    def random(self, purpose: str) -> np.random.Generator:
-        """Return the generator of (seed, device, purpose)."""
-        return self.draws.random(purpose)
-
-    def file(self, path: str) -> bytes:
-        """A file named in services.toml, relative to it."""
-        return self._directory.file(path).read_bytes()
-
-    def write_file(self, path: str, content: bytes) -> None:
-        """Write a file named in services.toml, relative to it."""
-        write_whole(self._directory.source.parent / path, content)
 
     def receive(self, envelope: Envelope) -> None:
         """Take what the laboratory or a stream sends to this device."""
@@ -205,13 +172,6 @@ class LockstepPorts:
         if self._can is not None and self._can.out:
             self._send("can", can_body(self._can.out))
             self._can.out.clear()
-
-    def raised(self) -> list[tuple[str, Mapping[str, Any]]]:
-        """Events raised since the last call, in order."""
-        if not self._raised:
-            return []
-        raised, self._raised = self._raised, []
-        return raised
 
     def _want_images(self, rate: float) -> None:
         self._wish += 1

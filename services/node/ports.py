@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from petrobot.services.comm.canopen.bus import CanBus
-from petrobot.services.comm.location_file import DeviceEntry, Directory
+from petrobot.services.comm.location_file import DeviceEntry, Directory, StreamEntry
 from petrobot.services.comm.protocol.messages import Event
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.comm.streams.image import ImageSource
@@ -24,7 +24,76 @@ if TYPE_CHECKING:
 CAN_KEYS = ("interface", "channel", "bitrate")
 
 
-class ProcessPorts:
+class DevicePorts:
+    """The ports of one device that are the same in real time and in lock step."""
+
+    def __init__(
+        self, directory: Directory, device: DeviceEntry, clock: Callable[[], float]
+    ) -> None:
+        self._directory = directory
+        self._device = device
+        self._clock = clock
+        self._raised: list[tuple[str, Mapping[str, Any]]] = []
+        self.draws = Draws(device.name)
+
+    @property
+    def now(self) -> float:
+        """The cell's clock (s)."""
+        return self._clock()
+
+    def raise_event(self, name: str, **data: Any) -> None:
+        """Raise an external event."""
+        raised = plain(name, "name"), plain(data, "data")
+        checked(Event(raised[0], self._device.name, 1, raised[1]))
+        self._raised.append(raised)
+
+    def raised(self) -> list[tuple[str, Mapping[str, Any]]]:
+        """Return the events raised since the last call, in order."""
+        if not self._raised:
+            return []
+        raised, self._raised = self._raised, []
+        return raised
+
+    def random(self, purpose: str) -> np.random.Generator:
+        """Return the generator of (seed, device, purpose)."""
+        return self.draws.random(purpose)
+
+    def file(self, path: str) -> bytes:
+        """Return the content of a file named in services.toml, relative to it."""
+        return self._directory.file(path).read_bytes()
+
+    def write_file(self, path: str, content: bytes) -> None:
+        """Write a file named in services.toml, relative to it."""
+        write_whole(self._directory.source.parent / path, content)
+
+    def _open_images(self) -> ImageSource:
+        """Return the image source that the device's key `source` names. The path of a recording is
+        relative to services.toml. Raises ValueError if there is no such recording."""
+        from petrobot.services.comm.streams.camera import open_images
+
+        config = self._device.config
+        kind, _, path = str(config.get("source", "")).partition(":")
+        if kind == "file" and path:
+            recording = self._directory.file(path)
+            if not recording.is_file():
+                raise ValueError(
+                    f'source = "file:{path}": no file {recording}; write the path of a recording'
+                )
+            config = {**config, "source": f"file:{recording}"}
+        return open_images(config, self._clock)
+
+    def _stream_entry(self, name: str) -> StreamEntry:
+        """Return a stream that services.toml directs to this device. Raises ValueError for any
+        other."""
+        entry = self._directory.streams.get(name)
+        if entry is None or entry.to != self._device.name:
+            raise ValueError(
+                f"no stream {name!r} leads here; write [streams.{name}] to = {self._device.name!r}"
+            )
+        return entry
+
+
+class ProcessPorts(DevicePorts):
     """Implements `services.device.Ports` for the driver of one device in its process."""
 
     def __init__(
@@ -34,22 +103,13 @@ class ProcessPorts:
         clock: Callable[[], float],
         tickets: Mapping[str, str],
     ) -> None:
-        self._directory = directory
-        self._device = device
-        self._clock = clock
+        super().__init__(directory, device, clock)
         self._tickets = tickets
         self._can: CanBus | None = None
         self._images: ImageSource | None = None
         self._setpoints: dict[str, SetpointReceiver] = {}
         self._incoming: dict[str, Incoming] = {}
         self._receiver: StreamReceiver | None = None
-        self._raised: list[tuple[str, Mapping[str, Any]]] = []
-        self.draws = Draws(device.name)
-
-    @property
-    def now(self) -> float:
-        """The cell's clock (s)."""
-        return self._clock()
 
     def can(self) -> CanBus:
         """The bus that the device's keys `interface`, `channel`, `bitrate` (or its table `can`)
@@ -73,32 +133,13 @@ class ProcessPorts:
     def images(self) -> ImageSource:
         """Return the image source that the device's key `source` names."""
         if self._images is None:
-            from petrobot.services.comm.streams.camera import open_images
-
-            self._images = open_images(self._located(self._device.config), self._clock)
+            self._images = self._open_images()
         return self._images
-
-    def _located(self, config: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the source with the path of a recording made absolute (it is relative to
-        services.toml). Raises ValueError if there is no such file."""
-        kind, _, path = str(config.get("source", "")).partition(":")
-        if kind != "file" or not path:
-            return config
-        recording = self._directory.file(path)
-        if not recording.is_file():
-            raise ValueError(
-                f'source = "file:{path}": no file {recording}; write the path of a recording'
-            )
-        return {**config, "source": f"file:{recording}"}
 
     def stream(self, name: str) -> SetpointReceiver:
         """Return the receiving end of a stream that services.toml directs to this device. Raises
         ValueError for any other."""
-        entry = self._directory.streams.get(name)
-        if entry is None or entry.to != self._device.name:
-            raise ValueError(
-                f"no stream {name!r} leads here; write [streams.{name}] to = {self._device.name!r}"
-            )
+        entry = self._stream_entry(name)
         if name not in self._setpoints:
             self._setpoints[name] = setpoint = SetpointReceiver(entry.period, self._clock)
             self._incoming[name] = Incoming(entry.period, setpoint, self._tickets[name])
@@ -109,24 +150,6 @@ class ProcessPorts:
                 self._device.name, self._incoming, host=host, key=key, clock=self._clock
             )
         return self._setpoints[name]
-
-    def raise_event(self, name: str, **data: Any) -> None:
-        """Raise an external event."""
-        raised = plain(name, "name"), plain(data, "data")
-        checked(Event(raised[0], self._device.name, 1, raised[1]))
-        self._raised.append(raised)
-
-    def random(self, purpose: str) -> np.random.Generator:
-        """Return the generator of (seed, device, purpose)."""
-        return self.draws.random(purpose)
-
-    def file(self, path: str) -> bytes:
-        """A file named in services.toml, relative to it."""
-        return self._directory.file(path).read_bytes()
-
-    def write_file(self, path: str, content: bytes) -> None:
-        """Write a file named in services.toml, relative to it."""
-        write_whole(self._directory.source.parent / path, content)
 
     def stream_ports(self) -> dict[str, int]:
         """Return the TCP port of each stream that is received here."""
@@ -145,8 +168,3 @@ class ProcessPorts:
     def busy(self) -> bool:
         """Whether `poll` must be called often."""
         return self._receiver is not None
-
-    def raised(self) -> list[tuple[str, Mapping[str, Any]]]:
-        """Return the events raised since the last call, in order."""
-        raised, self._raised = self._raised, []
-        return raised

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from petrobot.services.action import Context
-from petrobot.services.comm.streams.image import Image
+from petrobot.services.comm.streams.image import Image, RequestedImages
 from petrobot.services.device import Driver, Ports, refuse_unknown_keys
 from petrobot.services.vision.calibration_file import DEFAULT, parse_calibration
 from petrobot.services.vision.location import Background, BallDetector
@@ -60,7 +60,7 @@ class Camera(Driver):
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         refuse_unknown_keys(config, KEYS)
         self._ports = ports
-        self._images = ports.images()
+        self._images = RequestedImages(ports.images())
         cv2.setNumThreads(int(config.get("threads", 1)))
         cell = _cell(config, ports)
         name = str(config.get("calibration", ""))
@@ -72,11 +72,9 @@ class Camera(Driver):
         self.usual_rate = _rate(config.get("rate", cell["camera"]["rate"]))
         self._detectors: dict[str, BallDetector] = {}
         self._times: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
-        self._newest: Image | None = None
         self._shown: Image | None = None
         self.marks: tuple[Mark, ...] = ()
         """What was seen in the last image read; actions set it, the operator's picture shows it."""
-        self._rate = 0.0
         self._count = 0
 
     # For actions
@@ -84,7 +82,7 @@ class Camera(Driver):
     @property
     def rate(self) -> float:
         """Images/s requested now, 0 when none."""
-        return self._rate
+        return self._images.rate
 
     def start(self, rate: float = 0.0) -> bool:
         """Request images at `rate` (1/s; 0: the usual rate). Return False when they already arrive
@@ -93,24 +91,20 @@ class Camera(Driver):
         Raises ConnectionError when the source cannot be opened.
         """
         wanted = rate or self.usual_rate
-        if wanted == self._rate:
+        if wanted == self.rate:
             return False
-        self._newest = None
         self._images.start(wanted)
-        self._rate = wanted
         return True
 
     def end(self) -> None:
         """Take no more images."""
-        if self._rate:
-            self._images.stop()
-        self._rate, self._newest = 0.0, None
+        self._images.end()
 
     async def read(self, ctx: Context, timeout: float) -> Image | None:
         """Return the newest image that was not read yet, None when none arrives for `timeout` s.
         Raises CameraError for an image of another size."""
-        await ctx.wait(self._arrived, timeout)
-        image, self._newest = self._newest, None
+        await ctx.wait(self._images.arrived, timeout)
+        image = self._images.take()
         if image is None:
             return None
         if image.pixels.shape != (self.view.height_px, self.view.width_px):
@@ -123,12 +117,6 @@ class Camera(Driver):
         self._shown, self.marks = image, ()
         self._times.append((image.sequence, image.time))
         return image
-
-    def _arrived(self) -> bool:
-        newest = self._images.newest()
-        if newest is not None:
-            self._newest = newest
-        return self._newest is not None
 
     def time_of(self, sequence: int) -> float | None:
         """Return the mid-exposure time (s) of a recently read image, None when it is not
@@ -146,8 +134,8 @@ class Camera(Driver):
     def state(self) -> Mapping[str, Any]:
         """Return plain data for operator and report."""
         return {
-            "rate": self._rate,
-            "source": self._images.condition or "ok",
+            "rate": self.rate,
+            "source": self._images.condition,
             "images": self._count,
             "background_images": self.background.images,
         }
@@ -168,7 +156,7 @@ class Camera(Driver):
             "width": wide,
             "height": high,
             "age": self._ports.now - image.time,
-            "note": f"image {image.sequence}, {self._rate:g} images/s",
+            "note": f"image {image.sequence}, {self.rate:g} images/s",
             "detections": [shape for mark in self.marks for shape in self._shapes(mark)],
         }
 
@@ -209,11 +197,10 @@ class Camera(Driver):
 
     def stopped(self) -> bool:
         """Return whether no images are taken; a camera never moves."""
-        return self._rate == 0.0
+        return self.rate == 0.0
 
     def close(self) -> None:
         """Stop the images and close the source."""
-        self.end()
         self._images.close()
 
 

@@ -29,7 +29,7 @@ from petrobot.sim.catching.thrower import Thrower, draw_throw
 from petrobot.sim.catching.truth import LaboratoryError, Truth, read_toml
 from petrobot.sim.catching.world import BallWorld, SecondBall
 from petrobot.sim.exposures import camera_of
-from petrobot.sim.faults import FaultPlan, InjectedFault, read_fault
+from petrobot.sim.faults import ARM_FAULTS, FaultPlan, InjectedFault
 from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
 
 _NOISE, _FAULTS, _SCATTER, _SECOND = 0x6361, 0x6661, 0x7363, 0x7362
@@ -285,7 +285,7 @@ class CatchingLaboratory(LaboratoryParty):
             return {**score, "physics": self.physics}
         if service == FAULT:
             rest = {key: value for key, value in arguments.items() if key != "kind"}
-            self._faults.add(read_fault(self.now, str(arguments.get("kind", "")), rest))
+            self._faults.add(ARM_FAULTS.read(self.now, str(arguments.get("kind", "")), rest))
             return {}
         seed, throws = (
             whole_number(arguments, "seed", 0) or 0,

@@ -135,22 +135,22 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise LaboratoryError(f"{path}: not valid TOML ({fault}); correct it") from fault
 
 
-def disturb(settings: Mapping[str, Any], regime: str) -> tuple[tuple[float, float], dict[str, Any]]:
-    """Return the speed range and the disturbed values of a regime name. Raises LaboratoryError for
-    an unknown or contradictory one."""
-    name = regime.partition("@")[0]
-    base, *names = (part.strip() for part in name.replace(",", "+").split("+"))
+def disturbed(settings: Mapping[str, Any], regime: str) -> tuple[Mapping[str, Any], dict[str, Any]]:
+    """Return the table of the regime's base, and the nominal values with its disturbances. `regime`
+    is the base and any number of disturbances, joined by `+` (or a comma); `settings` is a
+    laboratory file. Raises LaboratoryError for an unknown or contradictory regime."""
+    base, *names = (part.strip() for part in regime.replace(",", "+").split("+"))
     regimes, disturbances = settings["regimes"], settings["disturbances"]
     if base in (contests := settings.get("contests", {})):
         base, *more = contests[base].split("+")
         names = more + names
     if base not in regimes:
+        known = [*regimes, *contests]
         raise LaboratoryError(
-            f"regime {regime!r}: it must begin with one of {', '.join([*regimes, *contests])}, "
-            "such as 'A' or 'A+dim'"
+            f"regime {regime!r}: it must begin with one of {', '.join(known)}, such as "
+            f"{known[0]!r} or '{known[0]}+{next(iter(disturbances))}'"
         )
-    values = dict(settings["nominal"])
-    set_by: dict[str, str] = {}
+    values, set_by = dict(settings["nominal"]), dict[str, str]()
     for name in names:
         if name not in disturbances:
             raise LaboratoryError(
@@ -167,8 +167,7 @@ def disturb(settings: Mapping[str, Any], regime: str) -> tuple[tuple[float, floa
                     f"regime {regime!r}: {set_by[key]} and {name} both set {key}; keep one of them"
                 )
             values[key], set_by[key] = value, name
-    low, high = regimes[base]["speed"]
-    return (float(low), float(high)), values
+    return regimes[base], values
 
 
 def installation_of(regime: str) -> int:
@@ -192,7 +191,8 @@ def read_truth(
     the regime's disturbances."""
     settings = read_toml(laboratory)
     try:
-        speed, values = disturb(settings, regime)
+        base, values = disturbed(settings, regime.partition("@")[0])
+        speed = (float(base["speed"][0]), float(base["speed"][1]))
         errors, number = settings["installation"], installation_of(regime)
         rng = np.random.default_rng(errors["seed"])
         camera, cup = _camera(cell["camera"], errors, values, rng), cell["cup"]

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from petrobot.services.comm.location_file import Directory
-from petrobot.sim.catching.truth import LaboratoryError, read_toml
+from petrobot.sim.catching.truth import LaboratoryError, disturbed, read_toml
 from petrobot.sim.picking.arm import TrueArm, true_arm
 from petrobot.sim.picking.camera import Lighting, Mounted, mounted
 from petrobot.sim.picking.gripper import Fingers
@@ -103,22 +103,8 @@ class PickingSite:
 
     def truth(self, regime: str) -> PickingTruth:
         """Return the truth of a regime. Raises LaboratoryError for an unknown one."""
-        base, *names = (part.strip() for part in regime.replace(",", "+").split("+"))
-        regimes, disturbances = self.settings["regimes"], self.settings["disturbances"]
-        if base not in regimes:
-            raise LaboratoryError(
-                f"regime {regime!r}: it must begin with one of {', '.join(regimes)}, such as "
-                "'plain' or 'plain+dim'"
-            )
-        values = dict(self.settings["nominal"])
-        for name in names:
-            if name not in disturbances:
-                raise LaboratoryError(
-                    f"regime {regime!r}: unknown disturbance {name!r}; the disturbances are "
-                    f"{', '.join(disturbances)}"
-                )
-            values.update(disturbances[name])
-        return PickingTruth(regime, int(regimes[base]["parts"]), values)
+        base, values = disturbed(self.settings, regime)
+        return PickingTruth(regime, int(base["parts"]), values)
 
     def parts(
         self, truth: PickingTruth, rng: np.random.Generator, count: int | None = None

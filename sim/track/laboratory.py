@@ -47,12 +47,6 @@ ROVER_FAULTS: Final = FaultKinds(
 )
 
 
-def read_rover_fault(now: float, kind: str, arguments: Mapping[str, Any]) -> InjectedFault:
-    """Return the fault that a caller asks for. Raises ValueError that says what is wrong and what
-    is expected."""
-    return ROVER_FAULTS.read(now, kind, arguments)
-
-
 # Light over the floor: a slow drift, and the flashes of spectators' cameras.
 
 
@@ -241,7 +235,7 @@ class TrackLaboratory(LaboratoryParty):
             return self.referee.score(self.now)
         if service == FAULT:
             rest = {key: value for key, value in arguments.items() if key != "kind"}
-            self._faults.add(read_rover_fault(self.now, str(arguments.get("kind", "")), rest))
+            self._faults.add(ROVER_FAULTS.read(self.now, str(arguments.get("kind", "")), rest))
             return {}
         seed = whole_number(arguments, "seed", 0) or 0
         truth = self._site.truth(str(arguments.get("regime", REGIME)))

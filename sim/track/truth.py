@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from petrobot.services.comm.location_file import Directory
-from petrobot.sim.catching.truth import LaboratoryError, read_toml
+from petrobot.sim.catching.truth import LaboratoryError, disturbed, read_toml
 from petrobot.sim.track.camera import Mount
 from petrobot.sim.track.course import Track
 
@@ -132,7 +132,7 @@ class TrackSite:
 
     def truth(self, regime: str) -> TrackTruth:
         """Return the truth of a regime. Raises LaboratoryError."""
-        base, values = _disturbed(self.settings, regime)
+        base, values = disturbed(self.settings, regime)
         errors, nominal = self.settings["installation"], self.nominal
         rng = np.random.default_rng(errors["seed"])
         try:
@@ -169,36 +169,6 @@ def track_site_of(directory: Directory) -> TrackSite:
         directory.file(directory.parameters["rover"]),
         directory.file(laboratory) if laboratory else LABORATORY_FILE,
     )
-
-
-def _disturbed(
-    settings: Mapping[str, Any], regime: str
-) -> tuple[Mapping[str, Any], dict[str, Any]]:
-    base, *names = (part.strip() for part in regime.replace(",", "+").split("+"))
-    regimes, disturbances = settings["regimes"], settings["disturbances"]
-    if base not in regimes:
-        raise LaboratoryError(
-            f"regime {regime!r}: it must begin with one of {', '.join(regimes)}, such as "
-            "'arcs' or 'arcs+slip'"
-        )
-    values, set_by = dict(settings["nominal"]), dict[str, str]()
-    for name in names:
-        if name not in disturbances:
-            raise LaboratoryError(
-                f"regime {regime!r}: unknown disturbance {name!r}; the disturbances are "
-                f"{', '.join(disturbances)}"
-            )
-        for key, value in disturbances[name].items():
-            if key not in values:
-                raise LaboratoryError(
-                    f"[disturbances.{name}] {key}: unknown key; [nominal] lists the keys"
-                )
-            if key in set_by:
-                raise LaboratoryError(
-                    f"regime {regime!r}: {set_by[key]} and {name} both set {key}; keep one of them"
-                )
-            values[key], set_by[key] = value, name
-    return regimes[base], values
 
 
 def _rover(

@@ -22,7 +22,7 @@ from petrobot.services.worker.remote import (
 )
 from petrobot.services.worker.runner import GRACE, Runner
 from tests.node.conftest import Clock, Device
-from tests.node.test_worker_place import Bench
+from tests.node.test_worker_host import Bench
 
 
 class Stopping(Driver):

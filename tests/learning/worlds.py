@@ -1,5 +1,5 @@
 """Bernoulli worlds with known J, and rules simulated in many of them in parallel: the convergence
-study of docs/learning.md."""
+study of docs/figures-selectors.md."""
 
 from __future__ import annotations
 

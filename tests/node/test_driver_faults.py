@@ -17,10 +17,11 @@ import pytest
 
 from petrobot.coordinator.cli import main
 from petrobot.services.comm.location_file import Directory, parse
-from petrobot.services.comm.protocol.messages import Accept, Call
+from petrobot.services.comm.protocol.messages import Call, Feedback
 from tests.node.conftest import OUTSIDE
 from tests.node.test_processes import PATIENCE, ROOT, Operator, operator_of
 from tests.ports import free_ports
+from tests.waiting import Limit, beat
 
 pytestmark = pytest.mark.processes
 FAULTS = {
@@ -113,10 +114,11 @@ async def operator(node: OneNode) -> AsyncIterator[Operator]:
 
 async def works(operator: Operator, name: str) -> None:
     """Check that the device accepts runs again as soon as its driver has returned."""
-    until = time.monotonic() + PATIENCE
-    while (end := await operator.call(name, None, send=[], seconds=0.01)).cause == "fenced":
-        assert time.monotonic() < until, end
-        await asyncio.sleep(0.1)
+    limit = Limit("the device to accept runs")
+    end = await operator.call(name, None, send=[], seconds=0.01)
+    while end.cause == "fenced" and limit.left():
+        await beat(0.1)
+        end = await operator.call(name, None, send=[], seconds=0.01)
     assert (end.status, end.text) == ("success", "")
 
 
@@ -154,8 +156,7 @@ async def test_a_stop_routine_that_raises_beside_its_action(
         {"send": [{"break": True}, {"go": True}], "seconds": 15.0},
     )
     running = asyncio.create_task(client.call("plain_stop", call.arguments))
-    await operator.heard(Accept)
-    await asyncio.sleep(0.3)
+    await operator.heard(Feedback)
     await operator.command("only", "stop", "the_plain_stop")
     end = await asyncio.wait_for(running, PATIENCE)
     assert (end.status, end.cause) == (
@@ -167,10 +168,9 @@ async def test_a_stop_routine_that_raises_beside_its_action(
 
 async def test_a_hold_that_raises_ends_the_run(node: OneNode, operator: Operator) -> None:
     running = asyncio.create_task(
-        operator.call("hold", None, send=[{"go": True}, {"break": True}], seconds=15.0)
+        operator.call("hold", None, send=[{"go": True}, {"break": True}], seconds=15.0, report=True)
     )
-    await operator.heard(Accept)
-    await asyncio.sleep(0.3)
+    await operator.heard(Feedback)
     await operator.command("only", "hold", "the_hold")
     end = await running
     assert (end.status, end.cause) == (
@@ -182,10 +182,9 @@ async def test_a_hold_that_raises_ends_the_run(node: OneNode, operator: Operator
 
 async def test_a_picture_that_raises_stops_nothing(node: OneNode, operator: Operator) -> None:
     running = asyncio.create_task(
-        operator.call("picture", None, send=[{"break": True}], seconds=1.0)
+        operator.call("picture", None, send=[{"break": True}], seconds=1.0, report=True)
     )
-    await operator.heard(Accept)
-    await asyncio.sleep(0.3)
+    await operator.heard(Feedback)
     answer = await operator.command("only", "picture", "the_picture")
     assert answer.data["devices"]["the_picture"].get("mime") is None
     assert (await running).status == "success"
@@ -251,11 +250,11 @@ async def test_a_driver_that_blocks_is_named_at_the_deadline(
     node: OneNode, operator: Operator, capsys: pytest.CaptureFixture[str]
 ) -> None:
     running = asyncio.create_task(operator.call("good", 2.5, send=[{"block": 5.0}], seconds=60.0))
-    await operator.heard(Accept)
-    await asyncio.sleep(0.5)
-    await asyncio.to_thread(main, ["nodes", "--services", str(node.file)])
-    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "no answer" in shown, shown
+    shown = ""
+    while "no answer" not in shown:
+        assert not running.done(), shown
+        await asyncio.to_thread(main, ["nodes", "--services", str(node.file)])
+        shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     end = await running
     assert end.cause == "deadline" and "the driver has published nothing for" in end.text, end
     await works(operator, "good")
@@ -265,7 +264,7 @@ async def test_a_driver_that_takes_no_commands(operator: Operator) -> None:
     """The action returns at once, before the driver could refuse its last command."""
     end = await operator.call("good", None, send=[{"block": 4.0}, {"go": True}])
     assert (end.status, end.cause) == ("error", "command_not_taken"), end
-    await asyncio.sleep(3.0)
+    await works(operator, "good")
 
 
 @pytest.mark.parametrize("breaks", ["constructor", "not_plain", "state", "step"])

@@ -13,7 +13,7 @@ from petrobot.services.node.worker_host import PATIENCE
 from petrobot.services.node.worker_pool import BUSY_AFTER, IDLE_LIMIT, KEPT, WorkerPool
 from petrobot.services.worker.pipe import Item
 from petrobot.services.worker.process import DROPPED, STREAM_AT, WANTED
-from tests.node.test_worker_place import FakeChild, HostBench
+from tests.node.test_worker_host import FakeChild, HostBench
 
 
 class OneByOne(FakeChild):

@@ -1,8 +1,8 @@
-"""The convergence study of docs/learning.md: every selector in Bernoulli worlds with known J, 1,000
+"""The convergence study of docs/figures-selectors.md: every selector in Bernoulli worlds with known J, 1,000
 seeds each.
 
     python -m tools.bench.learning            the table, less than three minutes on one core
-    python -m tools.bench.learning --write    write it to docs/learning.md, and draw
+    python -m tools.bench.learning --write    write it to docs/figures-selectors.md, and draw
                                               docs/pictures/learning-*.svg (needs matplotlib)
     python -m tools.bench.learning --long     also a million trials of the schemes of Nikolic and Fu
                                               (about ten minutes)
@@ -28,7 +28,7 @@ from petrobot.coordinator.learning.selectors import RULES
 from tests.learning.worlds import BanditWorld, PlayedTrials, gapped, play
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "learning.md"
+PAGE = ROOT / "docs" / "figures-selectors.md"
 PICTURES = ROOT / "docs" / "pictures"
 SEEDS, TRIALS, AT = 1000, 2000, 500
 MARKS = sorted({int(x) for x in np.geomspace(4, TRIALS, 40)} | {AT, TRIALS // 2, TRIALS})
@@ -258,7 +258,7 @@ def _draw_long(long: dict[str, Any]) -> None:
 
 
 def write_page(text: str, long: dict[str, Any] | None) -> None:
-    """Put the tables between their marks in docs/learning.md."""
+    """Put the tables between their marks in docs/figures-selectors.md."""
     page = PAGE.read_text(encoding="utf-8")
     page = _between(page, "convergence", text)
     if long is not None:
@@ -288,7 +288,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--write", action="store_true", help="write docs/learning.md and the pictures"
+        "--write", action="store_true", help="write docs/figures-selectors.md and the pictures"
     )
     parser.add_argument("--long", action="store_true", help="play a million trials too")
     parser.add_argument(

@@ -226,7 +226,7 @@ MUTATIONS = (
         "services/node/memory.py",
         "if current != version:",
         "if False:",
-        "tests/node/test_parts.py",
+        "tests/node/test_memory.py",
         "tests/node/test_inline_service.py",
     ),
     _m(
@@ -234,7 +234,7 @@ MUTATIONS = (
         "services/worker/setpoints.py",
         "return self._values if self.age <= self._limit else None",
         "return self._values",
-        "tests/node/test_parts.py",
+        "tests/node/test_setpoints.py",
         "tests/node/test_lockstep.py",
         "tests/motion/test_arm.py",
     ),

@@ -43,9 +43,13 @@ def test_another_seed_gives_other_parts_and_too_many_are_refused() -> None:
 
 @pytest.mark.parametrize(
     ("regime", "text"),
-    [("nonsense", "must begin with one of plain"), ("plain+fog", "unknown disturbance 'fog'")],
+    [
+        ("nonsense", "must begin with one of plain"),
+        ("plain+fog", "unknown disturbance 'fog'"),
+        ("plain+shadow+person", "shadow and person both set darkness"),
+    ],
 )
-def test_an_unknown_regime_is_refused_with_those_that_there_are(regime: str, text: str) -> None:
+def test_an_impossible_regime_is_refused_with_the_possible_ones(regime: str, text: str) -> None:
     with pytest.raises(LaboratoryError, match=text):
         site().truth(regime)
 

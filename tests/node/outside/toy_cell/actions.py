@@ -285,11 +285,16 @@ async def order(
     seconds: float = 0.0,
     look: bool = False,
     ends: str = "success",
+    report: bool = False,
 ) -> Result:
     """Send commands, wait a little, and end as requested, even if the driver failed on the
-    commands."""
+    commands. With `report`, send progress when the driver has handled them."""
+    number = 0
     for body in send:
-        ctx.device.send(body)
+        number = ctx.device.send(body)
+    if report:
+        await ctx.wait(lambda: ctx.device.handled >= number)
+        ctx.progress(0.5)
     if seconds:
         await ctx.sleep(seconds)
     if look:
@@ -300,9 +305,10 @@ async def order(
 
 
 async def order_directly(ctx: Context, *, send: list[dict[str, Any]], seconds: float) -> Result:
-    """As `order`, with a driver in the same process."""
+    """As `order`, with a driver in the same process; always sends progress."""
     for body in send:
         ctx.device.command(ctx.now, body)
+    ctx.progress(0.5)
     await ctx.sleep(seconds)
     return success()
 

@@ -1,0 +1,143 @@
+"""Scripted actions, and rehearsals of actions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from petrobot.services.action import Context, Result, Status, failure, provisional, success
+from petrobot.services.rehearsal import StillRunningError, rehearse
+from petrobot.services.scripted import ScriptError, load
+
+
+def test_a_script_is_played_line_by_line(tmp_path: Path) -> None:
+    file = tmp_path / "script.toml"
+    file.write_text(
+        "schema = 1\n[actions.one]\nseconds = [0.2, 0.4]\nvalues = { x = 1 }\n"
+        '[[actions.two]]\nstatus = "failure"\ncause = "c"\ntext = "t"\nseconds = 0.1\n'
+        'events = [{ after = 0.05, name = "half", data = { y = 2 } }, { after = 9.0, name = '
+        '"never" }]\n'
+        "[[actions.two]]\n"
+    )
+    script = load(file)
+    played = [rehearse(script["two"], anything=1) for _ in range(3)]
+    assert [(p.result.status, p.result.cause) for p in played] == [
+        ("failure", "c"),
+        ("success", ""),
+        ("failure", "c"),
+    ]
+    assert [(round(t, 3), name, data) for t, name, data in played[0].events] == [
+        (0.052, "half", {"y": 2})
+    ]
+    times = {rehearse(script["one"], seed=seed).seconds for seed in range(8)}
+    assert len(times) > 3 and all(0.2 - 1e-9 <= t <= 0.4 + 0.004 for t in times)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("schema = 2", "schema: write schema = 1"),
+        ("schema = 1\n[action.x]", "action: unknown table; did you mean 'actions'?"),
+        ("schema = 1\nactions = 3", "actions: write [actions.NAME] tables"),
+        ("schema = 1\n[actions.x]\nstate = 1", "actions.x: unknown key 'state'"),
+        (
+            'schema = 1\n[actions.x]\nstatus = "good"',
+            'status is \'good\'; write "success", "failure" or "error"',
+        ),
+        (
+            "schema = 1\n[actions.x]\nseconds = [2, 1]",
+            "seconds is [2, 1]; write a number, or [shortest, longest]",
+        ),
+        ("schema = 1\n[actions.x]\nvalues = 1", "values is 1; write a table"),
+        ("schema = 1\n[actions.x]\nevents = [{ name = 1 }]", "event {'name': 1}; write"),
+        ("schema = 1\n[actions]\nx = 1", "actions.x: is 1; write a table with status"),
+        ("schema = ", "not valid TOML"),
+    ],
+)
+def test_bad_scripts_are_refused(tmp_path: Path, text: str, says: str) -> None:
+    file = tmp_path / "script.toml"
+    file.write_text(text)
+    with pytest.raises(ScriptError) as caught:
+        load(file)
+    assert says in str(caught.value) and str(file) in str(caught.value)
+
+
+def test_a_rehearsal_reports_everything_that_an_action_did() -> None:
+    async def act(ctx: Context, *, n: int) -> Result:
+        ctx.progress(0.5)
+        ctx.publish("s", [1.0])
+        answer = await ctx.call("add", n=n)
+        await ctx.put("sum", answer.values["sum"])
+        if not await ctx.wait(lambda: ctx.device["light"], 1.0):
+            return failure("dark")
+        ctx.raise_event("seen")
+        return success(sum=await ctx.get("sum"), unknown=(await ctx.call("nobody")).cause)
+
+    lamp = {"light": False}
+    played = rehearse(
+        act,
+        device=lamp,
+        services={"add": lambda n: success(sum=n + 1)},
+        streams={"s": 0.02},
+        world=lambda now: lamp.update(light=now > 0.5),
+        n=4,
+    )
+    assert (
+        played.result.values == {"sum": 5, "unknown": "unknown_service"}
+        and 0.5 < played.seconds < 0.52
+    )
+    assert [name for _, name, _ in played.calls] == ["add", "memory.put", "memory.get", "nobody"]
+    assert (
+        len(played.published) == 26 and played.progress == [(0.0, 0.5)] and len(played.events) == 1
+    )
+
+
+def test_a_rehearsal_shows_what_is_provisional_and_what_was_judged() -> None:
+    async def act(ctx: Context, run: str) -> Result:
+        await ctx.sleep(0.1)
+        ctx.verdict(run, Status.FAILURE, "crooked")
+        with pytest.raises(ValueError, match=r"pass ctx\.run of the run's own context"):
+            ctx.verdict("pick#1", Status.FAILURE)
+        with pytest.raises(ValueError, match="good"):
+            ctx.verdict(run, "good")  # type: ignore[arg-type]
+        return provisional(failure("loose", "may hold", force=1.0))
+
+    played = rehearse(act, run="m/pick#1")
+    assert played.result == Result(
+        Status.FAILURE, {"force": 1.0}, "loose", "may hold", deferred=True
+    )
+    assert [(run, status, cause) for _, run, status, cause in played.verdicts] == [
+        ("m/pick#1", "failure", "crooked")
+    ]
+
+
+def test_the_run_of_one_rehearsal_can_be_judged_in_another() -> None:
+    async def pick(ctx: Context) -> Result:
+        return provisional(success(run=ctx.run))
+
+    async def judge(ctx: Context, run: str) -> Result:
+        ctx.verdict(run, Status.FAILURE, "crooked")
+        return success()
+
+    picked = rehearse(pick).result.values["run"]
+    assert [run for _, run, _, _ in rehearse(judge, run=picked).verdicts] == [picked]
+
+
+def test_a_script_may_be_provisional(tmp_path: Path) -> None:
+    file = tmp_path / "script.toml"
+    file.write_text("schema = 1\n[actions.one]\ndeferred = true\n")
+    assert rehearse(load(file)["one"]).result.deferred
+    file.write_text('schema = 1\n[actions.one]\ndeferred = "later"\n')
+    with pytest.raises(ScriptError, match=r"actions\.one: deferred is 'later'; write true"):
+        load(file)
+
+
+def test_a_rehearsal_has_a_limit() -> None:
+    async def act(ctx: Context) -> Result:
+        await ctx.sleep(100.0)
+        return success()
+
+    with pytest.raises(StillRunningError, match="has not ended after 2 s"):
+        rehearse(act, limit=2.0)
+    assert rehearse(act, cancel_after=1.0).result.cause == "cancelled"
