@@ -3,6 +3,7 @@ whoever writes actions."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,6 +18,7 @@ from petrobot.services.node.inline_host import InlineHost
 from petrobot.services.node.memory import GlobalMemory
 from petrobot.services.worker.context import Draws, Report, outcome_of, result_of
 from petrobot.services.worker.outlets import Sent
+from petrobot.services.worker.setpoints import SetpointReceiver
 
 NAME, RUN = "action", "rehearsal/action#1"
 
@@ -53,6 +55,7 @@ def rehearse(
     device: Any = None,
     services: Mapping[str, Callable[..., Result]] | None = None,
     streams: Mapping[str, float] | None = None,
+    memory: Mapping[str, Any] | None = None,
     world: Callable[[float], None] | None = None,
     cancel_after: float | None = None,
     limit: float = 60.0,
@@ -62,13 +65,16 @@ def rehearse(
     """Run an action to its end in ticks of 4 ms of simulated time; takes milliseconds of real time.
 
     `device` is a driver (`Driver`; a cyclic one is stepped, and one that was made with ports None
-    gets ports with a clock, `random` and `raise_event`), or whatever the action uses as
-    `ctx.device`. `services` answer its calls by name (the global memory is there anyway),
-    `streams` gives the periods of those it publishes to (s). `world(now)` is called each tick
+    gets ports with a clock, `random`, `raise_event` and `stream`, which receives what the action
+    publishes), or whatever the action uses as `ctx.device`. `services` answer its calls by name.
+    The global memory is there without being named; `memory` are its variables at the beginning.
+    `streams` gives the periods of streams (s; of others one tick). `world(now)` is called each tick
     before the action, to let something happen. With `cancel_after` it is cancelled then. Raises
     StillRunningError when it has not ended after `limit` seconds.
     """
-    stage = _Stage(action, device, services or {}, streams or {}, seed)
+    stage = _Stage(action, device, services or {}, defaultdict(lambda: TICK, streams or {}), seed)
+    for name, value in (memory or {}).items():
+        stage.played.memory.call("memory.put", {"name": name, "value": value})
     stage.place.take(0.0, Call(RUN, NAME, arguments, seed=seed))
     for tick in range(round(limit / TICK) + 1):
         stage.now = tick * TICK
@@ -80,8 +86,19 @@ def rehearse(
         if stage.step():
             return stage.played
     raise StillRunningError(
-        f"the action has not ended after {limit:g} s; it has told: {stage.played}"
+        f"the action has not ended after {limit:g} s; {_last_acts(stage.played)}"
     )
+
+
+def _last_acts(played: Rehearsal) -> str:
+    """Return how often the action called, published and raised events, and each time the last."""
+    kinds: dict[str, list[Any]] = {
+        "calls": played.calls,
+        "set points": played.published,
+        "events": played.events,
+    }
+    acts = [f"{len(a):,} {kind}, the last: {str(a[-1])[:200]}" for kind, a in kinds.items() if a]
+    return "; ".join(acts) or "it called and published nothing"
 
 
 class _Prop:
@@ -114,6 +131,10 @@ class _StagePorts:
         """Note the event in the rehearsal's `events`."""
         self._stage.played.events.append((self.now, name, data))
 
+    def stream(self, name: str) -> SetpointReceiver:
+        """The receiving end of a stream to which the action may publish."""
+        return self._stage.receiver(name)
+
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(f"a rehearsal has no ports.{name}; make the driver with ports that do")
 
@@ -134,6 +155,7 @@ class _Stage:
         if isinstance(device, Driver) and getattr(device, "ports", self) is None:
             device.ports = _StagePorts(self, seed)
         self._services = services
+        self._streams, self._receivers = streams, dict[str, SetpointReceiver]()
         driver = device if hasattr(device, "stopped") and hasattr(device, "period") else None
         self.place = InlineHost(
             {NAME: ActionEntry(NAME, "", "", "")},
@@ -144,6 +166,13 @@ class _Stage:
             substitutes={NAME: action},
             virtual=True,
         )
+
+    def receiver(self, stream: str) -> SetpointReceiver:
+        """What has arrived of a stream."""
+        if stream not in self._receivers:
+            period = self._streams[stream]
+            self._receivers[stream] = SetpointReceiver(period, lambda: self.now)
+        return self._receivers[stream]
 
     def step(self) -> bool:
         """One tick; whether the run has ended."""
@@ -160,6 +189,7 @@ class _Stage:
             played.seconds = report.seconds
         elif isinstance(report, Sent):
             played.published.append((self.now, report.stream, report.values))
+            self.receiver(report.stream).take(report.values, report.elapsed)
         elif isinstance(report, Event) and report.name.startswith(VERDICT_EVENTS):
             said = RunVerdict.of_data(report.data)
             played.verdicts.append((self.now, said.run, Status(said.status), said.cause))

@@ -106,6 +106,15 @@ def task_path(name: str) -> Path:
     )
 
 
+def own_tasks(directory: Directory) -> Path:
+    """Return the folder of the user's own tasks: `tasks` here, or if there is none, that of the
+    location file if it has a task."""
+    from petrobot.coordinator.page.task_store import TaskStore
+
+    beside = directory.source.parent
+    return beside if not OWN.is_dir() and TaskStore(beside).names() else OWN
+
+
 def load_task(name: str) -> Task:
     """Read a task file."""
     from petrobot.coordinator.task.file import TaskFileError, load

@@ -347,7 +347,7 @@ async def _lead_realtime(session: RunSession, options: argparse.Namespace) -> No
 async def _page(session: RunSession, options: argparse.Namespace) -> AsyncIterator[None]:
     """Serve the operator's page, or with --no-page the operator's protocol alone, while the run is
     active."""
-    from petrobot.coordinator.cli.loading import OWN, SHIPPED
+    from petrobot.coordinator.cli.loading import SHIPPED, own_tasks
     from petrobot.coordinator.operator.door_file import Door
     from petrobot.coordinator.operator.history import JournalHistory
     from petrobot.coordinator.operator.station import offered
@@ -359,7 +359,7 @@ async def _page(session: RunSession, options: argparse.Namespace) -> AsyncIterat
     with named_port(options.page_port):
         page = await start_page(
             operation,
-            tasks_folder=OWN,
+            tasks_folder=own_tasks(directory),
             shipped=SHIPPED,
             port=options.page_port,
             offers=lambda: offered(

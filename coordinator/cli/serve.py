@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
-    OWN,
     SHIPPED,
     add_services_argument,
     load_directory,
+    own_tasks,
     refuse_script,
 )
 from petrobot.coordinator.cli.options import (
@@ -40,9 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--tasks",
         metavar="FOLDER",
         type=Path,
-        default=OWN,
         help="folder of your own tasks, made when needed; tasks that come with petrobot are also "
-        "offered (%(default)s)",
+        "offered (default: tasks, or if it is not there, the folder of the location file, if a "
+        "task is in it)",
     )
     parser.add_argument(
         "--up",
@@ -72,6 +72,7 @@ def run(options: argparse.Namespace) -> int:
         raise CommandError(2, "--mock replaces actions of nodes that are started here: add --up")
     directory = load_directory(options.services)
     refuse_script(options.mock, directory)
+    options.tasks = options.tasks or own_tasks(directory)
     return asyncio.run(_serve(directory, options))
 
 

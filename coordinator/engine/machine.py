@@ -420,13 +420,14 @@ def _waits_for_draw(draft: Draft) -> bool:
 
 
 def _write(draft: Draft, name: str, value: Any) -> bool:
-    """Write a watched variable. A value of another type is reported, and the variable is none."""
+    """Write a watched variable. A value that it may not hold is reported, and it is none."""
     variable = draft.compiled.task.variables.get(name)
     if variable is None:
         _note(draft, "unknown_variable", f"{name!r} is no variable of the task; ignored", name)
         return False
-    if not variable.type.admits(value):
-        _warn(draft, "bad_value", f"{name} = {value!r} is no {variable.type}; it is none now", name)
+    if not variable.admits(value):
+        text = f"{name} = {value!r}, expected {variable.expected}; it is none now"
+        _warn(draft, "bad_value", text, name)
         value = None
     draft.write(name, value)
     return True

@@ -13,6 +13,8 @@ from petrobot.coordinator.page.edits import EditError, Rename, edited, parse
 from petrobot.services.host.whole_file import make_folder, write_whole
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,63}")
+_TASK = re.compile(rb"^\s*(\[\s*task\s*[].]|task\s*(=\s*\{|\.))", re.MULTILINE)
+"""What only a task file has: its table `task`."""
 LARGEST_FILE = 1024 * 1024
 
 
@@ -52,7 +54,7 @@ class TaskText:
 
 class TaskStore:
     """Task files by bare name: those of the user's own folder, made when it is first needed, then
-    the shipped ones."""
+    the shipped ones. Other TOML files of the folder are not offered."""
 
     def __init__(self, folder: Path, shipped: Path | None = None) -> None:
         self._folder = folder
@@ -107,12 +109,7 @@ class TaskStore:
         Only values that differ from those of the file are changed in its text. Raises Conflict,
         StoreError.
         """
-        try:
-            current: TaskText | None = self.read(name)
-        except StoreError as fault:
-            if fault.status != 404:
-                raise
-            current = None
+        current = self.current(name)
         yours = self.edited_text(current, document, renames)
         if (current.revision if current else None) != base:
             raise Conflict(current or TaskText(name, ""), yours)
@@ -124,7 +121,7 @@ class TaskStore:
         StoreError."""
         try:
             parse(text)
-            current = self.read(name) if name in self.names() else None
+            current = self.current(name)
         except EditError as fault:
             raise StoreError(400, str(fault)) from fault
         if (current.revision if current else None) != base:
@@ -140,6 +137,15 @@ class TaskStore:
             return edited(current.text if current else "", document, renames)
         except EditError as fault:
             raise StoreError(400, str(fault)) from fault
+
+    def current(self, name: str) -> TaskText | None:
+        """Return a task file as it is now, None if there is none. Raises StoreError."""
+        try:
+            return self.read(name)
+        except StoreError as fault:
+            if fault.status != 404:
+                raise
+            return None
 
     def _path(self, name: str) -> Path:
         if not _NAME.fullmatch(name):
@@ -160,7 +166,15 @@ class TaskStore:
 
 
 def _stems(folder: Path) -> set[str]:
-    return {path.stem for path in folder.glob("*.toml") if _NAME.fullmatch(path.stem)}
+    named = (path for path in folder.glob("*.toml") if _NAME.fullmatch(path.stem))
+    return {path.stem for path in named if _is_task(path)}
+
+
+def _is_task(path: Path) -> bool:
+    try:
+        return path.stat().st_size > LARGEST_FILE or _TASK.search(path.read_bytes()) is not None
+    except OSError:
+        return True  # opening it says what is wrong
 
 
 def _content(path: Path) -> str:

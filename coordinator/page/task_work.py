@@ -227,8 +227,7 @@ def _drawn(
     """Return the text that a drawing would be saved as: {text}."""
     store = _store(tasks, shipped)
     try:
-        current = store.read(name) if name in store.names() else None
-        return {"text": store.edited_text(current, document, _renames(renames))}
+        return {"text": store.edited_text(store.current(name), document, _renames(renames))}
     except StoreError as fault:
         raise _refused(fault) from fault
 

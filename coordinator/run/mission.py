@@ -3,6 +3,7 @@ sans-I/O machine like its parts."""
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -29,11 +30,12 @@ from petrobot.services.comm.calls.events import RunVerdict
 from petrobot.services.comm.location_file import Directory, DirectoryError
 from petrobot.services.comm.protocol.messages import Call, Feedback, Outcome, Welcome
 
+_log = logging.getLogger(__package__)
 SERVICE_DEADLINE = 20.0
 TOLD_ERRORS = 6
 """How many of its last failed runs the result of a mission run that ended in ERROR names."""
 BAD_VALUE = "bad_value"
-"""Key of the engine's report of a result that did not give a value, or gave one of another type."""
+"""Key of the engine's report of a result that did not give a value, or one that does not fit."""
 VERDICTS = "verdicts"
 """Key of a score under which it judges runs that ended provisionally: {run: {status, cause,
 text}}."""
@@ -104,7 +106,8 @@ def _count(n: int, what: str) -> str:
 
 @dataclass
 class MissionTally:
-    """An observer that counts what the result needs: firings, cycles, runs and reports."""
+    """An observer that counts what the result needs: firings, cycles, runs and reports. Errors of
+    the net are logged at once: a task that is stuck may never have a result."""
 
     runs_place: int | None
     firings: int = 0
@@ -130,6 +133,8 @@ class MissionTally:
             self.chosen[instruction.run] = instruction.action
         elif isinstance(instruction, Report) and instruction.severity is not Severity.NOTE:
             self.reports.append(instruction)
+            if instruction.severity is Severity.ERROR:
+                _log.error("%.3f s: %s", now, instruction.text)
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Nothing to count."""

@@ -320,6 +320,17 @@ class Variable:
     """Possible values of a `str` variable, if they are few. `check` uses them to prove that
     conditions cover all cases."""
 
+    def admits(self, value: Value) -> bool:
+        """Whether it may hold the value: one of `values` if it lists them, else of its type."""
+        return self.type.admits(value) and (
+            value is None or not self.values or value in self.values
+        )
+
+    @property
+    def expected(self) -> str:
+        """What it may hold, in words."""
+        return " or ".join(self.values) or str(self.type)
+
 
 class Parameter(StrEnum):
     """What a parameter of a subnet stands for: a place or a variable of the net around it, or a

@@ -44,19 +44,28 @@ class Outlets:
     `due`."""
 
     def __init__(self, periods: Mapping[str, float]) -> None:
-        self._outlets = {name: _Outlet(period) for name, period in periods.items()}
+        self._periods = periods
+        self._outlets: dict[str, _Outlet] = {}
         self._open: dict[str, _Outlet] = {}
 
     def publish(self, now: float, run: str, stream: str, values: Sequence[float]) -> None:
-        """Make `values` the newest of a stream. Raises ValueError for an unknown stream or numbers
-        that are not finite."""
+        """Make `values` the newest of a stream. Raises ValueError for an unknown stream, and for
+        what is not a list of finite numbers."""
         outlet = self._outlets.get(stream)
         if outlet is None:
+            try:
+                outlet = self._outlets[stream] = _Outlet(self._periods[stream])
+            except KeyError:
+                raise ValueError(
+                    f"no stream is named {stream!r}; services.toml has: "
+                    f"{', '.join(self._periods) or 'none'}"
+                ) from None
+        try:
+            numbers = tuple(float(v) for v in values)
+        except (TypeError, ValueError):
             raise ValueError(
-                f"no stream is named {stream!r}; services.toml has: "
-                f"{', '.join(self._outlets) or 'none'}"
-            )
-        numbers = tuple(float(v) for v in values)
+                f"set point of {stream!r}: expected a list of numbers, found {values!r:.100}"
+            ) from None
         if len(numbers) > MOST:
             raise ValueError(
                 f"set point of {stream!r}: expected at most {MOST} numbers, found {len(numbers):,}"

@@ -263,7 +263,7 @@ class Runner:
         self._clock = clock
         self._device = device
         self._refusing: Refusing | None = device if isinstance(device, Refusing) else None
-        self._outlets = Outlets(streams or {})
+        self._outlets = Outlets({} if streams is None else streams)
         self._callables: dict[str, Callable[..., Any]] = dict(substitutes or {})
         self._virtual = virtual
         self._runs: dict[str, Execution] = {}

@@ -313,6 +313,20 @@ def test_a_loop_that_never_ends_is_not_sound() -> None:
     assert "can go on for ever, but never comes to done == 1" in found.sound.reason
 
 
+def test_a_task_that_can_only_give_up_is_not_sound() -> None:
+    """Somebody expects two tokens of a resource that has one, and a bell rings for ever."""
+    net = {
+        "good": {"in": "act:normal", "out": "arm"},
+        "bad": {"in": "act:error", "out": "broken"},
+        "again": {"in": "arm", "event": "bell", "out": "act"},
+    }
+    ends: dict[str, Any] = {"final": "arm == 2", "final_error": parse("broken == 1")}
+    found = judged(make_task("arm~=1 act! broken", net, "bell", **ends))
+    assert found.deadlock_free.holds and found.sound.holds is False
+    assert found.sound.reason == "the task can only give up: it never comes to arm == 2"
+    assert found.sound.witness is not None  # so that `check` refuses it
+
+
 def test_an_incomplete_graph_proves_nothing_but_still_refutes() -> None:
     grows = make_task(
         "go=1 act! bin",

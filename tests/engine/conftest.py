@@ -46,6 +46,7 @@ def make_task(
     transitions: Mapping[str, Mapping[str, Any]],
     events: str = "",
     variables: Mapping[str, Value] | None = None,
+    values: Mapping[str, tuple[str, ...]] | None = None,
     alternatives: Mapping[str, tuple[str, ...]] | None = None,
     args: Mapping[str, Mapping[str, Value]] | None = None,
     out: Mapping[str, Mapping[str, str]] | None = None,
@@ -81,7 +82,10 @@ def make_task(
         primitive_tasks=primitives,
         final=parse(rest.pop("final", "1 == 2")),
         events={e.name: e for e in map(_event, events.split())},
-        variables={n: Variable(n, VariableType.of(v), v) for n, v in (variables or {}).items()},
+        variables={
+            n: Variable(n, VariableType.of(v), v, (values or {}).get(n, ()))
+            for n, v in (variables or {}).items()
+        },
         **rest,
     )
 

@@ -190,6 +190,17 @@ def test_value_that_does_not_fit_leaves_none_and_no_branch_sees_the_old_one(
     assert p.marked == {"r": 1}
 
 
+def test_value_that_is_not_listed_leaves_none(play: Plays) -> None:
+    p = play("a!=1 l", {"t": {"in": "a:normal", "out": "l", "when": "side == 'left'"}},
+             variables={"side": "left"}, values={"side": ("left", "right")},
+             out={"a": {"code": "side"}})  # fmt: skip
+    p(RunEnded("a#1", OK, values={"code": "middle"}))
+    assert p.marked == {"a": 1} and p.reports[:2] == ["bad_value", "nowhere_to_go"]
+    assert p.state.variables["side"] is None
+    p(VariableChanged("side", "above"))
+    assert p.reports.count("bad_value") == 2 and p.state.variables["side"] is None
+
+
 def test_reason_and_status_are_variables(play: Plays) -> None:
     net = {
         "lost": {"in": "a:error", "out": "l", "when": "a.reason == 'lost'"},

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from petrobot.services.action import Context, Result, Status, failure, provisional, success
+from petrobot.services.device import Driver
 from petrobot.services.rehearsal import StillRunningError, rehearse
 from petrobot.services.scripted import ScriptError, load
 
@@ -141,3 +142,37 @@ def test_a_rehearsal_has_a_limit() -> None:
     with pytest.raises(StillRunningError, match="has not ended after 2 s"):
         rehearse(act, limit=2.0)
     assert rehearse(act, cancel_after=1.0).result.cause == "cancelled"
+
+
+def test_a_rehearsal_that_does_not_end_says_what_was_done_last_and_no_more() -> None:
+    async def count(ctx: Context) -> Result:
+        while True:
+            number, _ = await ctx.get_versioned("parts", 0)
+            await ctx.compare_and_set("parts", 99, number + 1)
+
+    with pytest.raises(StillRunningError, match=r"\d+ calls, the last: .*memory\.") as raised:
+        rehearse(count, limit=2.0, memory={"parts": 4})
+    assert len(str(raised.value)) < 400
+
+
+def test_a_rehearsal_has_memory_and_streams_without_a_location_file() -> None:
+    class Desk(Driver):
+        period = 0.01
+        shown = 0.0
+
+        def step(self, now: float) -> None:
+            values = self.ports.stream("place").values
+            self.shown = 0.0 if values is None else values[0]
+
+    desk = Desk({}, None)  # type: ignore[arg-type]
+
+    async def tell(ctx: Context) -> Result:
+        ctx.publish("place", [await ctx.get("parts")])
+        await ctx.sleep(0.1)
+        with pytest.raises(ValueError, match=r"expected a list of numbers, found \{'x': 1\}"):
+            ctx.publish("place", {"x": 1})  # type: ignore[arg-type]
+        return success(shown=desk.shown)
+
+    played = rehearse(tell, device=desk, memory={"parts": 4})
+    assert played.result.values == {"shown": 4.0}
+    assert {(stream, values) for _, stream, values in played.published} == {("place", (4.0,))}

@@ -14,6 +14,7 @@ import pytest
 import pytest_asyncio
 
 from petrobot.coordinator.analysis.formats.pnml import parse_pnml
+from petrobot.coordinator.cli.loading import own_tasks
 from petrobot.coordinator.operator import history as journals
 from petrobot.coordinator.page import edits
 from petrobot.coordinator.page import task_store as store
@@ -22,6 +23,7 @@ from petrobot.coordinator.page.access import HEADERS
 from petrobot.coordinator.page.server import Page
 from petrobot.coordinator.page.task_work import as_task_file
 from petrobot.coordinator.task.file import load, loads
+from petrobot.services.comm import location_file
 from tests.page.stage import Stage
 
 pytestmark = pytest.mark.processes
@@ -52,6 +54,27 @@ async def http(page: Page) -> AsyncIterator[aiohttp.ClientSession]:
     headers = {"Authorization": f"Bearer {page.token}"}
     async with aiohttp.ClientSession(address, headers=headers) as session:
         yield session
+
+
+def test_a_task_beside_its_location_file_is_offered_and_other_files_are_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`petrobot serve` in the folder of a robot offers its task."""
+    monkeypatch.chdir(tmp_path)
+    cell = tmp_path / "services.toml"
+    node = '[nodes.pc]\nhost = "127.0.0.1"\nport = 7501\n'
+    cell.write_text(f'schema = 1\n{node}[actions.a]\nrun = "m:a"\nnode = "pc"\ntask = "go"\n')
+    (tmp_path / "pyproject.toml").write_text("[project]\n")
+    directory = location_file.load(cell)
+    assert own_tasks(directory) == Path("tasks")  # there is no task yet
+    (tmp_path / "sort.toml").write_text("schema = 1\n  [task]\n")
+    (tmp_path / "short.toml").write_text('task.name = "short"\n')
+    assert own_tasks(directory) == tmp_path
+    assert store.TaskStore(tmp_path).names() == ["short", "sort"]
+    with pytest.raises(store.Conflict):  # it is not offered, and not overwritten either
+        store.TaskStore(tmp_path).save_text("services", None, "[task]\n")
+    (tmp_path / "tasks").mkdir()
+    assert own_tasks(directory) == Path("tasks")
 
 
 async def opened(http: aiohttp.ClientSession, name: str = TASK) -> dict[str, Any]:

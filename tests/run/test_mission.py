@@ -8,11 +8,12 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.engine import Engine, RunRecorded
+from petrobot.coordinator.engine import Engine, Report, RunRecorded
+from petrobot.coordinator.engine.instructions import Severity
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.run.executor import Executor
 from petrobot.coordinator.run.interfaces import FirstAlternative
-from petrobot.coordinator.run.mission import Mission
+from petrobot.coordinator.run.mission import Mission, MissionTally
 from petrobot.coordinator.run.timeline import Timeline
 from petrobot.coordinator.task import Executed, Status, Task
 from petrobot.coordinator.task.file import loads
@@ -40,6 +41,15 @@ def failing(cause: str, status: ActionStatus = ActionStatus.ERROR) -> Line:
 
 
 GOOD = Line(seconds=(0.2, 0.2))
+
+
+def test_an_error_of_the_net_is_logged_when_it_occurs(caplog: pytest.LogCaptureFixture) -> None:
+    """A task that is stuck may never have a result."""
+    tally = MissionTally(None)
+    tally.instruction(1.5, Report(Severity.ERROR, "nowhere_to_go", "scan#1 has nowhere to go"))
+    tally.instruction(2.0, Report(Severity.WARNING, "bad_value", "scan#1 gave nothing"))
+    assert [r.getMessage() for r in caplog.records] == ["1.500 s: scan#1 has nowhere to go"]
+    assert len(tally.reports) == 2
 
 
 def test_four_runs_reach_final(catch_ball: Task) -> None:

@@ -1,5 +1,5 @@
-"""The convergence study of docs/figures-selectors.md: every selector in Bernoulli worlds with known J, 1,000
-seeds each.
+"""The convergence study of docs/figures-selectors.md: every selector in Bernoulli worlds with
+known J, 1,000 seeds each.
 
     python -m tools.bench.learning            the table, less than three minutes on one core
     python -m tools.bench.learning --write    write it to docs/figures-selectors.md, and draw

@@ -242,17 +242,20 @@ class Progress:
 
     @cached_property
     def sound(self) -> PropertyVerdict:
-        """An end can be reached from everywhere."""
+        """An end can be reached from everywhere, and not only by giving up."""
         x = self.x
+        final = x.engine.compiled.task.final
         good = x.final | x.given_up
         good[x.expanded :] = True
         lost = np.flatnonzero(~x.graph.backward(good))
+        if not len(lost) and x.complete and not x.final.any():
+            reason = f"the task can only give up: it never comes to {final}"
+            return self._no(reason, int(np.flatnonzero(x.given_up)[0]))
         if not len(lost):
             return self._yes("an end can be reached from every state")
         first = int(lost[0])
         reason = f"from {describe(x, first)} no designed end can be reached"
         if not x.dead.any() and not x.livelocks:
-            final = x.engine.compiled.task.final
             reason += f": the task can go on for ever, but never comes to {final}"
         return self._no(reason, first)
 
