@@ -1,4 +1,4 @@
-"""The convergence study of docs/figures-selectors.md: every selector in Bernoulli worlds with known J, 1,000
+"""The study of docs/figures-selectors.md: every selector in Bernoulli worlds with known J, 1,000
 seeds each.
 
     python -m tools.bench.learning            the table, less than three minutes on one core

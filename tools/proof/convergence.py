@@ -1,4 +1,4 @@
-"""How often selectors end on the best action: check the study of docs/figures-selectors.md against its
+"""How often selectors end on the best action: the study of docs/figures-selectors.md against its
 floors."""
 
 from __future__ import annotations
