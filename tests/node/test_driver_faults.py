@@ -250,8 +250,8 @@ async def test_a_driver_that_blocks_is_named_at_the_deadline(
     node: OneNode, operator: Operator, capsys: pytest.CaptureFixture[str]
 ) -> None:
     running = asyncio.create_task(operator.call("good", 2.5, send=[{"block": 5.0}], seconds=60.0))
-    shown = ""
-    while "no answer" not in shown:
+    shown, limit = "", Limit("the command to say that the driver does not answer")
+    while "no answer" not in shown and limit.left():
         assert not running.done(), shown
         await asyncio.to_thread(main, ["nodes", "--services", str(node.file)])
         shown = " ".join(capsys.readouterr().out.replace("│", " ").split())

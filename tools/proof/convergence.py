@@ -1,5 +1,5 @@
-"""How often selectors end on the best action: check the study of docs/figures-selectors.md against
-its floors."""
+"""How often selectors end on the best action: the study of docs/figures-selectors.md against its
+floors."""
 
 from __future__ import annotations
 
