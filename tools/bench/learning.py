@@ -1,10 +1,5 @@
-<<<<<<< HEAD
-"""The convergence study of docs/figures-selectors.md: every selector in Bernoulli worlds with
-known J, 1,000 seeds each.
-=======
 """The study of docs/figures-selectors.md: every selector in Bernoulli worlds with known J, 1,000
 seeds each.
->>>>>>> 2ca7e0fc790b9f9dda6b5396ea084f6ea9ae0660
 
     python -m tools.bench.learning            the table, less than three minutes on one core
     python -m tools.bench.learning --write    write it to docs/figures-selectors.md, and draw
