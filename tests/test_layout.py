@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tools.proof.mutations import MUTATIONS
 
 ROOT = Path(__file__).parents[1]
 TOP_LEVEL = {"coordinator", "services", "sim"}
@@ -311,6 +312,16 @@ def test_the_rule_of_limits_tells_waits_apart(source: str, limited: bool) -> Non
     """What the rule above refuses and what it lets pass."""
     (loop,) = ast.parse(source).body
     assert isinstance(loop, ast.While) and has_limit(loop, timed=False) is limited
+
+
+def test_every_mutation_still_finds_its_text() -> None:
+    """Else the next run of `tools.proof.mutations` stops there, long after the change."""
+    lost = [
+        f"{one.file}: {one.name}"
+        for one in MUTATIONS
+        if (ROOT / one.file).read_text(encoding="utf-8").count(one.old) != 1
+    ]
+    assert not lost, "\n".join(["expected its text once:", *lost])
 
 
 @pytest.mark.processes
