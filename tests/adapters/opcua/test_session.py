@@ -188,6 +188,18 @@ def test_it_keeps_the_rules_of_drivers(cell: Cell) -> None:
 
 
 @pytest.mark.processes
+def test_in_a_dry_run_nothing_is_written(cell: Cell) -> None:
+    cell.power(True)
+    driver = cell.driver(dry_run=True, on_stop={"count": 7})
+    before = await_(driver, complete, "all values")["values"]["count"]
+    assert done(driver, {"count": before + 1}) == ""
+    driver.stop(0.0)
+    assert driver.stopped()
+    other = cell.driver()
+    assert await_(other, complete, "all values")["values"]["count"] == before
+
+
+@pytest.mark.processes
 def test_a_wrong_node_is_named_and_the_others_work(cell: Cell) -> None:
     cell.power(True)
     wrong = {"lost": "ns=2;s=Cell.lost", "odd": "Cell.odd"}
