@@ -205,7 +205,7 @@ class Link:
                 self.count += 1
             data = self._line.receive()
         except OSError as fault:
-            self.drop(now, str(fault))
+            self._lose(now, str(fault))
             return b""
         if data:
             self.why, self._heard = "", now
@@ -223,6 +223,10 @@ class Link:
 
     def drop(self, now: float, why: str) -> None:
         """Give the line up, and open another one later: soon if this one served for long."""
+        if self.up:  # else the next one is due already
+            self._lose(now, why)
+
+    def _lose(self, now: float, why: str) -> None:
         if self.up and now - self._since > PAUSES[1]:
             self._pause = PAUSES[0]
         self.close()
