@@ -111,7 +111,7 @@ def measure(campaign: Sequence[str], runs: int) -> bool:
                 cluster = ("--cluster", f"tcp://{ADDRESSES[HERE]}:{PORT}", "--out", str(clustered))
                 begun = time.monotonic()
                 conduct = processes.start(HERE, *words, *cluster)
-                acts = [
+                acts: list[tuple[float, str, int | str]] = [
                     (0.1, "kill", 1), (0.2, "add", THERE), (0.3, "kill", 0), (0.4, "add", HERE),
                     (0.5, "kill", 2), (0.6, "add", THERE), (0.8, "kill", 3),
                 ]  # fmt: skip
