@@ -262,5 +262,11 @@ class OpcUaSession(Driver):
 
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
         """Take a notification (called by asyncua, in the session's thread)."""
-        plain = value if isinstance(value, bool | int | float | str | bytes | list) else str(value)
-        self._news.put(("value", self._by_id[node.nodeid], plain))
+        self._news.put(("value", self._by_id[node.nodeid], _plain(value)))
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as a driver's state may have it: dates, identifiers and structures as text."""
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value if isinstance(value, bool | int | float | str | bytes) else str(value)

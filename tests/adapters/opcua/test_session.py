@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -16,6 +17,7 @@ import pytest
 from petrobot import Ports, check_driver, rehearse
 from petrobot.services.adapters.opcua.actions import handshake, write
 from petrobot.services.adapters.opcua.session import OpcUaSession
+from petrobot.services.comm.protocol.plain import plain
 from tests.ports import free_ports
 from tests.waiting import Limit
 
@@ -185,6 +187,17 @@ def test_it_keeps_the_rules_of_drivers(cell: Cell) -> None:
     found = check_driver(cell.driver, cable=cell.power, within=30.0, seconds=30.0)
     late = [fault for fault in found.faults if "took longer than the period" in fault]
     assert found.faults == late  # a busy host delays a step; none of its steps waits
+
+
+def test_values_of_any_type_are_plain(cell: Cell) -> None:
+    """A list of dates would make the state one that cannot be published, and break the driver."""
+    driver = cell.driver()
+    driver._by_id = {"node": "count"}
+    dates = [datetime.datetime(2026, 11, 23), [datetime.datetime(2026, 11, 24)], 3]
+    driver.datachange_notification(SimpleNamespace(nodeid="node"), dates, None)
+    driver.step(0.0)
+    told = plain(driver.state())["values"]["count"]
+    assert told == ["2026-11-23 00:00:00", ["2026-11-24 00:00:00"], 3]
 
 
 @pytest.mark.processes
