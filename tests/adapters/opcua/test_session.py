@@ -96,7 +96,7 @@ def await_(driver: OpcUaSession, ready: Callable[[Any], object], awaited: str) -
 
 
 def complete(state: Any) -> bool:
-    return set(state["values"]) == set(NAMES)
+    return bool(state["up"]) and set(state["values"]) == set(NAMES)
 
 
 def done(driver: OpcUaSession, values: dict[str, Any]) -> str:
