@@ -25,7 +25,7 @@ from petrobot.services.adapters.ur import kinematics
 from petrobot.services.adapters.ur.rtde import Rtde, RtdeError
 
 OUTPUTS = (
-    *("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "runtime_state"),
+    *("actual_q", "actual_qd", "robot_mode", "safety_mode"),
     *("actual_digital_input_bits", "actual_digital_output_bits", "output_int_register_24"),
 )
 SETPOINT = (
