@@ -284,14 +284,15 @@ class _Check:
         positions, took = self.way(there, back, seconds)
         self.move(back, seconds)
         if "speed" in obeys:
-            self.again(f"speed = {SLOW}", speed=SLOW)
+            asked = SLOW * self.driver.speed  # its table may have a speed
+            self.again(f"speed = {asked:g}", speed=asked)
             most = max(positions, key=positions.__getitem__, default="")
             slow, slowly = self.way(there, back, seconds / SLOW)
             share = slow.get(most, 0.0) / slowly / (positions.get(most, 0.0) / took or 1.0)
             if share > SLOWED:
                 self.fault(
-                    f"speed = {SLOW}: {dict(there)} moves it at {share:.2f} of its usual speed; if "
-                    "it does not reach that on so short a way, give commands farther apart"
+                    f"speed = {asked:g}: {dict(there)} moves it at {share:.2f} of its usual speed; "
+                    "if it does not reach that on so short a way, give commands farther apart"
                 )
             self.move(back, seconds / SLOW)
         if "workspace" in obeys:

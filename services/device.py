@@ -19,7 +19,7 @@ from petrobot.services.comm.canopen.bus import CanBus
 from petrobot.services.comm.location_file.reading import nearest
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.comm.streams.image import ImageSource
-from petrobot.services.comm.streams.serial_line import SerialLine
+from petrobot.services.comm.streams.line import ByteLine
 
 if TYPE_CHECKING:
     import numpy as np
@@ -60,11 +60,17 @@ class Ports(Protocol):
     def can(self) -> CanBus:
         """The CAN bus of this device."""
 
-    def serial(self, port: str, baud: int) -> SerialLine:
+    def serial(self, port: str, baud: int) -> ByteLine:
         """Open a serial line (8 data bits, no parity, 1 stop bit); again after it was lost. `port`
         is the device's key of that name: a path, or "pty:PATH" at a simulated laboratory. In lock
         step it is the laboratory's whatever it says. Raises ConnectionError when it is not
         there."""
+
+    def tcp(self, host: str, port: int) -> ByteLine:
+        """Open a TCP connection to an IP address, or "unix:PATH" at a simulated laboratory; again
+        after it was lost. It is made while the driver goes on: what is sent meanwhile waits, and
+        `receive` raises ConnectionError if it cannot be made. In lock step it is the laboratory's
+        whatever it says. Raises ValueError for a host that is no address."""
 
     def images(self) -> ImageSource:
         """The image source of this device."""
@@ -336,6 +342,15 @@ def can_move(driver: type) -> bool:
     """Return whether the class is that of a cyclic driver: any other device does not move."""
     steps = getattr(driver, "step", Driver.step) is not Driver.step
     return steps or getattr(driver, "period", None) is not None
+
+
+def numbers(value: Any, count: int, name: str) -> list[float]:
+    """Return a list of so many finite numbers. Raises ValueError with the name for anything
+    else."""
+    fits = isinstance(value, list | tuple) and len(value) == count and all(map(_is_number, value))
+    if not fits:
+        raise ValueError(f"{name}: expected {count} finite numbers, found {value!r:.80}")
+    return [float(v) for v in value]
 
 
 def _is_number(value: Any) -> bool:

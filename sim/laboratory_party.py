@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 from petrobot.services.comm.calls.callee import Callee, Offer, Order
 from petrobot.services.comm.canopen.bus import Frame
@@ -19,6 +19,8 @@ from petrobot.services.comm.lockstep.channels import (
     image_body,
     read_can,
     read_images_wanted,
+    read_tcp,
+    tcp_body,
 )
 from petrobot.services.comm.lockstep.party import TICK, Envelope
 from petrobot.services.comm.protocol.messages import Call, Command, Executed, Outcome
@@ -34,6 +36,19 @@ def answer_command(now: float, callee: Callee, order: Order) -> None:
         callee.answer(now, order.id, True, {"answers": {}, "devices": {}, "emergency": []})
 
 
+class TcpSession(Protocol):
+    """The robot's end of a TCP connection."""
+
+    closed: bool
+    """Set by either end."""
+
+    def receive(self, data: bytes) -> None:
+        """Take bytes of the driver."""
+
+    def drain(self) -> bytes:
+        """Return the bytes for the driver."""
+
+
 class LaboratoryParty(ABC):
     """The party of a simulated node. `where` returns the party of an endpoint
     (`Directory.party`)."""
@@ -43,6 +58,8 @@ class LaboratoryParty(ABC):
     between_ticks: ClassVar[str] = PREPARE
     """The service that may take longer than a tick: in real time the world waits for it, not the
     callers."""
+    tcp_ports: Sequence[int] = ()
+    """Ports at which its robots accept TCP connections."""
 
     def __init__(self, name: str, where: Callable[[str], str], boot: str, directory: str) -> None:
         """`boot`, `directory`: as in services.comm.calls.callee."""
@@ -60,6 +77,8 @@ class LaboratoryParty(ABC):
         self._where = cache(where)
         self._camera_at: dict[str, str] = {}
         self._bus_ports: list[str] = []
+        self._tcp: dict[tuple[str, int], tuple[int, TcpSession]] = {}
+        """By device and port: number of the newest connection, and the connection."""
         self._out: list[Envelope] = []
 
     # What a world adds
@@ -94,6 +113,11 @@ class LaboratoryParty(ABC):
         such devices overrides this."""
         return b""
 
+    def connect(self, device: str, port: int) -> TcpSession:
+        """Accept a connection of a device's driver to one of `tcp_ports`. A world with such devices
+        overrides this."""
+        raise ValueError(f"nothing listens at port {port}")
+
     # The party
 
     def receive(self, now: float, envelope: Envelope) -> None:
@@ -105,6 +129,8 @@ class LaboratoryParty(ABC):
             if answer := self.take_on_serial(now, device, envelope.body):
                 party = self._where(device)
                 self._out.append(Envelope(party, self.name, device, "serial", answer))
+        elif envelope.channel == "tcp":
+            self._take_tcp(envelope.source, *read_tcp(envelope.body))
         elif envelope.channel == "control":
             wanted = read_images_wanted(envelope.body)
             if wanted is not None:
@@ -118,6 +144,7 @@ class LaboratoryParty(ABC):
         self.tick(now)
         self._send_frames()
         self._send_images(now)
+        self._send_tcp()
         self.callee.advance(now)
         for order in self.callee.orders():
             answer_command(now, self.callee, order)
@@ -142,6 +169,22 @@ class LaboratoryParty(ABC):
         except ValueError as fault:
             return Outcome(call.id, "error", {}, "bad_arguments", str(fault), Executed.NO)
         return Outcome(call.id, "success", values)
+
+    def _take_tcp(self, device: str, port: int, number: int, data: bytes) -> None:
+        newest, session = self._tcp.get((device, port), (0, None))
+        if number != newest:
+            if session is not None:
+                session.closed = True
+            session = self.connect(device, port)
+            self._tcp[device, port] = number, session
+        if session is not None and data:
+            session.receive(data)
+
+    def _send_tcp(self) -> None:
+        for (device, port), (number, session) in self._tcp.items():
+            if data := session.drain():
+                body = tcp_body(port, number, data)
+                self._out.append(Envelope(self._where(device), self.name, device, "tcp", body))
 
     def _send_frames(self) -> None:
         if not self._bus_ports:

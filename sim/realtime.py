@@ -37,8 +37,9 @@ from petrobot.services.comm.location_file.host_checks import listening, refuse_u
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.comm.protocol.messages import Call, Outcome
 from petrobot.services.comm.streams.camera import ImageServer
+from petrobot.services.comm.streams.line import UNIX, unix_socket
 from petrobot.services.comm.tls.credentials import credentials
-from petrobot.sim.bus.serial_line import PtyLine
+from petrobot.sim.bus.lines import PtyLine, TcpServer
 from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.laboratory_party import LaboratoryParty, answer_command
 
@@ -64,9 +65,11 @@ class Pacemaker:
         hub: CanHub | None,
         images: ImageServer | None,
         serial: Mapping[str, Path] | None = None,
+        tcp: Mapping[str, Path] | None = None,
     ) -> None:
         """`hub`: the bus, `images`: the camera's end of the wire; None where the cell has none.
-        `serial`: by device, where its serial line is to be."""
+        `serial`, `tcp`: by device, where its serial line and its Unix sockets are to be. Raises
+        OSError, ValueError."""
         self.lock = threading.Lock()
         self.slipped = 0.0
         """s by which the world has permanently fallen behind the clock."""
@@ -74,10 +77,16 @@ class Pacemaker:
         self._hub = hub
         self._port = hub.port() if hub else None
         self._images = images
-        self._lines = [
+        self._server = TcpServer()
+        for device, path in (tcp or {}).items():
+            for port in laboratory.tcp_ports:
+                accept = partial(laboratory.connect, device, port)
+                self._server.listen(Path(unix_socket(str(path), port)), accept)
+        self._lines: list[PtyLine | TcpServer] = [
             PtyLine(path, partial(self._answer_serial, device))
             for device, path in (serial or {}).items()
         ]
+        self._lines += [self._server] * bool(tcp)
         self._generation = 0
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Outcome], Future[Outcome]]] = (
             queue.SimpleQueue()
@@ -105,6 +114,7 @@ class Pacemaker:
             with self.lock:
                 self._laboratory.tick(self._laboratory.now)
                 self._send_frames()
+                self._server.flush()
             self._serve_camera()
             self._do_jobs()
 
@@ -125,7 +135,7 @@ class Pacemaker:
                 done.set_exception(fault)
 
     def _wait(self, deadline: float) -> None:
-        """Wait until the deadline, answering what comes from the bus and the serial lines."""
+        """Wait until the deadline, answering what comes from the bus and the lines."""
         while True:
             left = max(0.0, deadline - time.monotonic())
             if self._hub is not None and self._port is not None:
@@ -137,18 +147,18 @@ class Pacemaker:
             elif not self._lines:
                 self._stopped.wait(left)
             if self._lines and select.select(self._lines, [], [], 0.0 if self._hub else left)[0]:
-                for line in self._lines:
-                    line.poll()
+                with self.lock:
+                    for line in self._lines:
+                        line.poll()
             if left == 0.0:
                 return
 
     def _answer_serial(self, device: str, data: bytes) -> bytes:
-        with self.lock:
-            return self._laboratory.take_on_serial(self._laboratory.now, device, data)
+        return self._laboratory.take_on_serial(self._laboratory.now, device, data)
 
     def close(self) -> None:
-        """Close the serial lines, after `run` has ended."""
-        for line in self._lines:
+        """Close the lines, after `run` has ended."""
+        for line in (*self._lines, self._server):
             line.close()
 
     def _send_frames(self) -> None:
@@ -188,10 +198,9 @@ class LaboratoryShell:
             f"{':'.join(map(str, address or ()))}"
         ):
             self._images = ImageServer(*address) if address else None
-        with _had(f"{directory.source}: a simulated serial line"):
-            self.pacemaker = Pacemaker(
-                self.laboratory, self._hub, self._images, serial_lines(directory)
-            )
+        with _had(f"{directory.source}: a simulated line"):
+            lines = serial_lines(directory), tcp_hosts(directory)
+            self.pacemaker = Pacemaker(self.laboratory, self._hub, self._images, *lines)
         offers = {
             service: Offer(
                 inline=None if service == self.laboratory.between_ticks else self._answer
@@ -333,6 +342,17 @@ def serial_lines(directory: Directory) -> dict[str, Path]:
         name: directory.source.parent / port.removeprefix("pty:")
         for name, port in ports.items()
         if port.startswith("pty:")
+    }
+
+
+def tcp_hosts(directory: Directory) -> dict[str, Path]:
+    """Return where the Unix sockets of the laboratory's robots are to be, by device: those with
+    `host = "unix:PATH"`, relative to services.toml."""
+    hosts = {d.name: str(d.config.get("host", "")) for d in directory.devices.values()}
+    return {
+        name: directory.source.parent / host.removeprefix(UNIX)
+        for name, host in hosts.items()
+        if host.startswith(UNIX)
     }
 
 

@@ -192,8 +192,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plant",
         metavar="NAME",
-        help="show, task: runs of this plant: real, simulated or mock (default: the first of "
-        "these that the file has; they are never pooled)",
+        help="show, task, reset: runs of this plant: real, simulated or mock (default: the first "
+        "of these that the file has, of which none is pooled with another; reset: all)",
     )
     parser.add_argument(
         "--cost",
@@ -257,7 +257,7 @@ def run(options: argparse.Namespace) -> int:
             return show(kept, options.more or _tasks(kept), options)
         if options.verb == "reset":
             for task in options.more or [None]:
-                file.reset(task, selectors_only=options.selectors)
+                file.reset(task, selectors_only=options.selectors, plant=options.plant)
         else:
             _freeze(file, kept, options)
     except EstimatesError as fault:

@@ -113,6 +113,8 @@ def _print(answers: dict[str, Any]) -> None:
             answer.get("status", {}).get("devices", {}), answer.get("stopped", []), troubles
         )
         ends = [_ends(answer.get("certificate_ends", ""))] if certified else []
+        if answer.get("status", {}).get("dry_run"):
+            state += " [yellow]dry run[/]"
         offers = ", ".join(answer.get("offers", [answer.get("why", "")]))
         table.add_row(node, answer["address"], state, *ends, offers, shown)
     Console().print(table)

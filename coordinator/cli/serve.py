@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     SHIPPED,
+    add_dry_run_argument,
     add_services_argument,
     load_directory,
     own_tasks,
@@ -52,6 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mock", metavar="FILE", type=Path, help="with --up: replace actions by scripted ones"
     )
+    add_dry_run_argument(parser)
     add_page_port_argument(parser)
     parser.add_argument(
         "--estimates",
@@ -70,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
     if options.mock is not None and not options.up:
         raise CommandError(2, "--mock replaces actions of nodes that are started here: add --up")
-    directory = load_directory(options.services)
+    directory = load_directory(options.services, options.dry_run)
     refuse_script(options.mock, directory)
     options.tasks = options.tasks or own_tasks(directory)
     return asyncio.run(_serve(directory, options))

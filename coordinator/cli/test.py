@@ -12,6 +12,7 @@ from typing import Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import add_services_argument, load_directory
+from petrobot.services.comm.location_file import DirectoryError
 from petrobot.services.host.command_line import number
 
 EXAMPLE = """petrobot test driver axis --command '{"to": 0.2}' --command '{"to": 0.4}'"""
@@ -80,6 +81,8 @@ def run(options: argparse.Namespace) -> int:
             seconds=options.seconds,
             within=options.within,
         )
+    except DirectoryError as fault:  # it names the device itself
+        raise CommandError(2, str(fault)) from fault
     except (ValueError, OSError) as fault:
         raise CommandError(2, f"{directory.source}: devices.{options.device}: {fault}") from fault
     for text in (*found.faults, *found.notes):

@@ -316,13 +316,21 @@ class EstimatesFile:
             for (task, name), state in selectors.items():
                 put_selector(db, task, state, name)
 
-    def reset(self, primitive_task: str | None = None, *, selectors_only: bool = False) -> None:
-        """Forget a primitive task (None: everything): states of selectors, and estimates unless
-        `selectors_only`."""
+    def reset(
+        self,
+        primitive_task: str | None = None,
+        *,
+        selectors_only: bool = False,
+        plant: str | None = None,
+    ) -> None:
+        """Forget a primitive task (None: everything) in a plant (None: in all): states of
+        selectors, and estimates unless `selectors_only`."""
         with self._writing() as db:
-            which, given = (
-                ("WHERE primitive_task = ?", (primitive_task,)) if primitive_task else ("", ())
-            )
+            where = plants(db)
+            db.create_function("plant_of", 1, lambda origin: where.get(origin, ""))
+            db.create_function("learned_in", 1, lambda name: name.partition(IN)[2])
+            task, given = "coalesce(?1, primitive_task) = primitive_task", (primitive_task, plant)
+            which = f"WHERE {task} AND coalesce(?2, learned_in(name)) = learned_in(name)"
             tasks = db.execute(f"SELECT primitive_task FROM selector {which}", given).fetchall()
             own = {fact(db, "origin"), fact(db, "closed")} - {""}
             choices = [(origin, CHOICE + task) for origin in sorted(own) for (task,) in tasks]
@@ -331,6 +339,8 @@ class EstimatesFile:
             renew_origin(db)
             if selectors_only:
                 return
+            there = "coalesce(?2, plant_of(origin)) = plant_of(origin)"
+            which = f"WHERE {task} AND {there}"
             db.execute(
                 "INSERT OR IGNORE INTO forgotten SELECT DISTINCT origin, primitive_task "
                 f"FROM tally {which}",
@@ -339,9 +349,14 @@ class EstimatesFile:
             db.execute(f"DELETE FROM tally {which}", given)
             db.execute(f"DELETE FROM question {which}", given)
             if primitive_task is None:
-                db.execute("INSERT OR IGNORE INTO forgotten SELECT DISTINCT origin, '' FROM flow")
-                db.execute("DELETE FROM flow")
-                db.execute("DELETE FROM about WHERE name = ?", (PHYSICS,))
+                db.execute(
+                    "INSERT OR IGNORE INTO forgotten SELECT DISTINCT origin, '' "
+                    f"FROM flow WHERE {there}",
+                    given,
+                )
+                db.execute(f"DELETE FROM flow WHERE {there}", given)
+                if plant is None or has_physics(plant):
+                    db.execute("DELETE FROM about WHERE name = ?", (PHYSICS,))
 
     def merge(self, other: Path) -> None:
         """Merge another file into this one. Raises EstimatesError.

@@ -15,7 +15,9 @@ from petrobot.services.comm.lockstep.channels import (
     read_can,
     read_image,
     read_set_point,
+    read_tcp,
     set_point_body,
+    tcp_body,
 )
 from petrobot.services.comm.lockstep.party import Envelope
 from petrobot.services.comm.protocol.messages import (
@@ -33,7 +35,7 @@ from petrobot.services.comm.protocol.messages import (
 )
 from petrobot.services.comm.streams.camera import MemoryImages
 from petrobot.services.comm.streams.image import ImageSource
-from petrobot.services.comm.streams.serial_line import SerialLine
+from petrobot.services.comm.streams.line import ByteLine
 from petrobot.services.node.drivers import make_driver
 from petrobot.services.node.inline_host import Host, InlineHost
 from petrobot.services.node.node import GENERAL, Node
@@ -79,8 +81,8 @@ class MemoryCan:
             raise ConnectionError("this port has left the bus")
 
 
-class MemorySerial(SerialLine):
-    """A serial line to the laboratory: bytes out are collected, bytes in are put in."""
+class MemoryLine(ByteLine):
+    """A line to the laboratory: bytes out are collected, bytes in are put in."""
 
     def __init__(self) -> None:
         self.out = b""
@@ -113,7 +115,9 @@ class LockstepPorts(DevicePorts):
         super().__init__(directory, device, clock)
         self._post = post
         self._can: MemoryCan | None = None
-        self._serial: MemorySerial | None = None
+        self._serial: MemoryLine | None = None
+        self._tcp: dict[int, tuple[int, MemoryLine]] = {}
+        """By port: number of the newest connection, and the connection."""
         self._images: MemoryImages | None = None
         self._wish = 0
         self._streams: dict[str, SetpointReceiver] = {}
@@ -126,12 +130,20 @@ class LockstepPorts(DevicePorts):
             self._can = MemoryCan()
         return self._can
 
-    def serial(self, port: str, baud: int) -> MemorySerial:
+    def serial(self, port: str, baud: int) -> MemoryLine:
         """The laboratory's serial line to this device."""
         if self._serial is None:
             self._laboratory()
-            self._serial = MemorySerial()
+            self._serial = MemoryLine()
         return self._serial
+
+    def tcp(self, host: str, port: int) -> MemoryLine:
+        """Return a new connection to a port of the laboratory's robot."""
+        number, _ = self._tcp.get(port, (0, None))
+        line = MemoryLine()
+        self._tcp[port] = number + 1, line
+        self._send("tcp", tcp_body(port, number + 1, b""))
+        return line
 
     def images(self) -> ImageSource:
         """Return the laboratory's camera if the device has `source = "sim"`, otherwise the source
@@ -155,6 +167,11 @@ class LockstepPorts(DevicePorts):
             self._can.arrived += read_can(envelope.body)
         elif envelope.channel == "serial" and self._serial is not None:
             self._serial.arrived += envelope.body
+        elif envelope.channel == "tcp":
+            port, number, data = read_tcp(envelope.body)
+            newest, line = self._tcp.get(port, (0, None))
+            if line is not None and number == newest:
+                line.arrived += data
         elif envelope.channel == "image" and self._images is not None:
             image, wish = read_image(envelope.body, self.now)
             if wish == self._wish:
@@ -169,6 +186,10 @@ class LockstepPorts(DevicePorts):
         if self._serial is not None and self._serial.out:
             self._send("serial", self._serial.out)
             self._serial.out = b""
+        for port, (number, line) in self._tcp.items():
+            if line.out:
+                self._send("tcp", tcp_body(port, number, line.out))
+                line.out = b""
         if self._can is not None and self._can.out:
             self._send("can", can_body(self._can.out))
             self._can.out.clear()

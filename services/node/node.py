@@ -444,6 +444,7 @@ class Node:
                     data["note"] = command.note
                 if command.verb == "status":
                     data["emergency"] = list(self.stopped_in_emergency())
+                    data["dry_run"] = self.directory.dry_run
                 self.callee.answer(now, id_, held and not command.missing, data)
 
     # --- reports of places --------------------------------------------------------------------

@@ -11,7 +11,7 @@ from petrobot.services.comm.location_file import DeviceEntry, Directory, StreamE
 from petrobot.services.comm.protocol.messages import Event
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.comm.streams.image import ImageSource
-from petrobot.services.comm.streams.serial_line import SerialLine, SerialPort
+from petrobot.services.comm.streams.line import UNIX, ByteLine, SerialPort, TcpConnection
 from petrobot.services.comm.streams.stream import Incoming, StreamReceiver
 from petrobot.services.comm.tls.credentials import credentials
 from petrobot.services.host.whole_file import write_whole
@@ -123,12 +123,19 @@ class ProcessPorts(DevicePorts):
             )
         return self._can
 
-    def serial(self, port: str, baud: int) -> SerialLine:
+    def serial(self, port: str, baud: int) -> ByteLine:
         """Open a serial port of this host; "pty:PATH" is one of a simulated laboratory, with its
         path relative to services.toml."""
         if port.startswith("pty:"):
             port = str(self._directory.source.parent / port.removeprefix("pty:"))
         return SerialPort(port, baud)
+
+    def tcp(self, host: str, port: int) -> ByteLine:
+        """Open a TCP connection; "unix:PATH" is one to a simulated laboratory, with its path
+        relative to services.toml."""
+        if host.startswith(UNIX):
+            host = f"{UNIX}{self._directory.source.parent / host.removeprefix(UNIX)}"
+        return TcpConnection(host, port)
 
     def images(self) -> ImageSource:
         """Return the image source that the device's key `source` names."""

@@ -13,17 +13,19 @@ Sources: "Real-Time Data Exchange (RTDE) Guide" and "Dashboard Server e-Series" 
 from __future__ import annotations
 
 import re
-import selectors
-import socket
 import struct
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Final
+
+from petrobot.sim.bus.lines import TcpServer
 
 RTDE_PORT: Final = 30004
 DASHBOARD_PORT: Final = 29999
 PROGRAM_PORT: Final = 30002
+PORTS: Final = (RTDE_PORT, DASHBOARD_PORT, PROGRAM_PORT)
 STEP: Final = 0.002
 """s between two cycles of the joints."""
 TOP_SPEED: Final = 3.14
@@ -360,77 +362,30 @@ def _package(letter: str, payload: bytes) -> bytes:
     return struct.pack(">HB", 3 + len(payload), ord(letter)) + payload
 
 
-class UrServer:
-    """Serves a controller over TCP. Call `poll` often; `close` cuts all links."""
+class UrServer(TcpServer):
+    """Serves a controller over TCP, and lets its time pass."""
 
     def __init__(
         self,
         controller: UrController,
         host: str = "127.0.0.1",
-        ports: Sequence[int] = (RTDE_PORT, DASHBOARD_PORT, PROGRAM_PORT),
+        ports: Sequence[int] = PORTS,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """`ports`: where RTDE, dashboard and program are served; 0 for a free one."""
-        self._clock = clock
-        self.controller = controller
-        self._selector = selectors.DefaultSelector()
-        self._sessions: dict[socket.socket, ControllerSession] = {}
-        self._listeners: list[socket.socket] = []
-        for port, role in zip(ports, (RTDE_PORT, DASHBOARD_PORT, PROGRAM_PORT), strict=True):
-            listener = socket.create_server((host, port))
-            listener.setblocking(False)
-            self._listeners.append(listener)
-            self._selector.register(listener, selectors.EVENT_READ, role)
-        self.ports = [listener.getsockname()[1] for listener in self._listeners]
+        super().__init__()
+        self._clock, self.controller = clock, controller
+        self.ports = [
+            self.listen((host, port), partial(controller.connect, role))
+            for port, role in zip(ports, PORTS, strict=True)
+        ]
         self._begin = clock() - controller.now
 
     def poll(self, timeout: float = STEP) -> None:
         """Serve for at most `timeout` s, then let the arm move."""
-        for key, _ in self._selector.select(timeout):
-            if key.data is not None:
-                near, _ = key.fileobj.accept()  # type: ignore[union-attr]
-                near.setblocking(False)
-                near.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self._sessions[near] = self.controller.connect(key.data)
-                self._selector.register(near, selectors.EVENT_READ)
-            else:
-                self._read(key.fileobj)  # type: ignore[arg-type]
+        super().poll(timeout)
         self.controller.advance(self._clock() - self._begin)
-        for near, session in list(self._sessions.items()):
-            try:
-                near.sendall(session.drain())
-            except OSError:  # gone, or it does not read
-                session.closed = True
-            if session.closed:
-                self._drop(near)
-
-    def _read(self, near: socket.socket) -> None:
-        try:
-            data = near.recv(65536)
-        except OSError:
-            data = b""
-        if data:
-            self._sessions[near].receive(data)
-        else:
-            self._sessions[near].closed = True
-
-    def _drop(self, near: socket.socket) -> None:
-        self._selector.unregister(near)
-        self._sessions.pop(near).closed = True
-        near.close()
-
-    def cut(self) -> None:
-        """Cut all connections; new ones are accepted."""
-        for near in list(self._sessions):
-            self._drop(near)
-
-    def close(self) -> None:
-        """Cut all connections, and listen no more."""
-        self.cut()
-        for listener in self._listeners:
-            self._selector.unregister(listener)
-            listener.close()
-        self._listeners.clear()
+        self.flush()
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -4,12 +4,11 @@ angles, gap and force of the fingers."""
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Protocol
 
 from petrobot.sim.bus.feetech import STEPS, so101
-from petrobot.sim.bus.ur_controller import DASHBOARD_PORT, PROGRAM_PORT, RTDE_PORT, UrController
+from petrobot.sim.bus.ur_controller import ControllerSession, UrController
 from petrobot.sim.catching.truth import LaboratoryError
 
 
@@ -33,6 +32,9 @@ class Controller(Protocol):
 
     def block(self, gap: float | None) -> None:
         """Let a part stop the fingers at a gap (m); None: no part."""
+
+    def connect(self, port: int) -> ControllerSession:
+        """Accept a connection of the driver."""
 
     def close(self) -> None:
         """Release its resources."""
@@ -74,14 +76,17 @@ class FeetechArm:
         angle = max(0.0, gap or 0.0) / self._lever
         self._jaw.low = 2048.0 + angle / (2 * math.pi) * STEPS
 
+    def connect(self, port: int) -> ControllerSession:
+        """Refuse: it has a serial line. Raises LaboratoryError."""
+        raise LaboratoryError("the servos of this arm have a serial line, and no TCP port")
+
     def close(self) -> None:
         """Do nothing: all is in memory."""
 
 
 class UrArm:
-    """A UR controller, reached by frames on one line (`petrobot.services.picking.ur_line`), and a
-    gripper on its digital outputs and inputs: output 0 closes it, input 0 shows that it holds
-    something, input 1 that its fingers have stopped."""
+    """A UR controller, and a gripper on its digital outputs and inputs: output 0 closes it, input 0
+    says that it holds something, input 1 that its fingers stand."""
 
     def __init__(self, numbers: Mapping[str, Any]) -> None:
         """Raises KeyError for a number that is missing."""
@@ -89,22 +94,15 @@ class UrArm:
         self._opening, self._speed = float(gripper["opening"]), float(gripper["speed"])
         self._force, self._gap = float(gripper["force"]), float(gripper["opening"])
         self.ur = UrController([float(q) for q in numbers["poses"]["rest"]])
-        ports = RTDE_PORT, DASHBOARD_PORT, PROGRAM_PORT
-        self._sessions = [self.ur.connect(port) for port in ports]
         self._stop: float | None = None
-        self._rest = b""
 
     def receive(self, now: float, data: bytes) -> bytes:
-        """Take frames; return the controller's frames."""
-        self._rest += data
-        while len(self._rest) >= _HEAD.size:
-            number, size = _HEAD.unpack_from(self._rest)
-            if len(self._rest) < _HEAD.size + size:
-                break
-            self._sessions[number % 3].receive(self._rest[_HEAD.size : _HEAD.size + size])
-            self._rest = self._rest[_HEAD.size + size :]
-        said = [(number, bytes(session.drain())) for number, session in enumerate(self._sessions)]
-        return b"".join(_HEAD.pack(number, len(text)) + text for number, text in said if text)
+        """Answer nothing: it has no serial line."""
+        return b""
+
+    def connect(self, port: int) -> ControllerSession:
+        """Connect to the controller."""
+        return self.ur.connect(port)
 
     def advance(self, now: float, dt: float) -> None:
         """Let arm and fingers move for `dt` s."""
@@ -138,7 +136,6 @@ class UrArm:
         """Do nothing: all is in memory."""
 
 
-_HEAD: Final = struct.Struct("!BH")
 CONTROLLERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Controller]]] = {
     "feetech": FeetechArm,
     "ur": UrArm,

@@ -13,6 +13,7 @@ import numpy as np
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.lockstep.party import TICK
+from petrobot.sim.bus.ur_controller import PORTS, ControllerSession
 from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.faults import FaultKinds, FaultPlan
 from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
@@ -39,6 +40,8 @@ _PARTS, _IMAGE, _WORLD, _FAULTS = 0x7061, 0x696D, 0x776F, 0x6661
 class PickingLaboratory(LaboratoryParty):
     """The party of the simulated node `name`. `where` returns the party of an endpoint
     (`Directory.party`)."""
+
+    tcp_ports = PORTS
 
     def __init__(
         self,
@@ -101,6 +104,10 @@ class PickingLaboratory(LaboratoryParty):
     def take_on_serial(self, now: float, device: str, data: bytes) -> bytes:
         """Process bytes that the arm's driver sent; return the answer."""
         return self.controller.receive(now, data)
+
+    def connect(self, device: str, port: int) -> ControllerSession:
+        """Accept a connection of the arm's driver."""
+        return self.controller.connect(port)
 
     def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
         """Ignore frames: nothing here is on a CAN bus."""

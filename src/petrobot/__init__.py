@@ -23,38 +23,44 @@ if TYPE_CHECKING:
         provisional,
         success,
     )
-    from petrobot.services.comm.streams.serial_line import SerialLine
+    from petrobot.services.comm.streams.line import ByteLine, Link
     from petrobot.services.conformance import DriverCheck, check_driver
-    from petrobot.services.device import Driver, Ports, Remote, Setpoint, key
+    from petrobot.services.device import Driver, Ports, Remote, Setpoint, key, numbers
+    from petrobot.services.joint_motion import JointMotion
     from petrobot.services.rehearsal import Rehearsal, rehearse
 
 __all__ = [
+    "ByteLine",
     "CallFailed",
     "Cancelled",
     "CommandRefused",
     "Context",
     "Driver",
     "DriverCheck",
+    "JointMotion",
+    "Link",
     "Ports",
     "Rehearsal",
     "Remote",
     "Result",
-    "SerialLine",
     "Setpoint",
     "Status",
     "check_driver",
     "error",
     "failure",
     "key",
+    "numbers",
     "provisional",
     "rehearse",
     "success",
 ]
 
 _HOMES = {
+    **dict.fromkeys(("ByteLine", "Link"), "petrobot.services.comm.streams.line"),
     **dict.fromkeys(
-        ("Driver", "Ports", "Remote", "SerialLine", "Setpoint", "key"), "petrobot.services.device"
+        ("Driver", "Ports", "Remote", "Setpoint", "key", "numbers"), "petrobot.services.device"
     ),
+    "JointMotion": "petrobot.services.joint_motion",
     **dict.fromkeys(("DriverCheck", "check_driver"), "petrobot.services.conformance"),
     **dict.fromkeys(("Rehearsal", "rehearse"), "petrobot.services.rehearsal"),
 }

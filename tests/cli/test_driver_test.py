@@ -42,3 +42,17 @@ def test_devices_that_cannot_be_tested(
     except SystemExit as end:
         code = int(str(end.code))
     assert code == 2 and text in capsys.readouterr().err
+
+
+def test_a_device_that_is_not_there_is_one_clear_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    services = tmp_path / "services.toml"
+    services.write_text(
+        'schema = 1\n[nodes.pc]\nhost = "127.0.0.1"\nport = 7001\n[devices.arm]\nnode = "pc"\n'
+        'driver = "petrobot.services.adapters.so101.arm:Arm"\nport = "/dev/no-such-arm"\n'
+    )
+    assert main(["test", "driver", "arm", "--services", str(services)]) == 2
+    told = capsys.readouterr().err
+    assert "devices.arm: " in told and "check that it is connected" in told
+    assert "Traceback" not in told

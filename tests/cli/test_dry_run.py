@@ -10,8 +10,9 @@ import pytest
 
 from petrobot.coordinator.cli import main
 from petrobot.services.comm.calls.peers import Peers
-from petrobot.services.comm.location_file import dry, load, parse
+from petrobot.services.comm.location_file import dry, load, parse, resolve
 from petrobot.services.comm.protocol.messages import Hello, Refuse
+from petrobot.services.device import LIMITS, can_move, keys_of
 from tests.ports import free_ports
 
 ROBOT = '''
@@ -118,7 +119,7 @@ def test_check_refuses_what_a_driver_does_not_obey(
 
 
 @pytest.mark.processes
-@pytest.mark.parametrize("command", [["run", "go.toml", "--mode", "lockstep"], ["up"]])
+@pytest.mark.parametrize("command", [["run", "go.toml", "--mode", "lockstep"], ["up"], ["serve"]])
 def test_a_dry_run_is_refused_where_a_driver_cannot(
     cell: Path, command: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -127,6 +128,25 @@ def test_a_dry_run_is_refused_where_a_driver_cannot(
     told = capsys.readouterr().err
     assert "devices.axis.dry_run: dry_run: Deaf does not obey it" in told
     assert "Sensor" not in told
+
+
+@pytest.mark.parametrize(
+    ("driver", "limits"),
+    [
+        ("motion.arm:Arm", LIMITS),
+        ("mobile.rover:Rover", LIMITS),
+        ("adapters.so101.arm:Arm", LIMITS),
+        ("adapters.ur.arm:Arm", LIMITS),
+        ("adapters.ros2.bridge:Bridge", LIMITS),
+        ("adapters.ros2.topics:TopicDriver", LIMITS),
+        ("adapters.opcua.session:OpcUaSession", ("dry_run",)),
+    ],
+)
+def test_every_shipped_driver_of_what_moves_obeys(driver: str, limits: tuple[str, ...]) -> None:
+    """So no cell of them refuses a dry run."""
+    found = resolve(f"petrobot.services.{driver}")
+    assert can_move(found) and set(found.obeys) == set(limits)
+    assert "speed" not in keys_of(found)  # as a key of its own it would mean something else
 
 
 @pytest.mark.parametrize("mode", [["--mode", "lockstep"], ["--up"]])
@@ -160,3 +180,7 @@ def test_dry_run_and_normal_programs_refuse_each_other(cell: Path) -> None:
         peers = Peers("pc", mine.hash, False, 1.0)
         refused = peers.refusal("c", Hello(2, 2, "coordinator", "c", "boot", 1, its.hash))
         assert isinstance(refused, Refuse) and "give --dry-run to both" in refused.text
+        asks = Hello(2, 2, "client", "c", "boot", 0, its.hash)  # `petrobot nodes`: who only asks
+        assert Peers("pc", mine.hash, False, 1.0).refusal("c", asks) is None
+    other = Hello(2, 2, "client", "c", "boot", 0, "another file")
+    assert Peers("pc", dried.hash, False, 1.0).refusal("c", other) is not None

@@ -60,6 +60,17 @@ async def test_a_node_is_not_listed_as_a_device(
     assert status["general"]["runs"] == []
 
 
+async def test_a_node_of_a_dry_run_says_so(
+    directory: Directory, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "dry run" not in await said(directory, capsys, "nodes")
+    text = directory.source.read_text(encoding="utf-8")
+    dried = tmp_path / "dry.toml"
+    dried.write_text(f"dry_run = true\n{text}", encoding="utf-8")
+    assert await asyncio.to_thread(main, ["nodes", "--services", str(dried)]) == 0
+    assert "dry run" not in capsys.readouterr().out.replace("dry.toml", "")
+
+
 async def test_stopped_devices_are_shown_until_they_are_cleared(
     directory: Directory, capsys: pytest.CaptureFixture[str]
 ) -> None:

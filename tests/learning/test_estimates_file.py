@@ -730,6 +730,20 @@ def test_the_physics_counts_for_simulated_runs_alone(tmp_path: Path) -> None:
     assert file.read().physics == "portable 1" and file.read().plant == "real"
 
 
+def test_one_plant_alone_can_be_reset(tmp_path: Path) -> None:
+    """Estimates and selectors of the others stay, also after a merge of an old copy."""
+    file = EstimatesFile(tmp_path / "a.db")
+    for plant in ("simulated", "mock"):
+        file.add(gained(2), {"pick": state_of("nikolic_fu", {"A": 5})}, plant=plant)
+    copy = EstimatesFile(Path(shutil.copy(file.path, tmp_path / "copy.db")))
+    file.reset("pick", plant="mock")
+    file.merge(copy.path)
+    assert runs_by_plant(file).get("mock", 0) == 0 and runs_by_plant(file)["simulated"] == 2
+    assert [name for _, name in file.read().selectors] == ["nikolic_fu in simulated"]
+    file.reset(plant="simulated")
+    assert sum(runs_by_plant(file).values()) == 0 and not file.read().selectors
+
+
 def test_what_was_reset_in_one_plant_stays_forgotten_in_a_merge(tmp_path: Path) -> None:
     file, other = EstimatesFile(tmp_path / "a.db"), EstimatesFile(tmp_path / "b.db")
     for plant in ("simulated", "mock", "simulated"):

@@ -63,6 +63,9 @@ class YardPorts:
     def serial(self, port: str, baud: int) -> Any:
         raise LookupError("no serial line here")
 
+    def tcp(self, host: str, port: int) -> Any:
+        raise LookupError("no TCP here")
+
     def write_file(self, path: str, content: bytes) -> None:
         raise LookupError("no file is written here")
 

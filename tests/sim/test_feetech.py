@@ -11,7 +11,7 @@ import pytest
 
 from petrobot.sim.bus import feetech
 from petrobot.sim.bus.feetech import FeetechBus, Servo, so101
-from petrobot.sim.bus.serial_line import PtyLine
+from petrobot.sim.bus.lines import PtyLine
 
 STEP = 0.004
 

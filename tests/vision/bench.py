@@ -179,6 +179,9 @@ class BenchPorts:
     def serial(self, port: str, baud: int) -> Any:
         raise LookupError("no serial line here")
 
+    def tcp(self, host: str, port: int) -> Any:
+        raise LookupError("no TCP here")
+
     def write_file(self, path: str, content: bytes) -> None:
         raise LookupError("no file is written here")
 

@@ -29,6 +29,7 @@ class OpcUaSession(Driver):
     """One OPC UA server: named nodes, and events from their values."""
 
     period = 0.02
+    obeys = ("dry_run",)
     url: str = key(text="as opc.tcp://192.168.0.10:4840")
     nodes: dict[str, str] = key(text='names, as { start = "ns=2;s=Cell.Start" }')
     events: dict[str, Any] = key({}, 'as { part = { node = "sensor", becomes = true } }')
@@ -101,6 +102,9 @@ class OpcUaSession(Driver):
 
     def _write(self, values: dict[str, Any]) -> None:
         self._asked += 1
+        if self.dry_run:  # its machine would answer: here nothing changes
+            self._done, self._write_fault = self._asked, ""
+            return
         self._loop.call_soon_threadsafe(self._jobs.put_nowait, (self._asked, values))
 
     def step(self, now: float) -> None:
@@ -139,8 +143,10 @@ class OpcUaSession(Driver):
             self._write(dict(self.on_stop))
 
     def stopped(self) -> bool:
-        """Return whether there is a session and the server reports the values of `on_stop`."""
-        rest = all(self.values.get(name) == value for name, value in self.on_stop.items())
+        """Whether there is a session and the server reports the values of `on_stop`."""
+        rest = self.dry_run or all(
+            self.values.get(name) == value for name, value in self.on_stop.items()
+        )
         return rest and "session" not in self.faults
 
     def close(self) -> None:
@@ -256,6 +262,12 @@ class OpcUaSession(Driver):
         return ""
 
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
-        """Receive a notification (called by asyncua, in the session's thread)."""
-        plain = value if isinstance(value, bool | int | float | str | bytes | list) else str(value)
-        self._news.put(("value", self._by_id[node.nodeid], plain))
+        """Take a notification (called by asyncua, in the session's thread)."""
+        self._news.put(("value", self._by_id[node.nodeid], _plain(value)))
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as a driver's state may have it: dates, identifiers and structures as text."""
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value if isinstance(value, bool | int | float | str | bytes) else str(value)

@@ -7,7 +7,7 @@ from typing import Any
 
 from petrobot import Ports, key
 from petrobot.services.adapters.ros2.link import SimulatedLink, WebSocketLink
-from petrobot.services.adapters.ros2.protocol import MOVING, Exchanges, Message
+from petrobot.services.adapters.ros2.protocol import MOVING, ExchangePhase, Exchanges, Message
 from petrobot.services.adapters.ros2.topics import TopicDriver
 
 
@@ -54,7 +54,13 @@ class Bridge(TopicDriver):
             if result is not None and (absent := [n for n in keep or () if n not in result]):
                 has = ", ".join(result) or "none"
                 raise ValueError(f"the result of {interface} has no {absent}, but: {has}")
-            self._send(now, [self.exchanges.begin(now, body["run"], request, keep)])
+            if verb == "goal":
+                request["args"] = self.limited(request["args"], interface)
+            sent = self.exchanges.begin(now, body["run"], request, keep)
+            if self.dry_run:
+                self.exchanges.open[body["run"]].phase = ExchangePhase.SUCCEEDED
+            else:
+                self._send(now, [sent])
         else:
             super().command(now, body)
 
@@ -116,7 +122,9 @@ class Bridge(TopicDriver):
     def stop(self, now: float) -> None:
         """Cancel all goals, and send the set points of rest."""
         for name in list(self.exchanges.open):
-            self._send(now, self.exchanges.cancel(now, name))
+            if cancelled := self.exchanges.cancel(now, name):
+                self.exchanges.open[name].text = self.left
+                self._send(now, cancelled)
         super().stop(now)
 
     def stopped(self) -> bool:

@@ -307,7 +307,8 @@ class Exchanges:
             word = Word.SUCCEEDED
         else:
             word = _STATUS.get(int(status) if isinstance(status, int | float) else 0, Word.ABORTED)
-            one.text = "" if word is not Word.ABORTED else f"the goal ended with status {status}"
+            if word is Word.ABORTED:
+                one.text = f"the goal ended with status {status}"
         if isinstance(said, str):
             one.text, said = words(said)[:500], {}
         values = said if said else {}

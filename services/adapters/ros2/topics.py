@@ -3,14 +3,28 @@ wait for, and streams of set points that are sent to topics."""
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from petrobot import Driver, Ports, key
 from petrobot.services.adapters.ros2 import definitions
 from petrobot.services.adapters.ros2.protocol import Message, filled, pick, unfit, words
 
+SPEEDS = {
+    "geometry_msgs/msg/Twist": [
+        f"{part}.{axis}" for part in ("linear", "angular") for axis in "xyz"
+    ],
+    "moveit_msgs/action/MoveGroup": ["request.max_velocity_scaling_factor"],
+}
+"""By type: paths of the values that `speed` scales."""
+POINTS = {
+    "geometry_msgs/msg/PoseStamped": "pose.position",
+    "nav2_msgs/action/NavigateToPose": "pose.pose.position",
+    "nav_msgs/msg/Odometry": "pose.pose.position",
+}
+"""By type: path of the point that `workspace` bounds."""
 LARGEST_VALUE = 65_536
 """Largest topic message that is kept for actions (characters): all kept messages are published each
 cycle."""
@@ -21,9 +35,12 @@ class TopicDriver(Driver):
     each received message."""
 
     period = 0.02
+    obeys = ("speed", "workspace", "dry_run")
     definitions: dict[str, str] = key({}, "file of each type's .msg, .srv or .action, by type")
     subscribe: dict[str, Any] = key({}, "by name: topic, type, optional event, when, throttle")
     setpoints: dict[str, Any] = key({}, "by stream: topic, type, fields, optional rest")
+    speeds: dict[str, list[str]] = key({}, "by type: paths of the values that `speed` scales")
+    points: dict[str, str] = key({}, "by type: path of the point that `workspace` bounds")
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         super().__init__(config, ports)
@@ -38,7 +55,11 @@ class TopicDriver(Driver):
             if len(out.get("rest", out["fields"])) != len(out["fields"]):
                 raise ValueError(f"setpoints.{name}.rest: expected one value for each of `fields`")
             out["rest"] = [float(value) for value in out.get("rest", [0.0] * len(out["fields"]))]
-            self.check(filled({}, dict(zip(out["fields"], out["rest"], strict=True))), out["type"])
+            self.check(_row(out["fields"], out["rest"]), out["type"])
+        self.speeds, self.points = {**SPEEDS, **self.speeds}, {**POINTS, **self.points}
+        self._check_limits()
+        self.inside, self.left = True, ""
+        """Whether the robot is in its workspace as far as its topics tell; how it left it."""
         self.refused, self.fault = 0, ""
         """Number of messages that could not be used, and what was wrong with the last one."""
         self.topics: dict[str, Message] = {}
@@ -69,7 +90,9 @@ class TopicDriver(Driver):
         elif "publish" in body:
             message = body["publish"]
             self.check(message["msg"], message["type"])
-            self.transmit(now, message["topic"], message["type"], message["msg"])
+            limited = self.limited(message["msg"], message["type"])
+            if not self.dry_run:
+                self.transmit(now, message["topic"], message["type"], limited)
         else:
             raise ValueError(f"unknown command {sorted(body)}: publish or drive")
 
@@ -78,6 +101,44 @@ class TopicDriver(Driver):
         faults = [*definitions.faults(message, interface, self.known), unfit(message)]
         if wrong := "; ".join(filter(None, faults)):
             raise ValueError(f"{interface}: {wrong}")
+
+    def _check_limits(self) -> None:
+        for name, out in self.setpoints.items():
+            if self.speed < 1.0 and out["type"] not in self.speeds:
+                raise ValueError(f"speed: setpoints.{name}: {_unknown_speed(out['type'])}")
+        if self.workspace.bounds and not any(
+            sub["type"] in self.points for sub in self.subscribe.values()
+        ):
+            raise ValueError(
+                "workspace: nothing tells where the robot is; subscribe to a topic whose type has "
+                f"a point: {', '.join(self.points)}, or another one with points = {{ TYPE = PATH }}"
+            )
+
+    def limited(self, message: Message, interface: str) -> Message:
+        """Return a message as slow as the device's `speed` says. Raises ValueError if nothing says
+        what that means in this type, and for a point outside the workspace."""
+        if self.speed < 1.0:
+            if interface not in self.speeds:
+                raise ValueError(f"speed = {self.speed:g}: {_unknown_speed(interface)}")
+            slow = dict[str, float]()
+            for path in self.speeds[interface]:
+                with contextlib.suppress(ValueError):  # what is not given is 0
+                    slow[path] = self.speed * float(pick(message, path))
+            if self.speeds[interface] and not slow:
+                raise ValueError(
+                    f"speed = {self.speed:g}: expected {' or '.join(self.speeds[interface])}"
+                )
+            message = filled(message, slow)
+        if outside := self.outside(message, interface):
+            raise ValueError(outside)
+        return message
+
+    def outside(self, message: Message, interface: str) -> str:
+        """Return in words that the point of a message lies outside the workspace."""
+        if interface not in self.points or not self.workspace.bounds:
+            return ""
+        at = pick(message, self.points[interface])
+        return self.workspace.outside([float(at.get(axis, 0.0)) for axis in "xyz"])
 
     def refuse(self, fault: str) -> None:
         """Count a message that cannot be used."""
@@ -94,6 +155,7 @@ class TopicDriver(Driver):
         for name, sub in self.subscribe.items():
             if sub["topic"] != topic:
                 continue
+            self._watch(now, message, sub["type"])
             count = self.topics.get(name, {}).get("count", 0) + 1
             self.topics[name], self.arrived[name] = {"msg": message, "count": count}, now
             if "event" in sub:
@@ -101,6 +163,17 @@ class TopicDriver(Driver):
                 self.held[name] = holds and "when" in sub
                 if holds and not before:
                     self.ports.raise_event(sub["event"], msg=message)
+
+    def _watch(self, now: float, message: Message, interface: str) -> None:
+        """Stop when a message tells that the robot has left the workspace."""
+        if interface in self.points and self.workspace.bounds:
+            try:
+                self.left = self.outside(message, interface)
+            except (ValueError, TypeError, AttributeError) as fault:
+                self.left = f"{interface}: {fault}"
+            if self.left and self.inside:
+                self.stop(now)
+            self.inside = not self.left
 
     def step(self, now: float) -> None:
         """Send the set points that are due."""
@@ -118,17 +191,26 @@ class TopicDriver(Driver):
             return
         if moving and port.count == count and not resting:
             return
+        message = _row(out["fields"], out["rest"])
+        if moving and values is not None:
+            try:
+                message = self.limited(_row(out["fields"], values), out["type"])
+            except ValueError as fault:  # outside the workspace
+                self.refuse(str(fault))
+                moving = False
         self.sent[name] = (port.count, not moving)
-        chosen = values if moving and values is not None else out["rest"]
-        message = filled({}, dict(zip(out["fields"], chosen, strict=True)))
-        self.transmit(now, out["topic"], out["type"], message)
+        if not self.dry_run:
+            self.transmit(now, out["topic"], out["type"], message)
 
     def state(self) -> Mapping[str, Any]:
-        """Return `connected`, and the newest message of each topic with its `count` and `age` (s);
-        None before the first message and after a lost link."""
+        """`connected`, whether it is a `dry_run`, how the robot has `left` its workspace, messages
+        `refused` and the last `fault`, and the newest message of each topic with its `count` and
+        `age` (s), None before the first and after a lost link."""
         now = self.ports.now
         return {
             "connected": self.connected,
+            "dry_run": self.dry_run,
+            "left": self.left,
             "refused": self.refused,
             "fault": self.fault,
             "topics": {
@@ -157,6 +239,15 @@ class TopicDriver(Driver):
     def release(self, now: float) -> None:
         """Forward set points again."""
         self.paused = False
+
+
+def _row(fields: Sequence[str], values: Sequence[float]) -> Message:
+    return filled({}, dict(zip(fields, values, strict=True)))
+
+
+def _unknown_speed(interface: str) -> str:
+    table = f'speeds = {{ "{interface}" = [PATHS] }}'
+    return f"nothing says what is slower in {interface}; write {table}, [] if the robot limits it"
 
 
 def _table(config: Mapping[str, Any], where: str, needed: set[str], other: set[str]) -> None:

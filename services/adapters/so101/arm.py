@@ -16,19 +16,17 @@ import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, TypeGuard
+from functools import partial
+from typing import Any, Final
 
-from petrobot import Driver, Ports, SerialLine, key
+from petrobot import Driver, JointMotion, Link, Ports, key, numbers
 from petrobot.services.adapters.so101 import bus
-from petrobot.services.adapters.so101.kinematics import JOINTS
+from petrobot.services.adapters.so101.kinematics import JOINTS, forward
 
 LOST: Final = 0.3
 """Time without an answer after which a servo counts as missing (s)."""
 STILL, CREEP = 5, 5
-"""Number of equal readings after which a servo stands still, and the speed above which it does not
-(steps/s)."""
-RETRY: Final = (0.2, 3.2)
-"""Shortest and longest time between two attempts to open the port (s)."""
+"""Readings without a change after which a servo stands, unless it is faster (steps/s)."""
 TRIM_RATE, DEAD = 6.0, 0.004
 """The set point of a loaded joint is corrected until the joint is at its goal: share of the error
 per second, and the error that is tolerated because of friction (rad)."""
@@ -69,9 +67,7 @@ class Joint:
     ready: bool = False
     """Whether they are in effect, so that the servo can be moved."""
     aim: float = 0.0
-    velocity: float = 0.0
-    goal: float = 0.0
-    fastest: float = 0.0
+    """Where it shall be now."""
     trim: float = 0.0
     strained: float = 0.0
     """Duration of the present overload (s)."""
@@ -99,6 +95,11 @@ class Joint:
         """Position of the servo at an angle."""
         return min(bus.STEPS - 1, max(0, self.zero + self.sign * round(q / bus.RAD)))
 
+    def within(self) -> tuple[float, float]:
+        """Return the limits that the servo can reach, too: it does not turn beyond its ends."""
+        ends = sorted(self.angle(end) for end in (0, bus.STEPS - 1))
+        return max(self.low, ends[0]), min(self.high, ends[1])
+
     def take(self, now: float, read: bus.Reading) -> None:
         """Store what the servo reports."""
         moved = abs(read.position - self.rest) > 1
@@ -110,31 +111,15 @@ class Joint:
         that it still carries its load, or squeezes."""
         servo = self.angle(self.read.goal)
         near = self.read.torque and abs(servo - self.q) < NEAR
-        self.aim = self.goal = servo if near else self.q
-        self.velocity = self.trim = self.strained = 0.0
-
-    def brake(self, dt: float, acceleration: float) -> None:
-        """Set as goal the nearest position at which it can stop."""
-        step = acceleration * dt
-        way = self.velocity * max(0.0, abs(self.velocity) - step) * dt / (2 * step)
-        self.goal = min(self.high, max(self.low, self.aim + way))
-
-    def lead(self, dt: float, acceleration: float, held: bool) -> None:
-        """Move the set point by one period towards the goal."""
-        left, step = self.goal - self.aim, acceleration * dt
-        # The speed from which `periods` of braking, one step of speed each, end on the goal.
-        periods = max(1, math.ceil(math.sqrt(0.25 + 2 * abs(left) / (step * dt)) - 0.5))
-        braking = abs(left) / (periods * dt) + step * (periods - 1) / 2
-        wish = 0.0 if held else math.copysign(min(self.fastest, braking), left)
-        self.velocity += min(step, max(-step, wish - self.velocity))
-        self.aim += self.velocity * dt
-        if abs(self.goal - self.aim) < 1e-9:
-            self.aim = self.goal
+        self.aim = servo if near else self.q
+        self.trim = self.strained = 0.0
 
 
 class Arm(Driver):
-    """A SO-101 on a serial port."""
+    """A SO-101 on a serial port. Its workspace bounds the gripper's tip, in the frame of
+    `kinematics`."""
 
+    obeys = ("speed", "workspace", "dry_run")
     port: str = key(text="serial port, as /dev/ttyACM0")
     baud: int = key(1_000_000, "bit/s")
     period: float = key(0.02, "s between two set points")
@@ -142,7 +127,6 @@ class Arm(Driver):
     calibration: str = key("", "file of the zero positions, written by the command calibrate")
     limits: dict[str, Any] = key({}, "joints with other limits, as { gripper = [0.0, 1.5] } (rad)")
     reverse: list[str] = key([], "joints whose servo turns the other way")
-    speed: float = key(1.0, "share of `fastest`, for all movements")
     fastest: float = key(1.5, "rad/s")
     acceleration: float = key(6.0, "rad/s^2")
     overload: float = key(0.9, "load from which a joint gives way, share of the stall torque")
@@ -165,9 +149,10 @@ class Arm(Driver):
         self.faults: dict[str, str] = {}
         """By code: what is wrong, until `reset`."""
         self._calibrated = self._read_calibration()
-        self._on, self._held = self.enable, False
-        self._task = ""
-        """"move" while the commanded goal is followed; else empty."""
+        self._on = self.enable
+        speeds = self.fastest, self.acceleration
+        self.motion = JointMotion(self, _limits(self.arm), *speeds, lambda q: forward(q)[:3])
+        self.jaw = JointMotion(self, _limits([self.gripper]), *speeds)
         self._hand = ""
         """"open", "close", or "keep" (it was stopped while it held something)."""
         self._grip = self._gripped = 0.0
@@ -176,9 +161,8 @@ class Arm(Driver):
         """Order in which the servos are asked. Those that do not answer come last, each in turn
         first among them, so that a missing servo does not hide another."""
         self._split = bus.PacketSplitter()
-        self._lost, self._retry, self._pause = "", 0.0, RETRY[0]
         self._begun = ports.now
-        self._line: SerialLine | None = ports.serial(self.port, self.baud)
+        self._link = Link(ports.now, partial(ports.serial, self.port, self.baud))
 
     def _check_keys(self) -> None:
         if len(set(self.ids)) != 6 or not all(type(i) is int and 0 <= i < 254 for i in self.ids):
@@ -187,10 +171,11 @@ class Arm(Driver):
             if name not in JOINTS:
                 raise ValueError(f"no joint {name!r}; there are {', '.join(JOINTS)}")
         for name, pair in self.limits.items():
-            if not _numbers(pair, 2) or not -math.pi <= pair[0] < pair[1] <= math.pi:
+            low, high = numbers(pair, 2, f"limits.{name}")
+            if not -math.pi <= low < high <= math.pi:
                 raise ValueError(f"limits.{name}: expected [low, high] in rad, found {pair}")
-        for name in ("period", "speed", "fastest", "acceleration", "overload", "squeeze"):
-            most = 1.0 if name in ("speed", "overload", "squeeze") else math.inf
+        for name in ("period", "fastest", "acceleration", "overload", "squeeze"):
+            most = 1.0 if name in ("overload", "squeeze") else math.inf
             if not 0.0 < getattr(self, name) <= most:
                 raise ValueError(f"{name}: expected a number above 0, at most {most:g}")
         busy = 10 * (6 * 33 + 80) / self.baud
@@ -210,13 +195,15 @@ class Arm(Driver):
             return False
         except ValueError as fault:
             raise ValueError(f"calibration: {self.calibration}: {fault}") from fault
-        zeros = found.get("zero")
-        if found.get("ids") != self.ids or not _numbers(zeros, 6):
+        try:
+            zeros = numbers(found.get("zero"), 6, "zero")
+            if found.get("ids") != self.ids:
+                raise ValueError(f"ids: expected {self.ids}, found {found.get('ids')}")
+        except ValueError as fault:
             raise ValueError(
-                f"calibration: {self.calibration}: expected ids = {self.ids} and zero = six numbers"
-                f" of steps, found ids = {found.get('ids')}, zero = {zeros!r:.60}; is it this arm's"
-                " file? The command calibrate writes a new one"
-            )
+                f"calibration: {self.calibration}: {fault}; is it this arm's file? The command "
+                "calibrate writes a new one"
+            ) from fault
         for joint, zero in zip(self.joints, zeros, strict=True):
             joint.zero = round(zero)
         return True
@@ -245,42 +232,24 @@ class Arm(Driver):
         known[do](body)
 
     def _move(self, body: Mapping[str, Any]) -> None:
-        goals, share = body.get("joints"), body.get("speed", 1.0)
-        if not _numbers(goals, 5):
-            raise ValueError(f"joints: expected five angles (rad), found {goals!r:.60}")
-        if not _numbers([share], 1) or not 0.0 < share <= 1.0:
-            raise ValueError(f"speed: expected a share above 0, at most 1, found {share!r:.40}")
-        for joint, goal in zip(self.arm, goals, strict=True):
-            _within(joint, goal)
-        fastest, rate = self.fastest * self.speed * share, self.acceleration
-        far = max(abs(goal - joint.aim) for joint, goal in zip(self.arm, goals, strict=True))
-        peak = min(fastest, math.sqrt(far * rate))
-        time = far / peak + peak / rate if peak > 0.0 else 0.0
-        for joint, goal in zip(self.arm, goals, strict=True):
-            # the speed with which this joint takes as long as the slowest one
-            root = math.sqrt(max(0.0, (rate * time) ** 2 - 4 * rate * abs(goal - joint.aim)))
-            joint.goal, joint.fastest = goal, max((rate * time - root) / 2, 1e-3)
-        self._task = "move"
+        self.motion.begin([numbers(body.get("joints"), 5, "joints")], body.get("speed", 1.0))
 
     def _open(self, body: Mapping[str, Any]) -> None:
-        angle = body.get("angle", self.gripper.high)
-        if not _numbers([angle], 1):
-            raise ValueError(f"angle: expected rad, found {angle!r:.40}")
-        _within(self.gripper, angle)
+        self.jaw.halt(self.jaw.q)
+        self.jaw.begin([[body.get("angle", self.gripper.high)]])
         self._hand = "open"
-        self.gripper.goal, self.gripper.fastest = angle, self.fastest * self.speed
 
     def _close(self, body: Mapping[str, Any]) -> None:
-        squeeze = body.get("squeeze", self.squeeze / 2)
-        if not _numbers([squeeze], 1) or not 0.0 < squeeze <= self.squeeze:
-            raise ValueError(f"squeeze: expected at most {self.squeeze}, found {squeeze!r:.40}")
+        (squeeze,) = numbers([body.get("squeeze", self.squeeze / 2)], 1, "squeeze")
+        if not 0.0 < squeeze <= self.squeeze:
+            raise ValueError(f"squeeze: expected at most {self.squeeze}, found {squeeze:g}")
+        self.jaw.stop()
         self._hand, self._grip, self._gripped = "close", squeeze, 0.0
-        self.gripper.fastest = self.fastest * self.speed
 
     def _calibrate(self, body: Mapping[str, Any]) -> None:
-        pose = body.get("pose", [0.0] * 6)
-        if not _numbers(pose, 6):
-            raise ValueError(f"pose: expected six angles (rad), found {pose!r:.60}")
+        pose = numbers(body.get("pose", [0.0] * 6), 6, "pose")
+        if self.dry_run:
+            raise ValueError("a dry run does not know where the arm is: calibrate without it")
         if not self.calibration:
             raise ValueError('write calibration = "FILE" in the table of this device first')
         if not all(joint.stands for joint in self.joints):
@@ -294,10 +263,13 @@ class Arm(Driver):
         for joint, zero in zip(self.joints, zeros, strict=True):
             joint.zero = zero
             joint.settle()
-        self._calibrated, self._task, self._hand = True, "", ""
+        self.motion.limits, self.jaw.limits = _limits(self.arm), _limits([self.gripper])
+        self._calibrated, self._hand = True, ""
+        self._freeze()
 
     def _free(self, body: Mapping[str, Any]) -> None:
-        self._on, self._task, self._hand = False, "", ""
+        self._on, self._hand = False, ""
+        self._freeze()
 
     def _reset(self, body: Mapping[str, Any]) -> None:
         self.faults.clear()
@@ -310,24 +282,17 @@ class Arm(Driver):
 
     def step(self, now: float) -> None:
         """Read the answers, move the set points, send them and ask again. Never waits."""
-        try:
-            if self._line is None:
-                if now < self._retry:
-                    return
-                self._line = self.ports.serial(self.port, self.baud)
-            self._take(now, self._line.receive())
+        data = self._link.receive(now)
+        if self._link.up:
+            self._take(now, data)
             self._plan(now)
-            self._line.send(self._packets(now))
-        except (ConnectionError, OSError) as fault:
-            self._lost = str(fault)
-            self._retry, self._pause = now + self._pause, min(2 * self._pause, RETRY[1])
+            self._link.send(now, self._packets(now))
+        if not self._link.up:
             self._freeze()
+            self._split = bus.PacketSplitter()
             for joint in self.joints:
                 joint.heard, joint.still = -math.inf, 0
                 joint.started = joint.ready = False
-            if self._line is not None:
-                self._line.close()
-            self._line, self._split = None, bus.PacketSplitter()
 
     def _take(self, now: float, data: bytes) -> None:
         by_servo, heard = {joint.servo: joint for joint in self.joints}, []
@@ -336,8 +301,9 @@ class Arm(Driver):
             if joint is None or read is None:
                 continue
             heard.append(joint)
-            if joint.heard == -math.inf:
-                self._lost, self._pause = "", RETRY[0]
+            if self.dry_run and self._on and joint.started:  # as if it had followed
+                at = joint.steps(joint.aim)
+                read = read._replace(torque=True, goal=at, position=at, speed=0, load=0.0)
             joint.take(now, read)
             for bit, word in bus.ERRORS.items():
                 if answer.error & bit:
@@ -347,9 +313,13 @@ class Arm(Driver):
             if joint.ready and self._on and not read.torque:
                 self._fault("power", f"{joint.name} lost its torque: is its supply too weak?")
                 joint.started = False
-            if not joint.ready:
+            if not (joint.ready and read.torque):
                 joint.settle()
             joint.ready = read.torque and self._on and joint.started
+        if not self.motion.moving and not all(joint.ready for joint in self.arm):
+            self.motion.halt([joint.aim for joint in self.arm])
+        if not self.gripper.ready:
+            self.jaw.halt([self.gripper.aim])
         silent = [joint for joint in self._order if joint not in heard]
         self._order = [*(j for j in self._order if j in heard), *silent[1:], *silent[:1]]
 
@@ -361,46 +331,48 @@ class Arm(Driver):
     def _missing(self, now: float) -> str:
         late = now - LOST
         names = ", ".join(joint.name for joint in self.joints if joint.heard < late)
-        return f"no answer from {names} {self._lost}".rstrip() if names else ""
+        return f"no answer from {names} {self._link.why}".rstrip() if names else ""
 
     def _plan(self, now: float) -> None:
         if self._missing(now):
             self.stop(now)
-        for joint in self.joints:
+        if left := self.motion.watch([joint.q for joint in self.arm]):
+            self._fault("workspace", left)
+        if self.gripper.ready:
+            self._squeeze()
+        self.motion.step()
+        self.jaw.step()
+        for joint, aim in zip(self.joints, (*self.motion.q, *self.jaw.q), strict=True):
             if not joint.ready:
                 continue
-            if joint is self.gripper:
-                self._squeeze()
-            joint.lead(self.period, self.acceleration, self._held)
+            joint.aim = aim
             over = abs(joint.load) >= self.overload
             joint.strained = joint.strained + self.period if over else 0.0
             if joint.strained > STRAIN_TIME:
                 self._fault("overload", f"{joint.name} pushes against something")
                 joint.settle()
-        if not self._held:
-            for joint in self.arm:
-                if self._untrimmed(joint):
-                    change = TRIM_RATE * self.period * (joint.aim - joint.q)
-                    joint.trim = min(0.1, max(-0.1, joint.trim + change))
+                self._freeze()
+            if self._untrimmed(joint) and not self.motion.paused:
+                change = TRIM_RATE * self.period * (joint.aim - joint.q)
+                joint.trim = min(0.1, max(-0.1, joint.trim + change))
 
     def _untrimmed(self, joint: Joint) -> bool:
-        """Return whether a joint's load keeps it from its goal, and its set point is still being
-        corrected."""
-        if joint is self.gripper or self._task != "move" or joint.aim != joint.goal:
+        """Whether its load keeps a joint from its goal, and its set point is still being moved."""
+        if joint is self.gripper or not self.motion.arrived:
             return False
         return abs(joint.aim - joint.q) > DEAD and abs(joint.trim) < 0.1
 
     def _squeeze(self) -> None:
-        """Close the gripper while its load is below the wanted one, and find out whether it holds
-        something."""
-        joint = self.gripper
-        if self._hand == "close" and not self._held:
+        """Close the gripper as long as its load is below the wish; see whether it holds."""
+        joint, jaw = self.gripper, self.jaw
+        low, high = joint.within()
+        if self._hand == "close" and not jaw.paused:
             excess = -joint.load - self._grip
-            joint.goal = joint.low
             if excess > 0.0 or joint.stands:  # it touches something
                 way = GIVE * excess * self.period
-                joint.goal = joint.aim = min(joint.high, max(joint.low, joint.aim + way))
-                joint.velocity = 0.0
+                jaw.halt([min(high, max(low, joint.aim + way))])
+            elif not jaw.moving and jaw.q != [low]:
+                jaw.begin([[low]])
         holds = -joint.load >= 0.7 * self._grip and joint.stands
         self._gripped = self._gripped + self.period if holds else 0.0
 
@@ -427,21 +399,21 @@ class Arm(Driver):
         out = bus.sync_write(bus.GOAL, goals) if goals else b""
         out += bus.sync_write(bus.TORQUE, start) if start else b""
         out += bus.sync_write(bus.TORQUE, free) if free else b""
-        return out + bus.read_state(joint.servo for joint in self._order)
+        question = bus.read_state(joint.servo for joint in self._order)
+        return question if self.dry_run else out + question
 
     # --- called by the node ---------------------------------------------------------------------
 
     def stop(self, now: float) -> None:
         """Brake; the gripper keeps what it holds."""
-        self._task, self._hand = "", "keep" if self._holding else ""
-        for joint in self.joints:
-            joint.brake(self.period, self.acceleration)
+        self._hand = "keep" if self._holding else ""
+        self.motion.stop()
+        self.jaw.stop()
 
     def _freeze(self) -> None:
         """Stand still from this period on."""
-        self.stop(self.ports.now)
-        for joint in self.joints:
-            joint.goal, joint.velocity = joint.aim, 0.0
+        self.motion.halt([joint.aim for joint in self.arm])
+        self.jaw.halt([self.gripper.aim])
 
     def quick_stop(self, now: float) -> None:
         """Stop at once: by torque (`on_estop = "hold"`), or torque off."""
@@ -452,21 +424,20 @@ class Arm(Driver):
         """Return whether every servo answers and stands still, and no motion is left."""
         if self._missing(self.ports.now):
             return False
-        going = not self._held and any(
-            joint.aim != joint.goal or self._untrimmed(joint) for joint in self.joints
-        )
-        return not going and all(joint.velocity == 0.0 and joint.stands for joint in self.joints)
+        trims = not self.motion.paused and any(map(self._untrimmed, self.joints))
+        going = self.motion.moving or self.jaw.moving or trims
+        return not going and all(joint.stands for joint in self.joints)
 
     def hold(self, now: float) -> str:
         """Brake, and keep the goal until `release`."""
         if self._missing(now):
             return "cannot hold"
-        self._held = True
+        self.motion.paused = self.jaw.paused = True
         return "held"
 
     def release(self, now: float) -> None:
         """Move on."""
-        self._held = False
+        self.motion.paused = self.jaw.paused = False
 
     def state(self) -> Mapping[str, Any]:
         """Return angles (rad), speeds (rad/s), loads (share of the stall torque), temperatures
@@ -479,7 +450,7 @@ class Arm(Driver):
             faults["missing"] = missing
         if not self._calibrated:
             faults["uncalibrated"] = f"{self.calibration} is not there yet"
-        closed = self._hand == "close" and gripper.aim == gripper.low and gripper.stands
+        closed = self._hand == "close" and gripper.aim == gripper.within()[0] and gripper.stands
         return {
             "q": [joint.q for joint in arm],
             "qd": [0.0 if j.stands else j.sign * j.read.speed * bus.RAD for j in arm],
@@ -487,14 +458,16 @@ class Arm(Driver):
             "temperature": [joint.read.temperature for joint in self.joints],
             "voltage": min(joint.read.voltage for joint in self.joints),
             "moving": not missing and not self.stopped(),
-            "at_goal": self._task == "move"
-            and all(j.aim == j.goal and abs(j.q - j.goal) <= REACHED for j in arm)
+            "at_goal": self.motion.arrived
+            and all(abs(j.q - j.aim) <= REACHED for j in arm)
             and not any(map(self._untrimmed, arm)),
             "gripper": {
                 "angle": gripper.q,
                 "holding": self._holding,
                 "closed": closed and not self._holding,
-                "open": self._hand == "open" and abs(gripper.q - gripper.goal) <= 2 * REACHED,
+                "open": self._hand == "open"
+                and self.jaw.arrived
+                and abs(gripper.q - gripper.aim) <= 2 * REACHED,
             },
             "torque": self._on,
             "ready": not missing and all(joint.ready for joint in self.joints),
@@ -503,22 +476,8 @@ class Arm(Driver):
 
     def close(self) -> None:
         """Release the port. The servos keep their last goal."""
-        if self._line is not None:
-            self._line.close()
+        self._link.close()
 
 
-def _numbers(value: Any, count: int) -> TypeGuard[list[float]]:
-    """Return whether the value is a list of so many finite numbers."""
-    return (
-        isinstance(value, list | tuple)
-        and len(value) == count
-        and all(type(v) in (int, float) and math.isfinite(v) for v in value)
-    )
-
-
-def _within(joint: Joint, angle: float) -> None:
-    """Raise ValueError for an angle outside a joint's limits."""
-    ends = sorted(joint.sign * (end - joint.zero) * bus.RAD for end in (0, bus.STEPS - 1))
-    low, high = max(joint.low, ends[0]), min(joint.high, ends[1])
-    if not low <= angle <= high:
-        raise ValueError(f"{joint.name}: expected {low:.3f} to {high:.3f} rad, found {angle:.3f}")
+def _limits(joints: list[Joint]) -> dict[str, tuple[float, float]]:
+    return {joint.name: joint.within() for joint in joints}

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Iterable, Mapping
 from typing import Final, NamedTuple
 
-PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 0x01, 0x02, 0x03, 0x82, 0x83
+SYNC_READ, SYNC_WRITE = 0x82, 0x83
 BROADCAST: Final = 0xFE
 TORQUE, GOAL = 40, 42
 """Registers: torque enable (the first that `setup` writes), and goal position."""
@@ -46,16 +46,6 @@ def packet(servo: int, instruction: int, content: bytes = b"") -> bytes:
     """Return an instruction packet."""
     body = bytes((servo, len(content) + 2, instruction)) + content
     return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
-
-
-def read(servo: int, address: int, size: int) -> bytes:
-    """Ask one servo for registers."""
-    return packet(servo, READ, bytes((address, size)))
-
-
-def write(servo: int, address: int, data: bytes) -> bytes:
-    """Write registers of one servo."""
-    return packet(servo, WRITE, bytes((address,)) + data)
 
 
 def sync_read(address: int, size: int, servos: Iterable[int]) -> bytes:

@@ -16,17 +16,16 @@ The workspace limits the tool point in the base frame. After a fault nothing mov
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
-from petrobot import Driver, Ports, key
+from petrobot import Driver, JointMotion, Link, Ports, key, numbers
 from petrobot.services.adapters.ur import kinematics
-from petrobot.services.adapters.ur.link import links
 from petrobot.services.adapters.ur.rtde import Rtde, RtdeError
 
 OUTPUTS = (
-    *("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "runtime_state"),
+    *("actual_q", "actual_qd", "robot_mode", "safety_mode"),
     *("actual_digital_input_bits", "actual_digital_output_bits", "output_int_register_24"),
 )
 SETPOINT = (
@@ -43,14 +42,17 @@ STANDING = 0.01
 IN_PLACE = 0.003
 """Tolerance of a joint at the end of a motion (rad)."""
 STALE = 0.15
-"""Time without data, or without an echo of the program, after which link or program counts as lost
-(s)."""
+"""Seconds without data, or without an echo of the program, after which link or program is lost."""
+SILENT = 2.0
+"""Seconds without data after which the driver connects again."""
 ASK_AGAIN = 1.0
 """Time between two requests while the drives are being enabled (s)."""
 BY_ITSELF = 1.0
-"""Time within which the program stops the arm after the last set point (s)."""
-PART = 0.02
-"""Distance of two checked points of a joint motion (rad); on a straight line it is 4 mm."""
+"""Seconds in which the program has stopped the arm after the set points ceased."""
+PART = 0.02, 0.004
+"""rad and m between two places of a straight way."""
+TURN = 2 * math.pi
+JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 PROGRAM = """\
 def petrobot():
   patience = 0.1
@@ -83,7 +85,7 @@ class Arm(Driver):
 
     period = 0.008
     obeys = ("speed", "workspace", "dry_run")
-    host: str = key(text="IP address of the controller")
+    host: str = key(text="IP address of the controller, or unix:PATH of a simulated one")
     model: str = key("ur5e", "ur3e, ur5e or ur10e")
     tool: list[float] = key([0.0, 0.0, 0.0], "tool point in the flange's frame, m")
     top_speed: float = key(1.05, "rad/s")
@@ -101,23 +103,26 @@ class Arm(Driver):
             raise ValueError(
                 "expected top_speed in (0, 3.14] rad/s, acceleration in (0, 20] rad/s^2"
             )
-        self._arm = kinematics.Geometry(self.model, _numbers(self.tool, 3, "tool"))
-        addresses = [self.rtde_port, self.dashboard_port, self.program_port]
-        made, self._advance = links(self.host, addresses, [30004, 29999, 30002])
-        self._link, self._dashboard, self._program = made
-        self._rtde, self._connection = Rtde(OUTPUTS, (SETPOINT, DIGITAL), 125.0), 0
+        self._arm = kinematics.Geometry(self.model, numbers(self.tool, 3, "tool"))
+        addresses = self.rtde_port, self.dashboard_port, self.program_port
+        self._link, self._dashboard, self._program = (
+            Link(ports.now, partial(ports.tcp, self.host, port), patience)
+            for port, patience in zip(addresses, (SILENT, math.inf, math.inf), strict=True)
+        )
+        self._rtde, self._connection = Rtde(OUTPUTS, (SETPOINT, DIGITAL), 125.0), 1
+        self._motion = JointMotion(
+            self,
+            dict.fromkeys(JOINTS, (-TURN, TURN)),
+            self.top_speed,
+            self.acceleration,
+            point=lambda q: self._arm.tool(q)[:3],
+        )
         self._seen = self._echoed = -math.inf
         self._count, self._echo, self._beat, self._ask_at = 0, -1, 0, 0.0
-        self._wanted = self._enabled = self._quick = self._paused = False
+        self._wanted = self._enabled = self._quick = False
         self._fault = self._reason = ""
         self._unseen_until, self._now = -math.inf, 0.0
-        self._way: list[list[float]] = []
-        self._far: list[float] = []
-        self._at = self._rate = self._most = 0.0
-        self._commanded = [0.0] * 6
-        self._goal: list[float] | None = None
         self._outputs, self._pretended = list[dict[str, int]](), 0
-        self._inside = True
 
     # Commands
 
@@ -127,9 +132,9 @@ class Arm(Driver):
         if what == "enable":
             self._wanted, self._fault, self._reason, self._ask_at = True, "", "", now
         elif what == "move":
-            self._go([self._commanded, _numbers(body.get("q"), 6, "q")], body)
+            self._go([numbers(body.get("q"), 6, "q")], body)
         elif what == "linear":
-            self._go(self._straight(_numbers(body.get("pose"), 6, "pose")), body)
+            self._go(self._straight(numbers(body.get("pose"), 6, "pose")), body)
         elif what == "output":
             self._output(body.get("bit"), body.get("value"))
         elif what == "rest":
@@ -147,14 +152,14 @@ class Arm(Driver):
         self._outputs.append(dict(zip(DIGITAL, (1 << bit, value << bit), strict=True)))
 
     def _straight(self, pose: list[float]) -> list[list[float]]:
-        """Return joint poses along the tool's straight line from where the arm stands."""
-        begin, way = self._arm.tool(self._commanded), [self._commanded]
-        length = math.dist(begin[:3], pose[:3])
-        parts = max(2, math.ceil(length / 0.004), math.ceil(math.dist(begin[3:], pose[3:]) / PART))
+        """Joint poses along the straight way of the tool from where the arm rests."""
+        begin, way = self._arm.tool(self._motion.q), [self._motion.q]
+        turn, length = math.dist(begin[3:], pose[3:]), math.dist(begin[:3], pose[:3])
+        parts = max(2, math.ceil(turn / PART[0]), math.ceil(length / PART[1]))
         for part in range(1, parts + 1):
             place = kinematics.between(begin, pose, part / parts)
             found = self._arm.joints(place, way[-1])
-            if found is None or max(map(_off, found, way[-1])) > 0.2:
+            if found is None or _apart(found, way[-1]) > 0.2:
                 x, y, z = place[:3]
                 raise ValueError(
                     f"linear: the arm cannot pass x = {x:.3f}, y = {y:.3f}, z = {z:.3f} m"
@@ -163,61 +168,40 @@ class Arm(Driver):
         return way
 
     def _go(self, way: list[list[float]], body: Mapping[str, Any]) -> None:
-        """Begin a motion, after checking its whole path."""
-        share = body.get("speed", 1.0)
-        if isinstance(share, bool) or not isinstance(share, int | float) or not 0.0 < share <= 1.0:
-            raise ValueError(f"speed: expected a number above 0 and at most 1, got {share!r}")
         if not self._enabled:
             raise ValueError(f"the arm is not enabled ({self._reason or 'send enable'})")
-        if self._rate > 0.0:
-            raise ValueError("the arm is still moving: wait, or send rest first")
-        for angle in way[-1]:
-            if abs(angle) > 2 * math.pi:
-                raise ValueError(f"q: expected angles within 2 pi rad, got {angle:.3f}")
-        for begin, end in pairwise(way) if self.workspace.bounds else ():
-            parts = math.ceil(max(map(_off, begin, end)) / PART) or 1
-            for part in range(1, parts + 1):
-                q = [a + part / parts * (b - a) for a, b in zip(begin, end, strict=True)]
-                if outside := self.workspace.outside(self._arm.tool(q)[:3]):
-                    raise ValueError(outside)
-        self._way, self._far = way, [0.0]
-        for begin, end in pairwise(way):
-            self._far.append(self._far[-1] + max(map(_off, begin, end)))
-        self._at, self._goal, self._reason = 0.0, way[-1], ""
-        self._most, self._quick = share * self.speed * self.top_speed, False
+        self._motion.begin(way, body.get("speed", 1.0))
+        self._reason, self._quick = "", False
 
     # The cycle
 
     def step(self, now: float) -> None:
         """Receive, move the set point, send. Never waits."""
         self._now = now
-        self._advance(now)
         self._receive(now)
         self._look(now)
         if self._enabled:
-            self._move()
+            self._reason = self._motion.watch(self._q()) or self._reason
+            self._motion.step()
         self._send(now)
 
     def _receive(self, now: float) -> None:
-        data = self._link.poll(now)
-        if self._link.connections != self._connection:
-            self._connection = self._link.connections
+        data = self._link.receive(now)
+        if self._link.count != self._connection:
+            self._connection = self._link.count
             self._rtde, self._count = Rtde(OUTPUTS, (SETPOINT, DIGITAL), 125.0), 0
         try:
             self._rtde.receive(data)
         except RtdeError as fault:
             self._link.drop(now, str(fault))
         if self._rtde.count != self._count and self._link.up:
-            if not self._count:
-                self._link.settled()
             self._count, self._seen = self._rtde.count, now
             echo = self._rtde.data["output_int_register_24"]
             if echo != self._echo and 0 <= self._beat - echo < 100 and self._count > 1:
                 self._echoed = now  # the program has read the set point sent just before
             self._echo = echo
         for other in (self._dashboard, self._program):
-            if other.poll(now):  # their answers are not needed: RTDE reports the same
-                other.settled()
+            other.receive(now)  # what they say is not needed: RTDE tells it all
 
     def _look(self, now: float) -> None:
         """Find out whether the drives are enabled, and if not, why."""
@@ -232,10 +216,12 @@ class Arm(Driver):
             text = SAFETY.get(safety, "link_lost") if safety not in MAY_MOVE else ""
             self._lose(text or ("program_lost" if powered else "power_off"))
         elif ready and not self._enabled:
-            self._enabled, self._commanded = True, list(data["actual_q"])
-            self._reason = ""
+            self._enabled, self._reason = True, ""
+            self._motion.halt(data["actual_q"])
         elif self._wanted and not ready:
-            self._reason = "enabling" if fresh else f"no connection: {self._link.why}"
+            trouble = self._dashboard.why or self._program.why
+            waits = "no connection: " + (self._link.why or "no data yet")
+            self._reason = f"enabling {trouble}".rstrip() if fresh else waits
             if fresh and now >= self._ask_at and not self.dry_run:
                 self._ask_at = now + ASK_AGAIN
                 self._ask(now, safety, data["robot_mode"])
@@ -257,45 +243,13 @@ class Arm(Driver):
             self._unseen_until = self._now + BY_ITSELF
         self._enabled = self._wanted = False
         self._fault = self._reason = fault
-        self._rest()
-
-    def _rest(self) -> None:
-        self._way, self._far, self._rate, self._goal = [], [], 0.0, None
-
-    def _move(self) -> None:
-        """Move the set point along the path."""
-        self._check_workspace()
-        if not self._way:
-            return
-        left, dt = self._far[-1] - self._at, self.period
-        braking = math.sqrt(2.0 * self.acceleration * max(0.0, left))
-        wanted = 0.0 if self._paused or self._goal is None else min(self._most, braking)
-        change = self.acceleration * dt
-        self._rate = max(self._rate - 1.05 * change, min(self._rate + change, wanted))
-        self._at = min(self._far[-1], self._at + self._rate * dt)
-        number = next((n for n, far in enumerate(self._far) if far >= self._at), 0) or 1
-        span = self._far[number] - self._far[number - 1]
-        share = (self._at - self._far[number - 1]) / span if span else 1.0
-        rows = zip(self._way[number - 1], self._way[number], strict=True)
-        self._commanded = [a + share * (b - a) for a, b in rows]
-        if self._at >= self._far[-1] - 1e-5 and self._goal is not None:
-            self._commanded, self._way, self._rate = list(self._goal), [], 0.0
-        elif self._goal is None and self._rate <= 0.0:
-            self._rest()
-
-    def _check_workspace(self) -> None:
-        """Stop if the tool leaves the workspace, whatever moves it."""
-        if self.workspace.bounds:
-            outside = self.workspace.outside(self._arm.tool(self._q())[:3])
-            if outside and self._inside and self._way:
-                self._goal, self._reason = None, outside
-            self._inside = not outside
+        self._motion.halt(self._motion.q)
 
     def _send(self, now: float) -> None:
         if not self.dry_run:
             self._beat = (self._beat + 1) % (1 << 30)
             follows = int(self._enabled and not self._quick)
-            values = (self._beat, follows, *self._commanded)
+            values = (self._beat, follows, *self._motion.q)
             self._rtde.send(0, dict(zip(SETPOINT, values, strict=True)))
         for mask, value in (tuple(each.values()) for each in self._outputs):
             self._pretended = self._pretended & ~mask | value
@@ -306,23 +260,23 @@ class Arm(Driver):
 
     def _q(self) -> list[float]:
         pretends = self.dry_run and self._enabled
-        return list(self._commanded if pretends else self._rtde.data.get("actual_q", (0.0,) * 6))
+        return list(self._motion.q if pretends else self._rtde.data.get("actual_q", (0.0,) * 6))
 
     def state(self) -> Mapping[str, Any]:
-        """Return the state for actions, operator and report; docs/robots/ur.md explains the
-        keys."""
-        data, q = self._rtde.data, self._q()
-        goal = self._goal
+        """Return what actions, operator and report see; docs/robots/ur.md explains the keys."""
+        data, q, motion = self._rtde.data, self._q(), self._motion
         return {
             "enabled": self._enabled,
-            "mode": ("move" if self._way else "hold") if self._enabled else "off",
+            "mode": ("hold" if motion.arrived or motion.goal is None else "move")
+            if self._enabled
+            else "off",
             "reason": self._reason,
             "fault": self._fault,
             "connected": self._link.up and self._now - self._seen < STALE,
             "safety": SAFETY.get(data.get("safety_mode", 0), "unknown"),
             "q": q,
             "tool": self._arm.tool(q),
-            "in_place": goal is not None and not self._way and max(map(_off, q, goal)) < IN_PLACE,
+            "in_place": motion.arrived and _apart(q, motion.q) < IN_PLACE,
             "inputs": data.get("actual_digital_input_bits", 0),
             "outputs": self._pretended
             if self.dry_run
@@ -330,10 +284,8 @@ class Arm(Driver):
         }
 
     def stop(self, now: float) -> None:
-        """Brake along the path, and stay there."""
-        self._goal = None
-        if not self._way or self._rate <= 0.0:
-            self._rest()
+        """Brake on the way, and stay there."""
+        self._motion.stop()
 
     def quick_stop(self, now: float) -> None:
         """Let the controller stop the joints as hard as its program does."""
@@ -346,16 +298,16 @@ class Arm(Driver):
         if not self._link.up or self._now - self._seen > STALE:
             return self._now >= self._unseen_until and not self._enabled
         still = all(abs(v) < STANDING for v in self._rtde.data["actual_qd"])
-        return still and not self._way and self._now >= self._unseen_until
+        return still and not self._motion.moving and self._now >= self._unseen_until
 
     def hold(self, now: float) -> str:
-        """Pause: brake along the path, and continue on it after `release`."""
-        self._paused = True
+        """Pause: brake on the way, and go on along it after `release`."""
+        self._motion.paused = True
         return "held"
 
     def release(self, now: float) -> None:
         """End the pause."""
-        self._paused = False
+        self._motion.paused = False
 
     def close(self) -> None:
         """Close the connections; the program on the controller then stops the arm."""
@@ -363,12 +315,5 @@ class Arm(Driver):
             link.close()
 
 
-def _off(a: float, b: float) -> float:
-    return abs(a - b)
-
-
-def _numbers(value: Any, count: int, name: str) -> list[float]:
-    good = isinstance(value, Sequence) and not isinstance(value, str) and len(value) == count
-    if not good or not all(isinstance(v, int | float) and math.isfinite(v) for v in value):
-        raise ValueError(f"{name}: expected {count} finite numbers, got {value!r:.80}")
-    return [float(v) for v in value]
+def _apart(a: list[float], b: list[float]) -> float:
+    return max(abs(one - other) for one, other in zip(a, b, strict=True))

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 VERSION = 2
-REQUEST_VERSION, CONTROLLER, TEXT, DATA = "V", "v", "M", "U"
+REQUEST_VERSION, DATA = "V", "U"
 OUTPUTS, INPUTS, START, PAUSE = "O", "I", "S", "P"
 LETTERS = frozenset("VvMUOISP")
 FORMS: Mapping[str, str] = {
@@ -93,8 +93,6 @@ class Rtde:
         self.count = 0
         """How many data packages were received."""
         self.running = False
-        self.text = ""
-        """The controller's last text message."""
         self._outputs, self._inputs, self._rate = outputs, [tuple(names) for names in inputs], rate
         self._recipe: tuple[int, Recipe] | None = None
         self._sent: list[tuple[int, Recipe]] = []
@@ -125,9 +123,6 @@ class Rtde:
         if letter == DATA:
             if self._recipe is not None and payload[0] == self._recipe[0]:
                 self.data, self.count = self._recipe[1].unpack(payload[1:]), self.count + 1
-        elif letter == TEXT:
-            size = payload[0]
-            self.text = payload[1 : 1 + size].decode(errors="replace")
         elif letter == REQUEST_VERSION:
             if payload != b"\x01":
                 raise RtdeError(f"the controller refuses RTDE protocol {VERSION}: update it")

@@ -144,7 +144,7 @@ FLAT: Mapping[str, KeySpec] = {
     "keys": KeySpec("the path of a file or folder, relative to this one", _text),
     "parameters": KeySpec("the path of a file, relative to this one", _text),
 }
-CHANNELS = ("call", "can", "serial", "image", "stream", "control")
+CHANNELS = ("call", "can", "serial", "tcp", "image", "stream", "control")
 KEYS = ("file", "certificates", "also")
 COORDINATOR_PORT = 7299
 """Port of the coordinator unless `[coordinator]` sets another."""

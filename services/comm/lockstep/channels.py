@@ -7,6 +7,8 @@ stream's socket:
   tuple of `Frame`;
 - "serial": the bytes that one end of a serial line sent in a tick, from a device to the laboratory
   and back;
+- "tcp": the bytes that one end of a TCP connection sent in a tick (`tcp_body`); the first ones of a
+  connection, perhaps none, come from the device and open it;
 - "control": from a device to the laboratory, the rate at which it wants images (`images_wanted`);
 - "image": from the laboratory to a device (`image_body`), with its age when it was sent, as on the
   wire;
@@ -59,6 +61,18 @@ def read_can(body: Any) -> tuple[Frame, ...]:
     if _FRAMES.issuperset(map(type, body)):
         return tuple(body)
     return tuple(Frame(*frame) for frame in body)
+
+
+def tcp_body(port: int, number: int, data: bytes) -> tuple[int, int, bytes]:
+    """Return the body of a "tcp" envelope. `number` counts the connections of a device to this
+    port: a new one ends the one before it."""
+    return port, number, data
+
+
+def read_tcp(body: Sequence[Any]) -> tuple[int, int, bytes]:
+    """Return port, number and bytes of a "tcp" envelope."""
+    port, number, data = body
+    return port, number, data
 
 
 def images_wanted(rate: float, generation: int) -> Mapping[str, Any]:

@@ -22,8 +22,8 @@ class Envelope(NamedTuple):
     service or a party), not processes.
 
     `channel` says what `body` is: "call" a message of the node protocol, "can" frames, "serial"
-    bytes, "image" an image body, "stream" a set point, "control" a request of the cell itself (for
-    example the start of images). `party` is the receiving party.
+    and "tcp" bytes, "image" an image body, "stream" a set point, "control" a request of the cell
+    itself (for example the start of images). `party` is the receiving party.
     """
 
     party: str

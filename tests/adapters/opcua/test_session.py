@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -16,6 +17,7 @@ import pytest
 from petrobot import Ports, check_driver, rehearse
 from petrobot.services.adapters.opcua.actions import handshake, write
 from petrobot.services.adapters.opcua.session import OpcUaSession
+from petrobot.services.comm.protocol.plain import plain
 from tests.ports import free_ports
 from tests.waiting import Limit
 
@@ -94,7 +96,7 @@ def await_(driver: OpcUaSession, ready: Callable[[Any], object], awaited: str) -
 
 
 def complete(state: Any) -> bool:
-    return set(state["values"]) == set(NAMES)
+    return bool(state["up"]) and set(state["values"]) == set(NAMES)
 
 
 def done(driver: OpcUaSession, values: dict[str, Any]) -> str:
@@ -185,6 +187,29 @@ def test_it_keeps_the_rules_of_drivers(cell: Cell) -> None:
     found = check_driver(cell.driver, cable=cell.power, within=30.0, seconds=30.0)
     late = [fault for fault in found.faults if "took longer than the period" in fault]
     assert found.faults == late  # a busy host delays a step; none of its steps waits
+
+
+def test_values_of_any_type_are_plain(cell: Cell) -> None:
+    """A list of dates would make the state one that cannot be published, and break the driver."""
+    driver = cell.driver()
+    driver._by_id = {"node": "count"}
+    dates = [datetime.datetime(2026, 11, 23), [datetime.datetime(2026, 11, 24)], 3]
+    driver.datachange_notification(SimpleNamespace(nodeid="node"), dates, None)
+    driver.step(0.0)
+    told = plain(driver.state())["values"]["count"]
+    assert told == ["2026-11-23 00:00:00", ["2026-11-24 00:00:00"], 3]
+
+
+@pytest.mark.processes
+def test_in_a_dry_run_nothing_is_written(cell: Cell) -> None:
+    cell.power(True)
+    driver = cell.driver(dry_run=True, on_stop={"count": 7})
+    before = await_(driver, complete, "all values")["values"]["count"]
+    assert done(driver, {"count": before + 1}) == ""
+    driver.stop(0.0)
+    assert driver.stopped()
+    other = cell.driver()
+    assert await_(other, complete, "all values")["values"]["count"] == before
 
 
 @pytest.mark.processes

@@ -395,6 +395,90 @@ def test_a_wrong_table_is_refused(config: dict[str, Any], wrong: str) -> None:
     assert wrong in str(refused.value)
 
 
+MOVE_GROUP = {"request": {"max_velocity_scaling_factor": 0.8}}
+ODOMETRY = {"topic": "/odom", "type": "nav_msgs/msg/Odometry"}
+
+
+def test_speed_slows_goals_and_set_points() -> None:
+    bridge, link = wired(Ports(), speed=0.25, setpoints={"speed": SPEED})
+    bridge.ports.point.take(0.8, 0.4)  # type: ignore[attr-defined]
+    bridge.step(0.0)
+    bridge.command(0.0, {"drive": ["speed"]})
+    bridge.step(0.0)
+    assert link.fake.log[-1]["msg"] == {"linear": {"x": 0.2}, "angular": {"z": 0.1}}
+    bridge.ports = None  # type: ignore[assignment]
+    assert play("/ok", bridge, goal=MOVE_GROUP).result.status == "success"
+    (sent,) = (m for m in link.fake.log if m["op"] == "send_action_goal")
+    assert sent["args"]["request"]["max_velocity_scaling_factor"] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("options", "wrong"),
+    [
+        ({"goal": {"x": 1.0}}, "expected request.max_velocity_scaling_factor"),
+        ({"goal": MOVE_GROUP, "action_type": "a/action/B"}, 'write speeds = { "a/action/B" ='),
+    ],
+)
+def test_a_goal_of_which_nothing_says_its_speed_is_refused(
+    options: dict[str, Any], wrong: str
+) -> None:
+    bridge, link = robot(speed=0.5)
+    options = {"action_type": "moveit_msgs/action/MoveGroup", **options}
+    result = rehearse(actions.goal, device=bridge, action="/ok", **options).result
+    assert said(result) == ("error", "bad_goal", "no") and wrong in result.text
+    assert not link.fake.log
+    with pytest.raises(ValueError, match=r"setpoints\.s: nothing says what is slower"):
+        robot(speed=0.5, setpoints={"s": {**SPEED, "type": "a/msg/B"}})
+    free, _ = robot(speed=0.5, speeds={"a/action/B": []})  # the robot's own limit
+    assert (
+        rehearse(actions.goal, device=free, action="/ok", action_type="a/action/B").result.status
+        == "success"
+    )
+
+
+def test_the_workspace_bounds_goals_and_stops_what_leaves_it() -> None:
+    box = {"x": [-1.0, 1.0]}
+    with pytest.raises(ValueError, match="nothing tells where the robot is"):
+        robot(workspace=box)
+    bridge, link = robot(workspace=box, subscribe={"odom": ODOMETRY})
+    out = rehearse(actions.navigate_to_pose, device=bridge, x=2.0, y=0.0, action="/ok").result
+    assert said(out) == ("error", "bad_goal", "no") and "outside the workspace" in out.text
+    assert not [m for m in link.fake.log if m["op"] == "send_action_goal"]
+
+    def world(now: float) -> None:
+        if abs(now - 0.5) < 1e-6:
+            at = {"position": {"x": 1.2, "y": 0.0, "z": 0.0}}
+            shown(bridge, {"pose": {"pose": at}}, topic="/odom")
+
+    goal: dict[str, Any] = {"x": 0.5, "y": 0.0, "action": "/slow", "remaining": "distance"}
+    left = rehearse(actions.navigate_to_pose, device=bridge, world=world, **goal)
+    assert said(left.result) == ("error", "cancelled", "yes")
+    assert "x = 1.200" in left.result.text and left.seconds < 1.5
+    assert "x = 1.200" in bridge.state()["left"]
+
+
+def test_in_a_dry_run_nothing_is_sent_but_questions() -> None:
+    ports = Ports()
+    bridge, link = wired(ports, dry_run=True, setpoints={"speed": SPEED}, subscribe={"b": BUTTON})
+    ports.point.take(0.8, 0.4)
+    bridge.step(0.0)
+    bridge.command(0.0, {"drive": ["speed"]})
+    bridge.step(0.0)
+    assert not bridge.stopped()  # it would move
+    bridge.stop(0.0)
+    assert bridge.stopped()
+    message = {"topic": "/t", "type": "a/msg/B", "msg": {"x": 1}}
+    bridge.command(0.0, {"publish": message})
+    bridge.ports = None  # type: ignore[assignment]
+    done = play(
+        "/aborts", bridge, goal={}, values={"code": "error_code.val"}, expect={"error_code.val": 1}
+    ).result
+    assert (done.status, done.values) == ("success", {"code": 1})
+    called = rehearse(actions.call, device=bridge, service="/no", values={"left": "level"}).result
+    assert (called.status, called.values) == ("success", {"left": None})
+    assert {m["op"] for m in link.fake.log} == {"subscribe"}
+
+
 def test_the_driver_keeps_the_rules() -> None:
     assert check_driver(lambda: wired(Ports())[0], simulated=True).faults == []
 

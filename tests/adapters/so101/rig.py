@@ -6,12 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
-from petrobot import Ports, SerialLine
+from petrobot import ByteLine, Ports
 from petrobot.services.adapters.so101.arm import Arm
 from petrobot.sim.bus.feetech import FeetechBus, so101
 
 
-class Line(SerialLine):
+class Line(ByteLine):
     """The serial line to a simulated bus, in this process."""
 
     def __init__(self, bus: FeetechBus) -> None:
@@ -42,10 +42,10 @@ class Rig:
         self.bus = bus or so101()
         self.folder = folder
         self.plugged, self.opened = True, 0
-        self.line: SerialLine | None = None
-        self.open: Callable[[], SerialLine] = lambda: Line(self.bus)
+        self.line: ByteLine | None = None
+        self.open: Callable[[], ByteLine] = lambda: Line(self.bus)
 
-    def serial(self, port: str, baud: int) -> SerialLine:
+    def serial(self, port: str, baud: int) -> ByteLine:
         self.opened += 1
         if not self.plugged:
             raise ConnectionError(f"no {port}")

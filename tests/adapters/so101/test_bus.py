@@ -43,9 +43,6 @@ def test_packets_are_those_of_the_vendors_sdk(number: int, address: int, content
         getattr(packets, call)(port, *values)
         return port.sent
 
-    assert bus.read(number, address, size) == sent("readTx", number, address, size)
-    written = sent("writeTxOnly", number, address, size, list(content))
-    assert bus.write(number, address, content) == written
     several = [number, (number + 1) % 253]
     asked = sent("syncReadTx", address, size, several, 2)
     assert bus.sync_read(address, size, several) == asked

@@ -91,10 +91,10 @@ def test_nothing_is_sent_before_the_start_nor_while_it_is_paused() -> None:
     assert client.drain() == b"" and not client.running
 
 
-def test_a_recipe_of_another_number_is_passed_over_and_texts_are_kept() -> None:
+def test_a_recipe_of_another_number_and_texts_are_passed_over() -> None:
     client = Rtde(OUT, IN, 125.0)
     client.receive(ACCEPTED + package("U", b"\x02abc") + package("M", b"\x02hi\x00\x01"))
-    assert client.count == 0 and client.text == "hi"
+    assert client.count == 0 and client.data == {}
 
 
 @given(st.binary(max_size=60))

@@ -1,22 +1,23 @@
-"""Serial lines of a laboratory: a pseudo terminal in real time, envelopes in lock step."""
+"""Lines to a laboratory: a pseudo terminal or Unix sockets in real time, envelopes in lock step."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.location_file import load
 from petrobot.services.comm.lockstep.party import Envelope
-from petrobot.services.comm.streams.serial_line import SerialLine, SerialPort
+from petrobot.services.comm.streams.line import ByteLine, SerialPort, TcpConnection
 from petrobot.services.node.lockstep import LockstepPorts
-from petrobot.sim.bus.serial_line import PtyLine
+from petrobot.services.node.ports import ProcessPorts
+from petrobot.sim.bus.lines import PtyLine
 from petrobot.sim.laboratory_party import LaboratoryParty
-from petrobot.sim.realtime import Pacemaker, serial_lines
+from petrobot.sim.realtime import Pacemaker, serial_lines, tcp_hosts
 from tests.waiting import Limit
 
 CELL = """
@@ -36,11 +37,37 @@ port = "pty:run/arm"
 node = "pc"
 driver = "any:Arm"
 port = "/dev/ttyUSB0"
+[devices.crane]
+node = "pc"
+driver = "any:Arm"
+host = "unix:run/crane"
 """
 
 
+class Session:
+    """The robot's end of a connection: says hello, and answers in capitals."""
+
+    def __init__(self) -> None:
+        self.closed, self.out = False, b"hello "
+
+    def receive(self, data: bytes) -> None:
+        self.out += data.upper()
+
+    def drain(self) -> bytes:
+        out, self.out = self.out, b""
+        return out
+
+
 class Echo(LaboratoryParty):
-    """A world whose serial devices answer in capitals."""
+    """A world whose devices answer in capitals."""
+
+    tcp_ports = (7, 8)
+    sessions: ClassVar[list[Session]] = []
+
+    def connect(self, device: str, port: int) -> Session:
+        self.sessions.append(Session())
+        self.sessions[-1].out += f"{device} {port} ".encode()
+        return self.sessions[-1]
 
     def tick(self, now: float) -> None:
         self.now = now + 0.004
@@ -65,10 +92,12 @@ class Echo(LaboratoryParty):
 
 
 def echo() -> Echo:
-    return Echo("world", lambda endpoint: "pc" if endpoint == "arm" else endpoint, "b", "hash")
+    return Echo(
+        "world", lambda endpoint: "pc" if endpoint in ("arm", "crane") else endpoint, "b", "hash"
+    )
 
 
-def heard(line: SerialLine, size: int) -> bytes:
+def heard(line: ByteLine, size: int) -> bytes:
     got, limit = b"", Limit(f"{size} bytes")
     while len(got) < size and limit.left():
         got += line.receive()
@@ -130,3 +159,58 @@ def test_in_lock_step_it_is_envelopes(tmp_path: Path) -> None:
     assert (answer.party, answer.target) == ("pc", "arm")
     ports.receive(answer)
     assert line.receive() == b"arm HELLO" and line.receive() == b""
+
+
+def test_in_real_time_its_robots_accept_connections(tmp_path: Path) -> None:
+    (tmp_path / "services.toml").write_text(CELL)
+    directory = load(tmp_path / "services.toml")
+    assert tcp_hosts(directory) == {"crane": tmp_path / "run/crane"}
+    ports = ProcessPorts(directory, directory.devices["crane"], lambda: 0.0, {})
+    for _ in range(2):  # ended, and started again
+        pacemaker = Pacemaker(echo(), None, None, None, tcp_hosts(directory))
+        thread = threading.Thread(target=pacemaker.run)
+        thread.start()
+        one, other = ports.tcp("unix:run/crane", 7), ports.tcp("unix:run/crane", 8)
+        try:
+            one.send(b"yes")
+            assert heard(one, 17) == b"hello crane 7 YES"
+            assert heard(other, 14) == b"hello crane 8 "
+        finally:
+            pacemaker.stop()
+            thread.join()
+            pacemaker.close()
+        with pytest.raises(ConnectionError, match="closed the connection"):
+            one.receive()
+        one.close()
+        other.close()
+        again = TcpConnection(f"unix:{tmp_path}/run/crane", 7)
+        with pytest.raises(ConnectionError, match="No such file"):
+            again.receive()
+        again.close()
+
+
+def test_in_lock_step_a_connection_is_envelopes(tmp_path: Path) -> None:
+    (tmp_path / "services.toml").write_text(CELL)
+    directory = load(tmp_path / "services.toml")
+    sent: list[Envelope] = []
+    ports = LockstepPorts(directory, directory.devices["crane"], lambda: 0.0, sent.append)
+    world = echo()
+
+    def passes() -> None:
+        ports.flush()
+        for envelope in sent:
+            world.receive(0.0, envelope)
+        sent.clear()
+        world.advance(0.0)
+        for answer in world.drain():
+            assert (answer.party, answer.target, answer.channel) == ("pc", "crane", "tcp")
+            ports.receive(answer)
+
+    first = ports.tcp("192.168.1.10", 7)
+    passes()
+    assert first.receive() == b"hello crane 7 "
+    second, other = ports.tcp("192.168.1.10", 7), ports.tcp("192.168.1.10", 8)
+    second.send(b"yes")
+    passes()
+    assert (second.receive(), other.receive()) == (b"hello crane 7 YES", b"hello crane 8 ")
+    assert first.receive() == b"" and world.sessions[-3].closed and not world.sessions[-2].closed

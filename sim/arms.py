@@ -1,0 +1,71 @@
+"""A laboratory with nothing but arms, for their drivers: the servos of a SO-101 at each serial
+line, a UR controller at each TCP host. Cells with parts, cameras and contact are in folders of
+their own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.lockstep.party import TICK
+from petrobot.sim.bus.feetech import FeetechBus, so101
+from petrobot.sim.bus.ur_controller import PORTS, ControllerSession, UrController
+from petrobot.sim.laboratory_party import LaboratoryParty
+
+HELD = 2048.0 + 200.0
+"""Where the jaw of each SO-101's gripper meets what it holds (steps): a part of 0.3 rad."""
+
+
+class Arms(LaboratoryParty):
+    """The arms by device."""
+
+    services = ()
+    tcp_ports = PORTS
+
+    def __init__(self, directory: Directory, name: str) -> None:
+        super().__init__(name, directory.party, f"{name} arms", directory.hash)
+        self._servos: dict[str, FeetechBus] = {}
+        self._controllers: dict[str, UrController] = {}
+
+    def tick(self, now: float) -> None:
+        """Let the arms move."""
+        for bus in self._servos.values():
+            bus.advance(TICK)
+        for controller in self._controllers.values():
+            controller.advance(now + TICK)
+        self.now = now + TICK
+
+    def take_on_serial(self, now: float, device: str, data: bytes) -> bytes:
+        """Answer as the servos of this device."""
+        if device not in self._servos:
+            self._servos[device] = so101([0.0] * 5 + [1.0])
+            self._servos[device].servos[6].low = HELD
+        return self._servos[device].receive(data)
+
+    def connect(self, device: str, port: int) -> ControllerSession:
+        """Connect to the controller of this device."""
+        return self._controllers.setdefault(device, UrController()).connect(port)
+
+    def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
+        """It has no CAN bus."""
+
+    def take_frames(self) -> Sequence[Frame]:
+        """It has no CAN bus."""
+        return ()
+
+    def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """It has no services."""
+        raise ValueError(f"no service {service!r}")
+
+    def make_ready(self, arguments: Mapping[str, Any]) -> None:
+        """Nothing takes long."""
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def make_laboratory(directory: Directory, name: str) -> Arms:
+    """Make the laboratory of a simulated node."""
+    return Arms(directory, name)
