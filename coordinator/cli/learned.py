@@ -15,7 +15,7 @@ from petrobot.coordinator.cli.learned_show import (
     refuse_unknown_cost,
     show,
 )
-from petrobot.coordinator.cli.loading import load_task, write_json
+from petrobot.coordinator.cli.loading import estimates_path, load_task, write_json
 from petrobot.services.host.command_line import number, probability
 
 # `learned task`: R, C and J of primitive tasks and of a whole task, from an estimates file through
@@ -237,11 +237,7 @@ def run(options: argparse.Namespace) -> int:
     try:
         if options.verb == "merge":
             return _merge(file, options)
-        if not options.file.exists():
-            raise CommandError(
-                2,
-                f"{options.file}: no such file; `petrobot run ... --learn {options.file}` makes it",
-            )
+        file = EstimatesFile(estimates_path(options.file))
         kept = file.read(options.plant)
         if options.plant is not None and options.plant not in kept.plants:
             known = ", ".join(sorted(map(said, kept.plants))) or "none"

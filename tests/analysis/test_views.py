@@ -19,6 +19,7 @@ from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.net.ends_net import EndsNet, ends_net
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.space import SearchLimits, explore
+from petrobot.coordinator.analysis.report import analyse
 from petrobot.coordinator.analysis.time.completion import Completion, completion
 from petrobot.coordinator.analysis.time.gspn import Chain
 from petrobot.coordinator.analysis.time.markov import visits_before
@@ -354,6 +355,19 @@ def test_a_preemption_of_higher_priority_also_takes_an_ended_run() -> None:
     task = replace(task, places=places, transitions={**task.transitions, "ok": locked})
     assert completed(task)[1].probability == pytest.approx(1.0)
     assert by_engine(task) == pytest.approx((1.0, completed(task)[1].mean))
+
+
+def test_a_task_that_never_completes_has_no_mean_time() -> None:
+    """The end needs a token that nothing gives: the forecast says 0 and fails on nothing."""
+    task = batch(jobs=1)
+    locked = replace(task.transitions["ok"], inputs=(taken("act", End.NORMAL), Input("key")))
+    places = {**task.places, "key": Place("key", Kind.CONTROL)}
+    task = replace(task, places=places, transitions={**task.transitions, "ok": locked})
+    found = analyse(task, view="gspn")
+    assert found.forecast is not None and found.forecast.completion_probability == 0.0
+    assert {w.completion_gain for w in found.forecast.worth} == {0.0}
+    assert "no run ever reaches `final`, so there is no mean time" in found.text()
+    assert "nan" not in found.text()
 
 
 def beside(*names: str, stopped: str = "", servers: int | None = None) -> Task:
