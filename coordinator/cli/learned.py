@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.learned_show import (
     asked_question,
+    measured_task,
     refuse_unknown_context,
     refuse_unknown_cost,
     show,
+    task_line,
 )
 from petrobot.coordinator.cli.loading import estimates_path, load_task, write_json
 from petrobot.services.host.command_line import number, probability
@@ -87,6 +89,7 @@ def figures(kept: FileContents, name: str, options: argparse.Namespace) -> dict[
         "J": _known(found.j.value),
         "J_interval": _interval(found.j),
         "mean_time": _known(found.forecast.done.mean),
+        "measured": measured_task(kept, task.name, options),
         "assumptions": list(found.forecast.view.assumptions),
     }
 
@@ -136,6 +139,8 @@ def _print(found: dict[str, Any]) -> None:
     ):
         number = _cell(found[key], found.get(f"{key}_interval"))
         console.print(f"  {key:10} {number:>8}  {words}", highlight=False)
+    if found["measured"] is not None:
+        console.print(f"  measured: {task_line(found['measured'])}", highlight=False)
     if found["scenario"] is not None and found["context"] is None:
         console.print(
             f"  The task is judged in the scenario that is hardest for it: {found['scenario']}.",
