@@ -385,16 +385,19 @@ class Analysis:
             f"{w.completion_gain:+.2e} complete, {w.goal_gain:+.3f} goals"
             for w in f.worth[:SHOWN]
         ]
+        time = (
+            f"  time {done.mean:.3f} s, standard deviation {done.variance**0.5:.3f} s; mean time "
+            f"back to the nominal flow at most {f.recovery_time:.3f} s; residual "
+            f"{done.residual:.1e}"
+        )
+        never = "  no run ever reaches `final`, so there is no mean time"
         return [
             "",
             f"forecast: P_complete {done.probability:.9f}, {goal}R_conj "
             f"{f.conjunctive_reliability:.6f}",
-            f"  time {done.mean:.3f} s, standard deviation {done.variance**0.5:.3f} s; mean time "
-            f"back to the nominal flow at most {f.recovery_time:.3f} s; residual "
-            f"{done.residual:.1e}",
+            time if done.probability else never,
             *_missing_lines(self),
-            "worth improving:",
-            *rows,
+            *(["worth improving:", *rows] if done.probability else []),
             *(f"approximated: {text}" for text in f.approximations),
             *(f"{source}: {', '.join(names)}" for source, names in f.view.numbers.items()),
             *(f"assumed: {text}" for text in f.view.assumptions),
@@ -610,12 +613,17 @@ def missing(forecast: Forecast) -> list[tuple[float, Marking, tuple[str, ...]]]:
 
 def _missing_lines(found: Analysis) -> list[str]:
     """Say where the forecast and the verdict "sound" part: what completes with a probability below
-    1 ends somewhere else."""
+    1 ends somewhere else, or the numbers leave out what is not sound."""
     sound = found.verdicts().get("sound")
-    if found.forecast is None or sound is None or not sound.holds:
+    if found.forecast is None or sound is None or sound.holds is None:
         return []
     short = 1.0 - found.forecast.completion_probability
-    if short <= CERTAIN:
+    if not sound.holds and short <= CERTAIN:
+        return [
+            "P_complete is 1, but the task is not sound: by its numbers, what leads to a state "
+            "without an end never happens (a status has the share 0, or a time comes first)"
+        ]
+    if short <= CERTAIN or not sound.holds:
         return []
     lines = [
         f"sound, but P_complete is {short:.3g} short of 1: an end can always be reached, and not "

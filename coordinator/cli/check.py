@@ -273,8 +273,11 @@ def _reasons(analysis: Analysis) -> list[str]:
             lines.append(f"        by: {path or '(initial marking)'}")
     if stuck:
         lines.append(f"{'warning':8}{', '.join(stuck)}: the task can get stuck")
-    unknown = [v.reason for v in analysis.verdicts().values() if v.holds is None]
-    lines += [f"{'warning':8}{reason}" for reason in dict.fromkeys(unknown)]
+    unknown = dict[str, list[str]]()
+    for name, verdict in analysis.verdicts().items():
+        if verdict.holds is None:
+            unknown.setdefault(verdict.reason, []).append(name.replace("_", " "))
+    lines += [f"{'warning':8}{', '.join(names)}: {why}" for why, names in unknown.items()]
     if mendable:
         reason = analysis.verdicts()[mendable[0]].reason
         lines.append(f"{'note':8}{', '.join(mendable)}: {reason}; yes if {MENDED}")

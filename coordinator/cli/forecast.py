@@ -22,6 +22,7 @@ from petrobot.services.host.command_line import whole
 from petrobot.services.host.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
+    from petrobot.coordinator.analysis.may_run import Cell
     from petrobot.coordinator.learning.learning import Estimates
     from petrobot.coordinator.studies.campaign.plan import CampaignPlan
     from petrobot.coordinator.studies.campaign.rows import TrialRow
@@ -128,12 +129,12 @@ def _forecast(options: argparse.Namespace) -> int:
     from petrobot.coordinator.studies.forecast.tables import forecast_text
 
     task = load_task(options.task)
-    trainings, estimates, about = _trainings(task, options.estimates, options.plant)
+    cell = cell_finder(options.services, options.task)(task)
+    trainings, estimates, about = _trainings(task, options.estimates, options.plant, cell)
     names = [name for name in options.regime.split(",") if name] or list(trainings)
     requests = {name: _request(task, trainings, name, options) for name in names}
     if options.services is not None:
         _refuse_other_cell(task, options.services, requests, about)
-    cell = cell_finder(options.services, options.task)(task)
     made = register(task, trainings, requests, about, estimates, cell)
     doubtful = any(said["doubts"] for said in made["regimes"].values())
     registered = options.out is not None and (options.doubtful or not doubtful)
@@ -185,10 +186,11 @@ def _refuse_other_cell(
 
 
 def _trainings(
-    task: Task, path: Path, plant: str | None
+    task: Task, path: Path, plant: str | None, cell: Cell | None
 ) -> tuple[dict[str, Training], Estimates, dict[str, Any]]:
-    """Return the training trials by regime, the estimates, and their source as the forecast names
-    it."""
+    """Training trials by regime in a cell, the estimates, and what the forecast says about where
+    they come from."""
+    from petrobot.coordinator.analysis.may_run import devices_of
     from petrobot.coordinator.learning.estimates_file import MOCK, SIMULATED
     from petrobot.coordinator.studies.campaign.observed import estimates_of
     from petrobot.coordinator.studies.campaign.plan import digest, read_manifest
@@ -204,7 +206,7 @@ def _trainings(
         known = kept.estimates
         _refuse_other_names(task, path, {key.primitive_task: [key.action] for key in known.tallies})
         return (
-            trainings_of(task, known),
+            trainings_of(task, known, devices_of(cell)),
             known,
             {
                 "estimates": {"file": path.name, "sha256": digest(path)},
@@ -218,7 +220,7 @@ def _trainings(
     _refuse_other_task(task, plan, path)
     rows = list(read_table(path / TABLE))
     _refuse_other_runs(task, rows, path)
-    found = by_regime(task, rows)
+    found = by_regime(task, rows, devices_of(cell))
     if not found:
         raise CommandError(2, f"{path}: the table holds no trial yet")
     about = {

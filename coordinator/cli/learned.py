@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Any
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.learned_show import (
     asked_question,
+    measured_task,
     refuse_unknown_context,
     refuse_unknown_cost,
     show,
+    task_line,
 )
-from petrobot.coordinator.cli.loading import load_task, write_json
+from petrobot.coordinator.cli.loading import estimates_path, load_task, write_json
 from petrobot.services.host.command_line import number, probability
 
 # `learned task`: R, C and J of primitive tasks and of a whole task, from an estimates file through
@@ -88,6 +90,7 @@ def figures(kept: FileContents, name: str, options: argparse.Namespace) -> dict[
         "J": _known(found.j.value),
         "J_interval": _interval(found.j),
         "mean_time": _known(found.forecast.done.mean),
+        "measured": measured_task(kept, task.name, options),
         "assumptions": list(found.forecast.view.assumptions),
     }
 
@@ -137,6 +140,8 @@ def _print(found: dict[str, Any]) -> None:
     ):
         number = _cell(found[key], found.get(f"{key}_interval"))
         console.print(f"  {key:10} {number:>8}  {words}", highlight=False)
+    if found["measured"] is not None:
+        console.print(f"  measured: {task_line(found['measured'])}", highlight=False)
     if found["scenario"] is not None and found["context"] is None:
         console.print(
             f"  The task is judged in the scenario that is hardest for it: {found['scenario']}.",
@@ -238,11 +243,7 @@ def run(options: argparse.Namespace) -> int:
     try:
         if options.verb == "merge":
             return _merge(file, options)
-        if not options.file.exists():
-            raise CommandError(
-                2,
-                f"{options.file}: no such file; `petrobot run ... --learn {options.file}` makes it",
-            )
+        file = EstimatesFile(estimates_path(options.file))
         kept = file.read(options.plant)
         if options.plant is not None and options.plant not in kept.plants:
             known = ", ".join(sorted(map(said, kept.plants))) or "none"

@@ -50,14 +50,51 @@ def show(kept: FileContents, tasks: Sequence[str], options: argparse.Namespace) 
             prior = kept.priors.get(main)
             about["prior"] = None if prior is None else {"source": prior[0], "trials": prior[1]}
             shown[task] = about
+        names = () if options.more else sorted({key.task for key in kept.estimates.trials})
+        whole = {name: measured_task(kept, name, options) for name in names}
     except ValueError as fault:
         raise CommandError(2, str(fault)) from fault
     if options.json:
-        write_json(options.json, {"file": str(options.file), "primitive_tasks": shown})
+        told = {"file": str(options.file), "primitive_tasks": shown, "tasks": whole}
+        write_json(options.json, told)
     if options.json != "-":
         for task, about in shown.items():
             _print(task, about, options)
+        for task, figures in whole.items():
+            if figures is not None:
+                print(f"{task}: {task_line(figures)}")
     return 0
+
+
+def measured_task(
+    kept: FileContents, name: str, options: argparse.Namespace
+) -> dict[str, Any] | None:
+    """Return R_conj, C and J of a whole task as its trials in the plant measured them, as plain
+    data; None if the file has none. C is that of the costs by which the runs were judged."""
+    from petrobot.coordinator.learning.objective import compare, task_figures
+
+    trials = kept.estimates.trials_of(name, options.context)
+    asked = {p: kept.question(p) for sums in trials.values() for p in sums.runs}
+    compared = {p: compare(kept.estimates.of(p, options.context), q) for p, q in asked.items()}
+    measures = {p: q.measure for p, q in asked.items()}
+    found = task_figures(trials, measures, compared, options.rho)
+    if found is not None and options.cost not in (None, *measures.values()):
+        found = replace(found, cost=None, rho=None, j=None)  # trials hold costs of one measure
+    return None if found is None else found.to_plain()
+
+
+def task_line(figures: Mapping[str, Any]) -> str:
+    """Return R_conj, C and J of measured trials in one line."""
+    parts = [
+        f"{name} {figures[name]:.3g} ({low:.3g} to {high:.3g})"
+        for name in ("R_conj", "C", "J")
+        if figures[name] is not None
+        for low, high in [figures[f"{name}_interval"]]
+    ]
+    rho = "" if figures["rho"] is None else f", rho {figures['rho']:.3g}"
+    n, where = figures["trials"], figures["context"]
+    trials = f"{n} trial{'s' * (n != 1)} of the task{f' ({where})' if where else ''}"
+    return f"{trials}: {', '.join(parts)}{rho}"
 
 
 def asked_question(kept: FileContents, task: str, options: argparse.Namespace) -> Question:

@@ -45,22 +45,21 @@ def add_estimates_argument(parser: argparse.ArgumentParser) -> None:
         "--estimates",
         metavar="FILE",
         type=Path,
-        help="an estimates file (`run --learn FILE` keeps it): its measurements replace the "
-        "estimates declared in the task",
+        help="an estimates file (`run --learn FILE` keeps it) or a campaign's folder: its "
+        "measurements replace the estimates declared in the task",
     )
 
 
 def measurements(file: Path | None) -> Callable[[Task, Cell | None], Measured] | None:
-    """Return how a task in a cell gets the measurements of an estimates file; None without a file.
-    Raises CommandError."""
+    """Return how a task in a cell gets the measurements of an estimates file, or of a campaign's
+    folder; None without a file. Raises CommandError."""
     if file is None:
         return None
     from petrobot.coordinator.analysis.may_run import devices_of
     from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, said
     from petrobot.coordinator.learning.propagation import measured_from
 
-    if not file.exists():
-        raise CommandError(2, f"{file}: no such file; `petrobot run ... --learn {file}` makes it")
+    file = estimates_path(file)
     try:
         kept = EstimatesFile(file).read()
     except EstimatesError as fault:
@@ -84,6 +83,21 @@ def measurements(file: Path | None) -> Callable[[Task, Cell | None], Measured] |
         return found
 
     return of
+
+
+def estimates_path(given: Path) -> Path:
+    """Return an estimates file, given by its path or by the campaign's folder that holds it. Raises
+    CommandError."""
+    from petrobot.coordinator.studies.campaign.observed import ESTIMATES
+
+    if given.is_dir():
+        if not (given / ESTIMATES).is_file():
+            text = f"{given}: this folder holds no {ESTIMATES}; give an estimates file, or a folder"
+            raise CommandError(2, f"{text} that `petrobot campaign --out` made")
+        return given / ESTIMATES
+    if not given.exists():
+        raise CommandError(2, f"{given}: no such file; `petrobot run ... --learn {given}` makes it")
+    return given
 
 
 def task_path(name: str) -> Path:

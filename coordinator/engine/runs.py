@@ -192,7 +192,7 @@ def _has_server(draft: Draft, place: str) -> bool:
         r.phase in ACTIVE or r.phase in (Phase.CHOOSING, Phase.WAITING) for r in draft.tokens[place]
     )
     served += sum(r.place == place and r.phase is Phase.STOPPING for r in draft.stopping.values())
-    return served < (draft.compiled.task.places[place].servers or 1)
+    return served < draft.compiled.task.places[place].most_active
 
 
 def _choose(draft: Draft, run: Run, alternatives: tuple[str, ...]) -> None:

@@ -11,6 +11,7 @@ that counts `none` is censored: it tells only that the run lasted at least so lo
 from __future__ import annotations
 
 from bisect import insort
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from hashlib import blake2b
@@ -502,3 +503,73 @@ class Firings:
 def merge_firings(one: Firings, other: Firings) -> Firings:
     """Return the firings of both sets of runs."""
     return Firings(one.fired + other.fired, one.waits.merged(other.waits))
+
+
+@dataclass(frozen=True, order=True, slots=True)
+class TrialsKey:
+    """Identifies the trials of a task in a context."""
+
+    task: str
+    context: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class TrialSums:
+    """Sums over trials of a whole task. Immutable; can be merged."""
+
+    n: int = 0
+    """Trials that began and are over."""
+    success: int = 0
+    """Trials that completed and in which every run was a SUCCESS."""
+    goals: int = 0
+    """Trials in which a goal transition fired."""
+    cost: Moments = EMPTY
+    """Cost of a trial: the sum over its runs, those of parallel branches included; only trials all
+    of whose runs reported one."""
+    good_cost: Moments = EMPTY
+    """The same of the trials in which every run was a SUCCESS."""
+    runs: Mapping[str, int] = field(default_factory=dict)
+    """Number of runs of each primitive task."""
+
+    def adding(
+        self, success: bool, goal: bool, cost: float | None, runs: Iterable[str]
+    ) -> TrialSums:
+        """Return the sums with one more trial; `cost`: None if a run did not report its own;
+        `runs`: the primitive task of each of its runs."""
+        counts = Counter(self.runs) + Counter(runs)
+        return TrialSums(
+            self.n + 1,
+            self.success + success,
+            self.goals + goal,
+            self.cost if cost is None else self.cost.adding(cost),
+            self.good_cost if cost is None or not success else self.good_cost.adding(cost),
+            dict(sorted(counts.items())),
+        )
+
+    def to_plain(self) -> list[Any]:
+        """Return the sums as plain data."""
+        costs = [self.cost.to_plain(), self.good_cost.to_plain()]
+        return [self.n, self.success, self.goals, *costs, dict(self.runs)]
+
+    @classmethod
+    def of_plain(cls, data: Sequence[Any]) -> TrialSums:
+        """Read what `to_plain` returned. Raises ValueError or TypeError."""
+        n = whole(data[0], "trials")
+        success, goals = whole(data[1], "successes", n), whole(data[2], "goals", n)
+        cost, good = Moments.of_plain(data[3]), Moments.of_plain(data[4])
+        whole(cost.n, "costs", n)
+        whole(good.n, "costs of successes", success)
+        runs = {str(name): whole(k, f"runs of {name}") for name, k in data[5].items()}
+        return cls(n, success, goals, cost, good, dict(sorted(runs.items())))
+
+
+def merge_trials(one: TrialSums, other: TrialSums) -> TrialSums:
+    """Return the sums of both sets of trials."""
+    return TrialSums(
+        one.n + other.n,
+        one.success + other.success,
+        one.goals + other.goals,
+        one.cost.merged(other.cost),
+        one.good_cost.merged(other.good_cost),
+        dict(sorted((Counter(one.runs) + Counter(other.runs)).items())),
+    )

@@ -26,8 +26,11 @@ from petrobot.coordinator.learning.estimate import (
     Firings,
     FiringsKey,
     TallyKey,
+    TrialsKey,
+    TrialSums,
     merge_firings,
     merge_tallies,
+    merge_trials,
 )
 from petrobot.coordinator.learning.estimates_tables import (
     APPLICATION,
@@ -38,8 +41,10 @@ from petrobot.coordinator.learning.estimates_tables import (
     PLANT,
     SCHEMA,
     TABLES,
+    TRIAL,
     add_flow,
     add_tally,
+    add_trials,
     correct_tally,
     count_session,
     fact,
@@ -62,6 +67,9 @@ from petrobot.coordinator.learning.estimates_tables import (
     take_selector,
     tally_of,
     tally_row,
+    trial_rows,
+    trials_of,
+    trials_row,
     use_plant,
 )
 from petrobot.coordinator.learning.learning import Estimates
@@ -176,6 +184,10 @@ class EstimatesFile:
             into = kept.plants.setdefault(places.get(row[0], ""), Estimates())
             at = FiringsKey(*row[1:4])
             into.flows[at] = merge_firings(into.flows.get(at, Firings()), flow_of(row))
+        for row in trial_rows(db):
+            into = kept.plants.setdefault(places.get(row[0], ""), Estimates())
+            of = TrialsKey(*row[1:3])
+            into.trials[of] = merge_trials(into.trials.get(of, TrialSums()), trials_of(row))
         for task, name, state in db.execute("SELECT primitive_task, name, state FROM selector"):
             kept.selectors[task, name] = json.loads(state)
             kept.plants.setdefault(name.partition(IN)[2], Estimates())
@@ -249,6 +261,8 @@ class EstimatesFile:
                 add_tally(db, origin, key, tally)
             for where, flow in gained.flows.items():
                 add_flow(db, origin, where, flow)
+            for of, sums in gained.trials.items():
+                add_trials(db, origin, of, sums)
             for task, state in selectors.items():
                 put_selector(db, task, state, selector_name(state["selector"], plant))
             for task, question in (asked or {}).items():
@@ -298,6 +312,8 @@ class EstimatesFile:
             flows = (
                 [] if "" in gone else [flow_row(origin, k, f) for k, f in estimates.flows.items()]
             )
+            whole = [trials_row(origin, k, t) for k, t in estimates.trials.items()]
+            take_later(db, "trial", [] if "" in gone else whole)
             before = db.total_changes
             take_later(db, "tally", tallies)
             take_later(db, "flow", flows)
@@ -355,6 +371,7 @@ class EstimatesFile:
                     given,
                 )
                 db.execute(f"DELETE FROM flow WHERE {there}", given)
+                db.execute(f"DELETE FROM trial WHERE {there}", given)
                 if plant is None or has_physics(plant):
                     db.execute("DELETE FROM about WHERE name = ?", (PHYSICS,))
 
@@ -376,13 +393,15 @@ class EstimatesFile:
                 name: db.execute(f"SELECT * FROM {name}").fetchall()
                 for name in ("tally", "flow", "selector")
             }
-            rows["question"] = questions(db)
+            rows["question"], rows["trial"] = questions(db), trial_rows(db)
             gone = db.execute("SELECT * FROM forgotten").fetchall()
             places, simulated = plants(db), _simulated(db)
             for row in rows["tally"]:
                 tally_of(row)
             for row in rows["flow"]:
                 flow_of(row)
+            for row in rows["trial"]:
+                trials_of(row)
             for _, _, _, *asked in rows["question"]:
                 question_of(asked)
             states = [(task, name, state_of(body)) for task, name, _, body in rows["selector"]]
@@ -391,7 +410,7 @@ class EstimatesFile:
                 self._note_physics(mine, physics)
             for own, place in places.items():
                 put_fact(mine, PLANT + own, place)
-            for table in ("tally", "flow", "question"):
+            for table in ("tally", "flow", "question", "trial"):
                 take_later(mine, table, rows[table])
             for task, name, state in states:
                 take_selector(mine, task, name, state, origin)
@@ -418,6 +437,7 @@ class EstimatesFile:
                     self._make(db)
                 elif schema(db) < SCHEMA:
                     migrate(db)
+                db.execute(TRIAL)
                 self._settle(db)
                 yield db
                 db.execute("COMMIT")

@@ -16,8 +16,11 @@ from petrobot.coordinator.learning.estimate import (
     FiringsKey,
     Tally,
     TallyKey,
+    TrialsKey,
+    TrialSums,
     merge_firings,
     merge_tallies,
+    merge_trials,
 )
 from petrobot.coordinator.learning.learning import corrected
 from petrobot.coordinator.learning.objective import Question
@@ -85,6 +88,12 @@ QUESTION = """
 CREATE TABLE question(origin TEXT, primitive_task TEXT, version INTEGER NOT NULL,
   cost TEXT NOT NULL, target REAL, rho REAL, PRIMARY KEY(origin, primitive_task)) WITHOUT ROWID
 """
+TRIAL = """
+CREATE TABLE IF NOT EXISTS trial(origin TEXT, task TEXT, context TEXT, version INTEGER NOT NULL,
+  body TEXT NOT NULL, PRIMARY KEY(origin, task, context)) WITHOUT ROWID
+"""
+"""Sums of trials of whole tasks. Files that are older than this table get it when something is
+written to them."""
 TABLES = f"""
 CREATE TABLE about(name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE tally(origin TEXT, primitive_task TEXT, action TEXT, context TEXT,
@@ -99,6 +108,7 @@ CREATE TABLE forgotten(origin TEXT, primitive_task TEXT,
   PRIMARY KEY(origin, primitive_task)) WITHOUT ROWID;
 CREATE TABLE mission(id TEXT PRIMARY KEY, records INTEGER NOT NULL) WITHOUT ROWID;
 {QUESTION};
+{TRIAL};
 """
 
 
@@ -221,6 +231,39 @@ def flow_row(origin: str, key: FiringsKey, flow: Firings) -> tuple[Any, ...]:
     return origin, key.task, key.transition, key.context, flow.fired, json.dumps(flow.to_plain())
 
 
+def add_trials(db: sqlite3.Connection, origin: str, key: TrialsKey, gained: TrialSums) -> None:
+    """Add trials to the sums of an origin."""
+    row = db.execute(
+        "SELECT * FROM trial WHERE origin = ? AND task = ? AND context = ?",
+        (origin, key.task, key.context),
+    ).fetchone()
+    sums = merge_trials(trials_of(row) if row else TrialSums(), gained)
+    db.execute("INSERT OR REPLACE INTO trial VALUES (?, ?, ?, ?, ?)", trials_row(origin, key, sums))
+
+
+def trials_row(origin: str, key: TrialsKey, sums: TrialSums) -> tuple[Any, ...]:
+    """Return a row of the table `trial`."""
+    body = json.dumps(sums.to_plain(), separators=(",", ":"))
+    return origin, key.task, key.context, sums.n, body
+
+
+def trial_rows(db: sqlite3.Connection) -> list[tuple[Any, ...]]:
+    """Return the rows of the table `trial`; none in a file that is older than it."""
+    there = db.execute("SELECT 1 FROM sqlite_master WHERE name = 'trial'").fetchone()
+    return db.execute("SELECT * FROM trial").fetchall() if there else []
+
+
+def trials_of(row: Sequence[Any]) -> TrialSums:
+    """Read a row of the table `trial`. Raises ValueError naming the row."""
+    _, task, context, version, body = row
+    try:
+        sums = TrialSums.of_plain(json.loads(body))
+        _agree(sums.n, version)
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError) as fault:
+        raise ValueError(f"trials of {task}{_in(context)}: {_said(fault)}") from fault
+    return sums
+
+
 def put_question(
     db: sqlite3.Connection, origin: str, task: str, asked: Question, version: int
 ) -> None:
@@ -292,6 +335,10 @@ def forget(db: sqlite3.Connection) -> None:
         "DELETE FROM flow WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = flow.origin "
         "AND f.primitive_task = '')"
     )
+    db.execute(
+        "DELETE FROM trial WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = trial.origin "
+        "AND f.primitive_task = '')"
+    )
     gone = {origin for (origin,) in db.execute("SELECT DISTINCT origin FROM forgotten")}
     others = db.execute(
         "SELECT name, value FROM about WHERE substr(name, 1, ?) = ?", (len(ORIGIN_OF), ORIGIN_OF)
@@ -307,6 +354,7 @@ KEYS = {
     "tally": "origin, primitive_task, action, context",
     "flow": "origin, task, transition_name, context",
     "question": "origin, primitive_task",
+    "trial": "origin, task, context",
 }
 """Primary keys of the tables whose rows have a version."""
 

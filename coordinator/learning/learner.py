@@ -29,8 +29,16 @@ from petrobot.coordinator.engine.state import Phase
 from petrobot.coordinator.engine.stimuli import Chosen, RunEnded, Stimulus
 from petrobot.coordinator.learning.estimate import COUNT, Observation
 from petrobot.coordinator.learning.learning import Learning
-from petrobot.coordinator.learning.records import Choice, Correction, Passage, Record, RunEnd
-from petrobot.coordinator.learning.selectors import TASK, verdicts_of_task
+from petrobot.coordinator.learning.records import (
+    Choice,
+    Correction,
+    Passage,
+    Record,
+    RunEnd,
+    TrialEnd,
+)
+from petrobot.coordinator.learning.selectors import TASK, cost_of, verdicts_of_task
+from petrobot.coordinator.learning.statistics import added
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.task import Status, Task
 from petrobot.coordinator.task.conditions import ConditionError, ConditionFault, Expression
@@ -118,7 +126,11 @@ class _Trial:
     goals: int = 0
     met: bool | None = None
     """The verdict; None while there is none."""
+    back: bool = False
+    """Every token is back."""
     seconds: float = 0.0
+    context: str = ""
+    """The context in which it began."""
     runs: list[tuple[str, str, str, Observation]] = field(default_factory=list)
     """Primitive task, action, context and end of each run that served it."""
 
@@ -214,7 +226,7 @@ class LearningSelector(FirstAlternative):
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Remember the context of a choice, and what a run's result contains beside its status."""
         if self._trial is None and self._own is None:
-            self._trial = _Trial(now)
+            self._trial = _Trial(now, context=self.context)
         if isinstance(stimulus, Chosen):
             self._choice(now, stimulus)
         elif isinstance(stimulus, RunEnded):
@@ -331,7 +343,9 @@ class LearningSelector(FirstAlternative):
         if own is not None and fired.after[own] < fired.before[own]:
             if trial is not None and trial.met is None and trial.goals:
                 self._judge(now, trial, True)  # otherwise nobody can say whether it met the goal
-            self._trial = trial = _Trial(now)
+            if trial is not None:  # the task could take the next token, so this one is completed
+                self._count(trial, True)
+            self._trial = trial = _Trial(now, context=self.context)
         if trial is None:
             return
         trial.goals += fired.transition in self._goals
@@ -339,16 +353,29 @@ class LearningSelector(FirstAlternative):
         if own is not None and trial.met is None:
             back = fired.after[:own] + fired.after[own + 1 :]
             if back == initial[:own] + initial[own + 1 :]:
+                trial.back = True
                 self._judge(now, trial, trial.goals > 0 or not self._goals)
 
     def _finished(self, now: float, finished: Finished) -> None:
         """Judge the last token if the task came to its end, or if the goal was met before it was
         given up. What was given up otherwise is censored."""
         trial = self._trial
-        if trial is None or trial.met is not None:
+        if trial is None:
             return
-        if finished.status is Status.SUCCESS or trial.goals:
+        completed = finished.status is Status.SUCCESS or (self._own is not None and trial.back)
+        if trial.met is None and (finished.status is Status.SUCCESS or trial.goals):
             self._judge(now, trial, trial.goals > 0 or not self._goals)
+        self._count(trial, completed)
+
+    def _count(self, trial: _Trial, completed: bool) -> None:
+        """Record what a trial of the task came to, as campaigns count it."""
+        ends = [end for *_, end in trial.runs]
+        success = completed and all(end.status in (Status.SUCCESS, None) for end in ends)
+        costs = [cost_of(e, self.learning.question(name).measure) for name, _, _, e in trial.runs]
+        cost = added(costs)
+        runs = tuple(name for name, *_ in trial.runs)
+        told = trial.context, success, trial.goals > 0, None if cost != cost else cost
+        self._note(TrialEnd(*told, runs))
 
     def _judge(self, now: float, trial: _Trial, met: bool) -> None:
         trial.met, trial.seconds = met, round(max(0.0, now - trial.begun), 6)
@@ -379,9 +406,17 @@ class LearningSelector(FirstAlternative):
             return self._declared.get(record.action, 0.0) * used.get(COUNT, 1.0)
         return None if result is None else result.cpu_seconds
 
+    def _replace(self, was: Observation, status: Status) -> None:
+        """Let a run of the trial that is not counted yet have the status of its verdict."""
+        for i, run in enumerate(self._trial.runs if self._trial is not None else ()):
+            if run[3] is was:
+                assert self._trial is not None
+                self._trial.runs[i] = (*run[:3], replace(was, status=status))
+
     def _corrected(self, corrected: Corrected) -> None:
         end, trials = self._deferred.pop(corrected.run, (None, 0))
         if end is not None:
+            self._replace(end.outcome, corrected.status)
             what = (end.primitive_task, end.action, end.context, end.outcome)
             age = self._trials[end.primitive_task, end.context] - trials
             self._note(Correction(*what, corrected.status, corrected.cause, age))

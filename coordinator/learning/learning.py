@@ -21,8 +21,11 @@ from petrobot.coordinator.learning.estimate import (
     FiringsKey,
     Tally,
     TallyKey,
+    TrialsKey,
+    TrialSums,
     merge_firings,
     merge_tallies,
+    merge_trials,
 )
 from petrobot.coordinator.learning.objective import Comparison, Question, compare
 from petrobot.coordinator.learning.records import (
@@ -32,6 +35,7 @@ from petrobot.coordinator.learning.records import (
     Passage,
     Record,
     RunEnd,
+    TrialEnd,
 )
 from petrobot.coordinator.learning.selectors import ACTION, DEFAULT, TASK, RuleSelector, make
 from petrobot.coordinator.task import Task
@@ -47,11 +51,12 @@ def corrected(tally: Tally, record: Correction) -> Tally:
 
 @dataclass
 class Estimates:
-    """Tallies and firings from one source: the file of a machine, or what one session has
-    gained."""
+    """Tallies, firings and sums of trials from one source: the file of a machine, or what one
+    session has gained."""
 
     tallies: dict[TallyKey, Tally] = field(default_factory=dict)
     flows: dict[FiringsKey, Firings] = field(default_factory=dict)
+    trials: dict[TrialsKey, TrialSums] = field(default_factory=dict)
 
     def merged(self, other: Estimates) -> Estimates:
         """Return the estimates of both sets of runs."""
@@ -66,7 +71,16 @@ class Estimates:
                 k: merge_firings(self.flows.get(k, Firings()), other.flows.get(k, Firings()))
                 for k in keys
             },
+            {
+                k: merge_trials(self.trials.get(k, TrialSums()), other.trials.get(k, TrialSums()))
+                for k in sorted({*self.trials, *other.trials})
+            },
         )
+
+    def trials_of(self, task: str, context: str | None = None) -> dict[str, TrialSums]:
+        """Return the sums of a task's trials by context (only the given context, if any)."""
+        known = sorted(self.trials.items())
+        return {k.context: t for k, t in known if k.task == task and context in (None, k.context)}
 
     def tally(self, key: TallyKey) -> Tally:
         """Return what is known of an action in a context; an empty tally if nothing is."""
@@ -98,6 +112,10 @@ class Estimates:
         elif isinstance(record, Passage):
             where = FiringsKey(task, record.transition, record.context)
             self.flows[where] = self.flows.get(where, Firings()).adding(record.waited)
+        elif isinstance(record, TrialEnd):
+            of = TrialsKey(task, record.context)
+            told = record.success, record.goal, record.cost, record.runs
+            self.trials[of] = self.trials.get(of, TrialSums()).adding(*told)
 
 
 class Learning:
@@ -162,7 +180,7 @@ class Learning:
         self._select(record)
 
     def _select(self, record: Record) -> None:
-        if isinstance(record, Passage):
+        if isinstance(record, Passage | TrialEnd):
             return
         joint = self.joint
         if joint is not None and isinstance(record, Credit) and record.beside:

@@ -16,9 +16,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
-from math import inf, isnan, nan
+from math import inf, isfinite, isnan, nan, sqrt
+from typing import Any
 
-from petrobot.coordinator.learning.estimate import Tally, merge_tallies
+from petrobot.coordinator.learning.estimate import Tally, TrialSums, merge_tallies
 from petrobot.coordinator.learning.statistics import (
     joined,
     lowest_share,
@@ -353,3 +354,73 @@ def reliability_for(figures: Iterable[Figures], budget: float) -> Figures | None
     """Return the most reliable action whose cost is within the budget; None if none is."""
     payable = [f for f in figures if f.cost <= budget and not isnan(f.effective)]
     return max(payable, key=lambda f: (f.effective, -f.cost), default=None)
+
+
+# --- the whole task ---
+
+
+@dataclass(frozen=True, slots=True)
+class TaskFigures:
+    """R, C and J of a whole task as its trials measured them. A number is followed by the bounds of
+    its interval. C, rho and J are None if they are not known."""
+
+    context: str
+    """The one in which R is lowest."""
+    trials: int
+    """Trials there."""
+    reliability: tuple[float, float, float]
+    """R_conj: the trial completed and every run was a SUCCESS."""
+    cost: tuple[float, float, float] | None = None
+    """Expected cost of a trial, the sum over its runs."""
+    rho: float | None = None
+    j: tuple[float, float, float] | None = None
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return plain data for the results of commands."""
+        names = {"R_conj": self.reliability, "C": self.cost, "J": self.j}
+        found: dict[str, Any] = {"context": self.context, "trials": self.trials}
+        for name, number in names.items():
+            found[name] = None if number is None else round(number[0], 6)
+            found[f"{name}_interval"] = number and [round(x, 6) for x in number[1:]]
+        return found | {"rho": None if self.rho is None else round(self.rho, 9)}
+
+
+def task_figures(
+    trials: Mapping[str, TrialSums],
+    measures: Mapping[str, str],
+    compared: Mapping[str, Comparison],
+    rho: float | None = None,
+) -> TaskFigures | None:
+    """Return R_conj, C and J of a whole task, as its trials measured them by context; None without
+    trials.
+
+    The definition is that of `learned task`, which composes them from the actions' estimates: over
+    several contexts the task is judged in the one in which its R_conj is lowest, C is the expected
+    cost of a trial there, and rho is the given one, else 1 / C with the alternatives that cost
+    most. (Composed, C of an action is that of the hardest context that meets its target, if it has
+    one; trials cannot be taken apart so.) C and J are None if the primitive tasks measure different
+    costs, or if not all trials reported theirs. `measures` and `compared`: by primitive task, its
+    cost measure and the comparison of its actions.
+    """
+    begun = {context: sums for context, sums in trials.items() if sums.n}
+    if not begun:
+        return None
+    context = min(begun, key=lambda name: (begun[name].success / begun[name].n, name))
+    hardest = begun[context]
+    n, r, cost = hardest.n, hardest.success / hardest.n, hardest.cost
+    bounds = lowest_share([(one.success, one.n) for one in begun.values()])
+    found = TaskFigures(context, n, (r, *bounds))
+    if len({measures[name] for name in hardest.runs}) != 1 or cost.n < n or n < 2:
+        return found
+    largest = sum(
+        k / n * max((f.cost for f in compared[name].figures if isfinite(f.cost)), default=0.0)
+        for name, k in hardest.runs.items()
+    )
+    weight = rho if rho is not None else 1.0 / largest if largest > 0 else 0.0
+    # the cost in the context that happens to be the hardest of m: at level 1 - 0.05 / m
+    c = (cost.mean, *mean_interval(cost, 1.0 - 0.05 / len(begun)))
+    # correlation of success and cost within a trial: they come from the same trials
+    spread = sqrt(r * (1.0 - r) * cost.m2 / n)
+    joint = r * (hardest.good_cost.mean - cost.mean) / spread if spread > 0 else 0.0
+    below, above = objective_interval((r, *bounds), c, weight, joint)
+    return replace(found, cost=c, rho=weight, j=(objective(r, cost.mean, weight), below, above))

@@ -1,5 +1,5 @@
 """The records that a task learns from: choices, ends of runs, corrected verdicts, verdicts of the
-task on choices, and firings; as plain data and back."""
+task on choices, firings, and ends of trials; as plain data and back."""
 
 from __future__ import annotations
 
@@ -70,7 +70,21 @@ class Passage:
     events."""
 
 
-Record = Choice | RunEnd | Correction | Credit | Passage
+@dataclass(frozen=True, slots=True)
+class TrialEnd:
+    """A trial of the task is over."""
+
+    context: str
+    success: bool
+    """It completed, and every run was a SUCCESS."""
+    goal: bool
+    cost: float | None
+    """The sum over its runs; None if one of them reported none."""
+    runs: tuple[str, ...]
+    """The primitive task of each run."""
+
+
+Record = Choice | RunEnd | Correction | Credit | Passage | TrialEnd
 
 
 def to_plain(record: Record) -> dict[str, Any]:
@@ -81,6 +95,15 @@ def to_plain(record: Record) -> dict[str, Any]:
             "transition": record.transition,
             "context": record.context,
             "waited": record.waited,
+        }
+    if isinstance(record, TrialEnd):
+        return {
+            "kind": "Trial",
+            "context": record.context,
+            "success": record.success,
+            "goal": record.goal,
+            "cost": record.cost,
+            "runs": list(record.runs),
         }
     about = {
         "primitive_task": record.primitive_task,
@@ -103,6 +126,10 @@ def of_plain(data: Mapping[str, Any]) -> Record:
     kind = data["kind"]
     if kind == "Passage":
         return Passage(str(data["transition"]), str(data["context"]), data["waited"])
+    if kind == "Trial":
+        runs = tuple(map(str, data["runs"]))
+        told = bool(data["success"]), bool(data["goal"]), data["cost"]
+        return TrialEnd(str(data["context"]), *told, runs)
     about = (str(data["primitive_task"]), str(data["action"]), str(data["context"]))
     if kind == "Choice":
         return Choice(*about)
@@ -114,7 +141,8 @@ def of_plain(data: Mapping[str, Any]) -> Record:
     if kind == "Correction":
         verdict = (Status(data["status"]), str(data["cause"]), int(data.get("age", 0)))
         return Correction(*about, _observed(data["was"]), *verdict)
-    raise ValueError(f"kind: expected Choice, End, Correction, Credit or Passage, got {kind!r}")
+    known = "Choice, End, Correction, Credit, Passage or Trial"
+    raise ValueError(f"kind: expected {known}, got {kind!r}")
 
 
 def _observation(seen: Observation) -> dict[str, Any]:

@@ -173,8 +173,7 @@ class Place:
     out: Mapping[str, str] = field(default_factory=dict)
     """Action place: which value of the result goes to which variable."""
     servers: int | None = None
-    """Action place: how many runs go on at once, further tokens queue; None: one, and a second
-    token is a fault."""
+    """Action place: as the file says it; None: one run at a time, and a second token is a fault."""
     tries: int = 1
     """Action place: largest number of runs for one token, as long as each ends in ERROR."""
     retry_unknown: bool = False
@@ -198,6 +197,11 @@ class Place:
     label: str = ""
     x: float | None = None
     y: float | None = None
+
+    @property
+    def most_active(self) -> int:
+        """Action place: the most runs that are active at once; further tokens queue."""
+        return self.servers or 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -140,6 +140,31 @@ STUCK: dict[str, Case] = {
         ("has a false condition (n < 3)", "has a false condition (n > 3)"),
         more={"variables": {"n": 0}, "out": {"look": {"n": "n"}}},
     ),
+    "a branch of a join is lost while idle resources could begin again": Case(
+        "go=1 arm~=1 camera~=1 move! look! l r done",
+        {
+            "fork": {"in": "go arm camera", "out": "move look"},
+            "moved": {"in": "move:normal", "out": "l arm"},
+            "failed": {"in": "move:error", "out": "r arm"},
+            "seen": {"in": "look:normal", "out": "r camera"},
+            "unseen": {"in": "look:error", "out": "r camera"},
+            "join": {"in": "l r", "out": "done"},
+        },
+        "done == 1 and arm == 1 and camera == 1 and l == 0 and r == 0",
+        ("join needs l, which is empty: only `moved` can fill it, but `failed` took move",),
+    ),
+    "an error branch forgets what the end asks for": Case(
+        "parts=2 arm~=1 grasp! drop! boxes",
+        {
+            "next": {"in": "parts arm", "out": "grasp"},
+            "got": {"in": "grasp:normal", "out": "drop"},
+            "lost": {"in": "grasp:error", "out": "arm"},
+            "dropped": {"in": "drop:normal", "out": "arm boxes"},
+            "fallen": {"in": "drop:error", "out": "arm boxes"},
+        },
+        "parts == 0 and arm == 1 and boxes == 2",
+        ("boxes == 2 (it holds 0: only `dropped`, `fallen` can fill it, but `lost` took grasp)",),
+    ),
     "a capacity bars the way for good": Case(
         "go=2 look! box/1",
         {
@@ -148,7 +173,7 @@ STUCK: dict[str, Case] = {
             "fail": {"in": "look:error", "out": "go"},
         },
         "go == 0 and look == 0",
-        ("store is barred by box (capacity 1), which holds 1",),
+        ("store is barred by box (capacity 1), which holds 1, and no transition takes any out of",),
     ),
 }
 
@@ -279,6 +304,44 @@ def test_a_branch_that_can_never_fire_is_reported_with_its_reason() -> None:
     verdict = judged(task).quasi_live
     assert verdict.holds is False
     assert verdict.reason == "never can never fire: whenever the engine rests, it needs 2 of bin"
+
+
+def test_branches_that_wait_for_each_other_are_told_by_the_token_that_is_missing() -> None:
+    task = make_task(
+        "go=1 act! sort! done bin",
+        {
+            "begin": {"in": "go", "out": "act"},
+            "good": {"in": "act:normal", "out": "done"},
+            "bad": {"in": "act:error", "out": "done"},
+            "special": {"in": "act:normal bin", "out": "sort", "priority": 1},
+            "sorted": {"in": "sort:normal", "out": "bin done"},
+            "lost": {"in": "sort:error", "out": "bin done"},
+        },
+        final="done == 1",
+    )
+    reason = judged(task).quasi_live.reason
+    assert reason == (
+        "special can never fire: it needs bin, which only `sorted`, `lost` can fill; and so "
+        "neither can sorted, lost"
+    )
+
+
+def test_a_forecast_that_is_certain_of_a_task_that_is_not_sound_says_so() -> None:
+    """The estimates know no failure, for which the task has no way."""
+    task = make_task(
+        "go=1 act! done",
+        {
+            "begin": {"in": "go", "out": "act"},
+            "good": {"in": "act:normal", "out": "done", "when": "act.status == 'success'"},
+            "bad": {"in": "act:error", "out": "done"},
+        },
+        final="done == 1",
+    )
+    known = {Status.SUCCESS: Estimate(0.9, 1.0), Status.ERROR: Estimate(0.1, 1.0)}
+    primitives = {n: replace(p, estimates=known) for n, p in task.primitive_tasks.items()}
+    found = analyse(replace(task, primitive_tasks=primitives), view="gspn")
+    assert not found.verdicts()["sound"].holds
+    assert "P_complete is 1, but the task is not sound" in found.text()
 
 
 def test_endless_firing_is_reported() -> None:

@@ -10,18 +10,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from petrobot.coordinator.analysis.execution.chain import chain_of
 from petrobot.coordinator.analysis.execution.progress import progress_of
 from petrobot.coordinator.analysis.formats.netfile import NetFileError
+from petrobot.coordinator.analysis.net.ends_net import EndsNet, ends_net
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.space import SearchLimits, explore
+from petrobot.coordinator.analysis.report import analyse
 from petrobot.coordinator.analysis.time.completion import Completion, completion
 from petrobot.coordinator.analysis.time.gspn import Chain
 from petrobot.coordinator.analysis.time.markov import visits_before
 from petrobot.coordinator.analysis.time.measures import read_measure, value_of
+from petrobot.coordinator.analysis.time.simulate import simulate
 from petrobot.coordinator.analysis.time.stochastic import (
     Measured,
     NoEstimate,
@@ -48,9 +51,14 @@ from petrobot.coordinator.task import (
     Status,
     Task,
     Transition,
+    Variable,
+    VariableType,
 )
 from petrobot.coordinator.task.conditions import parse
 from petrobot.coordinator.task.file import load
+from petrobot.coordinator.task.net import Marking, Net
+from tests.analysis.test_execution_graph import COMMON
+from tests.engine.test_properties import tasks as any_tasks
 
 SHIPPED = sorted((Path(__file__).parents[2] / "coordinator" / "tasks").glob("*.toml"))
 EXPONENTIAL = {
@@ -270,6 +278,98 @@ def test_servers_run_in_parallel_and_other_runs_queue() -> None:
     assert [mean(k) for k in (1, 2, 3)] == pytest.approx([3.0, 2.0, 1 + 1 / 2 + 1 / 3])
 
 
+def batch(*moves: Transition, jobs: int = 3, **more: Any) -> Task:
+    """Jobs that all enter the action place at once; each run takes 1 s on average."""
+    steps = action("act", {Status.SUCCESS: Estimate(1.0, 1.0)}, **more)
+    return task_of(
+        [steps],
+        [Place("jobs", Kind.CONTROL, jobs), Place("done", Kind.CONTROL)],
+        [
+            Transition("go", (Input("jobs", jobs),), (Output("act", jobs),)),
+            Transition("ok", (taken("act", End.NORMAL),), (Output("done"),)),
+            *moves,
+        ],
+        f"done == {jobs}",
+        events={"bell": Event("bell", Scope.EXTERNAL, EventMemory.PULSE, mean_wait=2.0)},
+    )
+
+
+def by_engine(task: Task) -> tuple[float, float]:
+    """Return the probability of `final` and the mean time (s) by the chain on the execution
+    graph."""
+    found = progress_of(OrdinaryView(task), 20_000, None, {})
+    h, y = chain_of(found.x)._reach(found.x.final)
+    return float(h[0]), float(y[0] / h[0])
+
+
+def test_without_servers_one_run_is_active_and_further_tokens_queue() -> None:
+    for servers, expected in ((None, 3.0), (1, 3.0), (2, 0.5 + 0.5 + 1.0), (3, 11 / 6)):
+        task = batch(servers=servers)
+        assert completed(task)[1].mean == pytest.approx(expected), servers
+        assert by_engine(task)[1] == pytest.approx(expected), servers
+    gspn = stochastic_view(batch()).gspn
+    done = gspn.net.place_index["done"]
+    seen = simulate(
+        gspn, np.random.default_rng(1), replicas=400, goal=lambda m: m[done] == 3, confidence=0.9999
+    )
+    assert seen.time is not None and seen.time.covers(3.0)
+
+
+def test_a_preemption_takes_the_active_run_and_the_next_one_begins() -> None:
+    """Mean of the longest of three in a row, each of which the event may end: three waits of
+    1 / (1 + 1/2) s."""
+    bell = Transition(
+        "cut", (taken("act", End.PREEMPT, Counts.NONE),), (Output("done"),), events=("bell",)
+    )
+    for servers in (None, 1):
+        task = batch(bell, servers=servers)
+        assert completed(task)[1].mean == pytest.approx(3 / 1.5)
+        assert by_engine(task)[1] == pytest.approx(3 / 1.5)
+
+
+def test_a_preempted_run_whose_token_comes_back_draws_again() -> None:
+    again = Transition(
+        "again", (taken("act", End.PREEMPT, Counts.NONE),), (Output("act"),), events=("bell",)
+    )
+    task = batch(again, jobs=1)
+    steady = replace(task.primitive_tasks["act"], estimates={Status.SUCCESS: Estimate(1, 1.0, 0.5)})
+    task = replace(task, primitive_tasks={"act": steady})
+    rate = 4.0  # of each of four phases; the event comes at 0.5 per second and starts them again
+    kept = (rate / (rate + 0.5)) ** 4
+    assert completed(task)[1].mean == pytest.approx((1 - kept) / kept / 0.5)
+    assert by_engine(task)[1] == pytest.approx((1 - kept) / kept / 0.5)
+
+
+def test_a_preemption_of_higher_priority_also_takes_an_ended_run() -> None:
+    """The run ends and waits for `key`, which never comes; the event takes it as in the engine."""
+    cut = Transition(
+        "cut",
+        (taken("act", End.PREEMPT, Counts.NONE),),
+        (Output("done"),),
+        events=("bell",),
+        priority=1,
+    )
+    task = batch(cut, jobs=1)
+    locked = replace(task.transitions["ok"], inputs=(taken("act", End.NORMAL), Input("key")))
+    places = {**task.places, "key": Place("key", Kind.CONTROL)}
+    task = replace(task, places=places, transitions={**task.transitions, "ok": locked})
+    assert completed(task)[1].probability == pytest.approx(1.0)
+    assert by_engine(task) == pytest.approx((1.0, completed(task)[1].mean))
+
+
+def test_a_task_that_never_completes_has_no_mean_time() -> None:
+    """The end needs a token that nothing gives: the forecast says 0 and fails on nothing."""
+    task = batch(jobs=1)
+    locked = replace(task.transitions["ok"], inputs=(taken("act", End.NORMAL), Input("key")))
+    places = {**task.places, "key": Place("key", Kind.CONTROL)}
+    task = replace(task, places=places, transitions={**task.transitions, "ok": locked})
+    found = analyse(task, view="gspn")
+    assert found.forecast is not None and found.forecast.completion_probability == 0.0
+    assert {w.completion_gain for w in found.forecast.worth} == {0.0}
+    assert "no run ever reaches `final`, so there is no mean time" in found.text()
+    assert "nan" not in found.text()
+
+
 def beside(*names: str, stopped: str = "", servers: int | None = None) -> Task:
     """A run of mean 1, 2, 4, ... s in each place, which an event of mean 0.5 s begins. The event
     `bell` stops that of `stopped`; after an error the task never completes."""
@@ -354,7 +454,8 @@ def test_conditions_on_statuses_choose_their_branch_and_others_are_switches() ->
         "ok": replace(good, when=parse("seen")),
         "soso": replace(poor, when=parse("not seen")),
     }
-    free = replace(split, transitions=either)
+    seen = {"seen": Variable("seen", VariableType.BOOL, False)}
+    free = replace(split, transitions=either, variables=seen)
     view, done = completed(free)
     assert done.probability == pytest.approx(0.5) and any(
         "condition" in text for text in view.assumptions
@@ -379,8 +480,9 @@ def test_unknown_numbers_are_refused_with_a_remedy() -> None:
     stop = Transition(
         "stop", (taken("act", End.PREEMPT, Counts.NONE),), (Output("idle"),), events=("tick",)
     )
+    moves = {**several.transitions, "stop": stop}
     with pytest.raises(ValueError, match="one server for the forecast"):
-        stochastic_view(replace(several, transitions={**several.transitions, "stop": stop}))
+        stochastic_view(replace(several, transitions=moves, events=waits.events))
 
 
 @st.composite
@@ -453,3 +555,83 @@ def test_tokens_of_action_places_are_active_or_finished_runs(task: Task) -> None
             own = space.tokens(index[place.name])
             parts = sum(space.tokens(index[f"{place.name}.{s}"]) for s in ("going", *Status))
             assert (own == parts).all()
+
+
+def timed(task: Task) -> Task:
+    """The task with numbers, without the conditions that no view of markings keeps: those that
+    read more than the statuses of the runs that are taken."""
+
+    def kept(t: Transition) -> Transition:
+        own = {f"{a.place}.status" for a in t.inputs if a.end in (End.NORMAL, End.ERROR)}
+        return t if t.when is None or t.when.names <= own else replace(t, when=None)
+
+    primitives = {n: replace(p, estimates=EXPONENTIAL) for n, p in task.primitive_tasks.items()}
+    events = {n: replace(e, mean_wait=1.0) for n, e in task.events.items()}
+    moves = {n: kept(t) for n, t in task.transitions.items()}
+    return replace(task, primitive_tasks=primitives, events=events, transitions=moves)
+
+
+def parts_of_the_view(task: Task) -> list[tuple[str, ...]]:
+    """Return places of the stochastic view whose tokens the ends net has, too: those of each place,
+    of an action place those that are active, that ended normally and that ended with ERROR."""
+    found = list[tuple[str, ...]]()
+    for p in task.places.values():
+        normal, error = (f"{p.name}.success", f"{p.name}.failure"), (f"{p.name}.error",)
+        found += [(f"{p.name}.going",), normal, error] if p.kind is Kind.ACTION else [(p.name,)]
+    return found
+
+
+def parts_of_the_ends_net(n: EndsNet) -> list[tuple[str, ...]]:
+    """Return the same parts in the ends net."""
+    found = list[tuple[str, ...]]()
+    for p in n.task.places.values():
+        ends = n.ended.get(p.name, {}).items()
+        normal = tuple(label for kind, label in ends if kind[0] is not Status.ERROR)
+        error = tuple(label for kind, label in ends if kind[0] is Status.ERROR)
+        found += [(f"{p.name}.going",), normal, error] if p.kind is Kind.ACTION else [(p.name,)]
+    return found
+
+
+def held(net: Net, marking: Marking, parts: list[tuple[str, ...]]) -> tuple[int, ...]:
+    """Return the tokens of each part."""
+    return tuple(sum(marking[net.place_index[p]] for p in part) for part in parts)
+
+
+def view_is_within_the_ends_net(task: Task) -> bool:
+    """Compare the markings of both; return False if one of them is too large or not known."""
+    task = timed(task)
+    try:
+        view = stochastic_view(task, stages=1, timer_stages=1)
+    except ValueError as fault:
+        assert "one server" in str(fault)
+        return False
+    n = ends_net(task)
+    limits = SearchLimits(states=20_000)
+    ours, theirs = explore(view.gspn.net, limits=limits), explore(n.net, limits=limits)
+    if not ours.complete or not theirs.complete or n.left_out:
+        return False
+    parts, their_parts = parts_of_the_view(task), parts_of_the_ends_net(n)
+    allowed = {held(n.net, theirs.marking(i), their_parts) for i in range(len(theirs))}
+    for i in range(len(ours)):
+        marking = ours.marking(i)
+        assert held(ours.net, marking, parts) in allowed, ours.path(i)
+        tokens = dict(zip(ours.net.places, marking, strict=True))
+        for p in (p for p in task.places.values() if p.kind is Kind.ACTION):
+            name = p.name
+            stopped = tokens.get(f"{name}.preempted", 0)
+            active = tokens[f"{name}.going"] + stopped - tokens[f"{name}.begin"]
+            assert active <= p.most_active, ours.path(i)
+    return True
+
+
+@settings(COMMON, max_examples=60)
+@given(any_tasks())
+def test_the_stochastic_view_stays_within_the_ends_net(task: Task) -> None:
+    assume(view_is_within_the_ends_net(task))
+
+
+@pytest.mark.proof
+@settings(COMMON, max_examples=1000)
+@given(any_tasks())
+def test_the_stochastic_view_stays_within_the_ends_net_at_length(task: Task) -> None:
+    assume(view_is_within_the_ends_net(task))

@@ -119,6 +119,11 @@ def petrobot(
             "list.json is not a forecast: expected an object with schema and sha256",
         ),
         ("forecast work.toml --estimates .", "campaign.json: the key 'regimes' is missing"),
+        ("analyse work.toml --estimates .", "this folder holds no estimates.db; give an estimates"),
+        (
+            "learned show .",
+            "this folder holds no estimates.db; give an estimates file, or a folder",
+        ),
         (
             "campaign work.toml --learned nope",
             "not the result of a finished campaign: No such file or directory; give the folder of",

@@ -272,7 +272,7 @@ class Journal:
                         r for r in state.stopping.values() if r.place == name
                     ]
                     stuck = sum(r.phase == "stuck" for r in going)
-                    assert len(going) - stuck <= (place.servers or 1)
+                    assert len(going) - stuck <= place.most_active
         holders = [r for r in state.runs() if r.phase in ACTIVE and r.device and not r.at_once]
         holders += [r for r in state.stopping.values() if r.device and not r.at_once]
         assert max(Counter(r.device for r in holders).values(), default=0) <= 1, (

@@ -15,7 +15,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.learning.estimate import Firings, FiringsKey, Observation, TallyKey
+from petrobot.coordinator.learning.estimate import (
+    Firings,
+    FiringsKey,
+    Observation,
+    TallyKey,
+    TrialsKey,
+    TrialSums,
+)
 from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, FileContents
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
@@ -35,7 +42,11 @@ def gained(good: int, key: TallyKey = KEY, salt: str = "") -> Estimates:
     flow = Firings()
     for _ in range(good):
         flow = flow.adding(0.02)
-    return Estimates({key: tally}, {FiringsKey("sorting", "begin", "regime=A"): flow})
+    sums = TrialSums()
+    for i in range(good):
+        sums = sums.adding(i % 2 == 0, True, 0.1 * (i + 1), ["pick", "place"])
+    trials = {TrialsKey("sorting", "regime=A"): sums}
+    return Estimates({key: tally}, {FiringsKey("sorting", "begin", "regime=A"): flow}, trials)
 
 
 def file_of(path: Path, good: int, key: TallyKey = KEY) -> EstimatesFile:
@@ -49,7 +60,10 @@ def known(file: EstimatesFile) -> tuple[Any, Any]:
     """Return a file's estimates in a form that can be compared: everything except the order of
     sums."""
     kept = file.read()
-    tallies = {k: (t.counts, t.changes, t.sample) for k, t in kept.estimates.tallies.items()}
+    tallies: dict[Any, Any] = {
+        k: (t.counts, t.changes, t.sample) for k, t in kept.estimates.tallies.items()
+    }
+    tallies |= {k: (t.n, t.success, t.runs) for k, t in kept.estimates.trials.items()}
     return tallies, {k: f.fired for k, f in kept.estimates.flows.items()}
 
 
@@ -753,3 +767,25 @@ def test_what_was_reset_in_one_plant_stays_forgotten_in_a_merge(tmp_path: Path) 
     file.add(gained(3), {}, plant="mock")
     file.merge(other.path)
     assert runs_by_plant(file) == {"mock": 3, "simulated": 0}
+
+
+def test_a_file_without_trials_gets_them_when_something_is_added(tmp_path: Path) -> None:
+    """Files that are older than the table of trials are read, merged and continued."""
+    file = file_of(tmp_path / "old.db", 4)
+    db = sqlite3.connect(file.path)
+    db.execute("DROP TABLE trial")
+    db.commit()
+    db.close()
+    key = TrialsKey("sorting", "regime=A")
+    assert file.read().estimates.trials == {}
+    other = file_of(tmp_path / "new.db", 3)
+    other.merge(file.path)
+    assert other.read().estimates.trials[key].n == 3
+    file.add(gained(2), {})
+    assert file.read().estimates.trials[key].n == 2
+    db = sqlite3.connect(file.path)
+    db.execute("UPDATE trial SET version = 9")
+    db.commit()
+    db.close()
+    with pytest.raises(EstimatesError, match=r"trials of sorting .regime=A.: expected version 2"):
+        file.read()

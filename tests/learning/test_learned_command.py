@@ -437,6 +437,14 @@ def test_r_and_c_of_the_whole_task(cell: Path, capsys: pytest.CaptureFixture[str
     assert found["R_conj_interval"][0] < found["R_conj"] < found["R_conj_interval"][1]
     told = capsys.readouterr().out
     assert "every run a success" in told and "do not add: give --cost" in told
+    seen = found["measured"]
+    assert seen["trials"] == 30 and seen["R_conj"] == pytest.approx(found["R_conj"], abs=0.1)
+    assert seen["R_conj_interval"][0] < seen["R_conj"] < seen["R_conj_interval"][1]
+    assert seen["C"] is None and "measured: 30 trials of the task" in told
+    assert main(["learned", "show", "learned.db", "--json", "shown.json"]) == 0
+    shown = json.loads(Path("shown.json").read_text(encoding="utf-8"))
+    assert shown["tasks"] == {"sorting": seen}
+    assert "sorting: 30 trials of the task (regime=A): R_conj" in capsys.readouterr().out
     one = ["learned", "task", "learned.db", str(TASK_FILE), "--json", "task.json"]
     assert main([*one, "--cost", "wall", "--rho", "0.25"]) == 0
     same = json.loads(Path("task.json").read_text(encoding="utf-8"))
@@ -478,6 +486,10 @@ def test_a_run_that_was_saved_and_resumed_counts_once(tmp_path: Path) -> None:
     kept = EstimatesFile(path).read()
     for key, tally in one.learning.gained.tallies.items():
         assert kept.estimates.tally(key).counts == tally.counts
+    for of, sums in one.learning.gained.trials.items():
+        saved = kept.estimates.trials[of]
+        assert (saved.n, saved.success, saved.runs) == (sums.n, sums.success, sums.runs)
+        assert saved.cost.total == pytest.approx(sums.cost.total) and saved.n == 9
     assert kept.states("nikolic_fu_fast") == one.learning.state()
     assert directory(task).actions
     assert session_of(task, {"seed": 5}) is None

@@ -38,6 +38,10 @@ from petrobot.coordinator.operator.commands import Operation
 from petrobot.coordinator.run.journal import JournalWriter, read_journal
 from petrobot.coordinator.run.realtime import RealtimeMission
 from petrobot.coordinator.run.recording import JournalStore, replay
+from petrobot.coordinator.studies.campaign.block import costs
+from petrobot.coordinator.studies.campaign.observed import estimates_of
+from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.campaign.trials import TrialLog
 from petrobot.coordinator.task import Executed, Status, Task
 from tests.learning.cell import directory, run, scripts, sorting
 
@@ -70,6 +74,24 @@ def test_every_result_and_choice_is_recorded(task: Task) -> None:
     assert [
         of_plain(json.loads(json.dumps(to_plain(r)))) for r in selector.records
     ] == selector.records
+
+
+def test_trials_of_the_task_are_counted_as_campaigns_count_them(task: Task) -> None:
+    """One end of each trial, with the status and the cost that the observer of campaigns gives."""
+    selector = learner(task, "round_robin", seed=1)
+    cell, party = lockstep_cell(directory(task), Setting(task, {}, 12, 1, selector), scripts())
+    log = TrialLog(task, costs(task, directory(task)))
+    party.mission.executor.observers.append(log)
+    assert cell.run(lambda: party.over, 900_000)
+    rows = [TrialRow(t.k, "A", 0, t.k, 0, 0.0, t) for t in log.trials]
+    expected = estimates_of(task, rows, "").trials
+    found = selector.learning.gained.trials
+    assert list(found) == list(expected) and len(log.trials) == 12
+    for key, sums in expected.items():
+        assert (found[key].n, found[key].success, found[key].goals, found[key].runs) == (
+            sums.n, sums.success, sums.goals, sums.runs,
+        )  # fmt: skip
+        assert found[key].cost.total == pytest.approx(sums.cost.total)
 
 
 def test_costs_durations_waits_and_values(task: Task) -> None:

@@ -11,6 +11,7 @@ from petrobot.coordinator.analysis.execution.graph import ExecutionGraph
 from petrobot.coordinator.engine import Phase, State
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import Obstacle, obstacles
+from petrobot.coordinator.task import Kind
 from petrobot.coordinator.task.compiled_task import CompiledTransition
 from petrobot.coordinator.task.conditions import And, Compare, Expression, Literal, Name
 from petrobot.coordinator.task.conditions.language import Node
@@ -54,11 +55,13 @@ def explain(x: ExecutionGraph, state: int) -> str:
     firings = x.firings(state)
     waiting = [t for t in x.engine.compiled.transitions if _near(t, ended, draft.marking)]
     told = list[tuple[tuple[int, bool], str]]()
-    missed, spent = _asked(x, draft)
-    for t in waiting:
+    missed, spent, left = _asked(x, draft, firings)
+    for t in waiting if ended else [t for t in waiting if not _at_rest(draft, t)] or waiting:
         found = obstacles(draft, t)
-        if not ended and any(one.kind == "short" and one.place in spent for one in found):
-            continue  # `final` asks for this place to be empty, and it is
+        surplus = left.intersection(p for p, _ in t.needs)
+        short = {one.place for one in found if one.kind == "short"}
+        if not ended and not surplus and short & spent:
+            continue  # the end wants that place empty, and so it is
         if ended and all(_other_end(draft, one) for one in found):
             continue
         parts = [_cause(x, draft, firings, one) for one in found if not _other_end(draft, one)]
@@ -73,12 +76,14 @@ def explain(x: ExecutionGraph, state: int) -> str:
     return f"no transition takes what is left, and the end asks for {missed}"
 
 
-def _asked(x: ExecutionGraph, draft: Draft) -> tuple[str, set[int]]:
-    """Return in words which conditions of `final` and `final_error` do not hold, and the places
-    that `final` asks to be empty and that are empty."""
+def _asked(
+    x: ExecutionGraph, draft: Draft, firings: tuple[str, ...]
+) -> tuple[str, set[int], set[int]]:
+    """Return what of the designed ends does not hold, in words, the places that `final` wants
+    to be empty and that are, and the places with tokens that it does not want there."""
     task, index = x.engine.compiled.task, x.engine.compiled.net.place_index
     held = {name: draft.marking[p] for name, p in index.items()}
-    missed, spent = list[str](), set[int]()
+    missed, spent, left = list[str](), set[int](), set[int]()
     for node in _conjuncts(task.final.tree):
         if not (isinstance(node, Compare) and isinstance(node.left, Name)):
             missed += [str(task.final)] * (not Expression("", node).holds(held))
@@ -86,12 +91,15 @@ def _asked(x: ExecutionGraph, draft: Draft) -> tuple[str, set[int]]:
         name = node.left.name
         if not Expression("", node).holds(held):
             wanted = node.right.value if isinstance(node.right, Literal) else node.right
-            missed.append(f"{name} {node.sign} {wanted} (it holds {held[name]})")
+            why = "" if held[name] else f": {_fate(task.net, draft, firings, index[name])}"
+            missed.append(f"{name} {node.sign} {wanted} (it holds {held[name]}{why})")
+            if held[name] and Expression("", node).holds({**held, name: 0}):
+                left.add(index[name])
         elif not held[name]:
             spent.add(index[name])
     ends = [" and ".join(dict.fromkeys(missed))]
     ends += [str(task.final_error)] if task.final_error is not None else []
-    return ", or for ".join(ends), spent
+    return ", or for ".join(ends), spent, left
 
 
 def _conjuncts(node: Node) -> Iterator[Node]:
@@ -108,6 +116,15 @@ def _near(t: CompiledTransition, ended: set[str], marking: Sequence[int]) -> boo
     return any(marking[p] for p, _ in t.needs)
 
 
+def _at_rest(draft: Draft, t: CompiledTransition) -> bool:
+    """Whether all that is there for the transition are resources that nobody holds."""
+    net, places = draft.compiled.net, tuple(draft.compiled.task.places.values())
+    there = [p for p, _ in t.needs if draft.marking[p]]
+    return all(
+        places[p].kind is Kind.RESOURCE and draft.marking[p] == net.initial[p] for p in there
+    )
+
+
 def _other_end(draft: Draft, one: Obstacle) -> bool:
     """Return whether the transition is blocked only because the run there ended with another
     status."""
@@ -117,9 +134,14 @@ def _other_end(draft: Draft, one: Obstacle) -> bool:
 
 
 def _cause(x: ExecutionGraph, draft: Draft, firings: tuple[str, ...], one: Obstacle) -> str:
+    net = x.engine.compiled.net
+    if one.kind == "full" and one.place is not None:
+        changes = (change for some in net.compiled.changes for change in some)
+        emptied = any(p == one.place and gain < 0 for p, gain in changes)
+        return one.text if emptied else f"{one.text}, and no transition takes any out of it"
     if one.kind != "short" or one.place is None:
         return one.text
-    return f"{one.text}: {_fate(x.engine.compiled.net, draft, firings, one.place)}"
+    return f"{one.text}: {_fate(net, draft, firings, one.place)}"
 
 
 def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
@@ -129,8 +151,10 @@ def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
     order = [net.transition_index[name] for name in firings]
     last = max((i for i, t in enumerate(order) if change[t] < 0), default=None)
     back = ", ".join(f"`{net.transitions[t]}`" for t in givers)
+    if last is None and givers:
+        return f"only {back} can fill it{_elsewhere(net, order, givers)}"
     if last is None:
-        return f"only {back} can fill it" if givers else "nothing ever fills it"
+        return "nothing ever fills it"
     taker = f"taken by `{net.transitions[order[last]]}`"
     if not givers:
         return f"{taker}, and no transition returns it"
@@ -143,6 +167,21 @@ def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
         return f"{taker}, and nothing that follows it returns it"
     where = f"still held with {' and '.join(held)}" if held else f"to be returned by {back}"
     return f"{taker}, not returned by {names}; {where}" if movers else f"{taker}, {where}"
+
+
+def _elsewhere(net: Net, order: list[int], givers: list[int]) -> str:
+    """Return which firing took last what would have led to one of the givers of a place; empty if
+    none did."""
+    wanted, seen = set(givers), set[int]()
+    while wanted:
+        needed = {p for t in wanted for p, _ in net.consume[t] if not net.initial[p]} - seen
+        for t in reversed(order):
+            taken = [p for p, _ in net.consume[t] if p in needed]
+            if taken and t not in wanted:
+                return f", but `{net.transitions[t]}` took {net.places[taken[0]]}"
+        seen |= needed
+        wanted = {t for t, arcs in enumerate(net.produce) if any(p in needed for p, _ in arcs)}
+    return ""
 
 
 def _carried(net: Net, order: list[int]) -> tuple[list[int], set[int]]:

@@ -41,6 +41,7 @@ from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
 from petrobot.coordinator.analysis.time.stochastic import Measured, NoEstimate
 from petrobot.coordinator.engine import Engine, Policy
 from petrobot.coordinator.task import Kind
+from petrobot.coordinator.task.compiled import Arcs
 from petrobot.coordinator.task.compiled_task import CompiledTransition
 
 FAIR = "every awaited event comes at some time, and a run may always end in each of its ways"
@@ -268,41 +269,56 @@ class Progress:
             return PropertyVerdict(True, "every transition can fire", assumption=self._fair)
         if not self.x.complete:
             return self._unknown(f"not fired so far: {', '.join(t.name for t in idle)}")
-        roots = [t for t in idle if not self._fed_by(t, {u.index for u in idle})] or idle
-        told = [f"{t.name} can never fire: {self._never(t.index)}" for t in roots]
+        numbers = {t.index for t in idle}
+        roots = [t for t in idle if not self._fed_by(t, numbers, t.needs)]
+        # A ring of transitions that wait for each other is told by a token that it should begin
+        # with, not by a run.
+        roots = roots or [t for t in idle if self._fed_by(t, numbers, t.plain)] or idle
+        told = [f"{t.name} can never fire: {self._never(t, numbers)}" for t in roots]
         if others := [t.name for t in idle if t not in roots]:
             told.append(f"and so neither can {', '.join(others)}")
         return PropertyVerdict(False, "; ".join(told))
 
-    def _fed_by(self, t: CompiledTransition, idle: set[int]) -> bool:
-        """Return whether the transition needs a token that only transitions in `idle` produce."""
+    def _fed_by(self, t: CompiledTransition, idle: set[int], needs: Arcs) -> bool:
+        """Return whether the transition needs a token that only others in `idle` produce."""
         net = self.x.engine.compiled.net
-        for p, w in t.needs:
-            givers = {u for u, arcs in enumerate(net.produce) if p in dict(arcs)}
+        for p, w in needs:
+            givers = self._givers(p)
             if net.initial[p] < w and givers and givers <= idle - {t.index}:
                 return True
         return False
 
-    def _never(self, t: int) -> str:
-        """Return in words why a transition never fires: the first requirement that fails in every
-        state."""
+    def _givers(self, place: int) -> set[int]:
+        net = self.x.engine.compiled.net
+        return {t for t, arcs in enumerate(net.produce) if place in dict(arcs)}
+
+    def _never(self, t: CompiledTransition, idle: set[int]) -> str:
+        """Return why a transition never fires, in the words of the first thing that it lacks in
+        every state."""
         from petrobot.coordinator.engine.draft import Draft
         from petrobot.coordinator.engine.firing import obstacles
 
         compiled = self.x.engine.compiled
         lacking: list[set[str]] = []
         for state in self.x.states:
-            found = obstacles(Draft(compiled, state), compiled.transitions[t])
+            found = obstacles(Draft(compiled, state), t)
             lacking.append({_lack(one.kind, one.text) for one in found})
             if not found:
                 return (
                     "whenever its arcs allow it, its event or time does not come before others fire"
                 )
-        always = set.intersection(*lacking)
+        always, net, empty = set.intersection(*lacking), compiled.net, list[str]()
+        for p, w in t.plain:
+            givers = self._givers(p)
+            if net.initial[p] < w and givers <= idle:
+                names = ", ".join(f"`{net.transitions[u]}`" for u in sorted(givers))
+                own = f"only {names} can fill" if givers else "nothing ever fills"
+                empty.append(f"{net.places[p]}, which {own}")
+        if empty:
+            return f"it needs {' and '.join(empty)}"
         if always:
             return f"whenever the engine rests, it {' and '.join(sorted(always))}"
-        net = compiled.net
-        needs = ", ".join(net.places[p] for p, _ in compiled.transitions[t].needs)
+        needs = ", ".join(net.places[p] for p, _ in t.needs)
         return f"what it needs ({needs}) is never there together"
 
     # --- from mission to mission --------------------------------------------------------------
@@ -649,7 +665,7 @@ class Progress:
 
     def _yes(self, reason: str) -> PropertyVerdict:
         if not self.x.complete:
-            return self._unknown("none found so far")
+            return self._unknown("no fault found so far")
         return PropertyVerdict(True, reason, assumption=self._fair)
 
     def _no(self, reason: str, state: int) -> PropertyVerdict:

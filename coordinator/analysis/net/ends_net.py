@@ -345,7 +345,7 @@ class _Builder:
             raise TooManyCases(f"{x.name} has more than {CASES} cases")
         found = []
         for chosen in combinations_with_replacement(kinds, w):
-            if sum(bool(stays) for _, stays in chosen) > (self.task.places[p].servers or 1):
+            if sum(bool(stays) for _, stays in chosen) > self.task.places[p].most_active:
                 continue
             took, gave = Counter(label for label, _ in chosen), Counter[str]()
             for _, stays in chosen:
@@ -362,7 +362,7 @@ class _Builder:
         """Return what bars a case that stops runs: they hold their servers until they have
         stopped, so no more can be stopping than there are servers."""
         return {
-            f"{p}.stopping": (self.task.places[p].servers or 1) - gives[f"{p}.stopping"] + 1
+            f"{p}.stopping": self.task.places[p].most_active - gives[f"{p}.stopping"] + 1
             for p in self.engine.compiled.action_places
             if gives[f"{p}.stopping"]
         }

@@ -70,8 +70,11 @@ def reliability_slopes(done: Completion) -> dict[str, Slope]:
 
 
 def time_slopes(done: Completion) -> dict[str, Slope]:
-    """Return the derivatives of the mean time to completion (s), given completion."""
+    """Return the derivatives of the mean time to completion (s), given completion; all 0 for what
+    never completes."""
     chain, h, y = done.chain, done.h, done.y
+    if not done.probability:
+        return slopes_of(chain, np.zeros(len(chain.label)), 0.0)
     flow = _flow(done)
     transient = _transient(done)
     # y = s h + A y also changes through h, weighted with the time spent in each marking. A second

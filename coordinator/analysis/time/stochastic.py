@@ -9,24 +9,31 @@ A run first chooses its alternative (immediate, weight pi_a), then its status (i
 then takes a phase-type delay that belongs to this status (preselection). Preempting events race
 with the delay. What is left of a preempted run is flushed at once; a repeated run draws again.
 
+A place runs at most `Place.most_active` runs at once, as in the engine: where more tokens may come
+together, a run takes a token of `p.server`. Where place invariants exclude that, there is none.
+
 Where the cell is known, a token in `device d` is a run that holds the device d, and a run that has
 chosen its action waits until it is free. Devices that never have to be waited for are left out.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import combinations, product
+from itertools import combinations, combinations_with_replacement, product
 
-from petrobot.coordinator.analysis.net.structure import exclusive_places, place_semiflows
+from petrobot.coordinator.analysis.net.structure import (
+    exclusive_places,
+    place_bounds,
+    place_semiflows,
+)
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit, gamma_quantile
 from petrobot.coordinator.task import (
     End,
     Estimate,
-    Input,
     Kind,
     Place,
     Start,
@@ -34,8 +41,10 @@ from petrobot.coordinator.task import (
     Task,
     Transition,
 )
-from petrobot.coordinator.task.conditions import ConditionFault
+from petrobot.coordinator.task.compiled_task import ActionArc, compile_transitions
+from petrobot.coordinator.task.conditions.regions import can_hold
 from petrobot.coordinator.task.net import Marking, Net
+from petrobot.coordinator.task.validation import condition_domains
 
 FLUSH, CHOICE = 3_000_000, 2_000_000
 """Priorities of flushing and choosing, far above those of the task's transitions, which are TASK
@@ -86,20 +95,21 @@ def is_cause(transition: Transition) -> bool:
 
 
 def contended(task: Task, devices: Mapping[str, str]) -> frozenset[str]:
-    """Return the devices for which runs may have to wait for each other: one place has several
-    servers, or the place invariants do not exclude that two places are marked together. `devices`
-    gives the device of each action that has one."""
+    """Return the devices for which runs may have to wait for each other: the place invariants
+    exclude neither that several runs of one place are active, nor that two places are marked
+    together. `devices` gives the device of each action that has one."""
     if not devices:
         return frozenset()
     flat, net = task.flat, task.flat.net
+    flows = place_semiflows(net)
     users: dict[str, list[int]] = {}
-    for place in flat.places.values():
+    for place, bound in zip(flat.places.values(), place_bounds(net, flows), strict=True):
         if place.kind is Kind.ACTION:
             used = {devices.get(a, "") for a in task.primitive_task_of(place.name).alternatives}
+            most = place.most_active if bound is None else min(bound, place.most_active)
             for device in used - {""}:
-                own = net.place_index[place.name]
-                users.setdefault(device, []).extend([own] * (place.servers or 1))
-    never = exclusive_places(net, place_semiflows(net))
+                users.setdefault(device, []).extend([net.place_index[place.name]] * most)
+    never = exclusive_places(net, flows)
     return frozenset(
         device
         for device, places in users.items()
@@ -260,6 +270,14 @@ class _Derivation:
         self.sources: dict[str, str] = {}
         self.phases: dict[str, list[str]] = {}
         self.by: dict[tuple[str, str], str] = {}
+        self.compiled = compile_transitions(task)
+        self.domains = condition_domains(task)
+        self.queues = frozenset(
+            p.name
+            for p, bound in zip(task.places.values(), place_bounds(net), strict=True)
+            if p.kind is Kind.ACTION and (bound is None or bound > p.most_active)
+        )
+        """Action places where a token may have to wait for a server."""
         for device in sorted(self.contended):
             self.places[f"device {device}"] = 0
             self.assumptions.append(
@@ -326,8 +344,8 @@ class _Derivation:
         for suffix in ("begin", "going", *Status):
             self.places[f"{name}.{suffix}"] = 0
         self.places[f"{name}.begin"] = self.places[f"{name}.going"] = place.tokens
-        if place.servers is not None:
-            self.places[f"{name}.server"] = place.servers
+        if name in self.queues:
+            self.places[f"{name}.server"] = place.most_active
         self.possible[name], self.phases[name] = set(), []
         shared: dict[tuple[Status, PhaseType, str], list[tuple[str, float]]] = {}
         alternatives = self.numbers.alternatives(place)
@@ -352,7 +370,7 @@ class _Derivation:
             for t in self.task.transitions.values()
             for a in t.inputs
         )
-        if preempted and place.servers is not None and place.servers > 1:
+        if preempted and place.most_active > 1:
             raise ValueError(
                 f"places.{name}: it has {place.servers} servers and a preempting transition, but a "
                 "GSPN does not know which of its runs is the oldest; give the place one server for "
@@ -424,8 +442,8 @@ class _Derivation:
         return DECLARED
 
     def _choice(self, place: Place, action: str, chosen: float) -> None:
-        name, served = place.name, place.servers is not None
-        need = {f"{name}.begin": 1} | ({f"{name}.server": 1} if served else {})
+        name = place.name
+        need = {f"{name}.begin": 1, **self._server(name)}
         self.places[f"{name}.{action}"] = 0
         primitive = self.task.primitive_task_of(name)
         source = ""
@@ -500,25 +518,32 @@ class _Derivation:
                 self._timed(f"{stem}{i}", {f"{stem}{i}": 1}, {f"{stem}{i + 1}": 1}, rate, source)
             need = {f"{stem}{longest}": 1, f"{place.name}.going": 1}
             need |= {device: 1} if device else {}
-            give = {f"{place.name}.{status}": 1} | (
-                {f"{place.name}.server": 1} if place.servers is not None else {}
-            )
+            give = {f"{place.name}.{status}": 1, **self._server(place.name)}
             self._timed(f"{stem}{longest}", need, give, rate, source)
             entries += [(f"{stem}{longest - b.stages + 1}", b.probability) for b in branches]
         return entries
 
+    def _server(self, name: str) -> Weights:
+        """Return what a run of a place takes to begin and gives back when it ends."""
+        return {f"{name}.server": 1} if name in self.queues else {}
+
     def _flush(self, name: str) -> None:
-        """Remove what is left of a preempted run at once, and release its server and device."""
-        served = f"{name}.server" in self.places
-        give = {f"{name}.server": 1} if served else {}
+        """Remove what is left of a preempted run at once, and release its server and device. The
+        active run began first, so it goes before those that wait for a server."""
+        preempted = f"{name}.preempted"
+        self.places[preempted] = 0
         for p in self.phases[name]:
-            need = {p: 1} | ({self.held[p]: 1} if p in self.held else {})
-            self._immediate(f"flush {p}", need, dict(give), 1.0, FLUSH)
-            self.inhibit[f"flush {p}"] = {f"{name}.going": 1}
+            need = {p: 1, preempted: 1} | ({self.held[p]: 1} if p in self.held else {})
+            self._immediate(f"flush {p}", need, self._server(name), 1.0, FLUSH)
+        if name in self.queues:
+            begin = f"{name}.begin"
+            self._immediate(f"flush {begin}", {begin: 1, preempted: 1}, {}, 1.0, FLUSH - 1)
 
     # Transitions of the task.
 
     def _transition(self, t: Transition) -> None:
+        if self.compiled[self.task.net.transition_index[t.name]].never:
+            return
         cases = list(self._cases(t))
         for i, (need, give) in enumerate(cases):
             name = t.name if len(cases) == 1 else f"{t.name} {i + 1}"
@@ -538,9 +563,8 @@ class _Derivation:
                 for suffix in ("begin", "going"):
                     base_give[f"{output.place}.{suffix}"] = output.weight
         out = []
-        for combination in product(
-            *(self._takings(t, arc) for arc in t.inputs if arc.end is not None)
-        ):
+        actions = self.compiled[index].actions
+        for combination in product(*(self._takings(t, arc) for arc in actions)):
             taken = [(place, status) for place, status, _, _ in combination if status is not None]
             if not self._may_hold(t, dict(taken)):
                 continue
@@ -553,44 +577,44 @@ class _Derivation:
         return out
 
     def _takings(
-        self, t: Transition, arc: Input
+        self, t: Transition, arc: ActionArc
     ) -> list[tuple[str, Status | None, Weights, Weights]]:
         """Return how an arc may take its runs: (place, common status if any, taken, given back)."""
-        p, w = arc.place, arc.weight
-        if arc.end is End.PREEMPT:
-            cause = {self.by[p, t.name]: 1} if (p, t.name) in self.by else {}
-            return [(p, None, {f"{p}.going": w, **cause}, {})]
+        p, w, going = arc.name, arc.weight, f"{arc.name}.going"
         if arc.end is End.GOING:
-            return [(p, None, {f"{p}.going": w}, {f"{p}.going": w})]
-        if arc.end is End.ERROR:
-            return (
-                [(p, Status.ERROR, {f"{p}.{Status.ERROR}": w}, {})]
-                if Status.ERROR in self.possible[p]
-                else []
-            )
-        normal = [s for s in (Status.SUCCESS, Status.FAILURE) if s in self.possible[p]]
-        out: list[tuple[str, Status | None, Weights, Weights]] = [
-            (p, s, {f"{p}.{s}": w}, {}) for s in normal
+            return [(p, None, {going: w}, {going: w})]
+        if (p, t.name) in self.by:
+            if arc.takes_done:
+                self.assumptions.append(
+                    f"{t.name}: that it also takes a run of {p} which has ended was not measured; "
+                    "it is left out"
+                )
+            return [(p, None, {going: w, self.by[p, t.name]: w}, self._server(p))]
+        ended = [
+            s
+            for s in Status
+            if s in self.possible[p]
+            and (arc.takes_done or arc.end is (End.ERROR if s is Status.ERROR else End.NORMAL))
         ]
-        if len(normal) == 2:
-            first, second = (f"{p}.{s}" for s in normal)
-            out += [(p, None, {first: i, second: w - i}, {}) for i in range(1, w)]
+        kinds: list[Status | None] = [*ended, *([None] if arc.end is End.PREEMPT else [])]
+        out: list[tuple[str, Status | None, Weights, Weights]] = []
+        for chosen in combinations_with_replacement(kinds, w):
+            taken = Counter(going if s is None else f"{p}.{s}" for s in chosen)
+            given = {f"{p}.preempted": taken[going]} if taken[going] else {}
+            out.append((p, chosen[0] if len(set(chosen)) == 1 else None, dict(taken), given))
         return out
 
     def _may_hold(self, t: Transition, status: Mapping[str, Status]) -> bool:
         """Return whether the condition can be true for these statuses.
 
-        True as well if it reads anything else: then it becomes a random switch.
+        What else it reads may have any value: then it becomes a random switch.
         """
         if t.when is None:
             return True
-        values = {f"{place}.status": str(s) for place, s in status.items()}
-        if not t.when.names <= set(values):
-            return True
-        try:
-            return t.when.holds(values)
-        except ConditionFault:
-            return False
+        values = {f"{place}.status": str(s) for place, s in status.items()} | dict(
+            self.task.parameters
+        )
+        return can_hold(t.when, values, t.when.names - set(values), self.domains)
 
     def _fires(self, t: Transition, name: str, need: Weights, give: Weights) -> None:
         """Add a case: it fires at once, after an exponential wait for its events, or after a

@@ -6,11 +6,20 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from petrobot.coordinator.learning.estimate import Firings, FiringsKey, Observation, Tally, TallyKey
+from petrobot.coordinator.learning.estimate import (
+    Firings,
+    FiringsKey,
+    Observation,
+    Tally,
+    TallyKey,
+    TrialsKey,
+    TrialSums,
+)
 from petrobot.coordinator.learning.estimates_file import SIMULATED, EstimatesError, EstimatesFile
 from petrobot.coordinator.learning.estimates_tables import CAMPAIGN
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.learning.statistics import added
 from petrobot.coordinator.studies.campaign.plan import CampaignError
 from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry
@@ -68,6 +77,15 @@ def add_row(estimates: Estimates, task: Task, row: TrialRow, salt: str) -> None:
         for i in range(count):
             flow = flow.adding(known[i] if i < len(known) else None)
         estimates.flows[where] = flow
+    of = TrialsKey(task.name, context)
+    costs = [run.cost for run in row.trial.runs]
+    known = [cost for cost in costs if cost is not None]
+    estimates.trials[of] = estimates.trials.get(of, TrialSums()).adding(
+        row.trial.all_success,
+        row.trial.goals > 0,
+        added(known) if len(known) == len(costs) else None,
+        [task.primitive_task_of(run.place).name for run in row.trial.runs],
+    )
 
 
 def estimates_of(task: Task, rows: Iterable[TrialRow], salt: str) -> Estimates:

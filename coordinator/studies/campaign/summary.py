@@ -13,14 +13,8 @@ import numpy as np
 
 from petrobot.coordinator.learning.estimate import Tally, TallyKey
 from petrobot.coordinator.learning.learning import Estimates
-from petrobot.coordinator.learning.objective import Comparison, Question, compare, objective
-from petrobot.coordinator.learning.statistics import (
-    Moments,
-    lowest_share,
-    mean_interval,
-    objective_interval,
-    wilson,
-)
+from petrobot.coordinator.learning.objective import Comparison, Question, compare, task_figures
+from petrobot.coordinator.learning.statistics import wilson
 from petrobot.coordinator.studies.campaign.observed import ESTIMATES, add_row, context_of, regime_of
 from petrobot.coordinator.studies.campaign.plan import TABLE, CampaignPlan
 from petrobot.coordinator.studies.campaign.rows import TrialRow
@@ -41,13 +35,6 @@ class TrialCounts:
     all_success: int = 0
     times: list[float] = field(default_factory=list)
     """Durations of the completed trials (s)."""
-    cost: Moments = field(default_factory=Moments)
-    """Cost of a trial: the sum over its runs, those of parallel branches included; only trials all
-    of whose runs reported one."""
-    good_cost: Moments = field(default_factory=Moments)
-    """The same of the trials in which every run was a SUCCESS."""
-    run_counts: dict[str, int] = field(default_factory=dict)
-    """Number of runs of each primitive task."""
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     """Sums of the whole numbers that the task's score gives for each trial, by table and column:
     of all things counted, not of the first one of each trial."""
@@ -64,16 +51,6 @@ class TrialCounts:
         self.all_success += row.trial.all_success
         if row.trial.completed and row.trial.time is not None:
             self.times.append(row.trial.time)
-        costs = [run.cost for run in row.trial.runs]
-        known = [c for c in costs if c is not None]
-        if len(known) == len(costs):
-            self.cost = self.cost.adding(sum(known))
-            if row.trial.all_success:
-                self.good_cost = self.good_cost.adding(sum(known))
-
-    def count_run(self, primitive: str) -> None:
-        """Count a run of a primitive task."""
-        self.run_counts[primitive] = self.run_counts.get(primitive, 0) + 1
 
     def _add_up(self, row: TrialRow) -> None:
         for key, value in row.score.items():
@@ -184,7 +161,6 @@ class Summary:
         self._see(row)
         for run in row.trial.runs if row.trial is not None else ():
             primitive = self.task.primitive_task_of(run.place).name
-            self.by_regime[row.regime].count_run(primitive)
             actions = self.chosen.setdefault(primitive, {})
             actions[run.action] = actions.get(run.action, 0) + 1
         add_row(self.estimates, self.task, row, self.salt)
@@ -231,58 +207,16 @@ class Summary:
         }
 
     def task_figures(self) -> dict[str, Any]:
-        """Return R_conj, C and J of the whole task, as its trials measured them, with intervals.
-
-        The definition is that of `learned task`, which composes them from the actions' estimates:
-        over several regimes the task is judged in the one in which its R_conj is lowest, C is the
-        expected cost of a trial there, and rho is the given one, else 1 / C with the alternatives
-        that cost most. (Composed, C of an action is that of the hardest regime that meets its
-        target, if it has one; trials cannot be taken apart so.) C and J are None if the primitive
-        tasks measure different costs, or if not all trials reported theirs.
-        """
-        begun = {name: counts for name, counts in self.by_regime.items() if counts.runs}
-        if not begun:
+        """Return R_conj, C and J of the whole task with intervals (`objective.task_figures`), in
+        the regime in which R_conj is lowest; nothing without trials."""
+        rho, trials = self.options.get("rho"), self.estimates.trials_of(self.task.name)
+        measures = {name: p.cost for name, p in self.task.primitive_tasks.items()}
+        rho = None if rho is None else float(rho)
+        found = task_figures(trials, measures, self.comparisons(), rho)
+        if found is None:
             return {}
-        regime = min(begun, key=lambda name: (begun[name].all_success / begun[name].runs, name))
-        hardest = begun[regime]
-        n, r = hardest.runs, hardest.all_success / hardest.runs
-        low, high = lowest_share([(one.all_success, one.runs) for one in begun.values()])
-        # the cost in the regime that happens to be the hardest of m: at level 1 - 0.05 / m
-        level = 1.0 - 0.05 / len(begun)
-        out: dict[str, Any] = {
-            "regime": regime,
-            "trials": n,
-            "R_conj": round(r, 6),
-            "R_conj_interval": [round(low, 6), round(high, 6)],
-            "C": None,
-            "C_interval": None,
-            "rho": None,
-            "J": None,
-            "J_interval": None,
-        }
-        alike = len({self.task.primitive_tasks[name].cost for name in hardest.run_counts}) == 1
-        cost = hardest.cost
-        if not alike or cost.n < n or n < 2:
-            return out
-        found = self.comparisons()
-        largest = sum(
-            k / n * max((f.cost for f in found[name].figures if math.isfinite(f.cost)), default=0.0)
-            for name, k in hardest.run_counts.items()
-        )
-        given = self.options.get("rho")
-        rho = float(given) if given is not None else 1.0 / largest if largest > 0 else 0.0
-        c = (cost.mean, *mean_interval(cost, level))
-        # correlation of success and cost within a trial: they come from the same trials
-        spread = math.sqrt(r * (1.0 - r) * cost.m2 / n)
-        joint = r * (hardest.good_cost.mean - cost.mean) / spread if spread > 0 else 0.0
-        below, above = objective_interval((r, low, high), c, rho, joint)
-        return out | {
-            "C": round(cost.mean, 6),
-            "C_interval": [round(c[1], 6), round(c[2], 6)],
-            "rho": round(rho, 9),
-            "J": round(objective(r, cost.mean, rho), 6),
-            "J_interval": [round(below, 6), round(above, 6)],
-        }
+        plain = found.to_plain()
+        return {"regime": regime_of(plain.pop("context")), **plain}
 
     def to_plain(self) -> dict[str, Any]:
         """Return plain data."""

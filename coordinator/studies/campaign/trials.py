@@ -60,6 +60,9 @@ class RunEntry:
     cancelled: bool = False
     values: dict[str, float] = field(default_factory=dict)
     """Numbers in its result."""
+    waited: float | None = None
+    """How much of `took` had passed when it was started: the wait for the run before it, for a
+    choice and for its device. None: not known, as in tables that are older than this."""
 
     def to_plain(self) -> list[Any]:
         """Return a list in the order of the fields."""
@@ -239,7 +242,8 @@ class TrialLog:
     def _entry(self, now: float, start: StartRun) -> RunEntry:
         trial = self.trials[-1] if self.trials else None
         came = self._since[start.place]
-        entry = RunEntry(start.place, start.action, self._span(came, trial) if trial else 0.0)
+        begun = self._span(came, trial) if trial else 0.0
+        entry = RunEntry(start.place, start.action, begun, waited=round(now - came, DIGITS))
         if trial is not None:
             trial.runs.append(entry)
             self._entries[start.run], self._active[start.run] = (trial, entry), came

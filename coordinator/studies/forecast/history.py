@@ -3,15 +3,15 @@ its trial."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.coordinator.analysis.time.stochastic import is_cause
+from petrobot.coordinator.analysis.time.stochastic import contended, is_cause
 from petrobot.coordinator.learning.estimate import CENSORED as CENSORED_CAUSE
 from petrobot.coordinator.learning.estimate import Tally
 from petrobot.coordinator.learning.estimates_file import (
@@ -143,7 +143,8 @@ class Runs:
     censored: NDArray[np.bool_]
     """It was cut off: only known to have lasted at least so long."""
     took: Values
-    """Seconds from the arrival of its token to its end."""
+    """Seconds from the arrival of its token to its end; without what it waited for a device that
+    the simulated net lets it wait for."""
     trial: Codes
     """Index of its trial."""
     weight: Values
@@ -180,13 +181,27 @@ class Training:
     whole: bool = True
     """True if the trials are those that were run. Otherwise each holds a single run or wait, and
     the result of a whole trial is unknown."""
+    devices: Mapping[str, str] = field(default_factory=dict)
+    """By action: the device for which its runs may have to wait, because other runs use it."""
 
     @classmethod
-    def of(cls, task: Task, trials: Iterable[Trial], *, whole: bool = True) -> Training:
-        """Prepare trials. Raises ValueError if there are none."""
+    def of(
+        cls,
+        task: Task,
+        trials: Iterable[Trial],
+        *,
+        whole: bool = True,
+        devices: Mapping[str, str] | None = None,
+    ) -> Training:
+        """Prepare trials. `devices`: the device of each action that has one. Raises ValueError if
+        there are no trials."""
         kept, vocabulary = tuple(trials), RunVocabulary.of(task)
         if not kept:
             raise ValueError("expected at least one trial to learn from, got none")
+        shared = contended(task, devices or {})
+        waiting = {a: device for a, device in (devices or {}).items() if device in shared}
+        if any(run.waited is None and run.action in waiting for t in kept for run in t.runs):
+            waiting = {}  # an older table: the waits are in the durations
         waits: dict[str, list[tuple[float, int]]] = {}
         timers = _cutting_timers(task)
         for i, trial in enumerate(kept):
@@ -199,22 +214,25 @@ class Training:
             task,
             vocabulary,
             kept,
-            _runs(vocabulary, kept),
+            _runs(vocabulary, kept, waiting),
             {
                 name: (np.array([s for s, _ in w]), np.array([i for _, i in w]))
                 for name, w in waits.items()
             },
             whole,
+            waiting,
         )
 
 
-def by_regime(task: Task, rows: Iterable[TrialRow]) -> dict[str, Training]:
-    """Return the training of each regime of a table."""
+def by_regime(
+    task: Task, rows: Iterable[TrialRow], devices: Mapping[str, str] | None = None
+) -> dict[str, Training]:
+    """Return the training of each regime of a table. `devices`: the device of each action."""
     trials: dict[str, list[Trial]] = {}
     for row in rows:
         if row.trial is not None:
             trials.setdefault(row.regime, []).append(row.trial)
-    return {regime: Training.of(task, kept) for regime, kept in trials.items()}
+    return {regime: Training.of(task, kept, devices=devices) for regime, kept in trials.items()}
 
 
 def _cutting_timers(task: Task) -> list[str]:
@@ -245,11 +263,12 @@ def _waited(timer: str, trial: Trial) -> list[float]:
     return out
 
 
-def _runs(vocabulary: RunVocabulary, trials: tuple[Trial, ...]) -> Runs:
+def _runs(vocabulary: RunVocabulary, trials: tuple[Trial, ...], waiting: Mapping[str, str]) -> Runs:
     places = {name: i for i, name in enumerate(vocabulary.places)}
     actions = {name: i + 1 for i, name in enumerate(vocabulary.actions)}
     flat = [(i, run) for i, trial in enumerate(trials) for run in trial.runs if run.place in places]
     codes = [_outcome(vocabulary, run) for _, run in flat]
+    took = [run.took - (run.waited or 0.0) * (run.action in waiting) for _, run in flat]
     n, q = len(flat), len(places)
     seen = Seen.nothing(q, n)
     begin = 0
@@ -263,7 +282,7 @@ def _runs(vocabulary: RunVocabulary, trials: tuple[Trial, ...]) -> Runs:
                 one = (
                     np.array([codes[i]]),
                     np.array([actions.get(run.action, 0)]),
-                    np.array([run.took]),
+                    np.array([took[i]]),
                 )
                 seen.note(places[run.place], np.array([j]), *one)
         begin = end
@@ -273,7 +292,7 @@ def _runs(vocabulary: RunVocabulary, trials: tuple[Trial, ...]) -> Runs:
         np.array(codes, np.int64),
         np.array([run.cancelled for _, run in flat], np.bool_),
         np.array([_is_cut_off(vocabulary, run) for _, run in flat], np.bool_),
-        np.array([run.took for _, run in flat]),
+        np.array(took),
         np.array([i for i, _ in flat], np.int64),
         np.ones(n),
         seen,
@@ -344,11 +363,14 @@ def read_estimates(path: Path, plant: str | None = None) -> FileContents:
     return kept
 
 
-def trainings_of(task: Task, estimates: Estimates) -> dict[str, Training]:
-    """Return the training of each regime in an estimates file."""
+def trainings_of(
+    task: Task, estimates: Estimates, devices: Mapping[str, str] | None = None
+) -> dict[str, Training]:
+    """Return the training of each regime in an estimates file. `devices`: the device of each
+    action."""
     regimes = sorted({regime_of(key.context) for key in estimates.tallies})
     return {
-        regime: Training.of(task, _trials(task, estimates, regime), whole=False)
+        regime: Training.of(task, _trials(task, estimates, regime), whole=False, devices=devices)
         for regime in regimes
     }
 
@@ -384,7 +406,14 @@ def _runs_of_sums(place: str, action: str, tally: Tally) -> list[RunEntry]:
             took = seconds[i % len(seconds)]
             out.append(
                 RunEntry(
-                    place, action, 0.0, took, status, taken=transition, cancelled=bool(transition)
+                    place,
+                    action,
+                    0.0,
+                    took,
+                    status,
+                    taken=transition,
+                    cancelled=bool(transition),
+                    waited=0.0,
                 )
             )
     return out

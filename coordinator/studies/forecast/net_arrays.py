@@ -84,7 +84,7 @@ class Structure:
         flat = task.flat
         vocabulary = RunVocabulary.of(flat)
         for place in flat.places.values():
-            if place.kind is Kind.ACTION and (place.servers or 1) > 1:
+            if place.kind is Kind.ACTION and place.most_active > 1:
                 raise ValueError(
                     f"places.{place.name}: forecasts know one run at a time; give it servers = 1"
                 )

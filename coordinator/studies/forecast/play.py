@@ -5,7 +5,8 @@ This is the generalised semi-Markov process of docs/forecast.md: when a token en
 an action is chosen, then how and when its run will end is drawn in one draw (competing risks: of
 itself with a status, or preempted by an event or a timer); transitions that wait for events or
 timers race with their measured waits; everything else fires at once, also what preempts a run
-because another one has ended.
+because another one has ended. Runs wait for their devices, and tokens for the run before them, as
+in the engine: in the order in which they came.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from petrobot.coordinator.analysis.net.columns import concession
 from petrobot.coordinator.studies.forecast.distributions import Drawer, Mask
 from petrobot.coordinator.studies.forecast.history import CENSORED, STATUSES, Codes, Seen, Values
 from petrobot.coordinator.studies.forecast.net_arrays import ERROR, SUCCESS, Move, Structure
-from petrobot.coordinator.task import Counts, Status
+from petrobot.coordinator.task import Counts, Start, Status
 from petrobot.coordinator.task.net import Marking
 
 IDLE, GOING, DONE = 0, 1, 2
@@ -50,6 +51,9 @@ class Played:
     barred: Mapping[str, int] = field(default_factory=dict)
     """By transition: trials that came to a stop where it could have started a run in a place of
     which nothing was measured. It never fires."""
+    queued: Mapping[str, int] = field(default_factory=dict)
+    """By action place: trials in which a run that had ended was still there while the next token
+    waited. The engine begins the next run then; here it begins when the ended one is taken."""
     ways: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     """By action place: how often each transition took a token out of it."""
 
@@ -64,9 +68,11 @@ class Play:
         choices: Choices,
         replicate: Codes,
         longest: int = LONGEST,
+        devices: Mapping[str, str] | None = None,
     ) -> None:
-        """`longest`: steps (ends of runs and of waits) of a trial at most. Raises ValueError for a
-        choice without probabilities."""
+        """`longest`: steps (ends of runs and of waits) of a trial at most. `devices`: by action the
+        device for which its runs may have to wait. Raises ValueError for a choice without
+        probabilities."""
         self._longest = longest
         self._s, self._drawer = structure, drawer
         n, q = len(replicate), len(structure.vocabulary.places)
@@ -88,6 +94,21 @@ class Play:
         self._took, self._beyond = np.zeros((q, n)), np.zeros((q, n), np.bool_)
         self._odd: dict[tuple[str, str], set[int]] = {}
         self._ways: dict[str, dict[str, int]] = {}
+        names, actions = sorted(set((devices or {}).values())), structure.vocabulary.actions
+        self._device_of = np.array(
+            [-1, *(names.index(devices[a]) if devices and a in devices else -1 for a in actions)]
+        )
+        """By code of an action: its device; -1 for none."""
+        self._devices = range(len(names))
+        self._at_once = np.array(
+            [
+                structure.task.primitive_task_of(p).start is Start.AT_ONCE
+                for p in structure.vocabulary.places
+            ]
+        )
+        self._device, self._turn = np.full((q, n), -1), np.zeros((q, n), np.int64)
+        """By run: its device, and its number among those that wait for one; 0 if it does not."""
+        self._turns = 0
         self._seen = Seen.nothing(q, n)
         self._now, self._begun = np.zeros(n), np.zeros(n)
         self._goals, self._good = np.zeros(n, np.int64), np.ones(n, np.bool_)
@@ -105,14 +126,14 @@ class Play:
 
     def run(self) -> Played:
         """Play all to their ends. Raises KeyError and ValueError for what was never measured."""
-        for q, place in enumerate(self._s.action_places):
-            if self._s.initial[place]:
-                self._start(q, np.arange(len(self._column)))
+        for q in range(len(self._s.action_places)):
+            self._admit(q, np.arange(len(self._column)))
         for _ in range(self._longest):
             self._settle()
             self._finish(self._over())
             if not len(self._column):
                 break
+            self._grant()
             self._wait()
             self._advance()
         return replace(
@@ -132,6 +153,11 @@ class Play:
                 name: len(columns)
                 for (kind, name), columns in self._odd.items()
                 if kind == "barred"
+            },
+            queued={
+                name: len(columns)
+                for (kind, name), columns in self._odd.items()
+                if kind == "queued"
             },
             ways=self._ways,
         )
@@ -186,19 +212,47 @@ class Play:
         for q, counts, _ in m.preempt:
             if not m.cause:
                 self._cut(q, m, counts, columns[self._phase[q, columns] == GOING])
-        for q in (*m.normal, *m.error, *(q for q, _, _ in m.preempt)):
+        taken = (*m.normal, *m.error, *(q for q, _, _ in m.preempt))
+        for q in taken:
             self._phase[q, columns], self._end[q, columns] = IDLE, np.inf
+            self._device[q, columns], self._turn[q, columns] = -1, 0
             ways = self._ways.setdefault(self._s.vocabulary.places[q], {})
             ways[m.name] = ways.get(m.name, 0) + len(columns)
         if m.takes_run:
             self._begun[columns] = self._now[columns]
         self._goals[columns] += m.is_goal
-        for q in m.starts:
-            self._start(q, columns)
+        for q in dict.fromkeys((*taken, *m.starts)):
+            self._admit(q, columns)
+
+    def _admit(self, q: int, columns: Codes) -> None:
+        """Begin a run where a token is and none runs; further tokens wait."""
+        tokens, phase = self._tokens[self._s.action_places[q], columns], self._phase[q, columns]
+        fresh = columns[(tokens > 0) & (phase == IDLE)]
+        if len(fresh):
+            self._start(q, fresh)
+        late = columns[(tokens > 1) & (phase == DONE)]
+        self._note_odd("queued", self._s.vocabulary.places[q], late)
+
+    def _grant(self) -> None:
+        """Let runs begin whose device is free, in the order in which their tokens came."""
+        never = np.iinfo(np.int64).max
+        for device in self._devices:
+            mine, columns = self._device == device, np.arange(len(self._column))
+            busy = (mine & (self._turn == 0) & (self._phase == GOING)).any(axis=0)
+            turn = np.where(mine & (self._turn > 0), self._turn, never)
+            while (turn < never).any():
+                q = turn.argmin(axis=0)
+                begins = (turn[q, columns] < never) & (self._at_once[q] | ~busy)
+                own, its = columns[begins], q[begins]
+                self._turn[its, own], self._came[its, own] = 0, self._now[own]
+                self._end[its, own] = self._now[own] + self._took[its, own]
+                busy |= begins
+                turn[q, columns] = never
 
     def _cut(self, q: int, m: Move, counts: Counts, columns: Codes) -> None:
         """Runs that are taken while they go on: they count as the arc says, whatever they would
-        have come to."""
+        have come to. One that still waits for its device never began, so it does not count."""
+        columns = columns[self._turn[q, columns] == 0]
         status = CENSORED if counts is Counts.NONE else STATUSES.index(Status(counts.value))
         lasted = self._now[columns] - self._came[q, columns]
         code = np.full(len(columns), self._s.vocabulary.outcome(status, m.number))
@@ -236,6 +290,12 @@ class Play:
             ends.took,
         )
         self._came[q, columns], self._beyond[q, columns] = self._now[columns], ends.beyond
+        device = self._device_of[action]
+        self._device[q, columns], self._turn[q, columns] = device, 0
+        waits = columns[device >= 0]
+        if len(waits):
+            self._turns += 1
+            self._turn[q, waits], self._end[q, waits] = self._turns, np.inf
 
     def _wait(self) -> None:
         """Draw when transitions that wait will fire, as soon as they can; forget it when they
@@ -358,6 +418,6 @@ class Play:
             setattr(self, name, getattr(self, name)[kept])
         for name in (
             "_tokens", "_phase", "_status", "_want", "_preempted", "_end",
-            "_due", "_action", "_outcome", "_took", "_came", "_beyond",
+            "_due", "_action", "_outcome", "_took", "_came", "_beyond", "_device", "_turn",
         ):  # fmt: skip
             setattr(self, name, getattr(self, name)[:, kept])

@@ -328,7 +328,9 @@ def _played(
 ) -> Played:
     drawer = Drawer(measured_runs, training.waits, weights, random)
     try:
-        return Play(structure, drawer, request.choices, replicate, longest_of(training)).run()
+        longest = longest_of(training)
+        play = Play(structure, drawer, request.choices, replicate, longest, training.devices)
+        return play.run()
     except KeyError as fault:
         place, action = fault.args[0]
         names = training.vocabulary

@@ -62,7 +62,8 @@ def forecast_text(made: Mapping[str, Any]) -> str:
         lines += [f"    DOUBTFUL: {doubt}" for doubt in said["doubts"]]
     if "assumed" in made and any("gspn" in said for said in made["regimes"].values()):
         lines.append(
-            f"  measured times include waits for devices; the exact solution assumes: "
+            f"  measured trials include waits for devices; the simulated net and the exact "
+            f"solution assume: "
             f"{made['assumed']}"
         )
     return "\n".join(lines)

@@ -90,6 +90,12 @@ def test_train_forecast_run_and_compare(tmp_path: Path, capsys: pytest.CaptureFi
     assert set(train["by_regime"]) == {"easy", "rough"}
     assert sum(train["chosen"]["look"].values()) == train["begun"] <= train["runs"] == 300
     assert all(0 < j < 2.01 for j in train["J"]["look"].values())
+    capsys.readouterr()
+    shown = []
+    for numbers in (tmp_path / "train", tmp_path / "train" / "estimates.db"):
+        main(["analyse", str(TASK), "--view", "gspn", "--estimates", str(numbers)])
+        shown.append(capsys.readouterr().out)
+    assert "measured in" in shown[0] and shown[0] == shown[1]
     registered = tmp_path / "f.json"
     told = [
         "forecast",

@@ -3,7 +3,7 @@ dead ends, each against values computed by hand."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,9 +15,10 @@ from petrobot.coordinator.engine import (
     Fired,
     RunEnded,
     StartRun,
+    Stimulus,
     TimerFired,
 )
-from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial, TrialLog
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.distributions import Drawer, RunDistributions
 from petrobot.coordinator.studies.forecast.history import Training
@@ -442,3 +443,90 @@ def test_a_full_place_blocks_firing_into_it_as_in_the_engine() -> None:
     assert [i.transition for i in said if isinstance(i, Fired)] == ["full"]
     marked = dict(zip(task.net.places, state.marking, strict=True))
     assert marked == {"jobs": 0, "a": 0, "b": 0, "end": 1, "shelf": 1}
+
+
+BRANCHES = """
+[places.jobs]
+kind = "control"
+tokens = 1
+[places.end]
+kind = "control"
+"""
+
+
+def branches(devices: dict[str, str], at_once: str = "", queue: str = "") -> Task:
+    """Branches that begin together, each with the run of its own action; `queue` has two tokens."""
+    text = f'schema = 1\n[task]\nname = "net"\nfinal = "end == {len(devices) + bool(queue)}"\n'
+    text += 'runs_place = "jobs"\n' + BRANCHES
+    for name in devices:
+        start = '\nstart = "at_once"' if name == at_once else ""
+        text += f'[primitive_tasks.{name}]\ngoal = "{name}"\nalternatives = ["run_{name}"]\n'
+        text += f"deadline = 99.0{start}\n"
+        text += f'[places.{name}]\nkind = "action"\ntask = "{name}"\nservers = 1\n'
+    begun = [name + ("*2" if name == queue else "") for name in devices]
+    moves = f"begin: jobs -> {', '.join(begun)}\n"
+    for name in devices:
+        moves += f"{name}_done: {name}:normal -> end\n{name}_lost: {name}:error -> end\n"
+    return loads(with_transitions(text + moves), "net.toml")
+
+
+def by_engine(task: Task, devices: dict[str, str], took: dict[str, float]) -> Trial:
+    """Play one trial in the engine by a clock; each run takes as long as `took` says."""
+    engine = Engine(task, {f"run_{name}": device for name, device in devices.items()})
+    log = TrialLog(task, lambda record, values: None)
+    now, active, stimulus = 0.0, dict[str, float](), cast(Stimulus, Begin())
+    state = engine.initial()
+    for _ in range(100):
+        log.stimulus(now, stimulus)
+        state, said = engine.handle(state, stimulus)
+        for instruction in said:
+            log.instruction(now, instruction)
+            if isinstance(instruction, StartRun):
+                active[instruction.run] = now + took[instruction.place]
+        if not active:
+            return log.trials[0]
+        run = min(active, key=lambda name: active[name])
+        now, stimulus = active.pop(run), RunEnded(run, Status.SUCCESS)
+    raise AssertionError("the trial does not end")
+
+
+@pytest.mark.parametrize(
+    ("devices", "at_once", "queue", "expected"),
+    [
+        ({"a": "arm", "b": "arm"}, "", "", 3.0),
+        ({"a": "arm", "b": "gripper"}, "", "", 2.0),
+        ({"a": "arm", "b": "arm", "c": "camera", "d": "camera"}, "", "", 12.0),
+        ({"a": "arm", "b": "arm", "c": "arm"}, "", "", 7.0),
+        ({"a": "arm", "b": "arm", "c": "arm"}, "c", "", 6.0),
+        ({"a": "arm", "b": "gripper"}, "", "b", 4.0),
+        ({"a": "arm", "b": "arm"}, "", "a", 4.0),
+    ],
+)
+def test_runs_wait_for_their_device_as_in_the_engine(
+    devices: dict[str, str], at_once: str, queue: str, expected: float
+) -> None:
+    """The first run of a device goes first; a second token of a place waits for the first one."""
+    task = branches(devices, at_once, queue)
+    took = {"a": 1.0, "b": 2.0, "c": 4.0, "d": 8.0}
+    trial = by_engine(task, devices, took)
+    used = {f"run_{name}": device for name, device in devices.items()}
+    training = Training.of(task, [trial], devices=used)
+    random = np.random.default_rng(1)
+    drawer = Drawer(RunDistributions(training), training.waits, np.ones((1, 1)), random)
+    played = Play(
+        Structure.of(task),
+        drawer,
+        choices_of(training),
+        np.zeros(20, np.int64),
+        devices=training.devices,
+    ).run()
+    assert trial.time == expected
+    assert played.completed.all() and played.time.tolist() == [expected] * 20
+
+
+def test_waits_of_an_older_table_stay_in_the_durations() -> None:
+    devices = {"a": "arm", "b": "arm"}
+    task = branches(devices)
+    runs = [entry("a", 1.0, taken="a_done"), entry("b", 3.0, taken="b_done")]
+    used = {"run_a": "arm", "run_b": "arm"}
+    assert Training.of(task, [Trial(1, 0.0, runs=runs)], devices=used).devices == {}
