@@ -453,7 +453,7 @@ def test_a_memory_that_is_on_a_node_is_no_mistake(
     used = (CODE, "await ctx.sleep(0.3)", 'await ctx.put("parts", 1)', "")
     damaged(sound, [(CELL, "[actions.grip]", node, ""), used], tmp_path)
     monkeypatch.chdir(tmp_path)
-    expect("may run", CHECK, 0)
+    expect(r"sound yes, stable if mended, controllable if mended\n[^!]*: may run", CHECK, 0)
 
 
 @pytest.mark.processes
