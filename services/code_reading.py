@@ -32,6 +32,8 @@ AWAITED = frozenset(
     ("wait", "sleep", "call", "command", "get", "get_versioned", "put", "compare_and_set")
 )
 """Calls of the context that do nothing unless they are awaited."""
+REMEMBERS = frozenset(("get", "get_versioned", "put", "compare_and_set"))
+"""Calls of the context that need the global memory."""
 MADE = (actions.success, actions.failure, actions.error)
 API = (actions.__name__, Driver.__module__)
 """Modules of petrobot that actions and drivers are written with."""
@@ -59,6 +61,8 @@ class _Seen:
     events: dict[str, tuple[str, int]] = field(default_factory=dict)
     any_event: bool = False
     """Whether it raises events whose names do not stand in the code."""
+    memory: tuple[str, int] | None = None
+    """Where it uses the global memory first."""
 
 
 @dataclass(frozen=True)
@@ -170,6 +174,8 @@ def _method(
                 f"`{owner}.{name}` does nothing without `await`; write `await {owner}.{name}(...)`"
             )
             seen.faults.append((code.file, node.lineno, text))
+        if name in REMEMBERS and not ports and seen.memory is None:
+            seen.memory = (code.file, node.lineno)
         if name == "raise_event" and not isinstance(first, str):
             seen.any_event = True
         if isinstance(first, str):
@@ -287,6 +293,10 @@ def _faults_of_driver(thing: type, table: Mapping[str, Any]) -> list[tuple[str, 
     if moves and not (is_number and 0.0 < period < float("inf")):
         text = f"{thing.__name__}.period: expected seconds above 0 or None, found {period!r:.40}"
         keys.append(("driver", text))
+    own = [n for n in CYCLIC if getattr(thing, n, None) not in (None, getattr(Driver, n))]
+    if declared and period is None and own:
+        text = f"{thing.__name__} has `{own[-1]}` and no period: it is never called; write "
+        keys.append(("driver", f"{text}`period = 0.01` (s between two steps) in the class"))
     check = faults_of_keys if issubclass(thing, Driver) else faults_of_limits
     return [*keys, *check(thing, table)]
 
@@ -301,6 +311,7 @@ def _plain(seen: _Seen) -> dict[str, Any]:
         "streams": seen.streams,
         "events": seen.events,
         "any_event": seen.any_event,
+        "memory": seen.memory,
     }
 
 

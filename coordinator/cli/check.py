@@ -210,7 +210,11 @@ def _text(name: str, analysis: Analysis | None, ok: bool) -> str:
     if analysis is not None:
         # A place of a task may have several tokens, so "safe" says nothing about it.
         shown = {k: v for k, v in analysis.verdicts().items() if k != "safe"}
-        told = [f"{key.replace('_', ' ')} {_word(v)}" for key, v in shown.items()]
+        mended = _mendable(analysis)
+        words = {
+            key: "NO unless repaired" if key in mended else _word(v) for key, v in shown.items()
+        }
+        told = [f"{key.replace('_', ' ')} {word}" for key, word in words.items()]
         lines += [f"{'note':8}{note}" for note in (*analysis.notes, *analysis.hand_notes)]
         lines.append(f"{_size(analysis)}: {', '.join(told)}{_cut(analysis)}")
         lines += _reasons(analysis)
@@ -222,6 +226,12 @@ def _text(name: str, analysis: Analysis | None, ok: bool) -> str:
 
 def _word(verdict: PropertyVerdict) -> str:
     return {True: "yes", False: "NO", None: "unknown"}[verdict.holds]
+
+
+def _mendable(analysis: Analysis) -> list[str]:
+    """The verdicts that do not hold only because the task may give up."""
+    mended = analysis.progress.mended if analysis.progress else {}
+    return [name for name, verdict in mended.items() if verdict.holds]
 
 
 def _size(analysis: Analysis) -> str:
@@ -250,8 +260,7 @@ def _reasons(analysis: Analysis) -> list[str]:
     from petrobot.coordinator.analysis.execution.progress import AGAIN, MENDED
 
     lines, against, told = list[str](), analysis.objections, list[object]()
-    mended = analysis.progress.mended if analysis.progress else {}
-    mendable = [name for name, verdict in mended.items() if verdict.holds]
+    mendable = _mendable(analysis)
     refused = {
         n: v
         for n, v in analysis.verdicts().items()

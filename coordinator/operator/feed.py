@@ -3,12 +3,16 @@ port that is the same for every mission."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from time import monotonic
 from typing import Any
 
 from petrobot.coordinator.operator.changes import KINDS, State, apply, copy_state, empty_state
 
 Receive = Callable[[dict[str, Any]], None]
+READ_FOR = 5.0
+"""Time for which one who read a snapshot counts as watching (s): a script asks again and again."""
 
 
 class Feed:
@@ -21,6 +25,8 @@ class Feed:
         self._state = empty_state()
         self._receivers: dict[int, Receive] = {}
         self._tickets = 0
+        self._read = -math.inf
+        """When a snapshot was read last."""
 
     @property
     def state(self) -> State:
@@ -29,8 +35,8 @@ class Feed:
 
     @property
     def watched(self) -> bool:
-        """Whether there is a subscriber."""
-        return bool(self._receivers)
+        """Whether there is a subscriber, or somebody has just read a snapshot."""
+        return bool(self._receivers) or monotonic() - self._read < READ_FOR
 
     def emit(self, kind: str, *, time: float | None = None, **fields: Any) -> None:
         """Publish a change. `time` is the mission's clock (s); without it the clock stays."""
@@ -54,6 +60,7 @@ class Feed:
 
     def snapshot(self) -> dict[str, Any]:
         """Return a copy of the whole state."""
+        self._read = monotonic()
         return copy_state(self._state)
 
     def subscribe(self, receive: Receive) -> Callable[[], None]:

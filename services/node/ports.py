@@ -149,21 +149,29 @@ class ProcessPorts(DevicePorts):
         entry = self._stream_entry(name)
         if name not in self._setpoints:
             self._setpoints[name] = setpoint = SetpointReceiver(entry.period, self._clock)
-            self._incoming[name] = Incoming(entry.period, setpoint, self._tickets[name])
+            if ticket := self._tickets.get(name, ""):  # else there is no node that could send
+                self._incoming[name] = Incoming(entry.period, setpoint, ticket)
+                self._listen(ticket)
+        return self._setpoints[name]
+
+    def _listen(self, ticket: str) -> None:
         if self._receiver is None:
             host = self._directory.nodes[self._device.node].host
-            key = credentials(self._directory, self._device.node).stream_key(self._tickets[name])
+            key = credentials(self._directory, self._device.node).stream_key(ticket)
             self._receiver = StreamReceiver(
                 self._device.name, self._incoming, host=host, key=key, clock=self._clock
             )
-        return self._setpoints[name]
 
     def stream_ports(self) -> dict[str, int]:
-        """Return the TCP port of each stream that is received here."""
+        """Return the TCP port of each stream that leads here. All are open from the beginning: a
+        driver may ask for one as late as in its first `step`."""
+        for name in self._tickets:
+            if self._directory.streams[name].to == self._device.name:
+                self.stream(name)
         return (
             {}
             if self._receiver is None
-            else dict.fromkeys(self._setpoints, self._receiver.address[1])
+            else dict.fromkeys(self._incoming, self._receiver.address[1])
         )
 
     def poll(self) -> None:

@@ -192,6 +192,18 @@ IN_THE_CODE: list[Mistake] = [
     ),
     (
         CODE,
+        "    period = 0.01",
+        "    # period = 0.01",
+        r":LINE: devices.axis.driver: Axis has `step` and no period: it is never called; wri",
+    ),
+    (
+        CODE,
+        "await ctx.sleep(0.3)",
+        'await ctx.put("parts", 1)',
+        r"arm_bot.py:\d+: the global memory is on no node; write \[services.memory\] node = \"pc\"",
+    ),
+    (
+        CODE,
         "class Axis(Driver):",
         "class Axis:",
         r":LINE: .*Axis has no hold|close.*derive it from petrobot.Dr",
@@ -417,6 +429,45 @@ def test_an_event_does_not_become_internal_by_its_declaration(tmp_path: Path) ->
     services = shipped.parents[2] / "services.toml"
     pattern = r"events.ball_caught.by: follow_and_wait of catch_ball never raises 'ball_caught'"
     expect(pattern, ["check", str(tmp_path / "internal.toml"), "--services", str(services)])
+
+
+@pytest.mark.processes
+def test_an_event_that_a_driver_misspells_is_told(
+    sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mistakes: list[Mistake] = [
+        (TASK, "[errors]", '[events.button]\nscope = "external"\n\n[errors]', ""),
+        (CODE, "if not self.paused:", 'self.ports.raise_event("buton")\n        if True:', ""),
+    ]
+    damaged(sound, mistakes, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    told = r"arm_bot.py:\d+: a driver raises the event 'buton', .*did you mean 'button'"
+    expect(told, CHECK, 0)
+
+
+@pytest.mark.processes
+def test_a_memory_that_is_on_a_node_is_no_mistake(
+    sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = '[services.memory]\nnode = "pc"\n\n[actions.grip]'
+    used = (CODE, "await ctx.sleep(0.3)", 'await ctx.put("parts", 1)', "")
+    damaged(sound, [(CELL, "[actions.grip]", node, ""), used], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    expect(
+        r"sound yes, stable NO unless repaired, controllable NO unless repaired\n[^!]*: may run",
+        CHECK,
+        0,
+    )
+
+
+@pytest.mark.processes
+def test_a_module_that_cannot_be_imported_is_told_once(
+    sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    damaged(sound, [(CODE, "await ctx.sleep(0.3)", "await ctx.sleep(0.3", "")], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    code, words = said(*CHECK)
+    assert code == 2 and words.count("SyntaxError") == 1, words
 
 
 @pytest.mark.processes

@@ -13,6 +13,7 @@ from petrobot import CommandRefused, Context, Driver, Remote, Result, rehearse, 
 from petrobot.services.comm.location_file import DirectoryError, parse
 from petrobot.services.node.drivers import make_driver
 from petrobot.services.node.lockstep import LockstepPorts
+from petrobot.services.node.ports import ProcessPorts
 from petrobot.services.worker.context import Draws
 from petrobot.services.worker.remote import COMMAND, SEED, DeviceCommand, RemoteDriver
 
@@ -171,3 +172,28 @@ def test_a_driver_in_another_process_gets_each_new_seed() -> None:
 
     # a new process of the driver gets the seed at its start
     RemoteDriver(gone, lambda: 0.0).reseed(3)
+
+
+def test_a_stream_is_open_before_its_driver_asks_for_it() -> None:
+    """Senders learn the port once, from the ready process; a driver may ask in its first step."""
+    text = """
+schema = 1
+nodes.pc = { host = "127.0.0.1", port = 7501 }
+nodes.desk = { host = "127.0.0.1", port = 7502 }
+devices.cart = { node = "pc", driver = "m:Cart" }
+devices.lamp = { node = "desk", driver = "m:Lamp" }
+streams.speed = { to = "cart", period = 0.05 }
+streams.place = { to = "lamp", period = 0.05 }
+"""
+    directory = parse(text, Path("services.toml"))
+    cart = directory.devices["cart"]
+    tickets = {"speed": "cart.one", "place": "lamp.two"}
+    ports = ProcessPorts(directory, cart, lambda: 0.0, tickets)
+    opened = ports.stream_ports()
+    assert list(opened) == ["speed"] and opened["speed"] > 0
+    assert ports.stream("speed").values is None and ports.stream_ports() == opened
+    assert ports._receiver is not None
+    for sock in ports._receiver.sockets():
+        sock.close()
+    alone = ProcessPorts(directory, cart, lambda: 0.0, {})  # as `petrobot test driver` makes it
+    assert alone.stream("speed").values is None and alone.stream_ports() == {}

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from petrobot.coordinator.operator import feed as feeds
 from petrobot.coordinator.operator.changes import (
     KINDS,
     PENDING_LIMIT,
@@ -188,3 +190,16 @@ def test_a_reset_sends_every_client_a_snapshot() -> None:
 def test_a_snapshot_has_all_parts_named_by_the_protocol() -> None:
     """The parts in the protocol page are those of the state."""
     assert set(SNAPSHOT_KEYS) == empty_state().keys() - {"sequence"}
+
+
+def test_a_script_that_reads_snapshots_counts_as_watching(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nodes are asked for their devices only while somebody watches."""
+    now = 100.0
+    monkeypatch.setattr(feeds, "monotonic", lambda: now)
+    feed = Feed()
+    assert not feed.watched
+    feed.snapshot()
+    now += 4.9
+    assert feed.watched
+    now += 0.2
+    assert not feed.watched

@@ -7,7 +7,7 @@ action; actions of other hosts are not known here and are left out.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from petrobot.coordinator.task import Place, PrimitiveTask, Reference, Scope, Task
@@ -59,6 +59,7 @@ def code_findings(
     yield from _unraised(task, code)
     for action in used:
         yield from _events(task, action, code[action])
+    yield from _misspelt(task, [code[action].get("device", {}) for action in code])
     faults = {tuple(fault) for action in used for fault in code[action].get("faults", ())}
     for file, line, text in sorted(faults):
         yield Finding(Severity.ERROR, "code", f"{file}:{line}", text)
@@ -142,6 +143,19 @@ def _unraised(task: Task, code: Code) -> Iterator[Finding]:
             remedy = f'call ctx.raise_event("{name}") there, or write scope = "external"'
             severity = Severity.ERROR if none else Severity.WARNING
             yield Finding(severity, "code", f"events.{name}.by", text, remedy)
+
+
+def _misspelt(task: Task, drivers: Iterable[Mapping[str, Any]]) -> Iterator[Finding]:
+    """Events that a driver raises and the task knows by a similar name. Others are those of other
+    tasks."""
+    raised = {name: tuple(place) for driver in drivers
+              for name, place in driver.get("events", {}).items()}  # fmt: skip
+    for name, (file, line) in sorted(raised.items()):
+        missing = [known for known in task.events if known not in raised]
+        if name not in task.events and (hint := nearest(name, missing)):
+            text = f"a driver raises the event {name!r}, which the task does not declare{hint}"
+            remedy = f"correct the name, or declare [events.{name}]"
+            yield Finding(Severity.WARNING, "code", f"{file}:{line}", text, remedy)
 
 
 def _events(task: Task, action: str, facts: Mapping[str, Any]) -> Iterator[Finding]:

@@ -18,7 +18,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.location_file import MEMORY, Directory
 from petrobot.services.comm.location_file.reading import Faults, nearest
 from petrobot.services.comm.protocol.security import is_loopback
 from petrobot.services.host.json_text import json_text
@@ -28,7 +28,7 @@ SECONDS = 20.0
 """Processor time that the imports may take (s)."""
 BUSY = 3.0
 """How many times as long they may take altogether: on a busy host, or when they sleep."""
-MEMORY = 4 << 30
+ADDRESS_SPACE = 4 << 30
 """Bytes of address space that they may have."""
 
 Facts = Mapping[str, Any]
@@ -80,7 +80,7 @@ def _ask_process(question: str, seconds: float) -> tuple[list[Facts], str]:
         text=True,
         start_new_session=True,
     )  # fmt: skip
-    resource.prlimit(process.pid, resource.RLIMIT_AS, (MEMORY, MEMORY))
+    resource.prlimit(process.pid, resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
     # What counts is processor time: on a busy host an import may take several times as long.
     most = math.ceil(seconds)
     resource.prlimit(process.pid, resource.RLIMIT_CPU, (most, most + 1))
@@ -103,19 +103,37 @@ _ask_once = functools.lru_cache(maxsize=8)(_ask_process)
 def code_faults(directory: Directory, code: Mapping[str, Facts], text: str) -> tuple[str, ...]:
     """Return one line for each fault, as "FILE:LINE: KEY: what is wrong; remedy". `text` is that
     of the location file."""
-    faults = Faults(text, str(directory.source))
+    faults, told = Faults(text, str(directory.source)), set[tuple[str, str]]()
+
+    def unread(key: str, path: str) -> None:
+        """Say why a path cannot be imported; what is wrong in its module is said once."""
+        why = code.get(path, {}).get("import", "")
+        module = (path.partition(":")[0], why)
+        if why and module not in told:
+            faults.add(key, why)
+        if why.startswith("importing"):
+            told.add(module)
+
     for table in (directory.actions, directory.services):
         for entry in table.values():
             key = f"{'actions' if entry.name in directory.actions else 'services'}.{entry.name}"
-            if why := code.get(entry.run, {}).get("import"):
-                faults.add(f"{key}.run", why)
+            unread(f"{key}.run", entry.run)
     for device in directory.devices.values():
+        unread(f"devices.{device.name}.driver", device.driver)
         facts = code.get(device.driver, {})
-        if why := facts.get("import"):
-            faults.add(f"devices.{device.name}.driver", why)
         for key, said in facts.get("keys", {}).get(device.name, ()):
             faults.add(f"devices.{device.name}.{key}", said)
-    return (*faults.lines, *_streams(directory, code))
+    return (*faults.lines, *dict.fromkeys(_streams(directory, code)), *_memory(directory, code))
+
+
+def _memory(directory: Directory, code: Mapping[str, Facts]) -> Iterator[str]:
+    """The first use of a global memory that is on no node."""
+    for action in directory.actions.values():
+        place = code.get(action.run, {}).get("memory")
+        if place and MEMORY not in directory.services:
+            remedy = f'write [services.memory] node = "{action.node}" in {directory.source}'
+            yield f"{place[0]}:{place[1]}: the global memory is on no node; {remedy}"
+            return
 
 
 def _streams(directory: Directory, code: Mapping[str, Facts]) -> Iterator[str]:

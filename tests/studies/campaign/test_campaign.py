@@ -559,7 +559,8 @@ def test_blocks_that_are_copies_are_warned_of(conduct: Conduct, tmp_path: Path) 
     script.write_text("schema = 1\n" + "".join(lines), encoding="utf-8")
     result = conduct("copies", mock=str(script), digests={}).result()
     assert len(result["copies"]) == 2 and all(len(seeds) == 2 for seeds in result["copies"])
-    assert "copies of each other" in text_of(result)
+    assert "copies of each other" in text_of(result) and "never began" not in text_of(result)
+    assert "  3 more never began: their mission run" in text_of({**result, "not_begun": 3})
 
 
 def test_the_summary_adds_up_what_the_score_counts_for_each_trial() -> None:
