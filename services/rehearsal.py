@@ -1,5 +1,5 @@
-"""Tries an action out on a simulated clock, without node, device or network: for the tests of
-whoever writes actions."""
+"""Try out an action on a simulated clock, without node, device or network: for the tests of people
+who write actions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class StillRunningError(AssertionError):
 
 @dataclass
 class Rehearsal:
-    """What an action did: its result, and all that it told the world, with the simulated time since
+    """What an action did: its result, and everything that it sent, with the simulated time since
     its begin (s)."""
 
     result: Result
@@ -62,10 +62,10 @@ def rehearse(
     """Run an action to its end in ticks of 4 ms of simulated time; takes milliseconds of real time.
 
     `device` is a driver (`Driver`; a cyclic one is stepped, and one that was made with ports None
-    gets ports with a clock, `random` and `raise_event`), or whatever the action uses as
-    `ctx.device`. `services` answer its calls by name (the global memory is there anyway),
-    `streams` gives the periods of those it publishes to (s). `world(now)` is called each tick
-    before the action, to let something happen. With `cancel_after` it is cancelled then. Raises
+    gets ports with a clock, `random` and `raise_event`), or any object that the action uses as
+    `ctx.device`. `services` answer its calls by name (the global memory is always there), `streams`
+    has the periods of the streams that it publishes to (s). `world(now)` is called in each tick
+    before the action, to change the world. The action is cancelled after `cancel_after` s. Raises
     StillRunningError when it has not ended after `limit` seconds.
     """
     stage = _Stage(action, device, services or {}, streams or {}, seed)
@@ -85,21 +85,21 @@ def rehearse(
 
 
 class _Prop:
-    """Any object as the device of a rehearsal; it counts as standing still."""
+    """Makes any object the device of a rehearsal; it counts as standing still."""
 
     def __init__(self, handle: Any) -> None:
         self.handle = handle
 
     def stop(self, now: float) -> None:
-        """Nothing to stop."""
+        """Do nothing."""
 
     def stopped(self) -> bool:
-        """It never moves."""
+        """Return True: it never moves."""
         return True
 
 
 class _StagePorts:
-    """What a driver may reach in a rehearsal."""
+    """Ports of a driver in a rehearsal."""
 
     def __init__(self, stage: _Stage, seed: int) -> None:
         self._stage = stage
@@ -111,7 +111,7 @@ class _StagePorts:
         return self._stage.now
 
     def raise_event(self, name: str, **data: Any) -> None:
-        """Note the event in the rehearsal's `events`."""
+        """Record the event in the rehearsal's `events`."""
         self._stage.played.events.append((self.now, name, data))
 
     def __getattr__(self, name: str) -> Any:
@@ -119,7 +119,7 @@ class _StagePorts:
 
 
 class _Stage:
-    """A place for one run, with services around it."""
+    """Hosts one run, and answers its calls of services."""
 
     def __init__(
         self,
@@ -146,7 +146,7 @@ class _Stage:
         )
 
     def step(self) -> bool:
-        """One tick; whether the run has ended."""
+        """Advance by one tick; return whether the run has ended."""
         self.place.advance(self.now)
         reports = self.place.reports()
         for report in reports:

@@ -35,7 +35,7 @@ class PtyLine:
         """Answer what has come; wait up to `timeout` seconds for something."""
         if not select.select([self._near], [], [], timeout)[0]:
             return
-        with contextlib.suppress(BlockingIOError):  # nobody reads: lost, as on a real line
+        with contextlib.suppress(BlockingIOError):  # not read: lost, as on a real line
             answer = self._take(os.read(self._near, 65536))
             if answer:
                 os.write(self._near, answer)
