@@ -86,7 +86,7 @@ class Ports(Protocol):
     def file(self, path: str) -> bytes:
         """Return the content of a file named in services.toml, relative to it."""
 
-            def write_file(self, path: str, content: bytes) -> None:
+    def write_file(self, path: str, content: bytes) -> None:
         """Write such a file as a whole: after a power cut there is the old one or the new one. May
         take longer than a period."""
 

@@ -126,7 +126,7 @@ class _Scope:
     """By parameter: the full name of a place, a `Reference`, or a plain value."""
 
     def place(self, name: str) -> str:
-        """The full name of a place."""
+        """Return the full name of a place."""
         if name in self.places:
             return self.prefix + name
         return str(self.values.get(name, name))
