@@ -1,12 +1,12 @@
-"""What the code that a location file names says of itself: a program for a process of its own.
+"""Read what the code of a location file declares: a program that runs in a separate process.
 
 `python -m petrobot.services.code_reading` reads one JSON object from standard input, imports each
 module that it names, and answers with one line of JSON for each import path. Importing runs code of
-the user, which may print, wait, or end the process: so nothing of petrobot runs here, and whoever
-started it (`comm.location_file.code`) limits its time.
+the user, which may print, wait, or end the process. So nothing else of petrobot runs in this
+process, and `comm.location_file.code`, which starts it, limits its time.
 
-What a function does is read from its source (`ast`), with all functions and classes of the same
-top-level package that it names. Where the source cannot say it, `complete` is false.
+What a function does is read from its source (`ast`), and from all functions and classes of the same
+top-level package that it uses. If the source does not show everything, `complete` is false.
 """
 
 from __future__ import annotations
@@ -31,36 +31,36 @@ from petrobot.services.host.json_text import json_text
 AWAITED = frozenset(
     ("wait", "sleep", "call", "command", "get", "get_versioned", "put", "compare_and_set")
 )
-"""Calls of the context that do nothing unless they are awaited."""
+"""Methods of the context that do nothing unless they are awaited."""
 REMEMBERS = frozenset(("get", "get_versioned", "put", "compare_and_set"))
 """Calls of the context that need the global memory."""
 MADE = (actions.success, actions.failure, actions.error)
 API = (actions.__name__, Driver.__module__)
-"""Modules of petrobot that actions and drivers are written with."""
+"""Modules of petrobot that define the interface of actions and drivers."""
 METHODS = ("period", "state", "stop", "stopped", "hold", "release", "close")
 CYCLIC = ("command", "step")
-"""What a driver with a period needs beside `METHODS`."""
+"""Methods that a driver with a period needs in addition to `METHODS`."""
 _KINDS = {bool: "bool", int: "int", float: "float", str: "str", list: "list", dict: "dict"}
 
 
 @dataclass
 class _Seen:
-    """What was found in the code of one import path."""
+    """Findings in the code of one import path."""
 
     faults: list[tuple[str, int, str]] = field(default_factory=list)
-    """File, line, and what is wrong there."""
+    """Faults, each with file, line and text."""
     causes: set[str] = field(default_factory=set)
-    """First arguments of `error`."""
+    """Causes: first arguments of `error`."""
     values: set[str] = field(default_factory=set)
     """Names of values of results."""
     complete: bool = True
-    """Whether all causes and values stand in the code."""
+    """Whether the code contains all causes and values as literals."""
     words: set[str] = field(default_factory=set)
-    """All texts in the code: what an unknown cause may be."""
+    """All texts in the code: a cause that is not a literal may be one of them."""
     streams: dict[str, tuple[str, int]] = field(default_factory=dict)
     events: dict[str, tuple[str, int]] = field(default_factory=dict)
     any_event: bool = False
-    """Whether it raises events whose names do not stand in the code."""
+    """Whether it raises events whose names are not literals."""
     memory: tuple[str, int] | None = None
     """Where it uses the global memory first."""
 
@@ -72,10 +72,10 @@ class _Code:
     tree: ast.AST
     file: str
     names: Mapping[str, Any]
-    """What its global names are."""
+    """Values of its global names."""
 
     def value(self, node: ast.AST) -> Any:
-        """The object that a dotted name or a constant stands for, None if it is not known."""
+        """Return the object of a dotted name or a constant; None if it is not known."""
         if isinstance(node, ast.Constant):
             return node.value
         if isinstance(node, ast.Name):
@@ -91,7 +91,7 @@ def _parsed(file: str) -> ast.Module:
 
 
 def _code(thing: Any) -> _Code | None:
-    """The source of a function or class; None if there is none."""
+    """Return the source of a function or class; None if there is none."""
     try:
         thing = inspect.unwrap(thing)
         file, lines = inspect.getsourcefile(thing), inspect.getsourcelines(thing)
@@ -109,7 +109,7 @@ def _code(thing: Any) -> _Code | None:
 
 
 def _imported(tree: ast.AST) -> Iterator[tuple[str, Any]]:
-    """Yield the names that a function imports for itself, as far as they are imported already."""
+    """Yield the names that a function imports in its body, if their modules are loaded already."""
     for node in ast.walk(tree):
         for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
             if isinstance(node, ast.Import) and (alias.asname or "." not in alias.name):
@@ -120,8 +120,8 @@ def _imported(tree: ast.AST) -> Iterator[tuple[str, Any]]:
 
 
 def _reachable(thing: Any) -> Iterator[_Code]:
-    """Yield the source of a function or class, and of all of its package that it names: base
-    classes, helpers, what they name in turn."""
+    """Yield the source of a function or class, and of everything in its package that it uses,
+    directly or indirectly: base classes and helpers."""
     package = str(thing.__module__).partition(".")[0]
     waiting, seen = [thing], set[int]()
     while waiting:
@@ -140,7 +140,7 @@ def _reachable(thing: Any) -> Iterator[_Code]:
 
 
 def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
-    """Note what stands in one function or class."""
+    """Record the findings in one function or class."""
     awaited = _awaited(code.tree)
     for node in ast.walk(code.tree):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
@@ -162,7 +162,7 @@ def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
 def _method(
     code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen, awaited: bool
 ) -> None:
-    """Note a call of a method of the context, or of a driver's ports."""
+    """Record a call of a method of the context, or of a driver's ports."""
     owner, name = ast.unparse(function.value), function.attr
     first = code.value(node.args[0]) if node.args else None
     ports = owner in ("ports", "self.ports", "self._ports")
@@ -186,7 +186,7 @@ def _method(
 
 
 def _awaited(tree: ast.AST) -> set[ast.AST]:
-    """The calls that are awaited, or handed on to somebody who may await them."""
+    """Return the calls that are awaited, or passed on to code that may await them."""
     waits = {n.id for a in ast.walk(tree) if isinstance(a, ast.Await) for n in ast.walk(a.value)
              if isinstance(n, ast.Name)}  # fmt: skip
     found: set[ast.AST] = set()
@@ -205,7 +205,7 @@ def _awaited(tree: ast.AST) -> set[ast.AST]:
 
 
 def _result(code: _Code, node: ast.Call, made: Callable[..., Any], seen: _Seen) -> None:
-    """Note cause and values of `success(...)`, `failure(...)` or `error(...)`."""
+    """Record cause and values of `success(...)`, `failure(...)` or `error(...)`."""
     for keyword in node.keywords:
         if keyword.arg is None:
             seen.complete = False
@@ -223,7 +223,7 @@ def _result(code: _Code, node: ast.Call, made: Callable[..., Any], seen: _Seen) 
 
 
 def _branches(node: ast.expr) -> Iterator[ast.expr]:
-    """The values that an expression may have, as far as it is a choice."""
+    """Return the possible values of an expression: its branches if it is a choice."""
     if isinstance(node, ast.IfExp):
         yield from _branches(node.body)
         yield from _branches(node.orelse)
@@ -235,7 +235,7 @@ def _branches(node: ast.expr) -> Iterator[ast.expr]:
 
 
 def _function(thing: Callable[..., Any]) -> dict[str, Any]:
-    """What is known of an action or service."""
+    """Return the findings on an action or service."""
     try:
         parameters = list(inspect.signature(thing).parameters.values())
     except (TypeError, ValueError):
@@ -265,8 +265,8 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """What is known of a driver's class, and what is wrong with the keys of its devices' tables, by
-    device."""
+    """Return the findings on a driver's class, and by device the faults of the keys of its
+    table."""
     seen = _Seen()
     if not inspect.isclass(thing):
         text = "is not a class; a driver is a class derived from `Driver`"
@@ -278,7 +278,7 @@ def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, An
 
 
 def _faults_of_driver(thing: type, table: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What is wrong with a driver's class and the keys of a device's table."""
+    """Return the faults of a driver's class and of the keys of a device's table."""
     keys: list[tuple[str, str]] = []
     period: Any = getattr(thing, "period", None)
     if isinstance(period, Key):
@@ -316,7 +316,7 @@ def _plain(seen: _Seen) -> dict[str, Any]:
 
 
 def _read(path: str, tables: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Import one path and say what is known of it."""
+    """Import one path and return the findings."""
     try:
         thing = resolve(path)
     except ImportError as fault:
@@ -325,7 +325,7 @@ def _read(path: str, tables: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Answer on what was standard output; what imported code prints goes nowhere."""
+    """Answer on the original standard output; output of imported code is dropped."""
     asked = json.load(sys.stdin)
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     silent = os.open(os.devnull, os.O_WRONLY)
@@ -336,7 +336,7 @@ def main() -> None:
         answers.write(json_text({"path": path, **_read(path, tables)}) + "\n")
         answers.flush()
     answers.close()
-    os._exit(0)  # threads of imported modules, and what they do at exit, have no say
+    os._exit(0)  # threads and exit handlers of imported modules must not delay the end
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 """Checks that a driver keeps the rules of `services.device.Driver`: in a user's test, or as
 `petrobot test driver NAME`.
 
-The driver is run beside its device, or beside a simulation of it: it gets your commands, is stopped
-and held in the middle of a movement, closed and made again. Positions are found by themselves: they
-are the numbers of `state` that end a movement elsewhere than they began it, and stay there at rest
-(but for the noise of a measurement).
+The driver is run with its device, or with a simulation of it: it gets your commands, is stopped and
+held in the middle of a movement, closed and made again. Positions are found automatically: they are
+the numbers of `state` that a movement changes, and that keep their value at rest (except for
+noise).
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ from petrobot.services.device import LIMITS, Driver, keys_of
 
 Command = Mapping[str, Any]
 REST, PART = 20, 0.25
-"""Steps at rest that show which numbers change then, too; the part of a movement after which it is
-stopped or held."""
+"""Steps at rest, which show the numbers that also change then; and the share of a movement after
+which it is stopped or held."""
 PLAY = 0.01
-"""Share of its way by which a position may differ at rest: noise, and what is left of settling."""
+"""Share of its movement by which a position may change at rest: noise, and the end of settling."""
 SLOWEST, NOISE = 0.05, 3.0
 """A position counts as moving while it changes by more than this share of its fastest step, and by
-more than so many times of what it changes at rest."""
+more than this multiple of its change at rest."""
 LATE_SHARE = 0.02
 """Share of steps that may take longer than the period: a busy computer delays some."""
 STARTING = 2
 """Steps of a movement in which `stopped` may still be True."""
 UNKNOWN: Command = {"no driver knows this command": True}
 SLOW, SLOWED = 0.25, 0.5
-"""The share of its speed that a driver is given, and the greatest part of its usual quickness that
-it may have then: on its way it speeds up and slows down as usual."""
+"""Share of its speed at which a driver is tested, and the greatest share of its usual average speed
+that it may then have: acceleration and braking take their usual time."""
 ELSEWHERE: Command = dict.fromkeys("xyz", (1e6, 2e6))
-"""A workspace in which no command ends."""
+"""A workspace that no command ends in."""
 
 
 @dataclass
 class DriverCheck:
-    """What was found. `faults` is empty for a driver that keeps the rules."""
+    """The findings. `faults` is empty for a driver that keeps the rules."""
 
     faults: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -63,12 +63,12 @@ def check_driver(
     cable: Callable[[bool], None] | None = None,
     simulated: bool = False,
 ) -> DriverCheck:
-    """Check a driver that `make()` makes anew each time; `make(speed=0.25)` makes it with this key
-    added to the device's table, as `lambda **keys: Axis(keys, ports)` does.
+    """Check a driver. `make()` makes a new one each time; `make(speed=0.25)` adds this key to the
+    device's table, as `lambda **keys: Axis(keys, ports)` does.
 
-    `commands` are two or more that lead to different places, each in at most `seconds`, better in
-    more than `within`; `first` are those that a new driver needs before them, to switch its drives
-    on. The device must stand still `within` s after `stop`. `cable(False)` pulls
+    `commands` are two or more that move to different positions, each in at most `seconds`,
+    preferably in more than `within`; `first` are those that a new driver needs before them, to
+    switch its drives on. The device must stand still `within` s after `stop`. `cable(False)` pulls
     the device's cable, `cable(True)` puts it back. `simulated`: time passes only between two steps,
     for a driver whose device is simulated by its steps; the check then takes milliseconds.
     """
@@ -112,7 +112,7 @@ def check_device(
 
 
 class _Clock:
-    """Time that passes only where somebody sleeps (s)."""
+    """Simulated time (s) that passes only in `sleep`."""
 
     def __init__(self) -> None:
         self._now = 0.0
@@ -125,7 +125,7 @@ class _Clock:
 
 
 class _Check:
-    """One driver after the other, and what is wrong with it."""
+    """Tests one driver after the other, and collects the faults."""
 
     def __init__(
         self,
@@ -157,7 +157,7 @@ class _Check:
         self.found.notes.append(f"not checked: {text}")
 
     def numbers(self) -> dict[str, float]:
-        """The numbers of the state, by path."""
+        """Return the numbers of the state, by path."""
         try:
             state = plain(self.driver.state(), "state")
         except Exception as fault:
@@ -166,7 +166,7 @@ class _Check:
         return dict(_leaves(state, ""))
 
     def step(self) -> dict[str, float]:
-        """One step, its time taken; gives the numbers of the state after it."""
+        """Make one step and measure its time; return the numbers of the state after it."""
         begin = self.now()
         if self.driver.period is not None:
             self.driver.step(begin)
@@ -183,7 +183,7 @@ class _Check:
         until: Callable[[], bool] = lambda: False,
         positions: Mapping[str, float] | None = None,
     ) -> set[str]:
-        """Step for so long; gives the positions that changed by more than their play."""
+        """Step for so long; return the positions that changed by more than at rest."""
         begin, drifted, end = self.numbers(), set[str](), self.now() + seconds
         while self.now() < end and not until():
             drifted |= _differ(begin, self.step(), positions or {}, PLAY)
@@ -192,7 +192,7 @@ class _Check:
     def rules(
         self, commands: Sequence[Command], seconds: float, cable: Callable[[bool], None] | None
     ) -> None:
-        """Check all rules that the driver, the commands and the cable let check."""
+        """Check all rules that can be checked with this driver, these commands and the cable."""
         self.life()
         if self.driver.period is None:
             self.note("steps, commands and movements: the driver has no `period`")
@@ -212,7 +212,7 @@ class _Check:
             self.cable(cable, commands, seconds)
 
     def life(self) -> None:
-        """Made, closed, made again; stopped at rest, twice."""
+        """Make the driver, close it, make it again; stop it twice at rest."""
         if self.driver.period is not None and not self.driver.period > 0.0:
             self.fault(f"period: expected seconds above 0 or None, got {self.driver.period!r}")
         self.rest()
@@ -220,7 +220,7 @@ class _Check:
         self.stop("stop at rest")
 
     def rest(self) -> None:
-        """Find out what changes at rest, too: counters, ages, noise."""
+        """Find the numbers that also change at rest: counters, ages, noise."""
         before, changes = self.numbers(), dict[str, list[float]]()
         for _ in range(REST):
             after = self.step()
@@ -249,7 +249,7 @@ class _Check:
         self.fault(f"command: accepted {dict(UNKNOWN)}; raise ValueError for what it does not know")
 
     def movements(self, there: Command, back: Command, seconds: float) -> None:
-        """One to its end, one stopped on its way, one held on its way and released."""
+        """Make one movement to its end, stop one on its way, and hold and release one."""
         positions, took = self.way(there, back, seconds)
         if not positions:
             self.fault(f"{dict(there)}: no number of state changes: give a command that moves it")
@@ -272,7 +272,8 @@ class _Check:
         self.stop("stop", positions)
 
     def limits(self, commands: Sequence[Command], seconds: float) -> None:
-        """It obeys those of `speed`, `workspace` and `dry_run` that it says it obeys."""
+        """Check that it obeys those of `speed`, `workspace` and `dry_run` that are in its
+        `obeys`."""
         own = keys_of(type(self.driver))
         obeys = [name for name in LIMITS if name in self.driver.obeys and name not in own]
         takes = signature(self.make).parameters.values()
@@ -320,14 +321,14 @@ class _Check:
         self, there: Command, back: Command, seconds: float
     ) -> tuple[Mapping[str, float], float]:
         """Move back and there; return how far each position came, and how long it took (s)."""
-        self.move(back, seconds, judged=False)  # it may be there already, and only settle
+        self.move(back, seconds, judged=False)  # it may already be there, and only settle
         begin = self.now()
         positions = self.move(there, seconds)
         return positions, max(self.period, self.now() - begin - REST * self.period)
 
     def move(self, command: Command, seconds: float, judged: bool = True) -> Mapping[str, float]:
-        """Give a command and step for so long, or until it stands again; gives how far each
-        position came."""
+        """Give a command and step for so long, or until the device stands still again; return how
+        far each position moved."""
         self.refusing = ""
         for needed in (*self.first, command) if self.fresh else ():
             self.run(seconds, partial(self.accepts, needed))  # a new driver may need time
@@ -358,7 +359,8 @@ class _Check:
             if still and changed:
                 untrue, lied = untrue + 1, lied | changed
         found = {name: far for name, far in ways.items() if name in moved and name in away}
-        least = SLOWEST * max(found.values(), default=0.0)  # what hardly moves only settles
+        # a position that hardly moves only settles
+        least = SLOWEST * max(found.values(), default=0.0)
         found = {name: far for name, far in found.items() if far >= least}
         if judged and untrue > STARTING and lied & found.keys():
             names = _names(lied & found.keys())
@@ -384,7 +386,7 @@ class _Check:
         self.stands(what, positions)
 
     def stands(self, what: str, positions: Mapping[str, float] | None = None) -> None:
-        """It says that it stands still within the limit, and does."""
+        """Check that it reports to stand still within the limit, and does stand still."""
         self.run(self.within, self.driver.stopped)
         if not self.driver.stopped():
             self.fault(f"{what}: stopped() is still False after {self.within:g} s")
@@ -394,8 +396,8 @@ class _Check:
     def cable(
         self, cable: Callable[[bool], None], commands: Sequence[Command], seconds: float
     ) -> None:
-        """Without its cable a driver raises, or no longer says that it stands; with it, a new one
-        works."""
+        """Check that without its cable the driver raises, or no longer reports to stand still, and
+        that a new driver works with the cable."""
         for command in commands[-1:]:
             self.move(command, seconds)
         cable(False)
@@ -404,7 +406,7 @@ class _Check:
             self.run(seconds, lambda: not self.driver.stopped())
             if self.driver.stopped():
                 self.fault(f"cable pulled: stopped() is still True after {seconds:g} s")
-        except Exception:  # the rule: the node then makes a new one
+        except Exception:  # the rule: the node then makes a new driver
             pass
         cable(True)
         self.again("cable put back")
@@ -440,7 +442,7 @@ def _leaves(value: Any, path: str) -> Iterator[tuple[str, float]]:
 def _differ(
     before: Mapping[str, float], after: Mapping[str, float], ways: Mapping[str, float], share: float
 ) -> set[str]:
-    """Return the positions that differ by more than a share of their way."""
+    """Return the positions that differ by more than a share of their movement."""
     known = (name for name in ways if name in before and name in after)
     return {name for name in known if abs(after[name] - before[name]) > share * ways[name]}
 

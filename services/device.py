@@ -1,11 +1,11 @@
-"""How a device driver is written: what owns a camera, an arm or a rover on its node.
+"""The interface of device drivers. A driver controls a camera, an arm or a rover on its node.
 
 A driver is a class derived from `Driver` and named by import path in services.toml (`[devices.NAME]
-driver = "module:Class"`); it is made as `Class(config, ports)`. One without a `period` lives in the
-worker process of its device, and actions use it directly as `ctx.device`. One with a `period` is
-*cyclic*: in real time it lives in a process of its own, paced by absolute deadline, so no user code
-delays it; actions see a `Remote` of it: `send` a command, read `state`. In lock step both live
-inline."""
+driver = "module:Class"`); it is made as `Class(config, ports)`. A driver without a `period` is in
+the worker process of its device, and actions use it directly as `ctx.device`. A driver with a
+`period` is *cyclic*: in real time it has its own process, which steps it at absolute times, so no
+action delays it; actions use a `Remote` of it: they `send` commands and read `state`. In lock step
+both are in the node's process."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ class Setpoint(Protocol):
 
     @property
     def held(self) -> float:
-        """Seconds since its sender first sent these values (inf before the first), but for their
-        way here: a repeat makes them no younger. What a value that means "from now on" must be
-        reduced by; never less than `age`."""
+        """Seconds since its sender first sent these values, without their transport (inf before the
+        first). A repetition does not reset it. Subtract it from values that count from the moment
+        of sending, such as a remaining time. Never less than `age`."""
 
     @property
     def count(self) -> int:
-        """How many have arrived."""
+        """Number of set points that have arrived."""
 
 
 class Ports(Protocol):
-    """What a driver may reach: everything else is out of bounds for it."""
+    """Everything outside its device that a driver may use."""
 
     @property
     def now(self) -> float:
@@ -61,10 +61,10 @@ class Ports(Protocol):
         """The CAN bus of this device."""
 
     def serial(self, port: str, baud: int) -> ByteLine:
-        """Open a serial line (8 data bits, no parity, 1 stop bit); again after it was lost. `port`
-        is the device's key of that name: a path, or "pty:PATH" at a simulated laboratory. In lock
-        step it is the laboratory's whatever it says. Raises ConnectionError when it is not
-        there."""
+        """Open a serial line (8 data bits, no parity, 1 stop bit); call it again after the line was
+        lost. `port` is the device's key of that name: a path, or "pty:PATH" with a simulated
+        laboratory. In lock step the line is always the laboratory's. Raises ConnectionError if the
+        port does not exist."""
 
     def tcp(self, host: str, port: int) -> ByteLine:
         """Open a TCP connection to an IP address, or "unix:PATH" at a simulated laboratory; again
@@ -90,10 +90,10 @@ class Ports(Protocol):
         """
 
     def file(self, path: str) -> bytes:
-        """A file named in services.toml, relative to it."""
+        """Return the content of a file named in services.toml, relative to it."""
 
     def write_file(self, path: str, content: bytes) -> None:
-        """Write such a file whole: after a power cut there is the old one or the new one. It may
+        """Write such a file as a whole: after a power cut there is the old one or the new one. May
         take longer than a period."""
 
 
@@ -109,23 +109,23 @@ CAMERA_KEYS = (
     "colour",
 )
 PORT_KEYS = ("interface", "channel", "bitrate", "can", *CAMERA_KEYS)
-"""Keys of a device's table that its ports read: what bus and which images it has."""
+"""Keys of a device's table that its ports read: its bus and its image source."""
 LIMITS = ("speed", "workspace", "dry_run")
-"""Keys of a device's table for its first motions: any device may have them whose driver obeys
-them (`Driver.obeys`)."""
+"""Keys of a device's table for its first motions: any device may have them if its driver obeys them
+(`Driver.obeys`)."""
 COMMON_KEYS = (*PORT_KEYS, *LIMITS)
 
 
 def refuse_unknown_keys(config: Mapping[str, Any], own: Collection[str]) -> None:
-    """Raise ValueError if a device's table has a key that is neither its driver's `own` nor its
-    ports': a mistyped one would silently be no setting at all. For a driver's constructor."""
+    """Raise ValueError if a device's table has a key that is neither one of its driver's `own` nor
+    of its ports: a mistyped key would have no effect. For a driver's constructor."""
     for name in config:
         if name not in own and name not in COMMON_KEYS:
             raise ValueError(f"unknown key {name!r}{nearest(name, [*own, *COMMON_KEYS])}")
 
 
 class _Required:
-    """Default of a key that the table must give."""
+    """Default of a required key."""
 
 
 class Key:
@@ -136,7 +136,7 @@ class Key:
         self.text = text
         self.name = ""
         self.kind: type = object
-        """bool, int, float, str, list or dict; object: any plain data."""
+        """Type of the value: bool, int, float, str, list or dict; object: any plain data."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
@@ -149,7 +149,7 @@ class Key:
             self.kind = type(self.default)
 
     def read(self, config: Mapping[str, Any]) -> Any:
-        """The key's value in a table. Raises ValueError."""
+        """Return the key's value in a table. Raises ValueError."""
         if self.name not in config:
             if self.default is _Required:
                 raise ValueError(f"{self.name}: is missing; expected {self._expected()}")
@@ -185,7 +185,8 @@ def key(default: Any = _Required, text: str = "") -> Any:
 
 class Workspace:
     """The box in which a device may move: bounds (m) by axis, in the frame that its driver's
-    documentation names. An axis without bounds is free; the box without any is all of space."""
+    documentation names. An axis without bounds is not limited; a box without bounds is all of
+    space."""
 
     def __init__(self, bounds: Mapping[str, Sequence[float]] | None = None) -> None:
         """Raises ValueError for a table that is not a box."""
@@ -199,7 +200,7 @@ class Workspace:
                 )
 
     def outside(self, point: Sequence[float]) -> str:
-        """Return in words that a point (x, y, z in m) lies outside; empty if it lies inside."""
+        """Return a message if a point (x, y, z in m) is outside; empty if it is inside."""
         at = dict(zip("xyz", point, strict=False))
         if all(low <= at[axis] <= high for axis, (low, high) in self.bounds.items()):
             return ""
@@ -209,12 +210,12 @@ class Workspace:
 
 
 class Driver:
-    """One device: the base class of drivers. Override what the device can do.
+    """The base class of drivers, for one device. Override the methods that the device needs.
 
-    Nothing here may block. `now` is the cell's clock (s). A method that raises has broken the
-    driver, except `command` (which refuses by raising) and `picture`: the device is stopped, its
-    run ends in ERROR with the exception's words, and the traceback goes to the node's log. In real
-    time the driver is then made again in a new process; in lock step its device stays out of use.
+    Nothing here may block. `now` is the cell's clock (s). If a method raises, except `command`
+    (which refuses so) and `picture`, the device is stopped, its run ends in ERROR with the
+    exception's message, and the traceback is in the node's log. In real time the driver is then
+    made again in a new process; in lock step its device cannot be used any more.
     """
 
     period: float | None = None
@@ -228,8 +229,8 @@ class Driver:
     """Where the device may move: refuse commands and set points outside, and stop a motion that
     leaves it."""
     dry_run: bool = False
-    """Drives off: obey all as usual and report the motion that would have come of it, but enable
-    no drive and send no motion."""
+    """Drives off: obey all commands as usual and report the motion that would result, but enable no
+    drive and send no motion."""
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         """Read the keys of the device's table. Raises ValueError with every wrong key."""
@@ -250,8 +251,8 @@ class Driver:
         self.dry_run = config.get("dry_run", False)
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Take a command from an action (cyclic drivers). Raise ValueError to refuse it: that ends
-        its run in ERROR with these words, unless the action reads them in `Remote.refused`. Any
+        """Obey a command of an action (cyclic drivers). Raise ValueError to refuse it: that ends
+        the run in ERROR with this message, unless the action reads it in `Remote.refused`. Any
         other exception refuses it, too."""
         raise ValueError(f"this device takes no commands, but was sent {dict(body)}")
 
@@ -263,8 +264,8 @@ class Driver:
         return {}
 
     def stop(self, now: float) -> None:
-        """Bring the device to a safe standstill. May be called at any time, and again. A device
-        that can move must override this and `stopped`."""
+        """Bring the device to a safe standstill. May be called at any time, and repeatedly. A
+        device that can move must override this and `stopped`."""
 
     def stopped(self) -> bool:
         """Return whether the device is known to stand still."""
@@ -301,7 +302,8 @@ def read_keys(driver: type, config: Mapping[str, Any]) -> dict[str, Any]:
 
 def faults_of_keys(driver: type, config: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return each wrong key of a device's table, and what is wrong with it, without making the
-    driver; of a driver that declares no keys and reads them itself only `faults_of_limits`."""
+    driver; for a driver that declares no keys and reads its table itself, only
+    `faults_of_limits`."""
     reads_itself = driver.__init__ is not Driver.__init__ and not keys_of(driver)  # type: ignore[misc]
     own = [] if reads_itself else _faults_of_keys(driver, config)
     return own + faults_of_limits(driver, config)
@@ -309,9 +311,9 @@ def faults_of_keys(driver: type, config: Mapping[str, Any]) -> list[tuple[str, s
 
 def faults_of_limits(driver: type, config: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return what is wrong with `speed`, `workspace` and `dry_run` in a device's table, by key: a
-    driver that does not obey one would run as if it were not there. A key of this name that the
-    driver declares itself is its own, and so is one of a class that is not derived from `Driver`
-    and says nothing of `obeys`."""
+    driver that does not obey a key would ignore it. A key of this name that the driver declares
+    belongs to the driver, as does a key of a class that is not derived from `Driver` and has no
+    `obeys`."""
     faults = list[tuple[str, str]]()
     foreign = not issubclass(driver, Driver) and not hasattr(driver, "obeys")
     obeys = getattr(driver, "obeys", ())
@@ -375,27 +377,27 @@ class QuickStopping(Protocol):
     """A driver that can stop harder than its stop routine does."""
 
     def quick_stop(self, now: float) -> None:
-        """Emergency stop (IEC 60204-1, category 0 or 1): stop at once. It stays stopped: no command
-        comes until it is cleared."""
+        """Emergency stop (IEC 60204-1, category 0 or 1): stop at once. The device stays stopped: it
+        gets no command until the stop is cleared."""
 
 
 PICTURE = "picture"
-"""The operator's command for what a device sees."""
+"""The operator's command for a device's picture."""
 
 
 @runtime_checkable
 class HasPicture(Protocol):
-    """A driver that can show its operator a picture of what it sees."""
+    """A driver with a picture for the operator, such as a camera image."""
 
     def picture(self) -> Mapping[str, Any]:
-        """The newest one: `mime`, `data` (bytes), `width`, `height` (px), `age` (s), `note` and
-        `detections` as in docs/operator-protocol.md; empty when there is none. Asked for a few
-        times a second, and only while somebody looks."""
+        """Return the newest picture: `mime`, `data` (bytes), `width`, `height` (px), `age` (s),
+        `note` and `detections` as in docs/operator-protocol.md; empty when there is none. Called a
+        few times per second, only while an operator watches."""
 
 
 def picture_of(driver: Driver | None) -> Mapping[str, Any]:
-    """The picture of a device, empty for one that has none. One that cannot be had goes to the log:
-    the device moves on."""
+    """Return the picture of a device, empty if it has none. An exception is only logged: the device
+    continues."""
     try:
         picture: Mapping[str, Any] = (
             plain(driver.picture(), "picture") if isinstance(driver, HasPicture) else {}
@@ -416,15 +418,15 @@ def stop_at_once(driver: Driver, now: float) -> None:
 
 
 class Remote(Protocol):
-    """A cyclic driver as its actions see it."""
+    """A cyclic driver, as its actions use it."""
 
     def send(self, body: Mapping[str, Any]) -> int:
-        """Send a command; gives its number, which `handled` reaches once the driver has taken
-        it."""
+        """Send a command. Return its number; `handled` reaches it when the driver has accepted or
+        refused the command."""
 
     @property
     def handled(self) -> int:
-        """Number of the last command that the driver has taken."""
+        """Number of the last command that the driver has accepted or refused."""
 
     @property
     def refused(self) -> str:

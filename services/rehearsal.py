@@ -1,5 +1,5 @@
-"""Tries an action out on a simulated clock, without node, device or network: for the tests of
-whoever writes actions."""
+"""Try out an action on a simulated clock, without node, device or network: for the tests of people
+who write actions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class StillRunningError(AssertionError):
 
 @dataclass
 class Rehearsal:
-    """What an action did: its result, and all that it told the world, with the simulated time since
+    """What an action did: its result, and everything that it sent, with the simulated time since
     its begin (s)."""
 
     result: Result
@@ -102,21 +102,21 @@ def _last_acts(played: Rehearsal) -> str:
 
 
 class _Prop:
-    """Any object as the device of a rehearsal; it counts as standing still."""
+    """Makes any object the device of a rehearsal; it counts as standing still."""
 
     def __init__(self, handle: Any) -> None:
         self.handle = handle
 
     def stop(self, now: float) -> None:
-        """Nothing to stop."""
+        """Do nothing."""
 
     def stopped(self) -> bool:
-        """It never moves."""
+        """Return True: it never moves."""
         return True
 
 
 class _StagePorts:
-    """What a driver may reach in a rehearsal."""
+    """Ports of a driver in a rehearsal."""
 
     def __init__(self, stage: _Stage, seed: int) -> None:
         self._stage = stage
@@ -128,7 +128,7 @@ class _StagePorts:
         return self._stage.now
 
     def raise_event(self, name: str, **data: Any) -> None:
-        """Note the event in the rehearsal's `events`."""
+        """Record the event in the rehearsal's `events`."""
         self._stage.played.events.append((self.now, name, data))
 
     def stream(self, name: str) -> SetpointReceiver:
@@ -140,7 +140,7 @@ class _StagePorts:
 
 
 class _Stage:
-    """A place for one run, with services around it."""
+    """Hosts one run, and answers its calls of services."""
 
     def __init__(
         self,
@@ -175,7 +175,7 @@ class _Stage:
         return self._receivers[stream]
 
     def step(self) -> bool:
-        """One tick; whether the run has ended."""
+        """Advance by one tick; return whether the run has ended."""
         self.place.advance(self.now)
         reports = self.place.reports()
         for report in reports:

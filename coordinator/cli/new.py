@@ -361,7 +361,7 @@ def test_the_driver_keeps_the_rules_of_drivers():
     assert found.faults == []
 
 
-def test_what_is_out_of_reach_is_refused():
+def test_a_position_out_of_reach_is_refused():
     assert rehearse(move, device=Axis({}, None), to=9.0).result.cause == "command_refused"
 
 

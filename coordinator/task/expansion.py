@@ -1,16 +1,15 @@
-"""The flat net of a task: what is written in short becomes places, arcs and transitions.
+"""The flat net of a task: short forms are expanded to places, arcs and transitions.
 
-`expand` does all of it, in this order (docs/task-file.md, "What the short forms stand for"):
+`expand` does the steps in this order (docs/task-file.md, "Short forms"):
 
 1. `[errors]`: an error branch for each action place that has none, net by net;
 2. macro places with a subnet: its places and transitions, names prefixed, parameters replaced;
 3. `holds`: arcs from and to the resources;
 4. `tries`: a counter of the tries, and copies of the outgoing transitions by number of used tries;
-5. plain places: `final` asks that they are empty.
+5. plain places: `final` requires that they are empty.
 
-Everything that looks at a task afterwards (engine, analysis, journal, exports) sees this net alone.
-What was added carries the name of its origin in `expanded_from`, stands behind what was written,
-and has a name with a dot.
+All later code (engine, analysis, journal, exports) uses this net only. Added elements have the name
+of their origin in `expanded_from`, come after those of the file, and have a name with a dot.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class CircleError(ValueError):
 
 
 def expand(task: Task) -> Task:
-    """Return the flat task; the task itself if nothing in it is written in short.
+    """Return the flat task; the task itself if it has no short forms.
 
     Raises CircleError on subnets that contain themselves. Other faults are for `validation`, which
     must have found none before the result means anything.
@@ -92,8 +91,8 @@ def expand(task: Task) -> Task:
 def _with_error_branches(
     places: Places, transitions: Transitions, subnets: Mapping[str, Subnet], to: str
 ) -> Transitions:
-    """The transitions of one net with an error branch to place `to` for each action place, and for
-    each macro place whose subnet can fail, that has none."""
+    """Return the transitions of one net, with an added error branch to place `to` for each action
+    place, and each macro place whose subnet can fail, that has none."""
     if not to:
         return transitions
     handled = {a.place for t in transitions.values() for a in t.inputs if a.end is End.ERROR}
@@ -118,7 +117,7 @@ def _with_error_branches(
 
 @dataclass(frozen=True, slots=True)
 class _Scope:
-    """What the names in one net mean: its own places, the parameters of its subnet, else the names
+    """Resolves the names in one net: its own places, the parameters of its subnet, else the names
     of the task."""
 
     prefix: str
@@ -127,22 +126,22 @@ class _Scope:
     """By parameter: the full name of a place, a `Reference`, or a plain value."""
 
     def place(self, name: str) -> str:
-        """The full name of a place."""
+        """Return the full name of a place."""
         if name in self.places:
             return self.prefix + name
         return str(self.values.get(name, name))
 
     def variable(self, name: str) -> str:
-        """The name of the variable that is meant."""
+        """Return the full name of a variable."""
         value = self.values.get(name)
         return value.variable if isinstance(value, Reference) else name
 
     def value(self, value: Value) -> Value:
-        """An argument: the parameter's own value where it refers to one."""
+        """Return the value of an argument: that of the parameter if it refers to one."""
         return self.values.get(value.variable, value) if isinstance(value, Reference) else value
 
     def expression(self, expression: Expression) -> Expression:
-        """A condition or value with the names that are meant here."""
+        """Return a condition or value with full names."""
         names = {n: self._text(n) for n in expression.names}
         return rename(expression, {n: text for n, text in names.items() if n != text})
 
@@ -155,7 +154,8 @@ class _Scope:
 
 
 def written(value: Value) -> str:
-    """A plain value as conditions write it. Raises ValueError for what they cannot say."""
+    """Return a plain value as text of a condition. Raises ValueError for values that conditions
+    cannot contain."""
     if value is None:
         return "none"
     if isinstance(value, bool):
@@ -169,7 +169,7 @@ def written(value: Value) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Flat:
-    """What has been unfolded so far, by full name."""
+    """The elements expanded so far, by full name."""
 
     subnets: Mapping[str, Subnet]
     places: dict[str, Place] = field(default_factory=dict)
@@ -177,7 +177,7 @@ class _Flat:
     entered: dict[str, Subnet] = field(default_factory=dict)
     """The subnet of each macro place."""
     holds: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    """What a token in each place holds, macro places too: it is taken once for all that happens
+    """Resources that a token in each place holds. A macro place takes them once for everything
     inside, which may fork."""
 
 
@@ -219,7 +219,7 @@ def _unfold(flat: _Flat, scope: _Scope, transitions: Transitions, inside: tuple[
 
 
 def _bound(scope: _Scope, macro: Place, subnet: Subnet) -> dict[str, Value]:
-    """What the parameters of a subnet stand for at one macro place."""
+    """Return the values of a subnet's parameters at one macro place."""
     bound: dict[str, Value] = {}
     for name, parameter in subnet.parameters.items():
         given = macro.args[name]
@@ -233,8 +233,8 @@ def _bound(scope: _Scope, macro: Place, subnet: Subnet) -> dict[str, Value]:
 
 
 def _around(prefix: str, macro: str) -> str:
-    """The full name of the innermost macro place around something: the one it names, else the one
-    whose subnet it is in."""
+    """Return the full name of the innermost macro place around an element: the one it names, else
+    the one whose subnet it is in."""
     return prefix + macro if macro else prefix.removesuffix(".")
 
 
@@ -255,8 +255,8 @@ def _in_scope(t: Transition, scope: _Scope) -> Transition:
 
 
 def _rewired(transition: Transition, entries: Mapping[str, Subnet]) -> Transition:
-    """The transition with its arcs to and from macro places bent to the subnets' entry and exit
-    places."""
+    """Return the transition with its arcs to and from macro places moved to the subnets' entry and
+    exit places."""
     return replace(
         transition,
         inputs=tuple(_from(a, entries) for a in transition.inputs),
@@ -285,8 +285,9 @@ def _from(arc: Input, entries: Mapping[str, Subnet]) -> Input:
 
 
 def _with_holding(holds: Mapping[str, tuple[str, ...]], transitions: Transitions) -> Transitions:
-    """Transitions that take what their output places hold beyond their input places, and give back
-    what they no longer hold. A token that moves between two holding places never lets go."""
+    """Return transitions that take the resources that their output places hold and their input
+    places do not, and give back those that only their input places hold. A token that moves between
+    two holding places keeps its resources."""
     if not any(holds.values()):
         return transitions
     return {name: _holding(t, holds) for name, t in transitions.items()}
@@ -313,12 +314,12 @@ def _holding(t: Transition, holds: Mapping[str, tuple[str, ...]]) -> Transition:
 def _with_tries(
     places: Places, transitions: Transitions
 ) -> tuple[Places, Transitions, dict[str, tuple[str, ...]]]:
-    """Count the tries of a place in `p.left` and `p.used`, and give the used ones back on every way
-    out.
+    """Count the tries of a place in `p.left` and `p.used`, and give the used ones back at every
+    outgoing transition.
 
     Each outgoing transition becomes one copy for each number of used tries, of which exactly one
-    can fire: the net stays bounded and is exact without reset arcs. Also returns the names of the
-    copies by written transition.
+    can fire: so the net stays bounded and needs no reset arcs. Also return the names of the copies
+    by original transition.
     """
     again = {p.name: p for p in places.values() if p.tries > 1}
     new_places: dict[str, Place] = {}
@@ -353,14 +354,14 @@ def _with_tries(
 
 
 def _may_retry(p: Place) -> str:
-    """The condition under which an ERROR leads to another try."""
+    """Return the condition under which an ERROR leads to another try."""
     known = "" if p.retry_unknown else f" and {p.name}.executed != 'unknown'"
     return f"{p.name}.reason != 'emergency_stop'{known}"
 
 
 def _copies(t: Transition, again: Mapping[str, Place]) -> Iterator[Transition]:
-    """The transition by number of used tries of each such place that it takes a run from; first the
-    one that keeps its name."""
+    """Return the copies of a transition, one for each number of used tries of each such place from
+    which it takes a run; the first one keeps its name."""
     taken = [a for a in t.inputs if a.place in again and a.end is not End.GOING]
     for number, used in enumerate(product(*(range(again[a.place].tries) for a in taken))):
         copy = t
@@ -373,7 +374,7 @@ def _copies(t: Transition, again: Mapping[str, Place]) -> Iterator[Transition]:
 
 
 def _returning(t: Transition, p: Place, arc: Input, used: int) -> Transition:
-    """The transition when it takes a run of p after so many used tries: it gives them back."""
+    """Return the transition that takes a run of p after so many used tries and gives them back."""
     counter, last = f"{p.name}.used", used == p.tries - 1
     if used:
         t = replace(
@@ -394,20 +395,21 @@ def _returning(t: Transition, p: Place, arc: Input, used: int) -> Transition:
 
 
 def _written_first(transitions: Transitions) -> Transitions:
-    """What was made stands behind what was written: the order settles conflicts of last resort."""
+    """Put added elements after those of the file, because the order decides conflicts as the last
+    rule."""
     made = {name: t for name, t in transitions.items() if t.expanded_from}
     return {**{name: t for name, t in transitions.items() if name not in made}, **made}
 
 
 def _plainly(places: Places) -> Places:
-    """The places without the short forms that stand in the net now."""
+    """Return the places without the short forms that were expanded."""
     if not any(p.holds or p.tries > 1 for p in places.values()):
         return places
     return {name: replace(p, holds=(), tries=1) for name, p in places.items()}
 
 
 def _with_empty_places(final: Expression, places: Places) -> Expression:
-    """`final`, and that the plain places which it does not name are empty."""
+    """Return `final`, extended so that plain places which it does not name are empty."""
     empty = [
         f"{p.name} == 0"
         for p in places.values()

@@ -1,5 +1,5 @@
-"""The sending ends of set-point streams: newest value wins, paced by absolute deadline, repeated
-while its run stands by it."""
+"""The sending ends of set-point streams: the newest value is sent, at absolute times, and repeated
+until its run ends or withdraws it."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from petrobot.services.comm.streams.stream import StreamSender
 from petrobot.services.comm.tls.credentials import credentials
 
 MOST = (LIMITS[SetPoint.KIND] - 64) // 9
-"""Numbers of a set point: 9 bytes each in its message, and room for the rest of it."""
+"""Most numbers of a set point: each takes 9 bytes of its message."""
 SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A set point that leaves: the newest value of a stream, and how long ago its action published
-    it (s)."""
+    """A set point to send: the newest value of a stream, and how long ago its action published it
+    (s)."""
 
     run: str
     stream: str
@@ -40,7 +40,7 @@ class _Outlet:
 
 
 class Outlets:
-    """All streams that the runs of one place may send to; a machine: `publish`, `advance`,
+    """All streams that the runs of one worker may send to; a machine: `publish`, `advance`,
     `due`."""
 
     def __init__(self, periods: Mapping[str, float]) -> None:
@@ -73,49 +73,47 @@ class Outlets:
         if not all(map(math.isfinite, numbers)):
             raise ValueError(f"set point of {stream!r} is not finite: {numbers}")
         if stream not in self._open:
-            outlet.next = max(outlet.next, now)  # a pause is no delay to be made up for
+            outlet.next = max(outlet.next, now)  # after a pause, missed sends are not made up for
         outlet.run, outlet.values, outlet.published = run, numbers, now
         self._open[stream] = outlet
 
     def withdraw(self, stream: str, run: str | None = None) -> None:
-        """Stop standing by a stream's last value (only if it is that run's, when one is given)."""
+        """Withdraw a stream's last value (if `run` is given, only if that run published it)."""
         if stream in self._open and run in (None, self._open[stream].run):
             del self._open[stream]
 
     def close(self, run: str) -> None:
-        """A run ended: nobody stands by its set points any more."""
+        """Withdraw the set points of a run that ended."""
         for stream in [s for s, outlet in self._open.items() if outlet.run == run]:
             del self._open[stream]
 
     def advance(self, now: float) -> list[Sent]:
-        """What is to be sent now: of each open stream at most one value in a period, new or
-        repeated."""
+        """Return the set points to send now: at most one per stream and period, new or repeated."""
         sent = []
         for stream, outlet in self._open.items():
             if now + SLACK < outlet.next:
                 continue
             late = now - outlet.next
-            # absolute deadlines keep the rate; after a gap of more than a period the grid starts
-            # anew
+            # absolute times keep the rate; after a gap of more than a period the grid starts again
             outlet.next = (outlet.next if late < outlet.period else now) + outlet.period
             sent.append(Sent(outlet.run, stream, outlet.values, max(0.0, now - outlet.published)))
         return sent
 
     def due(self) -> float | None:
-        """When `advance` has something to send next (s), None if nothing is open."""
+        """Return when `advance` has something to send next (s), None if no stream is open."""
         return min((outlet.next for outlet in self._open.values()), default=None)
 
 
-# All streams that a worker sends: finds the receivers through its node, keeps the connections,
-# drops what cannot go now.
+# All streams that a worker sends: find the receivers through the node, keep the connections, drop
+# what cannot be sent now.
 
 ASK_AGAIN = 0.25
-"""Seconds between questions for the address of a receiver that is not there."""
+"""Time between two requests for the address of a receiver that is not there (s)."""
 
 
 class StreamOutlets:
-    """Sending ends by stream, made when first needed. A receiver that does not take a stream is
-    asked for anew."""
+    """Sending ends by stream, made when first needed. If a receiver does not accept a stream, its
+    address is requested again."""
 
     def __init__(self, directory: Directory, sender: str) -> None:
         self._sender = sender
@@ -125,7 +123,7 @@ class StreamOutlets:
         self._asked: dict[str, float] = {}
 
     def send(self, now: float, sent: Sent) -> bool:
-        """Send a set point. True when the stream's address is wanted (again)."""
+        """Send a set point. Return True if the stream's address must be requested (again)."""
         outlet = self._outlets.get(sent.stream)
         if outlet is not None and outlet.send(sent.values, sent.elapsed):
             return False
@@ -135,7 +133,7 @@ class StreamOutlets:
         return outlet is None or not outlet.up
 
     def found(self, stream: str, host: str, port: int, ticket: str) -> None:
-        """A stream's address is known: connect, unless it is connected there."""
+        """Connect to a stream's address, unless it is connected there already."""
         older = self._outlets.get(stream)
         if older is not None and older.up:
             return
@@ -156,7 +154,7 @@ class StreamOutlets:
         self._outlets[stream] = outlet
 
     def advance(self) -> bool:
-        """Look after the connections; True while one is being opened."""
+        """Advance the connections; return True while one is being opened."""
         lines = [outlet.advance() for outlet in self._outlets.values()]
         return None in lines
 

@@ -11,7 +11,7 @@ SLACK = 1e-6  # s: three periods to the tick are not yet too old
 
 
 class SetpointReceiver:
-    """Implements `services.device.Setpoint` for the driver, and the `Sink` of whoever receives the
+    """Implements `services.device.Setpoint` for the driver, and `Sink` for the receiver of the
     stream's messages."""
 
     def __init__(self, period: float, clock: Callable[[], float]) -> None:

@@ -1,4 +1,4 @@
-"""Findings of the check, each by a small broken task and by the same task mended."""
+"""Findings of the check, each with a small faulty task and the same task without the fault."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ E, W, N = Severity.ERROR, Severity.WARNING, Severity.NOTE
 
 
 def found(task: Task, **kwargs: Any) -> dict[str, Any]:
-    """Findings by code."""
+    """Return the findings by code."""
     return {f.code: f for f in check(task, **kwargs).findings}
 
 
@@ -208,7 +208,7 @@ def test_refused_internal_tick_says_why(task: Tasks) -> None:
     ],
     ids=["conditions", "priority", "weight"],
 )
-def test_what_settles_a_conflict(task: Tasks, mended: dict[str, dict[str, Any]]) -> None:
+def test_what_decides_a_conflict(task: Tasks, mended: dict[str, dict[str, Any]]) -> None:
     net = {n: {"in": "x", "event": "e", **mended[n]} for n in ("t", "u")}
     assert "unsettled-conflict" not in found(task("x=1", net, "e", {"k": 0}))
 
@@ -222,7 +222,7 @@ def test_conditions_that_overlap_give_a_witness(task: Tasks) -> None:
     assert 1 < witness["k"] < 4
 
 
-def test_uncovered_exit_gives_a_witness(task: Tasks) -> None:
+def test_uncovered_outgoing_transition_gives_a_witness(task: Tasks) -> None:
     net = {**A, "n": {"in": "a:normal", "when": "k > 1"}, "m": {"in": "a:normal", "when": "k < 0"}}
     assert 0 <= found(task("a!=1 y", net, variables={"k": 0}))["uncovered-exit"].witness["k"] <= 1
 
@@ -326,7 +326,7 @@ def test_action_that_is_said_to_translate_another_primitive_task(
     )
 
 
-def test_honest_end_at_start(task: Tasks) -> None:
+def test_final_error_at_the_start(task: Tasks) -> None:
     made = task(
         "x=1 y",
         {"t": {"in": "x", "out": "y", "event": "e"}},

@@ -1,5 +1,4 @@
-"""Steps and conflicts by table: what fires together, in which order, and what settles a
-conflict."""
+"""Steps and conflicts: what fires together, in which order, and what decides a conflict."""
 
 from __future__ import annotations
 
@@ -52,7 +51,7 @@ def test_timeless_cycle_pauses(play: Plays) -> None:
 
 
 def test_a_net_that_fires_without_end_is_given_up(play: Plays) -> None:
-    """With nobody there to continue it: an unattended run does not wait for ever."""
+    """An unattended run must not wait for ever for an operator to continue it."""
     p = play("x=3 y", {"t": {"in": "x", "out": "y"}, "u": {"in": "y", "out": "x"}})
     (finished,) = p.of(Finished)
     assert (
@@ -89,7 +88,7 @@ def test_runs_of_a_net_that_is_given_up_are_stopped_first(play: Plays) -> None:
 def test_a_net_that_comes_to_an_end_may_fire_often(
     play: Plays, places: str, net: dict[str, dict[str, str]], fired: int
 ) -> None:
-    """However many tokens there are: what must end needs no limit to end it."""
+    """A net whose structure guarantees an end needs no limit, however many tokens there are."""
     p = play(places, net)
     assert len(p.fired) == fired and p.reports == [] and p.state.mode is not Mode.PAUSED
 
@@ -126,7 +125,7 @@ def test_step_is_judged_on_one_marking(play: Plays) -> None:
     assert p.fired == ["t", "u"] and p.marked == {"z": 1, "y": 1}
 
 
-def test_conflict_settled_by_priority(play: Plays) -> None:
+def test_conflict_decided_by_priority(play: Plays) -> None:
     net = {
         "t": {"in": "x", "out": "y", "event": "e"},
         "u": {"in": "x", "out": "z", "event": "e", "priority": 1},
@@ -136,7 +135,7 @@ def test_conflict_settled_by_priority(play: Plays) -> None:
     assert p.fired == ["u"] and p.reports == []
 
 
-def test_priority_settles_conflicts_alone(play: Plays) -> None:
+def test_priority_decides_conflicts_only(play: Plays) -> None:
     net = {
         "t": {"in": "x", "out": "y", "event": "e"},
         "u": {"in": "w", "out": "z", "event": "e", "priority": 1},
@@ -165,7 +164,7 @@ def test_conflict_drawn_by_weight(play: Plays) -> None:
     assert p.fired == ["u"] and p.marked == {"z": 1}
 
 
-def test_what_does_not_conflict_fires_in_the_same_step_as_the_drawn_one(play: Plays) -> None:
+def test_transitions_without_conflict_fire_in_the_step_of_the_drawn_one(play: Plays) -> None:
     net = {
         "t": {"in": "x", "out": "y", "event": "e", "weight": 1.0},
         "u": {"in": "x", "out": "z", "event": "e", "weight": 1.0},
@@ -202,7 +201,7 @@ def test_stimuli_wait_while_a_draw_is_outstanding(play: Plays) -> None:
     assert p.fired == ["t", "v"] and p.state.backlog == ()
 
 
-def test_undecided_conflict_goes_by_file_order_and_is_reported(play: Plays) -> None:
+def test_an_undecided_conflict_is_decided_by_file_order_and_reported(play: Plays) -> None:
     net = {"t": {"in": "x", "out": "y", "event": "e"}, "u": {"in": "x", "out": "z", "event": "e"}}
     p = play("x=1 y z", net, events="e")
     p(EventOccurred("e"))
@@ -226,7 +225,7 @@ def ended(run: str) -> RunEnded:
     ("ends", "served"),
     [(("a#1", "b#1"), ["first", "second"]), (("b#1", "a#1"), ["second", "first"])],
 )
-def test_a_conflict_over_a_resource_is_settled_first_come_first_served(
+def test_a_conflict_over_a_resource_is_decided_first_come_first_served(
     play: Plays, ends: tuple[str, ...], served: list[str]
 ) -> None:
     p = play("go=1 arm~=1 a!=1 b!=1 c! done_a done_b", ARM)
@@ -248,7 +247,7 @@ def test_a_queue_for_a_resource_is_served_in_the_order_of_its_arrivals(order: li
     assert p.reports == []
 
 
-def test_who_waits_from_the_same_stimulus_goes_by_the_order_in_the_file(play: Plays) -> None:
+def test_transitions_that_wait_since_the_same_stimulus_fire_in_file_order(play: Plays) -> None:
     p = play("go=1 arm~=1 x a!=1 b!=1 c! done_a done_b", ARM, policy=Policy(end_when_dead=False))
     p(Pause(), ended("b#1"), ended("a#1"), Resume())
     waits = {name: wait.since for name, wait in p.state.waits.items()}
@@ -263,7 +262,7 @@ def test_who_waits_from_the_same_stimulus_goes_by_the_order_in_the_file(play: Pl
 
 
 def test_a_wait_ends_when_something_else_is_lacking(play: Plays) -> None:
-    """`second` came first, loses its own token for a while, and has to queue again."""
+    """`second` waited first, loses its own token for a while, and must queue again."""
     net = {**ARM, "second": {"in": "ticket arm", "out": "arm done_b"}}
     p = play("go=1 arm~=1 ticket=1 a!=1 c! done_a done_b", net)
     assert p.state.waits["second"].since == 1

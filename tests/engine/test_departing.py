@@ -1,5 +1,5 @@
-"""A mission run may begin at any point that another one has come to: marking, ended runs, variables
-and latches are the same."""
+"""A mission run may begin at any point of another one: marking, ended runs, variables and latched
+events are the same."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from tests.engine.test_properties import DEVICES, Journal, tasks
 
 
 def over(state: State) -> Counter[tuple[str, Status | None, str, str]]:
-    """The ended runs whose tokens wait."""
+    """Return the ended runs whose tokens wait."""
     return Counter(
         (r.place, r.status, r.cause, r.action) for r in state.runs() if r.phase is Phase.DONE
     )
 
 
 def alive(state: State) -> Counter[str]:
-    """The places of runs that have not ended."""
+    """Return the places of runs that have not ended."""
     return Counter(r.place for r in state.runs() if r.phase is not Phase.DONE)
 
 
@@ -63,7 +63,7 @@ def test_any_point_of_any_run_is_a_beginning_at_length(task: Task, data: st.Data
 
 
 def set_out_anywhere(task: Task, data: st.DataObject) -> None:
-    """Play anything; where the net was at rest, a run that sets out there stands where it stood."""
+    """Play random stimuli; a run that begins at a state at rest has the same state."""
     journal = Journal(task)
     journal.feed(Begin({}, {"n": 1}))
     for _ in range(data.draw(st.integers(0, 25))):
@@ -105,8 +105,8 @@ TASK = make_task(
         (Standing("a", Status.ERROR, "slipped"), ["lost", "go"]),
     ],
 )
-def test_runs_that_went_on_begin_again_or_are_over(standing: Standing, fired: list[str]) -> None:
-    """An ended run takes the way out of its status at once; one that begins again is started."""
+def test_active_runs_begin_again_or_have_ended(standing: Standing, fired: list[str]) -> None:
+    """An ended run leaves its place by its status at once; a run that begins again is started."""
     engine = Engine(TASK)
     state, instructions = engine.handle(engine.initial(), Begin(point=Point({"c": 1}, (standing,))))
     assert [i.transition for i in instructions if hasattr(i, "transition")] == fired
@@ -114,9 +114,8 @@ def test_runs_that_went_on_begin_again_or_are_over(standing: Standing, fired: li
     assert sum(state.marking) >= 1
 
 
-def test_what_the_task_does_not_know_is_told_and_left_out() -> None:
-    """A point of another task does no harm: unknown places are reported, tokens and runs always
-    agree."""
+def test_places_unknown_to_the_task_are_reported_and_left_out() -> None:
+    """With a point of another task, unknown places are reported, and tokens and runs agree."""
     engine = Engine(TASK)
     point = Point({"c": 1, "a": 3, "nowhere": 1}, (Standing("b"), Standing("r"), Standing("moon")))
     state, instructions = engine.handle(engine.initial(), Begin(point=point))
@@ -126,8 +125,8 @@ def test_what_the_task_does_not_know_is_told_and_left_out() -> None:
     assert (marking["a"], marking["b"], marking["c"]) == (0, 1, 1)
 
 
-def test_a_second_begin_is_still_none() -> None:
-    """A run that goes on is not put elsewhere."""
+def test_a_second_begin_is_ignored() -> None:
+    """An active mission run does not jump to another state."""
     engine = Engine(TASK)
     state, _ = engine.handle(engine.initial(), Begin())
     after, _ = engine.handle(state, Begin(point=Point({"c": 9})))

@@ -1,4 +1,4 @@
-"""Drawings: complete, valid, words that do not cover each other, error branches folded."""
+"""Drawings: complete, valid, texts do not overlap, error branches are folded."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def elements(svg: str, tag: str, style: str) -> list[ElementTree.Element]:
 
 
 def texts(svg: str) -> set[str]:
-    """All words."""
+    """Return all texts."""
     return {e.text or "" for e in ElementTree.fromstring(svg).iter(SVG + "text")}
 
 
 def unplaced(task: Task) -> Task:
-    """The task without positions."""
+    """Return the task without positions."""
     places = {n: replace(p, x=None, y=None) for n, p in task.places.items()}
     return replace(
         task,
@@ -79,7 +79,7 @@ def test_words_cover_neither_nodes_nor_each_other(path: Path, errors: bool, plac
 
 
 def overlap(a: Words, b: Words) -> bool:
-    """Whether two blocks of words cover each other."""
+    """Return whether two text blocks overlap."""
     return (
         a.box[0] < b.box[2] and b.box[0] < a.box[2] and a.box[1] < b.box[3] and b.box[1] < a.box[3]
     )

@@ -1,4 +1,4 @@
-"""Short forms of the task file: what they stand for, how they run, and the faults in them."""
+"""Short forms of the task file: their expansion, their execution, and their faults."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def arcs(task: Task) -> dict[str, str]:
     }
 
 
-def test_short_forms_stand_for_plain_net_elements() -> None:
+def test_short_forms_expand_to_plain_net_elements() -> None:
     task = loads(SHORT)
     assert loads(dumps(task)) == task
     assert arcs(task) == {
@@ -162,7 +162,7 @@ def test_short_forms_stand_for_plain_net_elements() -> None:
     assert {f.code for f in check(task).errors} == {"uncovered-exit"}  # bin may be 'right'
 
 
-def test_a_subnet_holds_once_for_all_that_happens_inside() -> None:
+def test_a_macro_place_holds_its_resource_once() -> None:
     """Two branches inside do not need the resource twice."""
     forked = (
         SHORT.replace('entry = "move"', 'entry = "begin"')
@@ -182,7 +182,7 @@ in = ["left"]
     assert found["placed"] == "put.over -> arm"
 
 
-def test_a_value_takes_the_place_of_a_parameter() -> None:
+def test_a_value_replaces_a_parameter() -> None:
     flat = loads(SHORT.replace('where = { var = "bin" }', 'where = "right"')).flat
     assert flat.places["put.move"].args == {"bin": "right"}
     when = flat.transitions["put.moved"].when
@@ -276,7 +276,8 @@ ENDS = st.sampled_from(
 def test_each_token_has_its_tries(
     ends: list[tuple[Status, str, Executed] | None], retry_unknown: bool
 ) -> None:
-    """Only an ERROR that was surely not an emergency stop, and is known, leads to another run."""
+    """Only an ERROR that is not an emergency stop, and after which `executed` is known, leads to
+    another run."""
     text = TRIES.replace("tries = 3", "tries = 3\nretry_unknown = true") if retry_unknown else TRIES
     play = Play(Engine(loads(text)))
     play(Begin())
@@ -306,7 +307,7 @@ def test_each_token_has_its_tries(
     assert (left["grasp.left"], left["grasp.used"], left["hand"]) == (2, 0, 1)
 
 
-def test_a_timeout_is_a_tighter_deadline() -> None:
+def test_a_timeout_is_a_shorter_deadline() -> None:
     play = Play(Engine(loads(SHORT)))
     (start,) = (i for i in play(Begin()) if isinstance(i, StartRun))
     assert (start.place, start.deadline) == ("grasp", 2.0)
@@ -360,7 +361,7 @@ out = ["button"]
 """
 
 
-def test_what_listens_is_stopped_when_the_task_is_done() -> None:
+def test_listening_runs_are_stopped_when_the_task_ends() -> None:
     play = Play(Engine(loads(LISTEN)))
     play(Begin(), RunEnded("button#1", Status.SUCCESS))
     answer = play(RunEnded("work#1", Status.SUCCESS))
@@ -436,7 +437,7 @@ out = ["done"]
 
 
 def test_a_firing_sets_variables_and_its_token_keeps_them() -> None:
-    """Three tokens wait for one server; each run gets what was set when its token entered. Two
+    """Three tokens wait for one server; each run gets the values from when its token entered. Two
     transitions that set one variable do not fire in one step."""
     play = Play(Engine(loads(SETS)))
     play(Begin())
@@ -603,7 +604,7 @@ def test_faults_name_key_and_remedy(text: str, old: str, new: str, key: str, wor
 
 @pytest.mark.parametrize("text", [SHORT, TRIES])
 def test_a_flat_task_can_be_written_and_read(text: str) -> None:
-    """As a journal keeps it: with the origin of each element, and flat in itself."""
+    """As in a journal: with the origin of each element, and without short forms."""
     flat = loads(text).flat
     again = loads(dumps(flat), flat=True)
     assert again == flat and again.flat is again and again.net == flat.net

@@ -54,8 +54,8 @@ COMMON = settings(
 
 
 def allowed(net: Net, marking: Sequence[int], t: int, occupied: Sequence[int]) -> bool:
-    """Whether tokens, inhibitor arcs and capacities allow transition t: the sentence of
-    docs/semantics.md, section 4. `occupied` counts runs that are still stopping, too."""
+    """Return whether tokens, inhibitor arcs and capacities allow transition t, by the sentence of
+    docs/semantics.md, section 4. `occupied` also counts runs that are still stopping."""
     pre, post = dict(net.consume[t]), dict(net.produce[t])
     below = dict(net.inhibit[t])
     for p, room in enumerate(net.capacity):
@@ -74,14 +74,14 @@ def successor(net: Net, marking: Sequence[int], t: int) -> Marking:
 
 
 def enabled(net: Net, marking: Marking) -> list[int]:
-    """The allowed transitions of the highest priority among them."""
+    """Return the allowed transitions of the highest priority."""
     able = [t for t in range(len(net.transitions)) if allowed(net, marking, t, marking)]
     return [t for t in able if all(net.priority[t] >= net.priority[u] for u in able)]
 
 
 def visited(task: Task, data: st.DataObject) -> list[State]:
-    """The states that the engine rests in while it is fed stimuli of the world. Every firing is
-    compared with the judge."""
+    """Return the states at rest of the engine under stimuli of the world. Every firing is compared
+    with the judge."""
     engine, world = Engine(task, DEVICES, Policy(firing_limit=40)), Journal(task)
     state, said = engine.handle(engine.initial(), Begin({}, {"n": 1}))
     states, marking = [state], engine.initial().marking
@@ -100,7 +100,8 @@ def visited(task: Task, data: st.DataObject) -> list[State]:
 
 
 def engine_agrees(task: Task, states: list[State]) -> None:
-    """The engine's token rule, with runs that are still stopping where they occupy a place."""
+    """Compare the engine's token rule, with runs that are still stopping as occupants of their
+    place."""
     compiled = Engine(task, DEVICES).compiled
     for state in states:
         draft = Draft(compiled, state)
@@ -153,7 +154,7 @@ def simulators_agree(net: Net, markings: list[Marking]) -> None:
 
 
 class Frozen(Play):
-    """A forecast whose runs are set from outside and neither drawn nor counted."""
+    """A forecast whose runs are set by the test, and neither drawn nor counted."""
 
     def _start(self, q: int, columns: Any) -> None:
         """No run is drawn."""
@@ -193,7 +194,8 @@ class Frozen(Play):
 
 
 def forecast_agrees(task: Task, states: list[State]) -> None:
-    """States with one run at a time that has not been asked to stop: what a forecast knows."""
+    """Compare states with at most one run per place, none of which is stopping: a forecast has no
+    others."""
     try:
         structure = Structure.of(task)
     except ValueError:
@@ -208,7 +210,7 @@ def forecast_agrees(task: Task, states: list[State]) -> None:
 
 
 def all_agree(task: Task, data: st.DataObject) -> None:
-    """Play the task in the engine, and put every marking that it rests in before the others."""
+    """Play the task in the engine, and give every marking at rest to the others."""
     states = visited(task, data)
     engine_agrees(task, states)
     forecast_agrees(task, states)
@@ -221,12 +223,12 @@ def all_agree(task: Task, data: st.DataObject) -> None:
 
 @settings(COMMON, max_examples=60)
 @given(tasks(), st.data())
-def test_all_that_play_a_task_agree(task: Task, data: st.DataObject) -> None:
+def test_all_players_of_a_task_agree(task: Task, data: st.DataObject) -> None:
     all_agree(task, data)
 
 
 @pytest.mark.proof
 @settings(COMMON, max_examples=5000)
 @given(tasks(), st.data())
-def test_all_that_play_a_task_agree_at_length(task: Task, data: st.DataObject) -> None:
+def test_all_players_of_a_task_agree_at_length(task: Task, data: st.DataObject) -> None:
     all_agree(task, data)

@@ -91,7 +91,7 @@ def test_timers_stop_with_the_pause_and_those_of_a_run_when_it_holds(play: Plays
     assert {i.key for i in released if isinstance(i, ReleaseTimer)} == set(keys.values())
 
 
-def test_timer_of_a_run_that_cannot_hold_goes_on_and_counts_after_the_pause(play: Plays) -> None:
+def test_the_timer_of_a_run_that_cannot_hold_continues_in_a_pause(play: Plays) -> None:
     p = play("a!=1 y", {"late": {"in": "a:preempt=none", "out": "y", "after": 3.0}})
     p(Pause(), RunHeld("a#1", Hold.CANNOT), TimerFired(p.of(ArmTimer)[0].key))
     assert p.fired == []
@@ -166,7 +166,7 @@ def test_unknown_breakpoint_is_refused_and_the_others_set(play: Plays) -> None:
 
 
 def test_an_override_is_kept_for_the_primitive_task_until_it_is_given_back(play: Plays) -> None:
-    """Also before the beginning; what is no task or no alternative is refused and changes
+    """It also works before the beginning; an unknown task or alternative is refused and changes
     nothing."""
     p = play("x=1 a! b! y", LINE, "e", alternatives={"a": ("do_a", "do_a_slowly")})
     p(Override("a", "do_a_slowly"), Override("a", "do_b"), Override("nothing", "do_a"))
@@ -179,8 +179,9 @@ def test_an_override_is_kept_for_the_primitive_task_until_it_is_given_back(play:
     assert p.state.overrides == {} and state_from_plain(to_plain(p.state)) == p.state
 
 
-def test_a_net_taken_over_while_paused_asks_every_run_to_hold_again(play: Plays) -> None:
-    """Whoever paused it may have died before the nodes had answered, or before they were asked."""
+def test_a_net_resumed_in_a_pause_asks_every_run_to_hold_again(play: Plays) -> None:
+    """The earlier coordinator may have died before the nodes answered, or before they were
+    asked."""
     p = play("x=1 a! b! y", LINE, "e")
     p(EventOccurred("e"), RunStarted("a#1"), Pause("by hand"))
     assert [type(order) for order in p.engine.outstanding(p.state)] == [StartRun, HoldRun]
@@ -272,7 +273,7 @@ def test_pause_waits_for_an_outstanding_draw_but_abort_does_not(play: Plays) -> 
     assert q.finished.status is ERR
 
 
-def test_operators_token_is_no_way_to_lose_the_end(play: Plays) -> None:
+def test_a_token_of_the_operator_does_not_prevent_the_end(play: Plays) -> None:
     p = play(
         "x=1 a!=1 y",
         {"t": {"in": "a:normal", "out": "y"}, "e": {"in": "a:error"}},
@@ -284,7 +285,7 @@ def test_operators_token_is_no_way_to_lose_the_end(play: Plays) -> None:
     assert p.finished.status is OK
 
 
-def test_outstanding_orders_are_those_that_nobody_has_answered(play: Plays) -> None:
+def test_outstanding_orders_are_those_without_an_answer(play: Plays) -> None:
     net = {
         "t": {"in": "a:preempt=none", "event": "e"},
         "late": {"in": "x", "after": 5.0},

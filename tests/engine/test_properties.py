@@ -180,7 +180,7 @@ def transitions(draw: st.DrawFn, name: str, places: Mapping[str, Place]) -> Tran
 
 @st.composite
 def tasks(draw: st.DrawFn) -> Task:
-    """A consistent task; nothing says that it is a good one."""
+    """A consistent task; it need not be a good one."""
     places = draw(place_tables())
     made = {f"t{i}": draw(transitions(f"t{i}", places)) for i in range(draw(st.integers(1, 6)))}
     final = parse(draw(st.sampled_from(("1 == 2", "c0 == 0", "a0 == 0 and c0 > 1"))))
@@ -280,7 +280,7 @@ class Journal:
         )
 
     def stimuli(self) -> list[Stimulus]:
-        """What could come now: mostly answers to what was ordered, and some nonsense."""
+        """Draw stimuli that could arrive now: mostly answers to orders, and some invalid ones."""
         runs = [r for r in self.state.runs() if r.phase in ACTIVE]
         found: list[Stimulus] = [
             RunEnded("a0#99", Status.SUCCESS),
@@ -310,7 +310,7 @@ class Journal:
         return found
 
     def commands(self) -> list[Stimulus]:
-        """What the operator could do, and what global memory could say."""
+        """Draw commands of the operator, and changes of the global memory."""
         found: list[Stimulus] = [
             Pause(),
             Resume(),
@@ -351,7 +351,7 @@ def test_any_stimuli_on_any_task_at_length(task: Task, data: st.DataObject) -> N
 
 
 def play_anything(task: Task, data: st.DataObject) -> None:
-    """Begin, then up to 25 stimuli drawn from what could come."""
+    """Begin, then handle up to 25 stimuli drawn from those that could arrive."""
     journal = Journal(task)
     journal.feed(Begin({}, {"n": 1}))
     for _ in range(data.draw(st.integers(0, 25))):
@@ -361,22 +361,22 @@ def play_anything(task: Task, data: st.DataObject) -> None:
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(tasks(), st.data())
-def test_what_check_calls_settled_is_never_left_undecided(task: Task, data: st.DataObject) -> None:
+def test_what_check_calls_decided_is_never_left_undecided(task: Task, data: st.DataObject) -> None:
     play_without_operator(task, data)
 
 
 @pytest.mark.proof
 @settings(max_examples=5000, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(tasks(), st.data())
-def test_what_check_calls_settled_is_never_left_undecided_at_length(
+def test_what_check_calls_decided_is_never_left_undecided_at_length(
     task: Task, data: st.DataObject
 ) -> None:
     play_without_operator(task, data)
 
 
 def play_without_operator(task: Task, data: st.DataObject) -> None:
-    """Stimuli of the world alone: whoever pauses a net lets stimuli gather that never come together
-    by themselves."""
+    """Play stimuli of the world only: during a pause, stimuli collect that would otherwise never
+    come together."""
     unsettled = any(f.code == "unsettled-conflict" for f in check(task).findings)
     engine = Engine(task, DEVICES, Policy(firing_limit=40))
     journal = Journal(task)

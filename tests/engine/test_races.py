@@ -1,8 +1,8 @@
-"""Races by name: two things that cross on their way, in either order. Each has one right outcome,
-and tokens stay whole.
+"""Race conditions: two messages that cross, in either order. Each case has one right outcome, and
+no token is lost or doubled.
 
-Where other coordination systems got one of them wrong, the name of the trouble is in the test; all
-of them by name, over a node, in tests/run/test_named_races.py.
+If another coordination system had a bug in such a case, the test names its issue;
+tests/run/test_named_races.py has all of them with a node.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The semantics by table: branches, events, conditions, timers, servers, results, the end."""
+"""The semantics: branches, events, conditions, timers, servers, results, the end."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_end_is_latched_so_that_a_join_waits_for_it(play: Plays) -> None:
     assert p.fired == ["join"] and p.marked == {"done": 1}
 
 
-def test_pulse_serves_who_is_ready_and_is_gone(play: Plays) -> None:
+def test_a_pulse_serves_ready_transitions_and_disappears(play: Plays) -> None:
     net = {"t": {"in": "x", "out": "y", "event": "tick"}, "u": {"in": "a:normal", "out": "x"}}
     p = play("x a!=1 y", net, events="tick")
     p(EventOccurred("tick"), RunEnded("a#1", OK))
@@ -80,7 +80,7 @@ def test_pulse_is_broadcast_and_fires_each_transition_once(play: Plays) -> None:
     assert sorted(p.fired) == ["t", "u"] and p.marked == {"x": 1, "z": 2}
 
 
-def test_pulse_does_not_serve_what_its_own_firing_enables(play: Plays) -> None:
+def test_a_pulse_does_not_serve_transitions_that_its_firing_enables(play: Plays) -> None:
     net = {
         "t": {"in": "x", "out": "y", "event": "tick"},
         "u": {"in": "y", "out": "z", "event": "tick"},
@@ -267,7 +267,7 @@ def test_after_timer_is_armed_fires_and_is_disarmed(play: Plays) -> None:
     assert p.fired == ["t", "late"]
 
 
-def test_after_timer_starts_anew_for_another_run(play: Plays) -> None:
+def test_after_timer_starts_again_for_another_run(play: Plays) -> None:
     net = {
         "retry": {"in": "a:error", "out": "a"},
         "long": {"in": "a:preempt=failure", "out": "z", "after": 9.0},
@@ -282,7 +282,7 @@ def test_after_timer_starts_anew_for_another_run(play: Plays) -> None:
     assert p.fired == ["retry", "long"] and p.marked == {"z": 1}
 
 
-def test_timer_starts_anew_after_its_own_firing(play: Plays) -> None:
+def test_timer_starts_again_after_its_own_firing(play: Plays) -> None:
     p = play("x=2 y", {"late": {"in": "x", "out": "y", "after": 2.0}})
     p(TimerFired(p.of(ArmTimer)[0].key))
     assert p.fired == ["late"] and len(p.of(ArmTimer)) == 2
@@ -290,8 +290,9 @@ def test_timer_starts_anew_after_its_own_firing(play: Plays) -> None:
     assert p.fired == ["late", "late"]
 
 
-def test_timer_starts_anew_when_a_firing_takes_its_token_and_gives_it_back(play: Plays) -> None:
-    """Between taking and giving the transition is not enabled, however short that is."""
+def test_timer_starts_again_when_a_firing_takes_its_token_and_gives_it_back(play: Plays) -> None:
+    """Between taking and giving the token, the transition is not enabled, even if no time
+    passes."""
     net = {
         "t": {"in": "x", "out": "x", "event": "e"},
         "late": {"in": "x", "out": "z", "after": 9.0},
@@ -388,9 +389,9 @@ def test_deferred_verdict_corrects_once_and_moves_nothing(play: Plays) -> None:
     assert p.marked == {"done": 1} and p.reports == ["no_verdict_due"]
 
 
-def test_a_verdict_may_overtake_the_end_of_its_run(play: Plays) -> None:
-    """Two nodes, two links: the judge's word may come first. It is kept until the run ends, and
-    counts once."""
+def test_a_verdict_may_come_before_the_end_of_its_run(play: Plays) -> None:
+    """The run's node and the judge's node have different links, so the verdict may come first. It
+    is kept until the run ends, and counts once."""
     p = play("a!=1 done broken", BRANCHES)
     p(Verdict("a#1", FAIL, "slipped", "seen from above"), Verdict("a#1", OK))
     assert p.of(Corrected) == [] and p.reports == ["no_verdict_due"]
@@ -405,7 +406,7 @@ def test_a_verdict_may_overtake_the_end_of_its_run(play: Plays) -> None:
     assert p.marked == {"done": 1} and p.reports == ["no_verdict_due"] * 2
 
 
-def test_a_verdict_on_a_run_that_was_sure_changes_nothing(play: Plays) -> None:
+def test_a_verdict_on_a_final_result_changes_nothing(play: Plays) -> None:
     p = play("a!=1 done broken", BRANCHES)
     p(Verdict("a#1", FAIL), RunEnded("a#1", OK), Verdict("a#1", FAIL), Verdict("b#7", OK))
     assert p.of(Corrected) == [] and p.reports == ["no_verdict_due"] * 3

@@ -1,5 +1,4 @@
-"""The catching task: its state space, its branches, and a mission run from begin to end in each of
-its ways."""
+"""The catching task: its state space, its branches, and a mission run to each of its ends."""
 
 from __future__ import annotations
 
@@ -52,7 +51,7 @@ def test_check_finds_nothing_but_one_arrival_order(catch: Task) -> None:
 
 
 def reachable(task: Task) -> dict[Marking, list[Marking]]:
-    """All markings with their successors."""
+    """Return all markings with their successors."""
     net = task.net
     found: dict[Marking, list[Marking]] = {}
     fresh = [net.initial]
@@ -64,7 +63,7 @@ def reachable(task: Task) -> dict[Marking, list[Marking]]:
     return found
 
 
-def test_every_ending_is_designed_or_honest_and_reachable_from_everywhere(catch: Task) -> None:
+def test_every_dead_marking_is_final_or_final_error_and_always_reachable(catch: Task) -> None:
     space = reachable(catch)
     names = catch.net.places
     assert len(space) < 1000 and max(map(max, space)) == 4, "bounded"
@@ -102,7 +101,8 @@ def test_all_transitions_can_fire_and_action_places_are_safe(catch: Task) -> Non
 
 
 class Cell:
-    """Answers every order at once: events when they are waited for, ends by a script."""
+    """Answers every order at once: events when a transition waits for them, ends of runs by a
+    script."""
 
     def __init__(self, task: Task, script: Script, caught: bool = True, ticks: bool = True) -> None:
         devices = {
@@ -117,7 +117,7 @@ class Cell:
         self.all: list[Instruction] = []
 
     def run(self) -> Finished:
-        """Play to the end."""
+        """Play the task to its end."""
         queue: list[Any] = [Begin({"seed": 7})]
         for _ in range(2000):
             stimulus = queue.pop(0) if queue else self._idle()
@@ -147,11 +147,11 @@ class Cell:
         return TimerFired([i for i in self.all if isinstance(i, ArmTimer)][-1].key)
 
     def records(self, place: str) -> list[RunRecorded]:
-        """How the runs of a place were recorded."""
+        """Return the records of the runs of a place."""
         return [i for i in self.all if isinstance(i, RunRecorded) and i.place == place]
 
     def tokens(self, place: str) -> int:
-        """Tokens of a place."""
+        """Return the tokens of a place."""
         return self.state.marking[self.engine.compiled.net.place_index[place]]
 
 
@@ -180,7 +180,7 @@ def test_balls_that_pass_use_up_the_runs(catch: Task) -> None:
 @pytest.mark.parametrize(
     "place", ["locate_ball", "track_ball", "move_to_point", "catch_ball", "return_home"]
 )
-def test_an_error_anywhere_comes_back_to_the_normal_flow(catch: Task, place: str) -> None:
+def test_an_error_anywhere_returns_to_the_normal_flow(catch: Task, place: str) -> None:
     cell = Cell(catch, lambda s: ERR if s.place == place else OK)
     assert cell.run().status is OK
     assert (cell.tokens("attempts"), cell.tokens("failed_attempts"), cell.tokens("arm_free")) == (

@@ -1,4 +1,4 @@
-"""Task files: every fault named with its line, key and remedy; the notation of arcs; subnets."""
+"""Task files: every fault has its line, key and remedy; the notation of arcs; subnets."""
 
 from __future__ import annotations
 
@@ -264,7 +264,7 @@ def test_broken_toml_says_where() -> None:
 
 
 @pytest.mark.parametrize("data", [b"\xff\xfe", b"schema = 1\n# \xff"])
-def test_file_that_is_no_text(tmp_path: Path, data: bytes) -> None:
+def test_a_file_that_is_not_text(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "task.toml"
     path.write_bytes(data)
     with pytest.raises(TaskFileError, match="UTF-8"):

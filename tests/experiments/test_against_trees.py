@@ -1,5 +1,5 @@
-"""The experiment beside a behaviour tree: its three programs do the task, its referee and its
-counting are right."""
+"""The experiment with a behaviour tree: its three programs do the task, and its referee and its
+counts are right."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_the_referee_names_what_is_wrong(
     assert (not found) if not says else any(says in line for line in found)
 
 
-def test_what_a_fault_shows_is_found() -> None:
+def test_symptoms_of_a_fault_are_found() -> None:
     names = [fault.name for fault in FAULTS]
     swapped = names.index("results of locating swapped")
     for program in PROGRAMS:
@@ -146,7 +146,7 @@ def test_the_chance_of_a_combination_is_the_plants() -> None:
     assert abs(sum(runs) / 200 - chance(usual, {})) < 0.11  # four standard errors
 
 
-def test_regret_is_what_the_best_choice_would_have_caught_more() -> None:
+def test_regret_is_the_difference_to_the_best_choice() -> None:
     _, first = best({})
     assert regret([5, 0]) == pytest.approx([5 * first - 5, 10 * first - 5])
 

@@ -113,7 +113,7 @@ async def test_processes_left_by_a_crashed_worker_end_with_it(
 
 
 @pytest.mark.parametrize("way", ["worker killed", "node killed", "node stopped"])
-async def test_processes_left_by_an_action_end_with_its_worker(
+async def test_what_an_action_leaves_running_lives_as_long_as_its_worker(
     own_nodes: Nodes, tmp_path: Path, way: str
 ) -> None:
     nodes = own_nodes

@@ -1,4 +1,4 @@
-"""How well the finders find: `python -m tests.picking.measure [REGIME ...]`."""
+"""Measure how well the finders find parts: `python -m tests.picking.measure [REGIME ...]`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Finding parts in images of the simulated camera, whose errors of installation finders do not
+"""Finding parts in images of the simulated camera, whose installation errors the finders do not
 know."""
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from tests.sim.picking.bench import scene
 
 SEEDS = range(40, 52)
 NEAR = 0.008
-"""m: installation errors, and half a finger's play."""
+"""Tolerance of a position (m): installation errors, and half a finger's play."""
 
 
 def rate(name: str, regime: str) -> float:
-    """Share of parts of all seeds that are found where they lie."""
+    """Return the share of parts of all seeds that are found at their positions."""
     cell, hit, count = cell_named(), 0, 0
     for seed in SEEDS:
         parts, image = scene(seed, regime)
@@ -70,7 +70,7 @@ def test_the_direction_of_a_long_part_is_found() -> None:
     assert seen >= 6
 
 
-def test_only_what_most_images_show_counts_and_the_freest_part_is_taken() -> None:
+def test_a_part_must_be_in_most_images_and_the_freest_one_is_taken() -> None:
     parts, image = scene(3)
     found = find_by_templates(image, cell_named())
     assert len(found) == len(parts)

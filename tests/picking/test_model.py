@@ -1,4 +1,4 @@
-"""The numbers of cell and arms: kinematics both ways, and what a bad file says."""
+"""The numbers of cell and arms: forward and inverse kinematics, and messages about bad files."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_the_laboratory_has_the_same_arm_but_for_its_errors(arm: str, joints: li
     assert 1e-4 < away < 0.02
 
 
-def test_what_is_out_of_reach_is_refused() -> None:
+def test_a_point_out_of_reach_is_refused() -> None:
     with pytest.raises(OutOfReachError, match=r"so101 cannot reach x 0\.600"):
         arm_named("so101").over(0.6, 0.0, 0.02, 0.0)
 

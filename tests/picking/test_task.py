@@ -1,5 +1,5 @@
-"""The shipped task with both arms: what check says, a whole run in lock step, the same again, and
-that its failures are judged."""
+"""The shipped task with both arms: no findings of check, a whole run in lock step and its
+repetition, and verdicts on failures."""
 
 from __future__ import annotations
 

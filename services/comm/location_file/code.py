@@ -1,8 +1,8 @@
-"""What the code that a location file names says of itself, read in a process of its own, and what
-does not fit the file.
+"""Read what the code of a location file declares, in a separate process, and compare it with the
+file.
 
-`petrobot check` asks here. Importing runs the user's code, so it happens elsewhere and within
-limits: a module that waits for a device, or ends the process, costs a line of text.
+For `petrobot check`. Importing runs the user's code, so it happens in another process and within
+limits: a module that waits for a device, or ends the process, gives one line of text.
 """
 
 from __future__ import annotations
@@ -27,19 +27,20 @@ PROGRAM = "petrobot.services.code_reading"
 SECONDS = 20.0
 """Processor time that the imports may take (s)."""
 BUSY = 3.0
-"""How many times as long they may take altogether: on a busy host, or when they sleep."""
+"""Limit of the elapsed time, as a multiple of the processor time: for a busy host, or imports that
+sleep."""
 ADDRESS_SPACE = 4 << 30
-"""Bytes of address space that they may have."""
+"""Address space that the imports may use (bytes)."""
 
 Facts = Mapping[str, Any]
-"""What `PROGRAM` says of one import path."""
+"""What `PROGRAM` reports about one import path."""
 
 
 def read_code(directory: Directory, seconds: float = SECONDS) -> dict[str, Facts]:
     """Return what is known of each action, service and driver of this host's nodes, by import path.
 
-    What cannot be imported, or not within `seconds` of processor time altogether, has the key
-    `import`: why.
+    A path that cannot be imported, or not within `seconds` of processor time for all paths
+    together, has the key `import` with the reason.
     """
     here = {node.name for node in directory.nodes.values() if is_loopback(node.host)}
     actions, services = directory.actions.values(), directory.services.values()
@@ -56,13 +57,14 @@ def read_code(directory: Directory, seconds: float = SECONDS) -> dict[str, Facts
         told, why = _ask(left, seconds)
         known |= {facts["path"]: facts for facts in told}
         for path, _ in left[len(told) : len(told) + 1]:
-            known[path] = {"import": why}  # its import broke the process; the others are asked anew
+            # its import ended the process; a new process reads the others
+            known[path] = {"import": why}
     return known
 
 
 def _ask(paths: list[Any], seconds: float) -> tuple[list[Facts], str]:
-    """Return what a new process says of the paths until it ends, and why it ended before the
-    last. Code that comes with petrobot does not change while this process lives: it is asked
+    """Return what a new process reports about the paths until it ends, and why it ended before the
+    last one. Code that comes with petrobot does not change while this process runs, so it is read
     once."""
     question = json_text({"sys_path": sys.path, "paths": paths})
     if all(path.startswith("petrobot.") for path, _ in paths):
@@ -81,7 +83,7 @@ def _ask_process(question: str, seconds: float) -> tuple[list[Facts], str]:
         start_new_session=True,
     )  # fmt: skip
     resource.prlimit(process.pid, resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
-    # What counts is processor time: on a busy host an import may take several times as long.
+    # The limit is one of processor time: on a busy host an import may take several times as long.
     most = math.ceil(seconds)
     resource.prlimit(process.pid, resource.RLIMIT_CPU, (most, most + 1))
     try:
@@ -137,7 +139,8 @@ def _memory(directory: Directory, code: Mapping[str, Facts]) -> Iterator[str]:
 
 
 def _streams(directory: Directory, code: Mapping[str, Facts]) -> Iterator[str]:
-    """Streams that the code names and the location file does not, or leads elsewhere."""
+    """Return the streams that the code uses and the location file does not have, or directs to
+    another device."""
     for device in directory.devices.values():
         for name, (file, line) in code.get(device.driver, {}).get("streams", {}).items():
             entry = directory.streams.get(name)

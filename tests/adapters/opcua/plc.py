@@ -1,6 +1,7 @@
-"""A PLC of the tests, in a process of its own: `plc.py PORT [CERTIFICATE KEY CLIENT]`.
+"""A simulated PLC for tests, in a separate process: `plc.py PORT [CERTIFICATE KEY CLIENT]`.
 
-`request` is acknowledged as `manner` says: "good", "silent", "stuck" (never withdrawn).
+The node `manner` decides how `request` is acknowledged: "good", "silent", "stuck" (never
+withdrawn).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ KINDS = {
 
 
 async def secure(server: Server, certificate: str, key: str, clients: str) -> None:
-    """Accept encrypted sessions alone, of clients with these certificates."""
+    """Accept only encrypted sessions of clients with these certificates."""
     server.set_security_policy(
         [ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt], SimpleRoleRuleset()
     )

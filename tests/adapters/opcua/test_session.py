@@ -1,4 +1,4 @@
-"""The OPC UA driver and its actions against a server in a process of its own."""
+"""The OPC UA driver and its actions with a server in a separate process."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Desk:
 
 
 class Cell:
-    """A PLC that can be killed and started again, and drivers of it."""
+    """A PLC that can be killed and restarted, and drivers of it."""
 
     def __init__(self, folder: Path) -> None:
         pytest.importorskip("asyncua")
@@ -100,7 +100,7 @@ def complete(state: Any) -> bool:
 
 
 def done(driver: OpcUaSession, values: dict[str, Any]) -> str:
-    """Write; why it failed."""
+    """Write values; return why that failed, empty if it did not."""
     driver.command(0.0, {"write": values})
     number = driver.state()["asked"]
     state = await_(driver, lambda state: state["done"] >= number, "the write")
@@ -123,7 +123,7 @@ def test_values_writes_events_and_a_restart(cell: Cell) -> None:
     assert done(driver, {"count": 7, "speed": 2, "sensor": True, "manner": "silent"}) == ""
     state = await_(driver, lambda state: state["values"]["manner"] == "silent", "the values")
     assert state["values"] | {"count": 7, "speed": 2.0, "sensor": True} == state["values"]
-    # What does not fit the node is refused by name and type; the session lives on.
+    # a value that does not fit its node is refused by name and type; the session continues
     assert "count: expected Int16" in done(driver, {"count": 70000})
     assert "count: expected Int16" in done(driver, {"count": "seven"})
     assert done(driver, {"sensor": False}) == "" and done(driver, {"sensor": True}) == ""
@@ -142,7 +142,7 @@ def test_values_writes_events_and_a_restart(cell: Cell) -> None:
 
 
 @pytest.mark.processes
-def test_a_handshake_and_all_that_can_go_wrong(cell: Cell) -> None:
+def test_a_handshake_and_its_errors(cell: Cell) -> None:
     cell.power(True)
     driver = cell.driver(on_stop={"request": False})
     await_(driver, complete, "all values")
@@ -280,7 +280,7 @@ def certificate(folder: Path, name: str, uri: str) -> None:
 
 
 @pytest.mark.processes
-def test_a_secured_server_accepts_its_certificate_alone(cell: Cell) -> None:
+def test_a_secured_server_accepts_only_its_certificate(cell: Cell) -> None:
     folder = cell.folder
     for name in ("plc", "me", "stranger"):
         certificate(folder, name, "urn:petrobot")

@@ -1,5 +1,5 @@
-"""A rosbridge server that behaves as its source does (rosbridge_suite, capabilities of ROS 2), with
-action servers behind it that misbehave by name; a process of its own.
+"""A rosbridge server that behaves like the source of rosbridge_suite (capabilities of ROS 2), with
+action servers that misbehave by name; it runs in a separate process.
 
     python fake.py       prints its port; `GET /log`: all that was received, `POST /send`: a text
                          for all clients, `POST /drop`: breaks connections, `POST /reset`: as new
@@ -27,8 +27,8 @@ REQUIRED: dict[str, dict[str, type]] = {
     "publish": {"topic": str},
     "subscribe": {"topic": str},
 }
-"""What rosbridge demands of each operation (`basic_type_check`); an operation without it is dropped
-with a line in the server's own log."""
+"""Required fields of each operation (`basic_type_check` of rosbridge); an operation without them is
+dropped with a line in the server's own log."""
 PERIOD = 0.05  # s between two feedback messages
 DONE = {"error_code": {"val": 1}, "text": "done"}
 
@@ -36,10 +36,10 @@ DONE = {"error_code": {"val": 1}, "text": "done"}
 class Fake:
     """Goals, services and topics for one client at a time; `now` is any clock (s).
 
-    Names decide what an action server does: /ok, /aborts, /rejects, /absent, /silent, /slow (until
-    cancelled), /stubborn (does not obey a cancel), /races (has succeeded when a cancel comes),
-    /late (rosbridge does not know the goal for 0.3 s, so ignores its cancel), /nan, /nested (as the
-    first servers answered), /wide (a result too large).
+    The name of an action server decides what it does: /ok, /aborts, /rejects, /absent, /silent,
+    /slow (until cancelled), /stubborn (does not obey a cancel), /races (has succeeded when a cancel
+    comes), /late (rosbridge does not know the goal for 0.3 s, so ignores its cancel), /nan, /nested
+    (as the first servers answered), /wide (a result too large).
     """
 
     def __init__(self) -> None:
@@ -82,7 +82,7 @@ class Fake:
         return []
 
     def step(self, now: float) -> list[Message]:
-        """Return what the action servers say as time passes."""
+        """Return the messages of the action servers that are due."""
         said = []
         for identity, (goal, begun, told) in list(self.goals.items()):
             name, age = goal["action"], now - begun
@@ -96,7 +96,7 @@ class Fake:
         return said
 
     def ended(self, goal: Message, name: str) -> Message:
-        """The result of an action server by its name."""
+        """Return the result of an action server by its name."""
         if name == "/nan":
             return self.end(goal, 4, {"error_code": {"val": 1}, "time": None})
         if name == "/wide":

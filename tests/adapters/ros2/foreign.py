@@ -1,4 +1,5 @@
-"""roslibpy, a client of other people, in a process of its own: sends goals, prints what comes.
+"""Runs roslibpy, an independent client, in a separate process: sends goals, prints the messages
+received.
 
 python foreign.py PORT ACTION GOAL_JSON [CANCEL_AFTER_FEEDBACK]
 """

@@ -1,4 +1,4 @@
-"""Actions of ROS 2 as primitive actions, in simulated time before a fake rosbridge."""
+"""Actions of ROS 2 as primitive actions, in simulated time with a fake rosbridge."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HERE = "tests.adapters.ros2.fake:Fake"
 
 
 class ScriptedLink:
-    """A fake behind a link that the test breaks and mends."""
+    """A fake server behind a link that the test breaks and restores."""
 
     def __init__(self) -> None:
         self.fake, self.epoch, self.now = Fake(), 1, 0.0
@@ -44,7 +44,7 @@ class ScriptedLink:
         self.inbox.append(("up", 2))
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing."""
 
 
 def robot(**config: Any) -> tuple[Bridge, ScriptedLink]:
@@ -109,14 +109,14 @@ def test_each_end_of_a_goal_is_one_result(
         assert bridge.stopped() and not link.fake.goals
 
 
-def test_what_a_result_has() -> None:
+def test_values_of_a_result() -> None:
     assert play("/ok").result.values == {"error_code": {"val": 1}, "text": "done"}
     named = play("/ok", values={"code": "error_code.val"}).result
     assert named.values == {"code": 1}
     assert play("/rejects").result.text == "Action goal was rejected"
 
 
-def test_a_goal_is_built_from_what_stands_fast_and_the_tasks_arguments() -> None:
+def test_a_goal_is_built_from_constants_and_the_tasks_arguments() -> None:
     bridge, link = robot()
     fields = {"x": "pose.pose.position.x", "frame": "pose.header.frame_id"}
     play("/ok", bridge, goal={"behavior_tree": "t"}, fields=fields, x=2.5, frame="map")
@@ -156,7 +156,7 @@ def test_a_cancelled_run_cancels_its_goal(name: str) -> None:
 
 @pytest.mark.parametrize("at", [0.0, 0.02, 0.06, 0.1, 0.14, 0.18, 0.2, 0.22])
 def test_a_link_lost_at_any_moment(at: float) -> None:
-    """The run ends at once and says that nobody knows; over the next link its goal is cancelled."""
+    """The run ends at once with executed = unknown; its goal is cancelled over the next link."""
     bridge, link = robot()
     pulled = False
 
@@ -179,7 +179,7 @@ def test_a_link_lost_at_any_moment(at: float) -> None:
     assert bridge.stopped() and not link.fake.goals
 
 
-def test_a_goal_that_is_recalled_does_not_touch_the_next_one() -> None:
+def test_a_cancelled_lost_goal_does_not_affect_the_next_one() -> None:
     bridge, link = robot()
 
     def world(now: float) -> None:
@@ -200,7 +200,7 @@ def test_a_goal_that_is_recalled_does_not_touch_the_next_one() -> None:
     assert [m["op"] for m in link.fake.log[1:]] == ["cancel_action_goal", "send_action_goal"]
 
 
-def test_a_server_that_never_answers_frees_the_device_in_the_end() -> None:
+def test_a_server_that_never_answers_frees_the_device_after_some_time() -> None:
     bridge, _ = robot(patience=1.0)
     assert play("/silent", bridge, timeout=0.2).result.executed == "unknown"
     assert bridge.stopped()
@@ -220,7 +220,7 @@ def test_services(service: str, ended: tuple[str, str, str]) -> None:
 
 
 class Ports:
-    """What a driver may reach, scripted."""
+    """Scripted ports of a driver."""
 
     def __init__(self, files: Mapping[str, str] | None = None) -> None:
         self.now, self.events = 0.0, list[tuple[str, Any]]()
@@ -266,7 +266,8 @@ def wired(ports: Ports, **config: Any) -> tuple[Bridge, ScriptedLink]:
     ("when", "raised"), [({}, [0, 1, 1, 0, 1]), ({"data": 1}, [1, 1]), ({"data": [1, 2]}, [1, 1])]
 )
 def test_topics_are_external_events(when: dict[str, Any], raised: list[int]) -> None:
-    """Each message without a condition; with one, each time that it begins to hold."""
+    """Without a condition each message raises one; with a condition, each time that it becomes
+    true."""
     ports = Ports()
     bridge, link = wired(ports, subscribe={"b": {**BUTTON, "event": "pressed", "when": when}})
     if not when:
@@ -317,8 +318,9 @@ SPEED = {
 }
 
 
-def test_set_points_go_to_a_topic_while_an_action_lets_them() -> None:
-    """Nothing before; rest when they stop coming, at a pause, at a stop and at the end."""
+def test_set_points_go_to_a_topic_while_an_action_permits() -> None:
+    """None are sent before; the set point of rest is sent when they stop coming, at a pause, at a
+    stop and at the end."""
     ports = Ports()
     bridge, link = wired(ports, setpoints={"speed": SPEED})
     drive = {"drive": ["speed"]}

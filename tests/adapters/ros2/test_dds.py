@@ -132,7 +132,7 @@ SPEED = {"topic": "/cmd_vel", "type": TWIST, "fields": ["linear.x", "angular.z"]
 
 
 def test_topics_through_a_domain() -> None:
-    """Two participants: set points one way, an event and a value the other way."""
+    """Two participants: set points in one direction, an event and a value in the other."""
     store = rosbags.get_typestore(rosbags.Stores.ROS2_JAZZY)
     texts = files(store, TWIST)
     config = {"definitions": {name: name for name in texts}, "domain": random.randint(1, 100)}

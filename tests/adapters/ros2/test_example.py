@@ -1,4 +1,4 @@
-"""examples/ros2 in simulated time, and in real time before a server in a process of its own."""
+"""examples/ros2 in simulated time, and in real time with a server in a separate process."""
 
 from __future__ import annotations
 
@@ -138,8 +138,8 @@ def test_set_points_reach_the_robot(tmp_path: Path, fake: FakeProcess, mode: str
 
 
 @pytest.mark.processes
-def test_it_runs_before_a_server(example: Path) -> None:
-    """As on the robot: the address is changed, nothing else."""
+def test_it_runs_with_a_server(example: Path) -> None:
+    """As with a robot: only the address is changed."""
     (port,) = free_ports(1)
     cell, robot = example / "services.toml", example / "simulated.py"
     cell.write_text(cell.read_text().replace("simulated:Robot", f"ws://127.0.0.1:{port}"))

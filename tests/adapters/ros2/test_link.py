@@ -1,4 +1,5 @@
-"""The connection to a rosbridge in another process: lost, cut, restarted, and fed with rubbish."""
+"""The connection to a rosbridge in another process: lost, cut, restarted, and with invalid
+messages."""
 
 from __future__ import annotations
 
@@ -88,7 +89,7 @@ def test_no_server_at_first() -> None:
     later.end()
 
 
-def test_a_cut_link_recalls_its_goal(bridge: Stepped, fake: FakeProcess) -> None:
+def test_after_a_cut_link_the_goal_is_cancelled(bridge: Stepped, fake: FakeProcess) -> None:
     bridge.goal("/slow")
     bridge.until_phase(ExchangePhase.ACTIVE)
     fake.post("drop")
@@ -100,7 +101,8 @@ def test_a_cut_link_recalls_its_goal(bridge: Stepped, fake: FakeProcess) -> None
 
 
 def test_a_killed_server_and_its_successor() -> None:
-    """The new server knows no goal: the cancel is ignored, and the goal given up after patience."""
+    """The new server does not know the goal: the cancel is ignored, and the goal is given up after
+    `patience`."""
     fake = FakeProcess()
     bridge = bridge_to(fake.url, patience=1.2)
     bridge.until(lambda: bridge.epoch, "the connection")
@@ -151,8 +153,8 @@ RUBBISH = [
 ]
 
 
-def test_rubbish_changes_nothing(bridge: Stepped, fake: FakeProcess) -> None:
-    """Frames that are no messages, or messages of nothing that was asked for."""
+def test_invalid_messages_change_nothing(bridge: Stepped, fake: FakeProcess) -> None:
+    """Frames that are not messages, or messages that were not requested."""
     bridge.subscribe = {"b": {"topic": "/b", "type": "a/msg/B"}}
     bridge.goal("/slow")
     bridge.until_phase(ExchangePhase.ACTIVE)
@@ -179,15 +181,15 @@ def test_odd_values_of_an_active_goal(bridge: Stepped, fake: FakeProcess, values
     assert bool(one.fault) is bool(values and values != "text") and one.values == {}
 
 
-def test_a_message_that_is_too_long_costs_the_link_only(bridge: Stepped, fake: FakeProcess) -> None:
+def test_a_message_that_is_too_long_ends_only_the_link(bridge: Stepped, fake: FakeProcess) -> None:
     fake.post("send", "x" * (5 << 20))
     bridge.until(lambda: bridge.epoch == 2, "the next connection")
     bridge.goal("/ok")
     bridge.until_phase(ExchangePhase.SUCCEEDED)
 
 
-def test_a_full_way_out_ends_the_connection(bridge: Stepped, fake: FakeProcess) -> None:
-    """The server does not read: nothing is kept without bound, and no step waits."""
+def test_a_full_send_buffer_ends_the_connection(bridge: Stepped, fake: FakeProcess) -> None:
+    """The server does not read: memory is bounded, and no step waits."""
     os.kill(fake.process.pid, signal.SIGSTOP)
     message = {"text": "x" * 60_000}
     limit = Limit("a full queue")

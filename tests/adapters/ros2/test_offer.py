@@ -34,7 +34,7 @@ RUN_TASK = re.search(
 
 
 class Page:
-    """The coordinator's page, scripted: a run lasts until the test ends it."""
+    """A scripted page of the coordinator: a run lasts until the test ends it."""
 
     def __init__(self) -> None:
         self.state, self.run, self.marking = "idle", "", {"a": 1}
@@ -62,7 +62,7 @@ class Page:
 
 
 class Link:
-    """rosbridge, scripted."""
+    """A scripted rosbridge."""
 
     def __init__(self) -> None:
         self.inbox: list[Item] = [("up", 1)]
@@ -88,7 +88,7 @@ Steps = Callable[[Page, Link], Any]
 
 
 def played(steps: Steps, **more: Any) -> tuple[Page, Link]:
-    """Serve while the test's steps are taken; then stop."""
+    """Serve while the test's steps run; then stop."""
     page, link = Page(), Link()
     given = {"task": "rest", "action": "/rest", "type": offering.TYPE, "mode": "realtime"}
     options = argparse.Namespace(**{**given, "definition": None, **more})
@@ -162,7 +162,7 @@ def test_a_cancel_that_comes_too_late_leaves_the_success() -> None:
     assert played(steps)[1].results() == [("g1", 4, "success")]
 
 
-def test_an_operator_who_aborts_is_no_cancel() -> None:
+def test_an_abort_by_the_operator_is_not_a_cancel() -> None:
     """rclpy refuses `cancelled` for a goal whose client did not cancel it."""
 
     async def steps(page: Page, link: Link) -> None:
@@ -210,7 +210,7 @@ def test_one_goal_at_a_time() -> None:
 
 
 @pytest.mark.parametrize("lost", ["link", "page", "stop"])
-def test_whoever_is_lost_no_run_goes_on_unseen(lost: str) -> None:
+def test_a_run_is_aborted_when_its_client_or_link_is_lost(lost: str) -> None:
     """A link that breaks aborts the run: its client can no longer cancel it."""
 
     async def steps(page: Page, link: Link) -> None:
@@ -233,7 +233,7 @@ def test_whoever_is_lost_no_run_goes_on_unseen(lost: str) -> None:
     assert len(offered) == (2 if lost == "link" else 1)
 
 
-def test_what_is_told_fits_the_definition(tmp_path: Path) -> None:
+def test_messages_fit_the_definition(tmp_path: Path) -> None:
     """rosbridge drops a message with an unknown field: its goal would never end."""
     (tmp_path / "Mine.action").write_text("---\nstring state\n---\nstring[] places\n")
 
@@ -343,7 +343,8 @@ def offered(
 
 @pytest.mark.processes
 def test_petrobot_starts_petrobot(offered: FakeProcess) -> None:
-    """Our client, rosbridge's way, our offer: success, cancel and refusal of real runs."""
+    """Our client starts our offered task through rosbridge: success, cancel and refusal of real
+    runs."""
     bridge = bridge_to(offered.url)
     bridge.until(lambda: bridge.epoch, "the connection")
     bridge.goal("/rest", "first")
@@ -384,12 +385,12 @@ def test_a_foreign_client_starts_petrobot(
 def test_the_fake_is_a_rosbridge_for_a_foreign_client(
     fake: FakeProcess, action: str, cancel: list[str], status: int
 ) -> None:
-    """What the other tests rely on: roslibpy takes the fake for a rosbridge."""
+    """roslibpy works with the fake as with a rosbridge; the other tests rely on that."""
     assert foreign(fake, action, "{}", *cancel)[-1]["status"] == status
 
 
 def foreign(fake: FakeProcess, *arguments: str) -> list[dict[str, Any]]:
-    """What roslibpy tells of a goal."""
+    """Return what roslibpy reports about a goal."""
     if importlib.util.find_spec("roslibpy") is None:
         pytest.skip("roslibpy is not installed")
     script = Path(__file__).parent / "foreign.py"

@@ -1,4 +1,4 @@
-"""What a rosbridge message may hold, and the table of phases of a goal."""
+"""Checks of rosbridge messages, and the phases of a goal."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ VALUES = st.recursive(
         '{"op": "x", "n": ' + "9" * 5000,
     ],
 )
-def test_what_is_no_message_is_refused(text: str) -> None:
+def test_data_that_is_not_a_message_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"not JSON|expected an object"):
         parse(text)
 
@@ -59,8 +59,8 @@ def test_numbers_that_are_not_finite_become_null() -> None:
 
 
 @given(st.dictionaries(st.text(), VALUES, max_size=5))
-def test_what_fits_can_be_sent_on(values: dict[str, Any]) -> None:
-    """Values that are let through are plain data of finite numbers, as petrobot sends them."""
+def test_accepted_values_can_be_sent(values: dict[str, Any]) -> None:
+    """Accepted values are plain data with finite numbers, which petrobot can send."""
     fault = unfit(values)
     try:
         text = json.dumps(values, allow_nan=False)
@@ -90,7 +90,7 @@ def _flat(value: Any) -> list[Any]:
         (json.loads('{"a": ' * 30 + "[1]" + "}" * 30), "deep"),
     ],
 )
-def test_what_cannot_be_sent_on_is_refused(values: Any, word: str) -> None:
+def test_values_that_cannot_be_sent_are_refused(values: Any, word: str) -> None:
     assert word in unfit(values)
 
 
@@ -116,9 +116,10 @@ ENDED = set(ExchangePhase) - RUNNING
 
 
 @given(st.lists(st.tuples(st.sampled_from(Word), st.floats(0.0, 3.0)), max_size=30))
-def test_a_goal_ends_once_and_as_the_first_word_says(words: list[tuple[Word, float]]) -> None:
-    """Whatever comes in whatever order: the first end counts, a run never sees another one, a lost
-    goal is recalled over the next link, and a cancel goes out only for a goal that may move."""
+def test_a_goal_ends_once_by_the_first_end(words: list[tuple[Word, float]]) -> None:
+    """For any events in any order: the first end counts and a run never sees another one, a lost
+    goal is cancelled over the next link, and a cancel is sent only for a goal that may move the
+    robot."""
     patience = 5.0
     exchanges = Exchanges(patience)
     identity = exchanges.begin(0.0, "run", GOAL)["id"]
@@ -152,10 +153,10 @@ def test_a_goal_ends_once_and_as_the_first_word_says(words: list[tuple[Word, flo
             ended = one.phase
             if word in RESULTS and word is not Word.REFUSED:
                 assert one.values == {"n": RESULTS[word]["status"]}
-        if ended is not None:  # what a run may tell of it stays the same
+        if ended is not None:  # the result that a run sees stays the same
             lost = {ExchangePhase.LOST, ExchangePhase.RECALLED, ExchangePhase.GONE}
             assert one.phase is ended or {one.phase, ended} <= lost
-    # however it stands, it comes to rest
+    # from any phase it reaches a final one
     for settled in (False, True):
         exchanges.link(now, settled)
     exchanges.cancel(now, "run")
@@ -166,8 +167,8 @@ def test_a_goal_ends_once_and_as_the_first_word_says(words: list[tuple[Word, flo
     assert not exchanges.open
 
 
-def test_a_repeated_cancel_waits_no_longer() -> None:
-    """A server that never answers: the cancel is repeated each second, and given up in the end."""
+def test_repeated_cancels_do_not_extend_the_wait() -> None:
+    """If the server never answers, the cancel is repeated each second, and finally given up."""
     exchanges = Exchanges(5.0)
     exchanges.begin(0.0, "run", GOAL)
     sent = exchanges.cancel(0.0, "run")
@@ -177,7 +178,7 @@ def test_a_repeated_cancel_waits_no_longer() -> None:
     assert len(sent) == 5
 
 
-def test_a_second_goal_of_a_run_leaves_the_first_one_to_be_recalled() -> None:
+def test_a_second_goal_of_a_run_does_not_prevent_the_cancel_of_the_first() -> None:
     exchanges = Exchanges(5.0)
     lost = exchanges.begin(0.0, "run", GOAL)["id"]
     exchanges.link(0.0, False)
@@ -189,7 +190,7 @@ def test_a_second_goal_of_a_run_leaves_the_first_one_to_be_recalled() -> None:
     assert list(exchanges.open) == ["run"]
 
 
-def test_results_that_no_action_reads_do_not_pile_up() -> None:
+def test_unread_results_do_not_accumulate() -> None:
     exchanges = Exchanges(5.0)
     for number in range(100):
         identity = exchanges.begin(0.0, f"run {number}", GOAL)["id"]
@@ -197,7 +198,7 @@ def test_results_that_no_action_reads_do_not_pile_up() -> None:
     assert len(exchanges.open) < 10
 
 
-def test_ids_are_unique_in_the_world() -> None:
+def test_ids_are_globally_unique() -> None:
     """All clients of a rosbridge server share one table of goals by id."""
     ids = [e.begin(0.0, "run", GOAL)["id"] for e in (Exchanges(1.0), Exchanges(1.0)) for _ in "12"]
     assert len(set(ids)) == 4

@@ -1,4 +1,4 @@
-"""A SO-101 whose bus is simulated, stepped with its driver on one clock."""
+"""A SO-101 with a simulated bus, stepped together with its driver on one clock."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def test_all_joints_arrive_together() -> None:
 @pytest.mark.parametrize(
     ("keys", "seconds"), [({}, 1.0), ({"speed": 0.25}, 3.0), ({"acceleration": 1.0}, 2.0)]
 )
-def test_it_takes_as_long_as_speed_and_acceleration_say(keys: Any, seconds: float) -> None:
+def test_its_duration_follows_from_speed_and_acceleration(keys: Any, seconds: float) -> None:
     arm = Rig().arm(**keys).ready()
     begin = arm.ports.now
     arm.command(begin, {"do": "move", "joints": [1.0, 0, 0, 0, 0]})
@@ -201,7 +201,7 @@ def test_without_its_calibration_file_it_does_not_move(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("chained", [False, True])
 @pytest.mark.parametrize("lost", [(1,), (3,), (6,), (2, 5), (1, 2, 3, 4, 5)])
-def test_a_missing_servo_hides_none_of_the_others(lost: tuple[int, ...], chained: bool) -> None:
+def test_a_missing_servo_does_not_hide_the_others(lost: tuple[int, ...], chained: bool) -> None:
     rig = Rig(FeetechBus((Servo(number) for number in range(1, 7)), chained=chained))
     arm = rig.arm().ready()
     arm.command(arm.ports.now, THERE)
@@ -340,7 +340,7 @@ def test_a_quick_stop_holds_or_lets_go(on_estop: str, falls: bool) -> None:
     assert arm.state()["torque"] != falls
 
 
-def test_a_driver_made_again_takes_the_arm_over_without_a_movement() -> None:
+def test_a_new_driver_continues_without_a_movement() -> None:
     rig = Rig()
     rig.bus.servos[2].external = -0.3
     arm = rig.arm().ready()

@@ -1,4 +1,4 @@
-"""Packets of the servos' bus: those of the vendor's SDK, and what becomes of noise."""
+"""Packets of the servos' bus compared with the vendor's SDK, and the handling of noise."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ servo = st.integers(0, 252)
 
 
 class Recorder:
-    """A port of the SDK that keeps what is written."""
+    """A port of the SDK that records what is written."""
 
     is_using = False
 
@@ -79,10 +79,11 @@ def test_answers_are_found_however_they_are_cut(parts: list[Any], size: int) -> 
 
 
 @given(st.binary(max_size=40), answers)
-def test_noise_costs_no_later_answer(noise: bytes, answer: Any) -> None:
+def test_noise_does_not_lose_later_answers(noise: bytes, answer: Any) -> None:
     splitter = bus.PacketSplitter()
     splitter.feed(noise)
-    # What looks like the begin of an answer is waited for: at most one of the greatest length.
+    # bytes that look like the beginning of an answer delay at most one answer of the greatest
+    # length
     found = splitter.feed(frame(*answer) * (2 + (bus.LONGEST + 4) // len(frame(*answer))))
     assert bus.ServoAnswer(*answer) in found
 
@@ -97,10 +98,10 @@ def test_noise_costs_no_later_answer(noise: bytes, answer: Any) -> None:
         b"\xff" * 9,
     ],
 )
-def test_a_spoilt_answer_hides_no_other(spoilt: bytes) -> None:
+def test_a_damaged_answer_does_not_hide_others(spoilt: bytes) -> None:
     found = bus.PacketSplitter().feed(spoilt + frame(2, 0, b"xy") + frame(3, 4, b""))
     assert found[-2:] == [(2, 0, b"xy"), (3, 4, b"")] and 1 not in {a.servo for a in found}
 
 
-def test_an_answer_to_another_question_is_no_state() -> None:
+def test_an_answer_to_another_request_is_not_a_state() -> None:
     assert bus.reading(b"\0" * 26) is None and bus.reading(b"\0" * 27) is not None

@@ -1,5 +1,5 @@
-"""The client of others (`ur_rtde`) at the simulated controller, in a process of its own: its
-constructors hold the interpreter's lock. Prints what it saw as JSON."""
+"""An independent client (`ur_rtde`) with the simulated controller, in a separate process, since its
+constructors keep the interpreter's lock. Prints its data as JSON."""
 
 import json
 import sys

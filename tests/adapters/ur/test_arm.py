@@ -80,7 +80,7 @@ class Cell:
         self.arm = UrPorts(self.controller).arm(**keys)
 
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """Step for so long, or until it holds."""
+        """Step for so long, or until the condition holds."""
         for _ in range(round(seconds / self.arm.period)):
             self.now += self.arm.period
             self.arm.step(self.now)
@@ -95,7 +95,7 @@ class Cell:
         return self
 
     def go(self, **command: Any) -> bool:
-        """Move; whether it arrived."""
+        """Move; return whether the arm arrived."""
         self.arm.command(self.now, {"do": "move", **command})
         return self.run(8.0, lambda: bool(self.arm.state()["in_place"]))
 
@@ -133,7 +133,7 @@ def test_it_moves_as_fast_as_it_may_and_no_faster() -> None:
     assert cell.controller.q == pytest.approx(THERE, abs=0.003)
 
 
-def test_a_straight_way_is_straight() -> None:
+def test_a_linear_motion_is_straight() -> None:
     cell = Cell().enabled()
     begin = cell.arm.state()["tool"]
     end = [begin[0] + 0.05, begin[1], begin[2] - 0.15, *begin[3:]]
@@ -215,7 +215,7 @@ def test_a_silent_driver_is_stopped_by_the_program() -> None:
     cell.arm.command(cell.now, {"do": "move", "q": THERE})
     cell.run(0.6)
     assert abs(cell.controller.qd[0]) > 0.3
-    cell.controller.advance(cell.now + 0.5)  # the driver's process hangs
+    cell.controller.advance(cell.now + 0.5)  # as if the driver's process hung
     assert max(map(abs, cell.controller.qd)) < 1e-6 and cell.controller.q[0] < 0.6
 
 
@@ -241,7 +241,7 @@ def test_an_emergency_stop_brakes_harder_than_a_stop() -> None:
 
 
 def played(action: Any, cell: Cell, **arguments: Any) -> Any:
-    """The result of an action; its driver's clock goes on from action to action."""
+    """Return the result of an action; the driver's clock continues from action to action."""
 
     class Later(Driver):
         period = Arm.period
@@ -304,7 +304,7 @@ class Clock:
 
 @pytest.fixture
 def clock() -> Clock:
-    """A clock that stands until a test moves it."""
+    """A clock that only the test advances."""
     return Clock()
 
 
@@ -324,7 +324,7 @@ def over(server: UrServer) -> Arm:
 
 
 def both(arm: Arm, server: UrServer, clock: Clock, until: Callable[[], bool]) -> bool:
-    """Let both ends run for 10 s of their time, or until it holds."""
+    """Let both ends run for 10 s of their time, or until the condition holds."""
     for _ in range(1250):
         clock.now += arm.period
         arm.step(clock.now)

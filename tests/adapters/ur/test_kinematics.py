@@ -1,4 +1,4 @@
-"""The arms' geometry: published poses, and joints that lead where they should."""
+"""The arms' geometry: published poses, and joint angles that reach the given poses."""
 
 from __future__ import annotations
 

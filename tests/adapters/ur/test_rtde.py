@@ -1,4 +1,4 @@
-"""The RTDE client byte by byte: whatever pieces arrive, what is refused, what is paused."""
+"""The RTDE client: bytes in any pieces, refused packages, and pauses."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_nothing_is_sent_before_the_start_nor_while_it_is_paused() -> None:
     assert client.drain() == b"" and not client.running
 
 
-def test_a_recipe_of_another_number_and_texts_are_passed_over() -> None:
+def test_data_of_another_recipe_and_texts_are_ignored() -> None:
     client = Rtde(OUT, IN, 125.0)
     client.receive(ACCEPTED + package("U", b"\x02abc") + package("M", b"\x02hi\x00\x01"))
     assert client.count == 0 and client.data == {}

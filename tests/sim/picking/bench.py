@@ -61,7 +61,7 @@ def puck(x: float = 0.0, y: float = 0.0, diameter: float = 0.024, **other: float
 
 
 class Crane:
-    """Fingers over a table, moved by hand: the world without an arm."""
+    """Fingers over a table, moved by the test: the world without an arm."""
 
     def __init__(self, *parts: Part) -> None:
         self.world = World(

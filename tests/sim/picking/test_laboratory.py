@@ -63,7 +63,7 @@ def test_the_top_of_a_part_is_where_the_camera_projects_it() -> None:
 
 
 @pytest.mark.parametrize("arm", ["so101", "ur5e"])
-def test_a_laboratory_stands_still_until_somebody_moves_it_and_repeats_itself(arm: str) -> None:
+def test_a_laboratory_is_at_rest_until_it_is_moved_and_is_repeatable(arm: str) -> None:
     scores = []
     for _ in range(2):
         laboratory = PickingLaboratory("laboratory", site(arm), lambda name: name)
@@ -87,7 +87,7 @@ def world_with(*places: tuple[float, float]) -> World:
 
 
 def watched(world: World, seconds: float, pose: ToolPose = AWAY) -> Referee:
-    """A referee who has watched that long."""
+    """A referee that has watched for so long."""
     referee = Referee(world, site().trays, site().belongs, 0.0)
     for k in range(round(seconds / 0.02)):
         referee.watch(k * 0.02, pose)
@@ -111,9 +111,7 @@ def test_the_referee_tells_trays_apart_and_counts_what_is_lost() -> None:
         ("table", "failure", "not_in_tray"),
     ],
 )
-def test_a_placing_is_judged_by_where_its_part_came_to_lie(
-    place: str, status: str, cause: str
-) -> None:
+def test_placing_is_judged_by_the_position_of_the_part(place: str, status: str, cause: str) -> None:
     trays = site().trays
     at = tuple(trays[place]["slots"][0]) if place in trays else (0.15, 0.0)
     world = world_with((0.15, 0.05))

@@ -1,5 +1,5 @@
-"""What fingers do to parts: hold, push, turn, let slip, drop. All from the physics, nothing from
-chance but where something falls."""
+"""Effects of fingers on parts: hold, push, turn, let slip, drop. All follow from physics; only
+where a part falls is random."""
 
 from __future__ import annotations
 
@@ -133,9 +133,7 @@ def test_a_push_ends_the_contact_and_moves_the_point_as_far_as_it_was_deep(
 
 @settings(max_examples=8, deadline=None)
 @given(x=st.floats(-0.03, 0.03), y=st.floats(-0.03, 0.03), turn=st.floats(-3.0, 3.0))
-def test_whatever_lies_there_parts_never_end_up_inside_fingers_or_each_other(
-    x: float, y: float, turn: float
-) -> None:
+def test_parts_never_end_up_inside_fingers_or_each_other(x: float, y: float, turn: float) -> None:
     first, second = cube(x, y, turn), puck(x + 0.03, y)
     crane = Crane(first, second)
     crane.pick()
