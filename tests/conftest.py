@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
+import petrobot  # noqa: F401 - first of all imports, as in petrobot's processes: numpy comes after it
+
 settings.register_profile(
     "petrobot", deadline=None, suppress_health_check=[HealthCheck.too_slow], print_blob=True
 )
