@@ -33,6 +33,16 @@ def _note_start(event: str, arguments: tuple[Any, ...]) -> None:
 sys.addaudithook(_note_start)
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Collect without the garbage collector, which finds nothing and takes a third of the time."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+
+
 def pytest_collection_finish() -> None:
     """Keep what was imported and collected out of the garbage collector's full passes.
 

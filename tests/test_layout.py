@@ -320,7 +320,7 @@ def test_the_rule_of_limits_tells_waits_apart(source: str, limited: bool) -> Non
     ("module", "late"),
     [
         ("services.worker.process", ("numpy", "scipy", "asyncio")),
-        ("services.node.realtime", ("numpy", "scipy")),
+        ("services.__main__", ("numpy", "scipy")),
         ("coordinator.operator.session", ("scipy", "aiohttp", "rich")),
         ("coordinator.cli", ("numpy", "scipy", "asyncio", "rich", "aiohttp")),
     ],
