@@ -57,6 +57,7 @@ def replayed(task: Task, firings: Sequence[str]) -> dict[str, int]:
     return {p: n for p, n in zip(task.net.places, last, strict=True) if n}
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("kind", VARIANTS)
 @pytest.mark.parametrize("name", ["catch_ball", "follow_track"])
 def test_broken_variants_are_caught(name: str, kind: str, tmp_path: Path) -> None:
@@ -125,6 +126,7 @@ def sample(name: str) -> list[tuple[str, Task]]:
     return found
 
 
+@pytest.mark.once
 @pytest.mark.parametrize(
     ("name", "number"), [(name, i) for name, (count, _) in SAMPLE.items() for i in range(count)]
 )
