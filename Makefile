@@ -6,13 +6,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUNS ?= 4
 MARKS ?= not proof and not browser
+TYPES := $(BIN)/mypy -p petrobot -p tests -p tools -p experiments
 ROUNDS ?= 20
 
 # Empty means not set. The tests start about a thousand processes: without cached bytecode each of
 # them compiles the sources again, which takes as long as all the rest of its start.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test suite load proof lint bench clean
+.PHONY: help demo test suite load proof lint style bench clean
 
 help:
 	@echo "make demo   set up, start the cell's nodes, catch $(RUNS) balls in real time, leave a report"
@@ -33,13 +34,17 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 demo: $(VENV)/.ready
 	$(BIN)/petrobot run catch_ball --up --runs $(RUNS) --report reports/demo
 
-lint: $(VENV)/.ready
+lint: style
+	$(TYPES)
+
+style: $(VENV)/.ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy -p petrobot -p tests -p tools -p experiments
 
-test: lint
-	$(BIN)/pytest -n 4 --dist worksteal -rs -m "not proof"
+# Types are checked beside the tests: one core would have nothing to do meanwhile.
+test: style
+	@$(TYPES) & types=$$!; $(BIN)/pytest -n 4 --dist worksteal -rs -m "not proof"; tests=$$?; \
+	  wait $$types && exit $$tests
 
 # What another interpreter has to pass, too: make suite PYTHON=python3.13 VENV=.venv-3.13
 suite: $(VENV)/.ready

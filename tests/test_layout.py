@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 from tools.proof.mutations import MUTATIONS
 
+pytestmark = pytest.mark.once
+
 ROOT = Path(__file__).parents[1]
 TOP_LEVEL = {"coordinator", "services", "sim"}
 
@@ -127,11 +129,11 @@ def modules() -> Iterator[tuple[str, Path]]:
             yield ".".join(parts[:-1] if parts[-1] == "__init__" else parts), path
 
 
-def imports(name: str, path: Path) -> Iterator[tuple[int, str]]:
+def imports(name: str, path: Path, tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Line and dotted name of everything that a module imports, wherever in the file."""
     own = f"petrobot.{name}"
     package = own if path.name == "__init__.py" else own.rpartition(".")[0]
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name.removeprefix("petrobot.")) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -155,11 +157,11 @@ MODULES = [(name, path, ast.parse(path.read_text(encoding="utf-8"))) for name, p
 def test_no_module_imports_what_its_room_may_not_know() -> None:
     """The arrows of `ALLOWED`."""
     wrong = []
-    for name, path, _ in MODULES:
+    for name, path, tree in MODULES:
         room, allowed = next((room, allowed) for room, allowed in ALLOWED if within(name, room))
         wrong += [
             f"{path.relative_to(ROOT)}:{line}: {target}"
-            for line, target in imports(name, path)
+            for line, target in imports(name, path, tree)
             if target.split(".")[0] in TOP_LEVEL
             and not any(within(target, known) for known in (room, *allowed))
         ]
@@ -173,7 +175,9 @@ def test_pure_rooms_stay_pure_and_nothing_is_unpickled() -> None:
         pure = name not in STORED and any(within(name, room) for room in PURE)
         banned = FORBIDDEN_IMPORTS | (IMPURE_IMPORTS if pure else set())
         where = path.relative_to(ROOT)
-        wrong += [f"{where}:{n}: {t}" for n, t in imports(name, path) if t.split(".")[0] in banned]
+        wrong += [
+            f"{where}:{n}: {t}" for n, t in imports(name, path, tree) if t.split(".")[0] in banned
+        ]
         wrong += [
             f"{where}:{node.lineno}: {node.func.id}"
             for node in ast.walk(tree)
@@ -329,7 +333,7 @@ def test_every_mutation_still_finds_its_text() -> None:
     ("module", "late"),
     [
         ("services.worker.process", ("numpy", "scipy", "asyncio")),
-        ("services.node.realtime", ("numpy", "scipy")),
+        ("services.__main__", ("numpy", "scipy")),
         ("coordinator.operator.session", ("scipy", "aiohttp", "rich")),
         ("coordinator.cli", ("numpy", "scipy", "asyncio", "rich", "aiohttp")),
     ],
@@ -346,3 +350,22 @@ def test_what_starts_often_imports_late(module: str, late: tuple[str, ...]) -> N
         check=True,
     )
     assert set(late).isdisjoint(done.stdout.split())
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(("given", "said"), [({}, "1 1"), ({"OPENBLAS_NUM_THREADS": "2"}, "2 ")])
+def test_numpy_has_one_thread_unless_the_user_gives_more(given: dict[str, str], said: str) -> None:
+    """Threads of OpenBLAS wait in busy loops and take the cores from other processes."""
+    look = (
+        "import os, petrobot, numpy; "
+        "print(os.environ['OPENBLAS_NUM_THREADS'], len(os.listdir('/proc/self/task')))"
+    )
+    others = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+    done = subprocess.run(
+        [sys.executable, "-c", look],
+        env={**others, "PYTHONPATH": str(ROOT / "src"), **given},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.startswith(said)

@@ -8,7 +8,12 @@ may change without notice.
 from __future__ import annotations
 
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
+
+# Before numpy is loaded. The threads of OpenBLAS wait for each other in busy loops: where a robot's
+# processes share the cores, inverting a matrix of 128 rows takes a hundred times as long with them.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 if TYPE_CHECKING:
     from petrobot.services.action import (

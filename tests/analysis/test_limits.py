@@ -50,7 +50,6 @@ def started(net: Net, folder: Path, *arguments: str) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
         preexec_fn=_limited,
     )
 
@@ -179,7 +178,6 @@ def test_an_analysis_uses_no_more_memory_than_allowed(tmp_path: Path) -> None:
     process = subprocess.run(
         [sys.executable, "-c", PEAK, sys.executable, "-m", "petrobot.coordinator", *arguments],
         capture_output=True,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
         text=True,
         timeout=120,
     )

@@ -25,6 +25,8 @@ from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import load, loads
 from tests.drawing.conftest import random_task
 
+pytestmark = pytest.mark.once
+
 SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks"
 SEEDS = range(300, 316)
 

@@ -16,6 +16,8 @@ from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.selectors import RuleSelector, make
 from petrobot.coordinator.task import Executed, Status
 
+pytestmark = pytest.mark.once
+
 Table = NDArray[np.float64]
 """Probability of the goal of each combination."""
 

@@ -17,6 +17,8 @@ from petrobot.coordinator.learning.rules import NikolicFu, Rule, Tracking
 from petrobot.coordinator.learning.selectors import RULES
 from tests.learning.worlds import BanditWorld, PlayedTrials, gapped, play
 
+pytestmark = pytest.mark.once
+
 SEEDS = 1000
 
 

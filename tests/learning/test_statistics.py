@@ -22,6 +22,8 @@ from petrobot.coordinator.learning.statistics import (
 )
 from petrobot.coordinator.task import Status
 
+pytestmark = pytest.mark.once
+
 REPEATED = 4000
 NEAR = 0.943
 """A coverage of 0.95 is measured as less than this in one of 50 studies."""

@@ -15,6 +15,8 @@ from petrobot.services.mobile.odometry import Pose
 from petrobot.services.mobile.track_map import Fit
 from tests.mobile.conftest import DrawnFloor
 
+pytestmark = pytest.mark.once
+
 PERIOD, LAG = 0.02, 0.06
 EVERY = pytest.mark.parametrize("law", LAWS)
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.once
+
 PAGE = Path(__file__).parents[2] / "coordinator" / "page" / "static"
 VENDOR = PAGE / "vendor"
 LIST = tomllib.loads((VENDOR / "vendored.toml").read_text(encoding="utf-8"))

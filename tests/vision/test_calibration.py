@@ -35,6 +35,8 @@ from petrobot.sim.catching.board import HELD, LAID, board_views, save_board_view
 from petrobot.sim.catching.camera import PinholeCamera
 from tests.vision.test_optics import drawn_optics
 
+pytestmark = pytest.mark.once
+
 Views = list[BoardView]
 
 

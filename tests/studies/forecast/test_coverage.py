@@ -23,6 +23,8 @@ from petrobot.coordinator.studies.forecast.history import Training
 from petrobot.coordinator.studies.forecast.predict import figures
 from petrobot.coordinator.studies.forecast.residual import measured
 
+pytestmark = pytest.mark.once
+
 FEW = 25
 
 

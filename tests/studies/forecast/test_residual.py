@@ -19,6 +19,8 @@ from petrobot.coordinator.studies.forecast.residual import (
 from petrobot.coordinator.task.file import loads
 from tests.studies.forecast.test_preempting import ONE_WAY, one_way, trials_of
 
+pytestmark = pytest.mark.once
+
 NOTHING = Played(np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros(0, np.bool_), np.zeros(0))
 
 
