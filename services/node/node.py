@@ -150,9 +150,10 @@ STREAM_PREFIX = "stream:"
 SENDERS = frozenset((COORDINATOR, NODE))
 """Roles that may ask for the ticket of a stream: actions on nodes send set points, and a
 coordinator may order anything."""
-ACCEPT_AFTER = 0.002
+ACCEPT_AFTER = 0.02
 """How long ACCEPT is held back in real time (s): the result of a quick action makes it superfluous.
-In lock step it is sent at once."""
+Less would cost quick actions more timers; people do not notice so little. In lock step it is sent
+at once."""
 ANSWER_WITHIN = 1.0
 """Time in which the devices must answer an operator's command (s)."""
 VERBS = frozenset({"hold", "release", "stop", "status", PICTURE, EMERGENCY_STOP, CLEAR_EMERGENCY})

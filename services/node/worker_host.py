@@ -233,12 +233,7 @@ class WorkerHost:
             self._stage is HostStage.READY
             and not self.failed
             and not self._withdrawn
-            and self._takes_orders()
-        )
-
-    def _takes_orders(self) -> bool:
-        return (
-            self._worker is not None
+            and self._worker is not None
             and not self._worker.closed
             and not (self._owner and self._owner.closed)
         )
@@ -464,11 +459,12 @@ class WorkerHost:
         self._pace += (end.seconds + HAND_OVER - self._pace) / 4
         if end.cause == OUT_OF_MEMORY:
             self.withdraw()
-        alone = all(run.posted is None for run in self._runs.values())
-        if end.cause == OUT_OF_MEMORY and alone and self._worker is not None:
-            # The memory that the run still holds would fail the next run, which may need little.
-            self._retiring = self._worker
-            self._worker.leave()
+            alone = all(run.posted is None for run in self._runs.values())
+            if alone and self._worker is not None:
+                # The memory that the run still holds would fail the next run, which may need
+                # little.
+                self._retiring = self._worker
+                self._worker.leave()
         self._release_if_over()
 
     def _end(self, id_: str, cause: str, text: str) -> None:

@@ -130,7 +130,10 @@ class Pipe:
             if not count:
                 self.closed = self.ended = True
                 break
-            self._feed(_BUFFER[:count])
+            try:
+                self._unpacker.feed(_BUFFER[:count])
+            except msgpack.BufferFull as fault:
+                raise ValueError(f"an item of more than {LARGEST} bytes") from fault
             # Taken out before more is read: several large items that came together are more than
             # its buffer holds.
             for unpacked in self._unpacker:
@@ -139,12 +142,6 @@ class Pipe:
             if count < CHUNK and not self.closed:
                 break  # all that arrived; the end of the pipe wakes its reader again
         return items
-
-    def _feed(self, data: memoryview) -> None:
-        try:
-            self._unpacker.feed(data)
-        except msgpack.BufferFull as fault:
-            raise ValueError(f"an item of more than {LARGEST} bytes") from fault
 
     def close(self) -> None:
         """Close this end."""

@@ -10,12 +10,12 @@ import time
 from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum, auto
-from functools import partial
 from math import inf
 from typing import Any, Protocol
 
 from petrobot.services.action import Cancelled, CommandRefused, Result, Status, Wait
 from petrobot.services.comm.location_file import ActionEntry, resolve
+from petrobot.services.comm.protocol.codec import EXECUTED
 from petrobot.services.comm.protocol.messages import Call, Cancel, Command, Executed, Outcome
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.worker.callables import (
@@ -137,7 +137,7 @@ class Execution:
     def begin(self, function: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
         """Call the action up to its first wait. Raises Returned if it ends, otherwise whatever it
         raises."""
-        returned = self._timed(lambda: function(self.context, **arguments))
+        returned = self._timed(function, self.context, **arguments)
         if not inspect.iscoroutine(returned):
             raise Returned(returned)
         self.coroutine = returned
@@ -174,9 +174,9 @@ class Execution:
         for _ in range(STEPS):
             try:
                 if isinstance(verdict, BaseException):
-                    wait: Any = self._timed(partial(coroutine.throw, verdict))
+                    wait: Any = self._timed(coroutine.throw, verdict)
                 else:
-                    wait = self._timed(partial(coroutine.send, verdict))
+                    wait = self._timed(coroutine.send, verdict)
             except StopIteration as returned:
                 self.coroutine = self.wait = None
                 raise Returned(returned.value) from None
@@ -213,10 +213,10 @@ class Execution:
         if self.wait is not None and self.wait.due is not None:
             self.wait.due += pause
 
-    def _timed(self, function: Callable[[], Any]) -> Any:
+    def _timed(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Any:
         before = time.process_time()
         try:
-            return function()
+            return function(*arguments, **named)
         finally:
             self.cpu += time.process_time() - before
 
@@ -420,7 +420,7 @@ class Runner:
         run.context = RunContext(call, handle, self._clock, self._outlets, self._report)
         run.phase, run.started = ActionPhase.RUNNING, now
         run.sent_before = self._refusing.sent if self._refusing is not None else 0
-        self._in_action(now, run, lambda: run.begin(function, arguments))
+        self._in_action(now, run, run.begin, function, arguments)
 
     # --- continue -----------------------------------------------------------------------------
 
@@ -432,16 +432,18 @@ class Runner:
         if run.phase is ActionPhase.NEW:
             self._start(now, run)
         elif run.phase is ActionPhase.RUNNING:
-            self._in_action(now, run, lambda: run.look(now))
+            self._in_action(now, run, run.look, now)
         elif run.phase is ActionPhase.TAKING:
             self._await_taking(now, run)
         elif run.result is not None and now >= run.ready_at - 1e-9:
             self._finish(now, run, run.result)
 
-    def _in_action(self, now: float, run: Execution, step: Callable[[], None]) -> None:
-        """Let the action's code continue, and handle its result."""
+    def _in_action(
+        self, now: float, run: Execution, step: Callable[..., None], *arguments: Any
+    ) -> None:
+        """Let the action's code continue by a step of its run, and handle its result."""
         try:
-            step()
+            step(*arguments)
         except Returned as returned:
             self._returned(now, run, returned.value)
         # an action may raise SystemExit or its like: that ends its run, not the others'
@@ -490,13 +492,15 @@ class Runner:
     def _finish(self, now: float, run: Execution, result: Result) -> None:
         """End the run with its action's result, as soon as it is known that the driver refused none
         of its commands."""
-        if result.status is Status.ERROR:
+        if self._refusing is None:
+            self._end(now, run, result)
+        elif result.status is Status.ERROR:
             text = self._with_refusal(run, result.text)
             self._end(now, run, replace(result, text=text))
-            return
-        self._outlets.close(run.call.id)
-        run.phase, run.result, run.ready_at = ActionPhase.TAKING, result, now + TAKEN_WITHIN
-        self._await_taking(now, run)
+        else:
+            self._outlets.close(run.call.id)
+            run.phase, run.result, run.ready_at = ActionPhase.TAKING, result, now + TAKEN_WITHIN
+            self._await_taking(now, run)
 
     def _await_taking(self, now: float, run: Execution) -> None:
         refusal = self._refusing.refusal(run.sent_before) if self._refusing is not None else ""
@@ -549,12 +553,12 @@ class Runner:
             self._outlets.close(run.call.id)
             run.phase = ActionPhase.SETTLING if run.over else ActionPhase.STOPPING
             if not run.over:
-                self._in_action(now, run, lambda: run.go_on(Cancelled(cause)))
+                self._in_action(now, run, run.go_on, Cancelled(cause))
 
     def _clean_up(self, now: float, run: Execution) -> None:
         assert run.limit is not None
         if now < run.limit:
-            self._in_action(now, run, lambda: run.look(now))
+            self._in_action(now, run, run.look, now)
             return
         run.phase, run.abandoned = ActionPhase.SETTLING, True
         if fault := run.close():
@@ -584,7 +588,7 @@ class Runner:
         identity = run.call.id
         self._outlets.close(identity)
         del self._runs[identity]
-        executed = Executed(result.executed)
+        executed = EXECUTED[result.executed]
         said = (result.status, result.values, result.cause, result.text, executed)
         # Not `now`: the action may have blocked since this step began.
         took = self._clock() - run.started

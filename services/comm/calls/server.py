@@ -21,7 +21,13 @@ from datetime import UTC, datetime
 from typing import Final
 
 from petrobot.services.comm.calls.callee import Callee, Order
-from petrobot.services.comm.calls.link import READ_BUFFER, AsyncLink, LinkLimits, LinkTiming
+from petrobot.services.comm.calls.link import (
+    READ_BUFFER,
+    Alarm,
+    AsyncLink,
+    LinkLimits,
+    LinkTiming,
+)
 from petrobot.services.comm.protocol.messages import (
     Answer,
     Bye,
@@ -274,7 +280,7 @@ class Server:
         self._closed = False
         self._server: asyncio.Server | TlsListener | None = None
         self._knocks = FailedHandshakes(self.limits.handshakes, self.limits.handshakes_at_once)
-        self._timer: asyncio.TimerHandle | None = None
+        self._alarm = Alarm(self._advance)
         self._daily: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
 
@@ -327,10 +333,9 @@ class Server:
                 link.end(text, Bye(text))
             else:
                 link.cut(text)
-        for timer in (self._timer, self._daily):
-            if timer is not None:
-                timer.cancel()
-        self._timer = self._daily = None
+        self._alarm.cancel()
+        if self._daily is not None:
+            self._daily.cancel()
         if self._server is not None:
             await self._server.wait_closed()
         while self._all:
@@ -364,19 +369,11 @@ class Server:
             link.send(messages)
 
     def arm(self) -> None:
-        """Set the timer for the callee's next `advance`."""
-        if self._timer is not None and self._timer.when() <= self.callee.soonest:
-            return
-        due = self.callee.due()
-        if due is None or (self._timer is not None and self._timer.when() <= due):
-            return
-        if self._timer is not None:
-            self._timer.cancel()
-        assert self._loop is not None
-        self._timer = self._loop.call_at(due, self._advance)
+        """Set the alarm for the callee's next `advance`."""
+        if self.callee.soonest < self._alarm.due:
+            self._alarm.set(self.callee.due())
 
     def _advance(self) -> None:
-        self._timer = None
         now = self.now()
         self.callee.advance(now)
         self.flush(now)
