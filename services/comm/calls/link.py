@@ -176,6 +176,7 @@ class AsyncLink(asyncio.BufferedProtocol):
         self.connection = Connection(side, server, key=key, nonce=nonce)
         self.loop = asyncio.get_running_loop()
         self.now = clock_of(self.loop)
+        self._logs = _log.isEnabledFor(logging.DEBUG)
         self.timing = timing
         self.limits = limits
         self.slow = False
@@ -240,7 +241,7 @@ class AsyncLink(asyncio.BufferedProtocol):
         except ProtocolError as fault:
             self._refuse(now, fault)
             return
-        if _log.isEnabledFor(logging.DEBUG):  # kinds and ids alone: results may hold tickets
+        if self._logs:  # kinds and ids alone: results may hold tickets
             named = [f"{type(one).__name__} {getattr(one, 'id', '')}" for one in messages]
             _log.debug("received %d bytes: %s", nbytes, ", ".join(named))
         self._unheard += nbytes

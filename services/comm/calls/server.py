@@ -157,10 +157,7 @@ class _ServerLink(AsyncLink):
                 callee.receive(now, peer, message)
         if self.frames:
             self.write()
-        if callee.has_work:
-            self._server.flush(now)
-        else:
-            self._server.arm()
+        self._server.flush(now)
 
     def _framed(self, answer: Outcome) -> tuple[Outcome, bytes]:
         """Return a result and its frame; if no frame can carry it, an ERROR result in its place."""
@@ -361,17 +358,13 @@ class Server:
                 by_peer.setdefault(peer, []).append(message)
             for peer, its in by_peer.items():
                 self._send(peer, its)
-        self.arm()
+        if callee.soonest < self._alarm.due:
+            self._alarm.set(callee.due())
 
     def _send(self, peer: str, messages: list[Message]) -> None:
         link = self._links.get(peer)
         if link is not None:
             link.send(messages)
-
-    def arm(self) -> None:
-        """Set the alarm for the callee's next `advance`."""
-        if self.callee.soonest < self._alarm.due:
-            self._alarm.set(self.callee.due())
 
     def _advance(self) -> None:
         now = self.now()
