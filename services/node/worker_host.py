@@ -126,6 +126,7 @@ NEXT: Mapping[tuple[HostStage, Happening], HostStage] = {
 """All transitions between stages. Anything else (a second READY) is ignored."""
 
 STARTING = (HostStage.DRIVER_STARTS, HostStage.ACTIONS_START)
+_TAKES_RUNS = HostStage.READY  # looked up once, see `runner.NEW`
 
 
 @dataclass(slots=True)
@@ -230,7 +231,7 @@ class WorkerHost:
         """Whether a run would start at once: its processes are up, and none of them is about to
         end."""
         return (
-            self._stage is HostStage.READY
+            self._stage is _TAKES_RUNS
             and not self.failed
             and not self._withdrawn
             and self._worker is not None
