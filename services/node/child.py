@@ -127,8 +127,7 @@ class Child:
         """Send an item; what does not fit into the pipe now is sent when the process reads."""
         if self._logs:
             _log.debug("to %d: %s", self._worker, _named(item))
-        self.pipe.post(item)
-        if self.pipe.unsent and not self.pipe.closed:
+        if not self.pipe.post(item):
             self._loop.add_writer(self.pipe.socket, self._flush)
 
     def _flush(self) -> None:

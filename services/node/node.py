@@ -386,11 +386,11 @@ class Node:
         key = self._host_of(call.service)
         if key not in (LOOP, GENERAL):  # a look opens files; what has no device needs none
             self._stop_places(now, self._stops.look(now))
-        if key in self._stops:
-            _log.info("run %s of %s refused: %s", call.id, call.service, EMERGENCY_STOP)
-            refused = (EMERGENCY_STOP, IN_EMERGENCY, Executed.NO)
-            self.callee.finish(now, Outcome(call.id, Status.ERROR, {}, *refused))
-            return
+            if key in self._stops:
+                _log.info("run %s of %s refused: %s", call.id, call.service, EMERGENCY_STOP)
+                refused = (EMERGENCY_STOP, IN_EMERGENCY, Executed.NO)
+                self.callee.finish(now, Outcome(call.id, Status.ERROR, {}, *refused))
+                return
         _log.info("run %s of %s started", call.id, call.service)
         self.places[key].take(now, call)
 

@@ -201,7 +201,10 @@ class WorkerPool:
         if self._held:
             self._workers[number].command(now, HOLD)
         self._workers[number].take(now, call)
-        if all(worker.busy for worker in self._workers.values()) and self._may_add():
+        for worker in self._workers.values():
+            if not worker.busy:
+                return
+        if self._may_add():
             self._add()
 
     @property

@@ -83,24 +83,25 @@ class Pipe:
         """Whether something waits until the other end reads."""
         return bool(self._unsent)
 
-    def post(self, item: Item) -> None:
-        """Send an item, or keep what does not fit for `flush`. Raises ProtocolError for a message
-        that cannot be sent."""
+    def post(self, item: Item) -> bool:
+        """Send an item. Return False if a part of it did not fit and waits for `flush`. Raises
+        ProtocolError for a message that cannot be sent."""
         if _Copy.made:
             os._exit(0)
         if self.closed:
-            return
+            return True
         data = self._packer.pack(item) if type(item) is list else encode(item)  # type: ignore[arg-type]
         if not self._unsent:
             try:
                 sent = self.socket.send(data)
                 if sent == len(data):
-                    return
+                    return True
                 data = data[sent:]
             except OSError:
                 pass  # met again, and dealt with, by `flush`
         self._unsent += data
         self.flush()
+        return not self._unsent
 
     def flush(self) -> None:
         """Send what waits, as much as fits."""

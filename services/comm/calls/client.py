@@ -217,7 +217,7 @@ class Client:
         if waiting >= AT_ONCE:
             self.flush(now)
         elif not self._flushing:
-            if caller.calls == 1:
+            if len(caller.pending) == 1:
                 self.flush(now)
             else:
                 self._flush_in_a_moment()
