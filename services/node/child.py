@@ -52,6 +52,7 @@ class Child:
         self._heard = heard
         self._ended = ended
         self._loop = asyncio.get_running_loop()
+        self._logs = _log.isEnabledFor(logging.DEBUG)
         self.pipe, pipe_end = pipe_pair()
         self._descriptors, descriptors_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         passed = [pipe_end, descriptors_end, *([link] if link else [])]
@@ -124,10 +125,9 @@ class Child:
 
     def post(self, item: Item) -> None:
         """Send an item; what does not fit into the pipe now is sent when the process reads."""
-        if _log.isEnabledFor(logging.DEBUG):
+        if self._logs:
             _log.debug("to %d: %s", self._worker, _named(item))
-        self.pipe.post(item)
-        if self.pipe.unsent and not self.pipe.closed:
+        if not self.pipe.post(item):
             self._loop.add_writer(self.pipe.socket, self._flush)
 
     def _flush(self) -> None:
@@ -186,7 +186,7 @@ class Child:
             self._worker = first[1]
             del received[0]
         if received:
-            if _log.isEnabledFor(logging.DEBUG):
+            if self._logs:
                 named = ", ".join(map(_named, received))
                 _log.debug("from %d: %s", self._worker, named)
             self._heard(self, received)

@@ -274,8 +274,8 @@ class InlineHost:
         """When `advance` has something to do at the latest (s)."""
         if self.failed:
             return None
-        times = (self._runner.due(), self._next_step)
-        return min((t for t in times if t is not None), default=None)
+        due, step = self._runner.due(), self._next_step
+        return step if due is None else due if step is None else min(due, step)
 
     def reports(self) -> list[Report]:
         """What happened since the last call, in order."""

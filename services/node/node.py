@@ -148,9 +148,10 @@ STREAM_PREFIX = "stream:"
 SENDERS = frozenset((COORDINATOR, NODE))
 """Roles that may ask for the ticket of a stream: actions on nodes send set points, and a
 coordinator may order anything."""
-ACCEPT_AFTER = 0.002
+ACCEPT_AFTER = 0.02
 """How long ACCEPT is held back in real time (s): the result of a quick action makes it superfluous.
-In lock step it is sent at once."""
+Less would cost quick actions more timers; people do not notice so little. In lock step it is sent
+at once."""
 ANSWER_WITHIN = 1.0
 """Time in which the devices must answer an operator's command (s)."""
 VERBS = frozenset({"hold", "release", "stop", "status", PICTURE, EMERGENCY_STOP, CLEAR_EMERGENCY})
@@ -383,11 +384,11 @@ class Node:
         key = self._host_of(call.service)
         if key not in (LOOP, GENERAL):  # a look opens files; what has no device needs none
             self._stop_places(now, self._stops.look(now))
-        if key in self._stops:
-            _log.info("run %s of %s refused: %s", call.id, call.service, EMERGENCY_STOP)
-            refused = (EMERGENCY_STOP, IN_EMERGENCY, Executed.NO)
-            self.callee.finish(now, Outcome(call.id, Status.ERROR, {}, *refused))
-            return
+            if key in self._stops:
+                _log.info("run %s of %s refused: %s", call.id, call.service, EMERGENCY_STOP)
+                refused = (EMERGENCY_STOP, IN_EMERGENCY, Executed.NO)
+                self.callee.finish(now, Outcome(call.id, Status.ERROR, {}, *refused))
+                return
         _log.info("run %s of %s started", call.id, call.service)
         self.places[key].take(now, call)
 

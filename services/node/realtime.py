@@ -16,6 +16,7 @@ from petrobot.services.action import Status
 from petrobot.services.comm.calls.callee import Order
 from petrobot.services.comm.calls.caller import Notice
 from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.link import Alarm, clock_of
 from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.location_file import Directory, DirectoryError
 from petrobot.services.comm.location_file.host_checks import listening, refuse_unusable
@@ -34,6 +35,7 @@ from petrobot.services.worker.remote import IN_EMERGENCY
 
 _log = logging.getLogger(__name__)
 
+_CALLS = frozenset((Call,))
 LOOK = 0.25
 """Time after which a node looks at a run that it gave to a worker, at the latest (s)."""
 
@@ -50,6 +52,7 @@ class NodeShell:
         self._directory = directory
         self._name = name
         self._loop = asyncio.get_running_loop()
+        self._now = clock_of(self._loop)
         self._tickets = _tickets(directory, name)
         level = logging.getLogger().getEffectiveLevel()
         self._setup = Setup(
@@ -63,7 +66,7 @@ class NodeShell:
             directory,
             name,
             boot=secrets.token_hex(8),
-            clock=self._loop.time,
+            clock=self._now,
             places=places,
             connect=self._connect,
             stream_address=self._stream_address,
@@ -74,8 +77,7 @@ class NodeShell:
         self._client_tls = self._credentials.client()
         self._clients: dict[str, Client] = {}
         self._tasks: set[asyncio.Task[None]] = set()
-        self._timer: asyncio.TimerHandle | None = None
-        self._soon: asyncio.Handle | None = None
+        self._alarm = Alarm(self._step)
         self._beating: asyncio.TimerHandle | None = None
         self._change = asyncio.Event()
         self._serving = False
@@ -93,7 +95,7 @@ class NodeShell:
             self._find_stream(device, stream)
 
         setup = replace(self._setup, device=device)
-        hosting = Hosting(setup, self._loop.time, self._heard, wanted)
+        hosting = Hosting(setup, self._now, self._heard, wanted)
         if device == GENERAL:
             return WorkerPool(hosting, self._directory.nodes[self._name].workers)
         return WorkerHost(hosting)
@@ -148,8 +150,8 @@ class NodeShell:
         """Run the stop routines of all devices, then close all connections."""
         if self._beating is not None:
             self._beating.cancel()
-        self._cancel_timers()
-        self.node.close(self._loop.time())
+        self._alarm.cancel()
+        self.node.close(self._now())
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -158,24 +160,18 @@ class NodeShell:
         await self.server.close()
         children = [child for place in self._workers.values() for child in place.children()]
         await asyncio.gather(*(child.wait() for child in children))
-        self._cancel_timers()
-
-    def _cancel_timers(self) -> None:
-        for handle in (self._timer, self._soon):
-            if handle is not None:
-                handle.cancel()
-        self._timer = self._soon = None
+        self._alarm.cancel()
 
     # --- steps --------------------------------------------------------------------------------
 
     def _obey(self, now: float, orders: list[Order]) -> None:
         self.node.obey(now, orders)
-        quiet = self.node.places[LOOP].idle and not any(p.news for p in self._workers.values())
-        if quiet and all(type(order) is Call for order in orders):
+        quiet = _CALLS.issuperset(map(type, orders)) and self.node.places[LOOP].idle
+        if quiet and not any(place.news for place in self._workers.values()):
             # Workers have their orders, and their answers cause the next step. Only a worker that
             # stays silent needs a step by itself, some seconds later. Computing that time would
             # cost every run more than a look now and then.
-            self._arm_at(now + LOOK)
+            self._alarm.set(now + LOOK)
         else:
             self._changed()
 
@@ -184,19 +180,14 @@ class NodeShell:
         self._changed()
 
     def _changed(self) -> None:
-        """Step once in this turn of the loop, however many messages arrived."""
+        """Step in the next turn of the loop, once, however many messages arrived."""
         self._change.set()
-        if self._soon is None:
-            self._soon = self._loop.call_soon(self._step)
+        self._alarm.set(0.0)
 
     def _heard(self, plain_ends: bool) -> None:
         """Step after a process has sent something or ended: at once, because another turn of the
         loop costs as much as the step. If only results arrived, only these are passed on."""
-        if (
-            not plain_ends
-            or not self._serving
-            or not self.node.ends_quiet(now := self._loop.time())
-        ):
+        if not plain_ends or not self._serving or not self.node.ends_quiet(now := self._now()):
             self._change.set()
             self._step()
             return
@@ -204,38 +195,16 @@ class NodeShell:
         self.server.flush(now)
         for client in self._clients.values():
             client.flush(now)
-        self._arm_at(now + LOOK)
+        self._alarm.set(now + LOOK)
 
     def _step(self) -> None:
-        if self._soon is not None:
-            self._soon.cancel()
-            self._soon = None
-        now = self._loop.time()
+        now = self._now()
         self.node.advance(now)
         if self._serving:
             self.server.flush(now)
         for client in self._clients.values():
             client.flush(now)
-        self._arm()
-
-    def _arm(self) -> None:
-        """Set the timer of the next step. A timer that is set for an earlier time stays: most runs
-        end long before their deadlines, and a superfluous step costs less than a timer for each
-        run."""
-        due = self.node.due()
-        if due is not None:
-            self._arm_at(due)
-
-    def _arm_at(self, due: float) -> None:
-        if self._timer is not None and self._timer.when() <= due:
-            return
-        if self._timer is not None:
-            self._timer.cancel()
-        self._timer = self._loop.call_at(due, self._step_when_due)
-
-    def _step_when_due(self) -> None:
-        self._timer = None
-        self._step()
+        self._alarm.set(self.node.due())
 
     # --- other nodes --------------------------------------------------------------------------
 

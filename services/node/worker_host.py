@@ -126,6 +126,7 @@ NEXT: Mapping[tuple[HostStage, Happening], HostStage] = {
 """All transitions between stages. Anything else (a second READY) is ignored."""
 
 STARTING = (HostStage.DRIVER_STARTS, HostStage.ACTIONS_START)
+_TAKES_RUNS = HostStage.READY  # looked up once, see `runner.NEW`
 
 
 @dataclass(slots=True)
@@ -230,15 +231,10 @@ class WorkerHost:
         """Whether a run would start at once: its processes are up, and none of them is about to
         end."""
         return (
-            self._stage is HostStage.READY
+            self._stage is _TAKES_RUNS
             and not self.failed
             and not self._withdrawn
-            and self._takes_orders()
-        )
-
-    def _takes_orders(self) -> bool:
-        return (
-            self._worker is not None
+            and self._worker is not None
             and not self._worker.closed
             and not (self._owner and self._owner.closed)
         )
@@ -464,11 +460,12 @@ class WorkerHost:
         self._pace += (end.seconds + HAND_OVER - self._pace) / 4
         if end.cause == OUT_OF_MEMORY:
             self.withdraw()
-        alone = all(run.posted is None for run in self._runs.values())
-        if end.cause == OUT_OF_MEMORY and alone and self._worker is not None:
-            # The memory that the run still holds would fail the next run, which may need little.
-            self._retiring = self._worker
-            self._worker.leave()
+            alone = all(run.posted is None for run in self._runs.values())
+            if alone and self._worker is not None:
+                # The memory that the run still holds would fail the next run, which may need
+                # little.
+                self._retiring = self._worker
+                self._worker.leave()
         self._release_if_over()
 
     def _end(self, id_: str, cause: str, text: str) -> None:

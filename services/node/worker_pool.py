@@ -12,6 +12,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 from petrobot.services.action import Status
 from petrobot.services.comm.protocol.messages import (
@@ -130,8 +131,8 @@ class WorkerPool:
         number = next(n for n in range(1, self._most + 1) if n not in self._workers)
         hosting = replace(
             self._hosting,
-            changed=lambda plain_ends: self._touch(number, plain_ends),
-            wanted=lambda stream: self._want(number, stream),
+            changed=partial(self._touch, number),
+            wanted=partial(self._want, number),
         )
         self._workers[number] = WorkerHost(hosting)
         self._workers = dict(sorted(self._workers.items()))
@@ -200,7 +201,10 @@ class WorkerPool:
         if self._held:
             self._workers[number].command(now, HOLD)
         self._workers[number].take(now, call)
-        if self._may_add() and all(worker.busy for worker in self._workers.values()):
+        for worker in self._workers.values():
+            if not worker.busy:
+                return
+        if self._may_add():
             self._add()
 
     @property

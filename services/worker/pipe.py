@@ -99,24 +99,25 @@ class Pipe:
             word = report.data.get("answer")
             self.post(Answer(report.id, True, {"answer": word, "text": fault.text}))
 
-    def post(self, item: Item) -> None:
-        """Send an item, or keep what does not fit for `flush`. Raises ProtocolError for a message
-        that cannot be sent."""
+    def post(self, item: Item) -> bool:
+        """Send an item. Return False if a part of it did not fit and waits for `flush`. Raises
+        ProtocolError for a message that cannot be sent."""
         if _Copy.made:
             os._exit(0)
         if self.closed:
-            return
+            return True
         data = self._packer.pack(item) if type(item) is list else encode(item)  # type: ignore[arg-type]
         if not self._unsent:
             try:
                 sent = self.socket.send(data)
                 if sent == len(data):
-                    return
+                    return True
                 data = data[sent:]
             except OSError:
                 pass  # met again, and dealt with, by `flush`
         self._unsent += data
         self.flush()
+        return not self._unsent
 
     def flush(self) -> None:
         """Send what waits, as much as fits."""
@@ -146,7 +147,10 @@ class Pipe:
             if not count:
                 self.closed = self.ended = True
                 break
-            self._feed(_BUFFER[:count])
+            try:
+                self._unpacker.feed(_BUFFER[:count])
+            except msgpack.BufferFull as fault:
+                raise ValueError(f"an item of more than {LARGEST} bytes") from fault
             # Taken out before more is read: several large items that came together are more than
             # its buffer holds.
             for unpacked in self._unpacker:
@@ -155,12 +159,6 @@ class Pipe:
             if count < CHUNK and not self.closed:
                 break  # all that arrived; the end of the pipe wakes its reader again
         return items
-
-    def _feed(self, data: memoryview) -> None:
-        try:
-            self._unpacker.feed(data)
-        except msgpack.BufferFull as fault:
-            raise ValueError(f"an item of more than {LARGEST} bytes") from fault
 
     def close(self) -> None:
         """Close this end."""

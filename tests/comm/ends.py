@@ -100,7 +100,7 @@ async def until(condition: Callable[[], bool]) -> None:
     stirred = asyncio.Event()
     with pytest.MonkeyPatch.context() as patch:
         for owner, name in (
-            (Server, "arm"),
+            (Server, "flush"),
             (Server, "gone"),
             (Client, "flush"),
             (AsyncLink, "_beat"),

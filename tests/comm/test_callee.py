@@ -416,7 +416,7 @@ def test_a_report_about_an_inactive_run_is_an_error_of_the_node_itself() -> None
 def test_a_service_answered_at_once_is_answered_exactly_once() -> None:
     callee = _callee()
     outcome = callee.answer_inline(1.0, "coord", m.Call("1", "get", epoch=3))
-    assert outcome == m.Outcome("1", "success", {"at": 1.0}) and not callee.has_work
+    assert outcome == m.Outcome("1", "success", {"at": 1.0}) and not callee.messages()
     callee.keep(1.0, "coord", outcome)
     assert callee.soonest == 1.0 + Retention().results, "the result is not kept for ever"
     for call in (

@@ -176,7 +176,7 @@ def test_a_lost_link_ends_its_calls_after_two_seconds_not_before() -> None:
     caller.link_down(1.0, "the other side hung up")
     assert caller.notices() == [PeerLost("the other side hung up")] and caller.due() == 1.0
     caller.advance(2.9)
-    assert caller.notices() == [] and caller.under_way() == ("1",)
+    assert caller.notices() == [] and list(caller.pending) == ["1"]
     caller.advance(3.0)
     assert _ends(caller.notices()) == [("1", "lost", Executed.UNKNOWN)]
 
@@ -274,7 +274,7 @@ def test_a_waiter_that_gave_up_is_not_notified_but_the_result_is_still_acknowled
         caller.messages(0.0)
         caller.take_outcomes(0.1, [m.Outcome("1", "success")])
         assert m.ResultAck("1") in caller.messages(1.0)
-    assert waiter.told == [] and caller.calls == 0
+    assert waiter.told == [] and not caller.pending
     assert not any(isinstance(notice, Outcome) for notice in caller.notices())
 
 
@@ -457,4 +457,4 @@ def test_bad_calls_are_refused_by_the_caller_itself() -> None:
     caller.call(0.0, CALL)
     with pytest.raises(ValueError, match="already pending"):
         caller.call(0.0, CALL)
-    assert caller.under_way() == ("1",)
+    assert list(caller.pending) == ["1"]

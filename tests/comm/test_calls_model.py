@@ -80,7 +80,7 @@ class World:
         self.caller.call(self.now, call)
 
     def cancel(self, which: int) -> None:
-        under_way = self.caller.under_way()
+        under_way = tuple(self.caller.pending)
         if under_way:
             self.caller.cancel(self.now, under_way[which % len(under_way)], "not wanted")
 
@@ -281,7 +281,7 @@ def _check(world: World) -> None:
         assert known == outcome or known.executed is Executed.UNKNOWN, (
             "only an unknown result may be corrected later"
         )
-    assert not world.callee.running() and not world.caller.under_way()
+    assert not world.callee.running() and not world.caller.pending
     answer = world.callee.link_up(world.now, COORD, world.caller.hello)
     assert isinstance(answer, m.Welcome)
     assert answer.runs == (), "a result was not acknowledged"

@@ -73,7 +73,7 @@ async def test_cancelling_the_future_cancels_the_call(open_node: Node) -> None:
     callee = open_node.server.callee
     callee.finish(open_node.server.now(), m.Outcome(cancel.id, "error", cause="cancelled"))
     open_node.server.flush()
-    await until(lambda: not coordinator.caller.under_way())
+    await until(lambda: not coordinator.caller.pending)
     await until(lambda: not callee._results.of("coord"))
     await coordinator.client.close()
 

@@ -415,7 +415,7 @@ async def test_cancel_hold_and_release(operator: Operator) -> None:
     await operator.until(lambda: _beyond(operator, positions[1]))
     busy = await operator.call("go", to=0.0)
     assert (busy.cause, busy.executed) == ("busy", "no")
-    left.caller.cancel(left.now(), left.caller.under_way()[0], "enough")
+    left.caller.cancel(left.now(), next(iter(left.caller.pending)), "enough")
     left.flush()
     end = await running
     assert (end.cause, end.executed) == ("cancelled", "yes")

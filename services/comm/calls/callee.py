@@ -28,8 +28,9 @@ import heapq
 from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from types import NoneType
 from typing import Any, Final
+
+import msgpack
 
 from petrobot.services.comm.calls.events import EventBoard
 from petrobot.services.comm.calls.peers import (
@@ -162,30 +163,8 @@ class Retention:
     runs is active."""
 
 
-_SCALAR = 9
-"""Bytes of a number on the wire: one marker and eight bytes."""
-_TEXTS = frozenset((str, bytes))
-_NUMBERS = frozenset((float, int, bool, NoneType))
-
-
-def weight_of(value: Any) -> int:
-    """Estimate how many bytes plain data takes on the wire."""
-    kind = type(value)
-    if kind is str or kind is bytes:
-        return len(value) + _SCALAR
-    if kind is dict:
-        weight = _SCALAR
-        for key, item in value.items():
-            weight += len(key) + (_SCALAR if type(item) in _NUMBERS else weight_of(item))
-        return weight
-    if kind is list or kind is tuple:
-        kinds = set(map(type, value))
-        if kinds <= _NUMBERS:
-            return _SCALAR * (1 + len(value))
-        if kinds <= _TEXTS:
-            return _SCALAR * (1 + len(value)) + sum(map(len, value))
-        return _SCALAR + sum(map(weight_of, value))
-    return _SCALAR
+_weigh = msgpack.Packer(default=lambda value: None, unicode_errors="surrogatepass").pack
+"""Packs data to learn its length on the wire; what cannot be sent counts as nothing."""
 
 
 _DIGITS = "0123456789"
@@ -260,10 +239,10 @@ class ResultStore:
         return id_ in self._results or id_ in self.gone
 
     def add(self, now: float, peer: str, outcome: Outcome, weight: int | None = None) -> None:
-        """Keep a result for its caller. `weight` is its length on the wire (bytes); it is estimated
-        when left out."""
+        """Keep a result for its caller. `weight` is its length on the wire (bytes); left out, the
+        length of its values is taken."""
         if weight is None:
-            weight = weight_of(outcome.values) if outcome.values else 0
+            weight = len(_weigh(outcome.values))
         results, id_ = self._results, outcome.id
         older = results.get(id_)
         self._weight += weight if older is None else weight - older[3]
@@ -505,11 +484,6 @@ class Callee:
         due = now + self._keeping.results
         if due < self.soonest:
             self.soonest = due
-
-    @property
-    def has_work(self) -> bool:
-        """Return whether there are orders or messages to take."""
-        return bool(self._orders or self._messages)
 
     def _known(self, peer: str, id_: str) -> None:
         """Answer a call id that came before with what is known; never run it again."""

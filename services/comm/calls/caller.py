@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import heapq
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -391,6 +391,8 @@ class Caller:
         self._patience = patience or Patience()
         self._absence = PeerAbsence(peer, self._patience)
         self._pending = PendingCalls()
+        self.pending: Collection[str] = self._pending.keys()
+        """Ids of the calls without a result."""
         self._commands: dict[str, float] = {}
         self._names: tuple[str, ...] | None = None
         self._events = EventIntake()
@@ -559,10 +561,6 @@ class Caller:
         if ack is not None and self.up:
             self._messages.append(ack)
 
-    def under_way(self) -> tuple[str, ...]:
-        """Return the ids of the pending calls."""
-        return tuple(self._pending)
-
     def link_up(self, now: float, welcome: m.Welcome) -> None:
         """The peer welcomed us: send pending calls again under their ids, or end them if it is
         another boot."""
@@ -644,7 +642,7 @@ class Caller:
             taker(now, message)
 
     def take_outcomes(self, now: float, outcomes: Iterable[m.Outcome]) -> None:
-        """Handle several results at once (as `receive`)."""
+        """Handle several results at once, as `receive`."""
         safe: list[str] = []
         take = self._pending.pop
         for outcome in outcomes:
@@ -724,11 +722,6 @@ class Caller:
         waits = (self._pending.due(), self._settled.due, self._absence.until)
         self.soonest = soonest = min(*waits, *self._commands.values())
         return soonest if soonest < NEVER else None
-
-    @property
-    def calls(self) -> int:
-        """Return how many calls are pending."""
-        return len(self._pending)
 
     @property
     def has_news(self) -> bool:

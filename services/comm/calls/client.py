@@ -17,11 +17,12 @@ import random
 import socket
 import ssl
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from typing import Any
 
-from petrobot.services.comm.calls.caller import NEVER, Caller, Notice
+from petrobot.services.comm.calls.caller import Caller, Notice
 from petrobot.services.comm.calls.link import (
     READ_BUFFER,
+    Alarm,
     AsyncLink,
     LinkLimits,
     LinkTiming,
@@ -79,7 +80,7 @@ class _ClientLink(AsyncLink):
     def took(self, now: float, messages: list[Message]) -> None:
         client = self._client
         if _OUTCOMES.issuperset(map(type, messages)):
-            client.took_outcomes(now, cast("list[Outcome]", messages))
+            client.took_outcomes(now, messages)  # type: ignore[arg-type]
             return
         for message in messages:
             if isinstance(message, Welcome):
@@ -154,8 +155,7 @@ class Client:
         self._link: _ClientLink | None = None
         self._future = futures_of(self._loop)
         self._task: asyncio.Task[None] | None = None
-        self._timer: asyncio.TimerHandle | None = None
-        self._armed = NEVER
+        self._alarm = Alarm(self._advance)
         self._flushing = False
         self._up = asyncio.Event()
         self._prefix = f"{caller.hello.name}/{caller.hello.boot}/"
@@ -192,9 +192,7 @@ class Client:
         if link is not None:
             link.end(text, Bye(text) if link.connection.state is ConnectionState.OPEN else None)
             await link.finished.wait()
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer, self._armed = None, NEVER
+        self._alarm.cancel()
         self.caller.link_down(self.now(), text, final=True)
         self._tell(self.now())
 
@@ -219,7 +217,7 @@ class Client:
         if waiting >= AT_ONCE:
             self.flush(now)
         elif not self._flushing:
-            if caller.calls == 1:
+            if len(caller.pending) == 1:
                 self.flush(now)
             else:
                 self._flush_in_a_moment()
@@ -257,25 +255,15 @@ class Client:
                 self._link.send(messages)
         if caller.has_news:
             self._tell(now)
-        if caller.soonest < self._armed:
-            self._arm()
+        if caller.soonest < self._alarm.due:
+            self._alarm.set(caller.due())
 
     def _tell(self, now: float) -> None:
         notices = self.caller.notices()
         if notices and self._on_notices is not None:
             self._on_notices(now, notices)
 
-    def _arm(self) -> None:
-        due = self.caller.due()
-        if due is None or due >= self._armed:
-            return
-        if self._timer is not None:
-            self._timer.cancel()
-        self._armed = due
-        self._timer = self._loop.call_at(due, self._advance)
-
     def _advance(self) -> None:
-        self._timer, self._armed = None, NEVER
         now = self.now()
         self.caller.advance(now)
         self.flush(now)
@@ -324,7 +312,7 @@ class Client:
         caller.take_outcomes(now, outcomes)
         if caller.has_news:
             self.flush(now)
-        elif len(outcomes) > 1 or caller.soonest < self._armed:
+        elif len(outcomes) > 1 or caller.soonest < self._alarm.due:
             self._flush_in_a_moment()
 
     def welcomed(self, now: float, link: _ClientLink, welcome: Welcome) -> None:

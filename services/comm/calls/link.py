@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import functools
 import logging
+import math
 import secrets
 import socket
 import time
@@ -123,6 +124,36 @@ class Heartbeat:
         return self._due
 
 
+class Alarm:
+    """A timer of the running loop that calls `act`. An earlier time that is set stays: a call too
+    many costs less than a timer for each message."""
+
+    __slots__ = ("_act", "_timer", "due")
+
+    def __init__(self, act: Callable[[], None]) -> None:
+        self.due = math.inf
+        """When `act` is called (s, clock of the loop)."""
+        self._act = act
+        self._timer: asyncio.TimerHandle | None = None
+
+    def set(self, due: float | None) -> None:
+        """Call `act` at `due` (s; None: never), or at the earlier time that is set."""
+        if due is not None and due < self.due:
+            self.cancel()
+            self.due = due
+            self._timer = asyncio.get_running_loop().call_at(due, self._ring)
+
+    def cancel(self) -> None:
+        """Do not call `act`."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer, self.due = None, math.inf
+
+    def _ring(self) -> None:
+        self.cancel()
+        self._act()
+
+
 class AsyncLink(asyncio.BufferedProtocol):
     """Base class of both ends. Subclasses handle messages in `took` and the end of the connection
     in `over`.
@@ -145,6 +176,7 @@ class AsyncLink(asyncio.BufferedProtocol):
         self.connection = Connection(side, server, key=key, nonce=nonce)
         self.loop = asyncio.get_running_loop()
         self.now = clock_of(self.loop)
+        self._logs = _log.isEnabledFor(logging.DEBUG)
         self.timing = timing
         self.limits = limits
         self.slow = False
@@ -209,7 +241,7 @@ class AsyncLink(asyncio.BufferedProtocol):
         except ProtocolError as fault:
             self._refuse(now, fault)
             return
-        if _log.isEnabledFor(logging.DEBUG):  # kinds and ids alone: results may hold tickets
+        if self._logs:  # kinds and ids alone: results may hold tickets
             named = [f"{type(one).__name__} {getattr(one, 'id', '')}" for one in messages]
             _log.debug("received %d bytes: %s", nbytes, ", ".join(named))
         self._unheard += nbytes

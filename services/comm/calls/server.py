@@ -21,7 +21,13 @@ from datetime import UTC, datetime
 from typing import Final
 
 from petrobot.services.comm.calls.callee import Callee, Order
-from petrobot.services.comm.calls.link import READ_BUFFER, AsyncLink, LinkLimits, LinkTiming
+from petrobot.services.comm.calls.link import (
+    READ_BUFFER,
+    Alarm,
+    AsyncLink,
+    LinkLimits,
+    LinkTiming,
+)
 from petrobot.services.comm.protocol.messages import (
     Answer,
     Bye,
@@ -151,10 +157,7 @@ class _ServerLink(AsyncLink):
                 callee.receive(now, peer, message)
         if self.frames:
             self.write()
-        if callee.has_work:
-            self._server.flush(now)
-        else:
-            self._server.arm()
+        self._server.flush(now)
 
     def _framed(self, answer: Outcome) -> tuple[Outcome, bytes]:
         """Return a result and its frame; if no frame can carry it, an ERROR result in its place."""
@@ -274,7 +277,7 @@ class Server:
         self._closed = False
         self._server: asyncio.Server | TlsListener | None = None
         self._knocks = FailedHandshakes(self.limits.handshakes, self.limits.handshakes_at_once)
-        self._timer: asyncio.TimerHandle | None = None
+        self._alarm = Alarm(self._advance)
         self._daily: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
 
@@ -327,10 +330,9 @@ class Server:
                 link.end(text, Bye(text))
             else:
                 link.cut(text)
-        for timer in (self._timer, self._daily):
-            if timer is not None:
-                timer.cancel()
-        self._timer = self._daily = None
+        self._alarm.cancel()
+        if self._daily is not None:
+            self._daily.cancel()
         if self._server is not None:
             await self._server.wait_closed()
         while self._all:
@@ -356,27 +358,15 @@ class Server:
                 by_peer.setdefault(peer, []).append(message)
             for peer, its in by_peer.items():
                 self._send(peer, its)
-        self.arm()
+        if callee.soonest < self._alarm.due:
+            self._alarm.set(callee.due())
 
     def _send(self, peer: str, messages: list[Message]) -> None:
         link = self._links.get(peer)
         if link is not None:
             link.send(messages)
 
-    def arm(self) -> None:
-        """Set the timer for the callee's next `advance`."""
-        if self._timer is not None and self._timer.when() <= self.callee.soonest:
-            return
-        due = self.callee.due()
-        if due is None or (self._timer is not None and self._timer.when() <= due):
-            return
-        if self._timer is not None:
-            self._timer.cancel()
-        assert self._loop is not None
-        self._timer = self._loop.call_at(due, self._advance)
-
     def _advance(self) -> None:
-        self._timer = None
         now = self.now()
         self.callee.advance(now)
         self.flush(now)

@@ -270,6 +270,7 @@ _SELDOM = frozenset((m.Call.KIND, m.Outcome.KIND))
 the field still reads the message."""
 _COUNTED = frozenset((m.Call.KIND, m.Outcome.KIND, m.Event.KIND, m.Answer.KIND))
 _NUMBERS = frozenset((float, int))
+_TEXT = frozenset((str,))
 _TICK = Tick.KIND
 _ARRAY, _MESSAGE = 1, 2
 """msgpack extension types inside a Tick: an array of numbers, and a message."""
@@ -326,10 +327,9 @@ def _plain_map(value: dict[Any, Any]) -> dict[Any, Any]:
 
 
 def _names(value: list[Any]) -> tuple[str, ...]:
-    for item in value:
-        if type(item) is not str:
-            raise _FieldError("expected an array of str")
-        _name(item)
+    if not _TEXT.issuperset(map(type, value)):
+        raise _FieldError("expected an array of str")
+    _name(max(value, key=len, default=""))
     return tuple(value)
 
 

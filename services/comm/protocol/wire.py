@@ -210,6 +210,7 @@ class Connection:
         if key is not None and len(nonce) != NONCE_BYTES:
             raise ValueError(f"a connection with a key needs a nonce of {NONCE_BYTES} bytes")
         self.side = side
+        self.state = ConnectionState.OPENING
         self.version = 0
         """Agreed version; 0 before WELCOME."""
         self.proven = True
@@ -236,13 +237,9 @@ class Connection:
         self._quick_out = NOTHING
         """Open connection only: kinds that may be sent on the fast path."""
 
-    @property
-    def state(self) -> ConnectionState:
-        """Return the state: opening, open, closing or closed."""
-        return STATES.get(self._phase, ConnectionState.OPENING)
-
     def _enter(self, phase: ConnectionPhase) -> None:
         self._phase = phase
+        self.state = STATES.get(phase, ConnectionState.OPENING)
         self._may_come = MAY_COME.get((self.side, phase), NOTHING)
         self._may_go = MAY_GO.get((self.side, phase), NOTHING)
         if phase is ConnectionPhase.OPEN:

@@ -43,6 +43,7 @@ from petrobot.services.comm.protocol.wire import (
 STALE_AFTER: Final = 3
 """A set point is too old after so many periods."""
 
+_OPEN: Final = ConnectionState.OPEN  # looked up once: members of an Enum class are slow to find
 _DRIFT: Final = 1e-4
 """Assumed drift between two clocks (s/s); quartz is ten times better."""
 _CHUNK: Final = 1 << 14
@@ -238,7 +239,7 @@ class StreamSender:
     @property
     def up(self) -> bool:
         """Return whether the receiver has welcomed the stream."""
-        return self._line is not None and self._line.connection.state is ConnectionState.OPEN
+        return self._line is not None and self._line.connection.state is _OPEN
 
     def send(self, values: Sequence[float], held: float = 0.0) -> bool:
         """Send the newest values, which the sender has held for `held` seconds. Return False if
