@@ -172,17 +172,19 @@ async def disturbed(ctx: Context[Remote], enable: Any, moves: list[Any]) -> Resu
     """Move there and back until a move fails; try again until one succeeds."""
     assert (await enable(ctx)).status == "success"
     failed: Result | None = None
-    while failed is None:
+    limit = Limit("a move that fails, then one that succeeds", steps=10_000)
+    while failed is None and limit.left():
         for move in moves:
             result = await move(ctx)
             if result.status != "success" and failed is None:
                 failed, late = result, ctx.now
-    while True:
+    moved: Result | None = None
+    while (moved is None or moved.status != "success") and limit.left():
         await ctx.sleep(1.0)
         enabled = await enable(ctx)
         moved = await moves[0](ctx) if enabled.status == "success" else enabled
-        if moved.status == "success":
-            return success(cause=failed.cause, text=failed.text, late=late, back=ctx.now)
+    assert failed is not None
+    return success(cause=failed.cause, text=failed.text, late=late, back=ctx.now)
 
 
 def told(driver: Any, enable: Any, moves: list[Any]) -> dict[str, Any]:
@@ -266,10 +268,10 @@ def rogue(port: int, how: str) -> Iterator[int]:
     WebSocket that stops in the middle of a frame (`half`)."""
     listener = socket.create_server(("127.0.0.1", port))
     listener.settimeout(0.05)
-    over, held = threading.Event(), list[socket.socket]()
+    over, held, limit = threading.Event(), list[socket.socket](), Limit("the end of the test")
 
     def serve() -> None:
-        while not over.is_set():
+        while not over.is_set() and limit.left():
             try:
                 near, _ = listener.accept()
             except TimeoutError:

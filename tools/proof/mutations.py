@@ -217,8 +217,8 @@ MUTATIONS = (
     _m(
         "a run starts although its device is stopped",
         "services/node/node.py",
-        "        if key in self._stops:\n            _log.info",
-        "        if False:\n            _log.info",
+        "            if key in self._stops:\n                _log.info",
+        "            if False:\n                _log.info",
         "tests/node/test_lockstep.py",
     ),
     _m(
@@ -265,8 +265,8 @@ MUTATIONS = (
     _m(
         "a search that stopped early proves that there is no dead end",
         ANALYSIS + "execution/progress.py",
-        'if not self.x.complete:\n            return self._unknown("none found so far")',
-        'if False:\n            return self._unknown("none found so far")',
+        'if not self.x.complete:\n            return self._unknown("no fault found so far")',
+        'if False:\n            return self._unknown("no fault found so far")',
         "tests/analysis/test_progress.py",
     ),
     # Learning.
