@@ -1,4 +1,4 @@
-"""Files, functions and modules that pages and docstrings name exist, and links work."""
+"""Files, functions and modules that pages, docstrings and mutations name exist, and links work."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import ast
 import re
 from functools import cache
 from pathlib import Path
+
+from tools.proof.mutations import MUTATIONS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -114,3 +116,14 @@ def test_no_page_is_too_long() -> None:
     lengths = {page.name: len(page.read_text(encoding="utf-8").splitlines()) for page in PAGES}
     long = {name: n for name, n in lengths.items() if n > LONGER.get(name, LONGEST_PAGE)}
     assert long == {}
+
+
+def test_every_fault_of_the_mutations_can_be_injected() -> None:
+    """Each text to replace occurs once in its file, and the named tests exist."""
+    wrong = [
+        fault.name
+        for fault in MUTATIONS
+        if (ROOT / fault.file).read_text(encoding="utf-8").count(fault.old) != 1
+        or not all((ROOT / test.partition("::")[0]).exists() for test in fault.tests)
+    ]
+    assert wrong == []

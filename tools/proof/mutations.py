@@ -114,8 +114,8 @@ MUTATIONS = (
     _m(
         "a device is free before its cancelled run has stopped",
         ENGINE + "runs.py",
-        "for r in (*going, *draft.stopping.values())",
-        "for r in going",
+        "for r in (*active, *draft.stopping.values())",
+        "for r in active",
         "tests/engine",
     ),
     _m(
