@@ -253,7 +253,7 @@ class Progress:
         reason = f"from {describe(x, first)} no designed end can be reached"
         if not x.dead.any() and not x.livelocks:
             final = x.engine.compiled.task.final
-            reason += f": the task can go on for ever, but never comes to {final}"
+            reason += f": the task can continue for ever, but never reaches {final}"
         return self._no(reason, first)
 
     @cached_property
@@ -292,15 +292,13 @@ class Progress:
             found = obstacles(Draft(compiled, state), compiled.transitions[t])
             lacking.append({_lack(one.kind, one.text) for one in found})
             if not found:
-                return (
-                    "whenever its arcs allow it, its event or time does not come before others fire"
-                )
+                return "whenever its arcs are satisfied, others fire before its event or time comes"
         always = set.intersection(*lacking)
         if always:
-            return f"whenever the engine rests, it {' and '.join(sorted(always))}"
+            return f"in every state at rest it {' and '.join(sorted(always))}"
         net = compiled.net
         needs = ", ".join(net.places[p] for p, _ in compiled.transitions[t].needs)
-        return f"what it needs ({needs}) is never there together"
+        return f"the tokens that it needs ({needs}) are never there together"
 
     # --- from mission to mission --------------------------------------------------------------
 
