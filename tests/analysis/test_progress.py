@@ -303,7 +303,7 @@ def test_a_branch_that_can_never_fire_is_reported_with_its_reason() -> None:
     )
     verdict = judged(task).quasi_live
     assert verdict.holds is False
-    assert verdict.reason == "never can never fire: whenever the engine rests, it needs 2 of bin"
+    assert verdict.reason == "never can never fire: in every state at rest it needs 2 of bin"
 
 
 def test_branches_that_wait_for_each_other_are_told_by_the_token_that_is_missing() -> None:
@@ -373,7 +373,7 @@ def test_a_loop_that_never_ends_is_not_sound() -> None:
     )
     found = judged(task)
     assert found.deadlock_free.holds and found.sound.holds is False
-    assert "can go on for ever, but never comes to done == 1" in found.sound.reason
+    assert "can continue for ever, but never reaches done == 1" in found.sound.reason
 
 
 def test_a_task_that_can_only_give_up_is_not_sound() -> None:

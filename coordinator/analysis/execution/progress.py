@@ -257,7 +257,7 @@ class Progress:
         first = int(lost[0])
         reason = f"from {describe(x, first)} no designed end can be reached"
         if not x.dead.any() and not x.livelocks:
-            reason += f": the task can go on for ever, but never comes to {final}"
+            reason += f": the task can continue for ever, but never reaches {final}"
         return self._no(reason, first)
 
     @cached_property
@@ -304,9 +304,7 @@ class Progress:
             found = obstacles(Draft(compiled, state), t)
             lacking.append({_lack(one.kind, one.text) for one in found})
             if not found:
-                return (
-                    "whenever its arcs allow it, its event or time does not come before others fire"
-                )
+                return "whenever its arcs are satisfied, others fire before its event or time comes"
         always, net, empty = set.intersection(*lacking), compiled.net, list[str]()
         for p, w in t.plain:
             givers = self._givers(p)
@@ -317,9 +315,9 @@ class Progress:
         if empty:
             return f"it needs {' and '.join(empty)}"
         if always:
-            return f"whenever the engine rests, it {' and '.join(sorted(always))}"
+            return f"in every state at rest it {' and '.join(sorted(always))}"
         needs = ", ".join(net.places[p] for p, _ in t.needs)
-        return f"what it needs ({needs}) is never there together"
+        return f"the tokens that it needs ({needs}) are never there together"
 
     # --- from mission to mission --------------------------------------------------------------
 
