@@ -128,13 +128,13 @@ def inline_service(service: ServiceEntry, raised: Callable[[Event], None]) -> In
                 describe(fault),
             )
         try:
-            result = checked_result(call.id, result, "values")
+            outcome = checked_result(call.id, result, "values")
         except ValueError as fault:
             return Outcome(
                 call.id, Status.ERROR, {}, "bad_result", f"what it returned cannot be sent: {fault}"
             )
-        cpu = time.process_time() - before
-        return outcome_of(call.id, result, cpu_seconds=cpu)
+        outcome.cpu_seconds = time.process_time() - before
+        return outcome
 
     return answer
 

@@ -49,21 +49,10 @@ def checked(message: Message) -> None:
         raise ValueError(fault.text) from None
 
 
-def outcome_of(
-    identity: str, result: Result, seconds: float = 0.0, cpu_seconds: float = 0.0
-) -> Outcome:
+def outcome_of(identity: str, result: Result) -> Outcome:
     """Return the result of a call as the message that carries it."""
-    return Outcome(
-        identity,
-        result.status,
-        result.values,
-        result.cause,
-        result.text,
-        Executed(result.executed),
-        seconds,
-        cpu_seconds,
-        result.deferred,
-    )
+    said = (result.status, result.values, result.cause, result.text)
+    return Outcome(identity, *said, Executed(result.executed), deferred=result.deferred)
 
 
 def result_of(outcome: Outcome) -> Result:
@@ -78,9 +67,9 @@ def result_of(outcome: Outcome) -> Result:
     )
 
 
-def checked_result(identity: str, returned: Any, where: str = "result") -> Result:
-    """Return what an action or a service returned, as plain data that can be sent. Raises
-    ValueError if that is impossible; `where` names the values in its text."""
+def checked_result(identity: str, returned: Any, where: str = "result") -> Outcome:
+    """Return what an action or a service returned as an outcome of plain data that can be sent.
+    Raises ValueError if that is impossible; `where` names the values in its text."""
     if not isinstance(returned, Result):
         name = type(returned).__name__
         raise ValueError(f"returned a {name}; return success(), failure() or error()")
@@ -88,12 +77,14 @@ def checked_result(identity: str, returned: Any, where: str = "result") -> Resul
         values = plain(returned.values, where)
         if type(values) is not dict:
             raise ValueError(f"{where}: expected values by name, found a {type(values).__name__}")
-        said = (plain(str(returned.cause)), plain(str(returned.text)), bool(returned.deferred))
+        said = (plain(str(returned.cause)), plain(str(returned.text)))
         # Most are members already: to make one of its text takes 1 us.
         status = returned.status if type(returned.status) is Status else Status(returned.status)
         executed = EXECUTED.get(returned.executed) or Executed(returned.executed)
-        result = Result(status, values, *said, executed=executed)
-        checked(outcome_of(identity, result))
+        result = Outcome(
+            identity, status, values, *said, executed, deferred=bool(returned.deferred)
+        )
+        checked(result)
     except (TypeError, ValueError, MemoryError) as fault:
         raise ValueError(words_of(fault) or type(fault).__name__) from None
     except Exception as fault:  # the value's own code: an object may raise whatever is asked of it

@@ -23,7 +23,7 @@ from petrobot.services.worker.callables import (
     from_outside,
     log_fault,
 )
-from petrobot.services.worker.context import Report, RunContext, checked_result, never, outcome_of
+from petrobot.services.worker.context import Report, RunContext, checked_result, never
 from petrobot.services.worker.outlets import Outlets
 from petrobot.services.worker.remote import Refusing
 
@@ -109,7 +109,7 @@ class Execution:
     sent_before: int = 0
     """Number of the last command that was sent to its device before it began."""
     cpu: float = 0.0
-    result: Result | None = None
+    result: Outcome | None = None
     cause: str = ""
     text: str = ""
     abandoned: bool = False
@@ -492,7 +492,7 @@ class Runner:
         else:
             self._finish(now, run, result)
 
-    def _finish(self, now: float, run: Execution, result: Result) -> None:
+    def _finish(self, now: float, run: Execution, result: Outcome) -> None:
         """End the run with its action's result, as soon as it is known that the driver refused none
         of its commands."""
         if self._refusing is None:
@@ -572,7 +572,7 @@ class Runner:
         over."""
         assert run.limit is not None
         self._outlets.close(run.call.id)
-        failed = Result(Status.ERROR, {}, run.cause, run.text)
+        failed = Outcome(run.call.id, Status.ERROR, {}, run.cause, run.text)
         if self._device is None or (
             self._device.stopped() and (run.stop_called or not run.abandoned)
         ):
@@ -585,15 +585,15 @@ class Runner:
         else:
             self._fenced = True
             run.note("the device is not known to stand still")
-            self._end(now, run, Result(Status.ERROR, {}, run.cause, run.text))
+            self._end(now, run, replace(failed, text=run.text))
 
-    def _end(self, now: float, run: Execution, result: Result) -> None:
+    def _end(self, now: float, run: Execution, result: Outcome) -> None:
         identity = run.call.id
         self._outlets.close(identity)
         del self._runs[identity]
         # Not `now`: the action may have blocked since this step began.
-        took = self._clock() - run.started
-        self._reports.append(outcome_of(identity, result, took, run.cpu))
+        result.seconds, result.cpu_seconds = self._clock() - run.started, run.cpu
+        self._reports.append(result)
 
     def _hold(self, now: float, frozen: bool) -> None:
         """Freeze the runs, or let them continue with all their times shifted by the pause."""
