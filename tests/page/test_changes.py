@@ -197,9 +197,9 @@ def test_a_script_that_reads_snapshots_counts_as_watching(monkeypatch: pytest.Mo
     now = 100.0
     monkeypatch.setattr(feeds, "monotonic", lambda: now)
     feed = Feed()
-    assert not feed.watched
+    watched = [feed.watched]
     feed.snapshot()
-    now += 4.9
-    assert feed.watched
-    now += 0.2
-    assert not feed.watched
+    for later in (4.9, 0.2):
+        now += later
+        watched.append(feed.watched)
+    assert watched == [False, True, False]
