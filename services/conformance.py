@@ -95,7 +95,7 @@ def _with_ports(make: Callable[..., Driver], clock: Callable[[], float]) -> Call
         driver = make(**keys)
         if getattr(driver, "ports", make) is None:
             silent = SetpointReceiver(1.0, clock)
-            driver.ports = TestPorts(clock, [], lambda name: silent)  # type: ignore[assignment]
+            driver.ports = TestPorts(clock, [], lambda name: silent)
         return driver
 
     return made

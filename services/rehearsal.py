@@ -4,7 +4,7 @@ whoever writes actions."""
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -92,7 +92,11 @@ def rehearse(
 
 def _last_acts(played: Rehearsal) -> str:
     """How often an action did what it can do, and what it did last of each."""
-    kinds = {"calls": played.calls, "set points": played.published, "events": played.events}
+    kinds: dict[str, Sequence[Any]] = {
+        "calls": played.calls,
+        "set points": played.published,
+        "events": played.events,
+    }
     acts = [f"{len(a):,} {kind}, the last: {a[-1]!s:.200}" for kind, a in kinds.items() if a]
     return "; ".join(acts) or "it called and published nothing"
 
@@ -155,7 +159,7 @@ class _Stage:
         self.played = Rehearsal(error("still_running"), 0.0)
         if isinstance(device, Driver) and getattr(device, "ports", self) is None:
             clock, events = (lambda: self.now), self.played.events
-            device.ports = TestPorts(clock, events, self.receiver, seed)  # type: ignore[assignment]
+            device.ports = TestPorts(clock, events, self.receiver, seed)
         self._services = services
         self._streams, self._receivers = streams, dict[str, SetpointReceiver]()
         driver = device if hasattr(device, "stopped") and hasattr(device, "period") else None

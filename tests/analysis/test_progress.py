@@ -320,7 +320,7 @@ def test_a_task_that_can_only_give_up_is_not_sound() -> None:
         "bad": {"in": "act:error", "out": "broken"},
         "again": {"in": "arm", "event": "bell", "out": "act"},
     }
-    ends = {"final": "arm == 2", "final_error": parse("broken == 1")}
+    ends: dict[str, Any] = {"final": "arm == 2", "final_error": parse("broken == 1")}
     found = judged(make_task("arm~=1 act! broken", net, "bell", **ends))
     assert found.deadlock_free.holds and found.sound.holds is False
     assert found.sound.reason == "the task can only give up: it never comes to arm == 2"
