@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import partial, wraps
 from inspect import signature
 from itertools import pairwise
 from typing import Any
@@ -22,6 +22,8 @@ from typing import Any
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import LIMITS, Driver, keys_of
+from petrobot.services.rehearsal import TestPorts
+from petrobot.services.worker.setpoints import SetpointReceiver
 
 Command = Mapping[str, Any]
 REST, PART = 20, 0.25
@@ -70,9 +72,12 @@ def check_driver(
     preferably in more than `within`; `first` are those that a new driver needs before them, to
     switch its drives on. The device must stand still `within` s after `stop`. `cable(False)` pulls
     the device's cable, `cable(True)` puts it back. `simulated`: time passes only between two steps,
-    for a driver whose device is simulated by its steps; the check then takes milliseconds.
+    for a driver whose device is simulated by its steps; the check then takes milliseconds. A driver
+    that was made with ports None gets ports with a clock, `random`, `raise_event` and silent
+    streams.
     """
-    check = _Check(make, _Clock() if simulated else time, within, first)
+    clock: Any = _Clock() if simulated else time
+    check = _Check(_with_ports(make, clock.monotonic), clock, within, first)
     try:
         check.rules(commands, seconds, cable)
     except Exception as fault:
@@ -80,6 +85,20 @@ def check_driver(
     finally:  # also after Ctrl-C: the device may be moving
         check.end()
     return check.found
+
+
+def _with_ports(make: Callable[..., Driver], clock: Callable[[], float]) -> Callable[..., Driver]:
+    """The same, with ports for a driver that has none."""
+
+    @wraps(make)
+    def made(**keys: Any) -> Driver:
+        driver = make(**keys)
+        if getattr(driver, "ports", make) is None:
+            silent = SetpointReceiver(1.0, clock)
+            driver.ports = TestPorts(clock, [], lambda name: silent)
+        return driver
+
+    return made
 
 
 def check_device(

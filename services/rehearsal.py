@@ -4,7 +4,7 @@ who write actions."""
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -92,12 +92,12 @@ def rehearse(
 
 def _last_acts(played: Rehearsal) -> str:
     """Return how often the action called, published and raised events, and each time the last."""
-    kinds: dict[str, list[Any]] = {
+    kinds: dict[str, Sequence[Any]] = {
         "calls": played.calls,
         "set points": played.published,
         "events": played.events,
     }
-    acts = [f"{len(a):,} {kind}, the last: {str(a[-1])[:200]}" for kind, a in kinds.items() if a]
+    acts = [f"{len(a):,} {kind}, the last: {a[-1]!s:.200}" for kind, a in kinds.items() if a]
     return "; ".join(acts) or "it called and published nothing"
 
 
@@ -115,28 +115,33 @@ class _Prop:
         return True
 
 
-class _StagePorts:
-    """Ports of a driver in a rehearsal."""
+class TestPorts:
+    """Ports of a driver in a test, if it was made with ports None: a clock, `random`, and a
+    list of the events that it raises; `receiver` gives it streams."""
 
-    def __init__(self, stage: _Stage, seed: int) -> None:
-        self._stage = stage
+    __test__ = False
+
+    def __init__(
+        self,
+        clock: Callable[[], float],
+        events: list[tuple[float, str, Mapping[str, Any]]],
+        receiver: Callable[[str], SetpointReceiver],
+        seed: int = 0,
+    ) -> None:
+        self._clock, self._events, self.stream = clock, events, receiver
         self.random = Draws("device", seed).random
 
     @property
     def now(self) -> float:
-        """The rehearsal's clock (s)."""
-        return self._stage.now
+        """The test's clock (s)."""
+        return self._clock()
 
     def raise_event(self, name: str, **data: Any) -> None:
-        """Record the event in the rehearsal's `events`."""
-        self._stage.played.events.append((self.now, name, data))
-
-    def stream(self, name: str) -> SetpointReceiver:
-        """The receiving end of a stream to which the action may publish."""
-        return self._stage.receiver(name)
+        """Record the event."""
+        self._events.append((self.now, name, data))
 
     def __getattr__(self, name: str) -> Any:
-        raise AttributeError(f"a rehearsal has no ports.{name}; make the driver with ports that do")
+        raise AttributeError(f"a test has no ports.{name}; make the driver with ports that do")
 
 
 class _Stage:
@@ -153,7 +158,8 @@ class _Stage:
         self.now = 0.0
         self.played = Rehearsal(error("still_running"), 0.0)
         if isinstance(device, Driver) and getattr(device, "ports", self) is None:
-            device.ports = _StagePorts(self, seed)
+            clock, events = (lambda: self.now), self.played.events
+            device.ports = TestPorts(clock, events, self.receiver, seed)
         self._services = services
         self._streams, self._receivers = streams, dict[str, SetpointReceiver]()
         driver = device if hasattr(device, "stopped") and hasattr(device, "period") else None

@@ -53,7 +53,7 @@ def test_nonsense_is_an_error():
 '''
 
 TASK = """\
-# {name}: say here what the task is for. Draw it with `petrobot show {name}.toml`.
+# {name}: say here what the task is for. Draw it: petrobot show {name}.toml --out {name}.svg
 schema = 1
 
 [task]
@@ -267,7 +267,8 @@ async def grip(ctx: Context[Remote], *, slips: float = 0.2) -> Result:
 '''
 
 ROBOT_TASK = """\
-# {name}: carries parts from one end of its axis to the other. Draw it: petrobot show {name}.toml
+# {name}: carries parts from one end of its axis to the other.
+# Draw it: petrobot show {name}.toml --out {name}.svg
 schema = 1
 
 [task]

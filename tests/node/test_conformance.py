@@ -70,6 +70,16 @@ def test_a_good_driver_passes() -> None:
     assert found.notes == ["not checked: a pulled cable: give `cable`"]
 
 
+def test_a_driver_without_ports_may_draw_read_a_stream_and_raise_events() -> None:
+    class Notices(Axis):
+        def step(self, now: float) -> None:
+            super().step(now)
+            if self.ports.random("hum").random() < 0.1 and self.ports.stream("wish").values is None:
+                self.ports.raise_event("hum", at=self.ports.now)
+
+    assert checked(Notices).faults == []
+
+
 class NeverStops(Axis):
     def stop(self, now: float) -> None:
         pass

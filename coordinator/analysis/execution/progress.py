@@ -400,7 +400,8 @@ class Progress:
         for place, state in self.x.crowded.items():
             reason = (
                 f"{place} is entered while its run is still active: it holds "
-                f"{self.x.marked(state).get(place, 2)} tokens, but can run only once at a time"
+                f"{self.x.marked(state).get(place, 2)} tokens, but can run only once at a time; "
+                "with `servers = 1` the next one waits"
             )
             return self._no(reason, state)
         return self._yes("no action place is entered while its run is active")
