@@ -171,18 +171,17 @@ class Ur(UrArm):
 async def disturbed(ctx: Context[Remote], enable: Any, moves: list[Any]) -> Result:
     """Move there and back until a move fails; try again until one succeeds."""
     assert (await enable(ctx)).status == "success"
-    failed: Result | None = None
-    while failed is None:
-        for move in moves:
-            result = await move(ctx)
-            if result.status != "success" and failed is None:
-                failed, late = result, ctx.now
-    while True:
+    failed, late = success(), 0.0
+    for move in 20 * moves:
+        failed = failed if failed.cause else await move(ctx)
+        late = late if late or not failed.cause else ctx.now
+    for _ in range(20):
         await ctx.sleep(1.0)
         enabled = await enable(ctx)
         moved = await moves[0](ctx) if enabled.status == "success" else enabled
         if moved.status == "success":
             return success(cause=failed.cause, text=failed.text, late=late, back=ctx.now)
+    return error("not_back", f"after {failed.cause}: {failed.text}")
 
 
 def told(driver: Any, enable: Any, moves: list[Any]) -> dict[str, Any]:
@@ -269,7 +268,8 @@ def rogue(port: int, how: str) -> Iterator[int]:
     over, held = threading.Event(), list[socket.socket]()
 
     def serve() -> None:
-        while not over.is_set():
+        limit = Limit("the end of the test", 120.0)
+        while not over.is_set() and limit.left():
             try:
                 near, _ = listener.accept()
             except TimeoutError:
