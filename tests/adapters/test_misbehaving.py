@@ -171,20 +171,17 @@ class Ur(UrArm):
 async def disturbed(ctx: Context[Remote], enable: Any, moves: list[Any]) -> Result:
     """Move there and back until a move fails; try again until one succeeds."""
     assert (await enable(ctx)).status == "success"
-    failed: Result | None = None
-    limit = Limit("a move that fails, then one that succeeds", steps=10_000)
-    while failed is None and limit.left():
-        for move in moves:
-            result = await move(ctx)
-            if result.status != "success" and failed is None:
-                failed, late = result, ctx.now
-    moved: Result | None = None
-    while (moved is None or moved.status != "success") and limit.left():
+    failed, late = success(), 0.0
+    for move in 20 * moves:
+        failed = failed if failed.cause else await move(ctx)
+        late = late if late or not failed.cause else ctx.now
+    for _ in range(20):
         await ctx.sleep(1.0)
         enabled = await enable(ctx)
         moved = await moves[0](ctx) if enabled.status == "success" else enabled
-    assert failed is not None
-    return success(cause=failed.cause, text=failed.text, late=late, back=ctx.now)
+        if moved.status == "success":
+            return success(cause=failed.cause, text=failed.text, late=late, back=ctx.now)
+    return error("not_back", f"after {failed.cause}: {failed.text}")
 
 
 def told(driver: Any, enable: Any, moves: list[Any]) -> dict[str, Any]:
@@ -268,9 +265,10 @@ def rogue(port: int, how: str) -> Iterator[int]:
     WebSocket that stops in the middle of a frame (`half`)."""
     listener = socket.create_server(("127.0.0.1", port))
     listener.settimeout(0.05)
-    over, held, limit = threading.Event(), list[socket.socket](), Limit("the end of the test")
+    over, held = threading.Event(), list[socket.socket]()
 
     def serve() -> None:
+        limit = Limit("the end of the test", 120.0)
         while not over.is_set() and limit.left():
             try:
                 near, _ = listener.accept()
