@@ -103,19 +103,6 @@ def test_auto_changes_to_numpy_and_agrees_with_integers() -> None:
     assert list(auto.markings(1000))[3][1].tolist() == list(plain.markings(1000))[3][1].tolist()
 
 
-def test_a_large_search_goes_on_with_numba_where_it_is_installed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The same markings, edges and bits, from whichever engine."""
-    monkeypatch.setattr("petrobot.coordinator.analysis.net.space.NUMBA_FROM", 12_000)
-    auto, whole = explore(philosophers(9)), explore(philosophers(9), engine="numpy")
-    assert auto.engine == ("numba" if COMPILED else "numpy") and auto.complete
-    for name in ("row", "target", "label"):
-        assert np.array_equal(getattr(auto, name), getattr(whole, name)), name
-    pairs = zip(auto.markings(5000), whole.markings(5000), strict=True)
-    assert all(np.array_equal(a[1], b[1]) for a, b in pairs)
-
-
 @pytest.mark.parametrize(
     ("n", "states", "edges"), [(1, 160, 616), (2, 4600, 28120), (3, 58400, 446400)]
 )

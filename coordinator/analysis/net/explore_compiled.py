@@ -1,7 +1,7 @@
 """The engine that numba compiles: one loop over markings and an open-addressed hash table.
 
 Without numba the same code runs in Python: same results, but slow. Only space.py imports this file,
-for the engine "numba", or where numba is installed and a search is large; it stays optional.
+and only when the engine "numba" is requested, so that numba stays optional.
 """
 
 from __future__ import annotations

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib.util import find_spec
 from typing import Literal
 
 import numpy as np
@@ -33,9 +32,6 @@ EngineName = Literal["auto", "integers", "numpy", "numba"]
 
 HANDOVER = 10_000
 """Markings after which `auto` changes from plain integers to numpy."""
-NUMBA_FROM = 500_000
-"""Markings after which `auto` changes from numpy to numba, where it is installed: to load the
-compiled loop takes 0.4 s, and 10 s more when it was never compiled on this machine."""
 NARROW = 8
 """Value bits that plain integers reserve for a place without a known bound (width costs them
 little)."""
@@ -233,13 +229,8 @@ def explore(
         )
     try:
         reason = _run(found, limits, started, budget)
-        if reason == _HAND_OVER:  # each next engine is faster, but costs more to begin with
-            name, found = "numpy", _engine("numpy", found.explored(), bounds)
-            # numba is looked for and not imported: that alone takes 0.3 s
-            reason = _run(found, limits, started, NUMBA_FROM if find_spec("numba") else None)
         if reason == _HAND_OVER:
-            name = "numba" if _is_compiled() else "numpy"
-            found = _engine(name, found.explored(), bounds)
+            name, found = "numpy", _engine("numpy", found.explored(), bounds)
             reason = _run(found, limits, started, None)
     except KeyboardInterrupt:
         reason = INTERRUPTED
@@ -255,14 +246,6 @@ def _plain_engine(net: Net, layout: Layout, edges: bool) -> ExplorationEngine:
 
 
 _HAND_OVER = "hand over"
-
-
-def _is_compiled() -> bool:
-    """Whether numba is installed and in use."""
-    from petrobot.coordinator.analysis.net.explore_compiled import expand_block
-    from petrobot.services.host.numba_kernels import plain
-
-    return plain(expand_block) is not expand_block
 
 
 def _engine(name: str, begun: Explored, bounds: Sequence[int | None] | None) -> ExplorationEngine:
@@ -282,9 +265,10 @@ def _engine(name: str, begun: Explored, bounds: Sequence[int | None] | None) -> 
         Layout.for_net(begun.net, [max(g, top) for g, top in zip(guess, seen, strict=True)])
     )
     if name == "numba":
-        from petrobot.coordinator.analysis.net.explore_compiled import NumbaEngine
+        from petrobot.coordinator.analysis.net.explore_compiled import NumbaEngine, expand_block
+        from petrobot.services.host.numba_kernels import plain
 
-        if not _is_compiled():
+        if plain(expand_block) is expand_block:
             raise ImportError(
                 "the engine 'numba' needs numba: install petrobot[fast], or take the engine 'numpy'"
             )
