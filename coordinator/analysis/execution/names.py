@@ -101,6 +101,7 @@ class Names:
                         self.asked[field].add(place)
                     if not any(a.end in (End.NORMAL, End.ERROR) for a in arcs):
                         self.known.add(name)
+        self._in_order = sorted(self.known)
         self._status_read = {n.rpartition(".")[0] for n in read if n.endswith(".status")}
         self.free = sorted(self.known & compiled.free)
         self._mixed = {a.name for x in compiled.transitions for a in x.actions if a.takes_done}
@@ -133,18 +134,23 @@ class Names:
         """Return what the future of the state depends on."""
         if state.mode is Mode.FINISHED:
             return (state.mode, state.marking)
-        runs, at = list[Hashable](), dict[str, tuple[str, int]]()
+        runs, at, waiting = list[Hashable](), dict[str, tuple[str, int]](), list[Run]()
         for place in self.engine.compiled.action_places:
             present = state.tokens.get(place, ())
-            if place not in self._mixed:
+            if not present:
+                runs.append(())
+                continue
+            if len(present) > 1 and place not in self._mixed:
                 present = tuple(
                     sorted(present, key=lambda r: r.ended if r.phase is Phase.DONE else 0)
                 )
-            at |= {run.id: (place, i) for i, run in enumerate(present)}
-            ends = sorted(r.ended for r in present if r.phase is Phase.DONE)
-            runs.append(tuple(self._run(run, ends) for run in present))
-        stopping = sorted((r.place, r.phase.value, r.device) for r in state.stopping.values())
-        waiting = [r for r in state.runs() if r.phase is Phase.WAITING]
+            ends = sorted([r.ended for r in present if r.phase is Phase.DONE])
+            runs.append(tuple([self._run(run, ends) for run in present]))
+            for i, run in enumerate(present):
+                at[run.id] = (place, i)
+                if run.phase is Phase.WAITING:
+                    waiting.append(run)
+        stopping = sorted([(r.place, r.phase.value, r.device) for r in state.stopping.values()])
         timers = sorted(
             (name, timer.elapsed, tuple(at[i] for i in timer.runs))
             for name, timer in state.timers.items()
@@ -162,9 +168,7 @@ class Names:
             tuple(timers),
             orders,
             None if draw is None else (draw.pulse, draw.choices, draw.alternatives, draw.only),
-            tuple(
-                self.region(name, state.variables.get(name, MISSING)) for name in sorted(self.known)
-            ),
+            tuple([self.region(n, state.variables.get(n, MISSING)) for n in self._in_order]),
         )
 
     def _waiting(self, state: State) -> Hashable:
