@@ -197,6 +197,8 @@ def analysed(
         )
     for shown in verdicts:
         mended = analysis.progress and analysis.progress.mended.get(shown["name"])
+        designed = bool(mended and mended.holds) or shown["name"].startswith("recovery ")
+        shown["problem"] = shown["holds"] is False and not designed
         if mended and mended.holds:
             shown["reason"] += f"; it holds if {mended.assumption}"
     order = {False: 0, None: 1, True: 2}

@@ -38,6 +38,8 @@ async def test_verdicts_and_forecast_come_from_a_process_of_its_own() -> None:
     assert {"bounded", "sound", "controllable"} <= {
         verdict["name"] for verdict in answer["verdicts"]
     }
+    wrong = {v["name"]: v["problem"] for v in answer["verdicts"] if v["holds"] is False}
+    assert wrong and not any(wrong.values()), "what a task that gives up cannot do is no problem"
     assert set(answer["heat"]) >= {"locate_ball", "track_ball"}, (
         "the last line is the fullest: with the forecast"
     )

@@ -295,7 +295,7 @@ async def test_verdicts_are_shown_next_to_the_drawing(
     field = tab.get_by_label("Ends when")
     await field.fill("parts == 0 and look == 1")
     await field.press("Enter")
-    await expect(analysis.get_by_role("status")).to_contain_text("10 problems found")
+    await expect(analysis.get_by_role("status")).to_contain_text("6 problems found")
     refused = analysis.get_by_role(
         "button", name=re.compile("^Never stuck before its end: does not hold")
     )

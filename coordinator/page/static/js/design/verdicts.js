@@ -58,7 +58,7 @@ export class Verdicts {
       this.head.textContent = answer;
       return;
     }
-    const against = answer.verdicts.filter((v) => v.holds === false).length;
+    const against = answer.verdicts.filter((v) => v.problem).length;
     this.head.textContent = `${against ? `${against} ${against === 1 ? "problem" : "problems"}` : "no problem"} found in ${answer.markings} markings${answer.complete ? "" : " (not all were examined)"}`;
     attribute(this.root, "data-state", against ? "error" : null);
     this.heat = answer.heat;
@@ -70,7 +70,7 @@ export class Verdicts {
     const { witness } = verdict;
     const button = h("button", { type: "button", disabled: verdict.holds !== false || !witness, "aria-pressed": "false", onclick: () => this.show(verdict, button) },
       icon(SIGN[verdict.holds]), h("strong", {}, `${verdict.words}: ${SAID[verdict.holds]}`), h("span", {}, verdict.reason, witness && verdict.holds === false ? `. Example: ${witness.firings.join(", ") || "the initial marking"}.` : ""));
-    return h("li", { class: verdict.holds === false ? "error" : "" }, button);
+    return h("li", { class: verdict.problem ? "error" : "" }, button);
   }
 
   /** The marking of the counterexample, with the order in which transitions fired; a second click removes it. */
