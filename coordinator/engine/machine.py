@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from petrobot.coordinator.engine import operator, runs
@@ -130,6 +131,9 @@ class Engine:
         """Compile the task. Raises ValueError with every fault of an inconsistent one."""
         self.task = task
         self.policy = policy or Policy()
+        if not self.policy.listed_values:
+            free = {name: replace(v, values=()) for name, v in task.variables.items()}
+            task = replace(task, variables=free)
         self.compiled = compile_task(task, devices or {})
         self._handlers: dict[type, Callable[[Draft, Any], None]] = {
             Begin: self._begin,
@@ -420,14 +424,13 @@ def _waits_for_draw(draft: Draft) -> bool:
 
 
 def _write(draft: Draft, name: str, value: Any) -> bool:
-    """Write a watched variable. A value that it may not hold is reported, and it is none."""
+    """Write a watched variable. A value that it cannot have is reported, and it is none."""
     variable = draft.compiled.task.variables.get(name)
     if variable is None:
         _note(draft, "unknown_variable", f"{name!r} is no variable of the task; ignored", name)
         return False
-    if not variable.admits(value):
-        text = f"{name} = {value!r}, expected {variable.expected}; it is none now"
-        _warn(draft, "bad_value", text, name)
+    if refused := variable.refused(value):
+        _warn(draft, "bad_value", f"{name} = {value!r} is {refused}; it is none now", name)
         value = None
     draft.write(name, value)
     return True

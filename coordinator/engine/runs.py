@@ -178,10 +178,10 @@ def _write_results(draft: Draft, run: Run, end: RunEnded) -> None:
         if name not in end.values and end.status is Status.ERROR:
             continue
         value = end.values.get(name)
-        declared = task.variables[variable]
-        if not declared.admits(value) or name not in end.values:
-            was = f"{value!r}, expected {declared.expected}," if name in end.values else "nothing"
-            text = f"{run.id} ({run.action}) gave {was} for {name!r}; variable {variable} is none"
+        refused = task.variables[variable].refused(value)
+        if refused or name not in end.values:
+            was = f"gave {value!r}, which is {refused}" if name in end.values else "gave nothing"
+            text = f"{run.id} ({run.action}) {was} for {name!r}; variable {variable} is none now"
             draft.report(Severity.WARNING, "bad_value", text, run.id)
             value = None
         draft.write(variable, value)

@@ -63,15 +63,19 @@ class Policy:
     """Decide a conflict that neither priority nor weight decides by first come, first served.
     Journals with `semantics` 3 or less in their header were recorded with the order in the file
     instead."""
+    listed_values: bool = True
+    """A variable that lists its `values` takes no other. Journals with `semantics` 4 or less in
+    their header were recorded without that."""
     ask_undecided: bool = False
     """Ask with `Choose` for each conflict that neither priority nor weight decides. The analysis
     uses this to see whether a verdict depends on the answer."""
 
 
 RECORDED: Final[Mapping[int, Policy]] = {
-    1: Policy(firing_limit=1000, report_dead_ends=False, first_come=False),
-    2: Policy(report_dead_ends=False, first_come=False),
-    3: Policy(first_come=False),
+    1: Policy(firing_limit=1000, report_dead_ends=False, first_come=False, listed_values=False),
+    2: Policy(report_dead_ends=False, first_come=False, listed_values=False),
+    3: Policy(first_come=False, listed_values=False),
+    4: Policy(listed_values=False),
 }
 """The engine's policy in older journals, by the `semantics` of their header."""
 

@@ -324,16 +324,12 @@ class Variable:
     """Possible values of a `str` variable, if they are few. `check` uses them to prove that
     conditions cover all cases."""
 
-    def admits(self, value: Value) -> bool:
-        """Whether it may hold the value: one of `values` if it lists them, else of its type."""
-        return self.type.admits(value) and (
-            value is None or not self.values or value in self.values
-        )
-
-    @property
-    def expected(self) -> str:
-        """What it may hold, in words."""
-        return " or ".join(self.values) or str(self.type)
+    def refused(self, value: Value) -> str:
+        """Return in words why the variable cannot have this value; empty if it can."""
+        if not self.type.admits(value):
+            return f"no {self.type}"
+        listed = value is None or not self.values or value in self.values
+        return "" if listed else f"none of {', '.join(self.values)}"
 
 
 class Parameter(StrEnum):
