@@ -294,11 +294,22 @@ def _faults_of_driver(thing: type, table: Mapping[str, Any]) -> list[tuple[str, 
         text = f"{thing.__name__}.period: expected seconds above 0 or None, found {period!r:.40}"
         keys.append(("driver", text))
     own = [n for n in CYCLIC if getattr(thing, n, None) not in (None, getattr(Driver, n))]
-    if declared and period is None and own:
+    if declared and period is None and own and not _sets_period(thing):
         text = f"{thing.__name__} has `{own[-1]}` and no period: it is never called; write "
         keys.append(("driver", f"{text}`period = 0.01` (s between two steps) in the class"))
     check = faults_of_keys if issubclass(thing, Driver) else faults_of_limits
     return [*keys, *check(thing, table)]
+
+
+def _sets_period(thing: type) -> bool:
+    """Return whether a driver's code assigns its period, as one that reads it from a file does."""
+    return any(
+        isinstance(node, ast.Attribute)
+        and isinstance(node.ctx, ast.Store)
+        and node.attr == "period"
+        for code in _reachable(thing)
+        for node in ast.walk(code.tree)
+    )
 
 
 def _plain(seen: _Seen) -> dict[str, Any]:

@@ -380,7 +380,7 @@ def text_of(result: dict[str, Any]) -> str:
         f"{result['task']}: {result['begun']} runs, selector {result['selector']}, seed "
         f"{result['seed']}"
     ]
-    if missing := result["not_begun"]:
+    if missing := result.get("not_begun"):  # absent in older results
         lines.append(f"  {missing} more never began: their mission run was given up before")
     wide = max(16, *(len(name) + 2 for name in (*result["by_regime"], *result["chosen"])))
     for name, part in [*result["by_regime"].items(), ("all", result)]:

@@ -29,7 +29,7 @@ IN_THE_TASK: list[Mistake] = [
         r"arm_bot.toml:LINE: schema: 2 is not known.*write schema = 1",
     ),
     (TASK, "[task]", "[tsk]", r":LINE: tsk: unknown key.*did you mean 'task'\?"),
-    (TASK, 'final = "parts == 0"', "", r":4: task.final: missing; give a text"),
+    (TASK, 'final = "parts == 0"', "", r":5: task.final: missing; give a text"),
     (TASK, '"parts == 0"', '"part == 0"', r":LINE: task.final: in 'part == 0'.*'part'.*parts"),
     (TASK, '"parts == 0"', '"parts = 0"', r":LINE: task.final: .* at column 7: parts >>>= 0"),
     (TASK, '"parts == 0"', "0", r":LINE: task.final: 0 is not a text; give a text"),
@@ -135,7 +135,7 @@ IN_THE_TASK: list[Mistake] = [
         TASK,
         '{ in = ["carry:normal"] }',
         '{ in = ["carry:error"] }',
-        r":33: places.carry: no outgoing arc `normal`",
+        r":34: places.carry: no outgoing arc `normal`",
     ),
 ]
 
