@@ -119,7 +119,8 @@ class EmergencyLine:
         self.client.start()
         up = self.reached = await self.client.connected(timeout)
         if not up and not self.why:
-            trouble = f": {self.client.trouble}" if self.client.answered else ""
+            said = self.client.trouble if self.client.answered else ""
+            trouble = f": {said}" if said else ""
             self.why = (
                 f"{self.node} does not answer on {self.client.host}:{self.client.port}{trouble}"
             )

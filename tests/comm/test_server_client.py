@@ -10,6 +10,7 @@ from petrobot.services.comm.calls.caller import PeerLost
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.messages import Answer, Executed, Outcome, Welcome
 from petrobot.services.comm.protocol.security import KeyNeededError
+from tests import waiting
 from tests.comm.ends import Coordinator, Node, until
 
 
@@ -189,3 +190,22 @@ async def test_a_second_process_of_a_name_is_refused_and_a_newer_epoch_takes_ove
     assert (await third.client.call("echo")).status == "success"
     await first.client.close()
     await third.client.close()
+
+
+async def test_the_reason_of_a_failed_attempt_stays_while_the_next_one_is_under_way() -> None:
+    """Else a refused emergency stop gave no reason if its time was over at that moment."""
+    attempts: list[asyncio.StreamWriter] = []
+
+    async def serve(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        attempts.append(writer)
+        if len(attempts) == 1:
+            writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    coordinator = Coordinator(*server.sockets[0].getsockname())
+    await waiting.until(lambda: len(attempts) == 2, "a second attempt")
+    assert coordinator.client.answered and coordinator.client.trouble
+    await coordinator.client.close()
+    for writer in attempts:
+        writer.close()
+    server.close()

@@ -144,7 +144,8 @@ class Client:
         self.key = key
         self.tls = tls
         self.trouble = ""
-        """Why the last attempt to connect failed; empty if it succeeded."""
+        """Why the last attempt to connect failed, until one succeeds: the next attempt has no
+        reason of its own before it ends."""
         self.answered = False
         """Whether a process answered the last attempt, even by a refusal: then none needs to be
         launched there."""
@@ -301,7 +302,7 @@ class Client:
             )
             self.flush()
             return None
-        self.trouble, self.answered = "", True
+        self.answered = True
         self._link = link
         return link
 
@@ -318,7 +319,7 @@ class Client:
     def welcomed(self, now: float, link: _ClientLink, welcome: Welcome) -> None:
         """The peer welcomed a connection."""
         _log.info("link to %s is up", self.caller.peer)
-        self._link = link
+        self._link, self.trouble = link, ""
         self._up.set()
         self.caller.link_up(now, welcome)
 
