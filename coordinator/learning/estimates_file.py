@@ -345,8 +345,9 @@ class EstimatesFile:
             where = plants(db)
             db.create_function("plant_of", 1, lambda origin: where.get(origin, ""))
             db.create_function("learned_in", 1, lambda name: name.partition(IN)[2])
-            task, given = "coalesce(?1, primitive_task) = primitive_task", (primitive_task, plant)
-            which = f"WHERE {task} AND coalesce(?2, learned_in(name)) = learned_in(name)"
+            task = "coalesce(:task, primitive_task) = primitive_task"
+            given = {"task": primitive_task, "plant": plant}
+            which = f"WHERE {task} AND coalesce(:plant, learned_in(name)) = learned_in(name)"
             tasks = db.execute(f"SELECT primitive_task FROM selector {which}", given).fetchall()
             own = {fact(db, "origin"), fact(db, "closed")} - {""}
             choices = [(origin, CHOICE + task) for origin in sorted(own) for (task,) in tasks]
@@ -355,7 +356,7 @@ class EstimatesFile:
             renew_origin(db)
             if selectors_only:
                 return
-            there = "coalesce(?2, plant_of(origin)) = plant_of(origin)"
+            there = "coalesce(:plant, plant_of(origin)) = plant_of(origin)"
             which = f"WHERE {task} AND {there}"
             db.execute(
                 "INSERT OR IGNORE INTO forgotten SELECT DISTINCT origin, primitive_task "
