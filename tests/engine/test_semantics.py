@@ -26,6 +26,7 @@ from petrobot.coordinator.engine import (
     VariableChanged,
     Verdict,
 )
+from petrobot.coordinator.engine.step import RECORDED
 from petrobot.coordinator.task import Executed, Reference, Status, Task
 from petrobot.coordinator.task.conditions import parse
 
@@ -199,6 +200,14 @@ def test_value_that_is_not_listed_leaves_none(play: Plays) -> None:
     assert p.state.variables["side"] is None
     p(VariableChanged("side", "above"))
     assert p.reports.count("bad_value") == 2 and p.state.variables["side"] is None
+
+
+def test_older_journals_take_values_that_are_not_listed(play: Plays) -> None:
+    p = play("a!=1 l", {"t": {"in": "a:normal", "out": "l"}}, policy=RECORDED[4],
+             variables={"side": "left"}, values={"side": ("left", "right")},
+             out={"a": {"code": "side"}})  # fmt: skip
+    p(RunEnded("a#1", OK, values={"code": "middle"}))
+    assert p.state.variables["side"] == "middle" and "bad_value" not in p.reports
 
 
 def test_reason_and_status_are_variables(play: Plays) -> None:
