@@ -1,11 +1,12 @@
 """The collision guard: no set point passes that leads beyond a joint limit or into table, floor or
 pedestal.
 
-A commanded step is allowed only if the pose in which the arm would come to rest, braking from after
-that step, touches nothing, and, where the braking distance is long, if the path to it touches
-nothing either. So the arm can stop at any moment without touching anything: where a step is
-refused, the arm brakes along the path that was found clear one cycle before (compare
-T. Fraichard, H. Asama, Inevitable collision states: a step towards safer robots?, IROS 2003).
+A commanded step is allowed only if the pose after it and the pose in which the arm would come to
+rest, braking from there, touch nothing, and, where the braking distance is long, if the path
+between them touches nothing either. So the arm can stop at any moment without touching anything:
+where a step is refused, the arm brakes along the path that was found clear one cycle before
+(compare T. Fraichard, H. Asama, Inevitable collision states: a step towards safer robots?, IROS
+2003).
 
 The kernels compute on plain floats and use square roots and squares only, so that the compiled
 kernels (numba) decide exactly as the uncompiled ones; sine and cosine come from the same C library
@@ -189,12 +190,15 @@ def clear_step(
     """Compute the next cycle toward `target`: positions, velocities, and whether the arm can come
     to rest from there.
 
-    Where braking takes more than `near` rad, the path to rest is checked at its beginning, after a
-    quarter and after half of its time.
+    Where braking takes more than `near` rad, the path to rest is also checked after a quarter and
+    after half of its time.
     """
     q, qd = toward(period, q, qd, target, speed, acceleration)
     rest = rest_of(period, q, qd, brakes)
-    if not clear(rest, lower, upper, links, radii, cup, solids):
+    if not (
+        clear(rest, lower, upper, links, radii, cup, solids)
+        and clear(q, lower, upper, links, radii, cup, solids)
+    ):
         return q, qd, False
     if not farther(rest, q, near):
         return q, qd, True
@@ -203,8 +207,7 @@ def clear_step(
     return (
         q,
         qd,
-        clear(q, lower, upper, links, radii, cup, solids)
-        and clear(braked_for(0.25 * longest, q, qd, times), lower, upper, links, radii, cup, solids)
+        clear(braked_for(0.25 * longest, q, qd, times), lower, upper, links, radii, cup, solids)
         and clear(braked_for(0.5 * longest, q, qd, times), lower, upper, links, radii, cup, solids),
     )
 
@@ -221,9 +224,9 @@ ARM_MARGIN = 0.01
 NEAR = 0.02
 """rad of braking below which the path to rest is too short to need a check at its middle; 10 mm at
 the cup."""
-LOOKS = (0.0, 0.25, 0.5)
-"""Shares of the braking time at which a long path to rest is checked, besides its end; `clear_step`
-uses the same."""
+LOOKS = (0.25, 0.5)
+"""Shares of the braking time at which a long path to rest is checked, besides its beginning and its
+end; `clear_step` uses the same."""
 JOINT_SLACK = 1e-6
 """rad by which rounding may carry a command beyond a joint limit."""
 
@@ -451,12 +454,8 @@ class CollisionGuard:
         """Return what the arm would touch where it comes to rest from this state, or on the way
         there; empty if nothing."""
         rest = trajectory.resting(q, qd)
-        refused = self.violation(rest)
-        if not refused and farther(rest, q, NEAR):
-            refused = next(
-                filter(None, map(self.violation, trajectory.stopping(q, qd, *LOOKS))), ""
-            )
-        return refused
+        path = trajectory.stopping(q, qd, *LOOKS) if farther(rest, q, NEAR) else ()
+        return next(filter(None, map(self.violation, (rest, q, *path))), "")
 
     def stops_clear(self, trajectory: Trajectory) -> bool:
         """Return whether the pose in which the trajectory comes to rest is clear; needs no check if

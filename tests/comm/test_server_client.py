@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 
 import pytest
 
@@ -109,6 +110,21 @@ async def test_the_heartbeat_keeps_an_idle_link_and_a_broken_one_is_restored(
     back = await coordinator.notice(Welcome, 2)
     assert back.boot == (await coordinator.notice(Welcome)).boot and back.runs == ("1",)
     assert not any(isinstance(order, m.Cancel) for order in open_node.orders)
+    await coordinator.client.close()
+
+
+async def test_a_call_outlives_a_host_that_stands_still(open_node: Node) -> None:
+    """Both ends stand still for longer than the wait for ACCEPT."""
+    coordinator = open_node.client()
+    assert await coordinator.client.connected(60.0)
+    coordinator.call("1", "move")
+    time.sleep(coordinator.caller._patience.accept + 0.2)
+    await open_node.order(m.Call)
+    callee = open_node.server.callee
+    callee.finish(open_node.server.now(), m.Outcome("1", "success"))
+    open_node.server.flush()
+    outcome = await coordinator.notice(Outcome)
+    assert (outcome.status, outcome.text) == ("success", "")
     await coordinator.client.close()
 
 

@@ -81,7 +81,7 @@ def test_a_drive_that_never_answers_is_named_and_tried_again() -> None:
     ("base", "text"),
     [
         (TPDO1_BASE, "right wheel: the drive is silent"),
-        (HEARTBEAT_BASE, "node 2 sends no heartbeat"),
+        (HEARTBEAT_BASE, "node 2 is not operational"),
     ],
 )
 def test_silence_of_one_drive_stops_both(base: int, text: str) -> None:
@@ -111,12 +111,33 @@ def test_an_emergency_is_reported_with_its_wheel_and_its_code() -> None:
 
 def test_a_restarted_drive_is_a_trouble_and_a_restarted_sensor_is_not() -> None:
     bench = WheelBench().enabled()
+    bench.run(0.2)
     bench.master.receive(bench.now, Frame(HEARTBEAT_BASE + SENSOR, b"\0"))
     told = [trouble.text for trouble in bench.master.troubles]
     bench.master.receive(bench.now, Frame(HEARTBEAT_BASE + LEFT, b"\0"))
     assert (told, [trouble.text for trouble in bench.master.troubles]) == (
         [],
         ["node 1 has restarted"],
+    )
+
+
+def test_a_drive_that_never_says_that_it_is_operational_stops_both() -> None:
+    """Some drives send boot-up messages until they have handled the start."""
+    bench = WheelBench().enabled()
+    bench.passes = without(LEFT, HEARTBEAT_BASE)
+    bench.master.reset(bench.now)
+    bench.master.bus_lost(bench.now, "unplugged")
+    while bench.master.phase is MasterPhase.CONFIGURING:
+        bench.run(CYCLE)
+    bench.master.troubles.clear()
+    for _ in range(5):
+        bench.master.receive(bench.now, Frame(HEARTBEAT_BASE + LEFT, b"\0"))
+        bench.run(0.05)
+    early = [trouble.text for trouble in bench.master.troubles]
+    bench.run(0.3)
+    assert (early, [trouble.text for trouble in bench.master.troubles]) == (
+        [],
+        ["node 1 is not operational"],
     )
 
 

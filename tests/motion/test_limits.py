@@ -203,7 +203,7 @@ def test_a_clear_step_can_stop_anywhere_on_its_path(goal: Six, share: Six) -> No
     trajectory.aim(goal)
     q, qd = trajectory.proposed()
     rest = trajectory.resting(q, qd)
-    poses = [rest]
+    poses = [rest, q]
     if max(abs(a - b) for a, b in zip(rest, q, strict=True)) > NEAR:
         poses += trajectory.stopping(q, qd, *LOOKS)
     refused = next(filter(None, map(GUARD.violation, poses)), "")

@@ -134,6 +134,14 @@ class PendingCalls(dict[str, PendingCall]):
             pending.result_due += pause
             heapq.heappush(self._results, (pending.result_due, id_))
 
+    def postpone(self, by: float) -> None:
+        """Let every timeout that is watched be due `by` s later."""
+        self._accepts = deque((due + by, id_) for due, id_ in self._accepts)
+        self._results = [(due + by, id_) for due, id_ in self._results]
+        for pending in self.values():
+            pending.accept_due += by
+            pending.result_due += by
+
     def not_accepted(self, now: float) -> Iterator[str]:
         """Yield ids that have waited too long for ACCEPT."""
         while self._accepts and self._accepts[0][0] <= now:
@@ -699,6 +707,11 @@ class Caller:
     def _take_answer(self, now: float, answer: m.Answer) -> None:
         if self._commands.pop(answer.id, None) is not None:
             self._notices.append(answer)
+
+    def postpone(self, by: float) -> None:
+        """Wait `by` s longer for ACCEPT, results and answers."""
+        self._pending.postpone(by)
+        self._commands = {id_: due + by for id_, due in self._commands.items()}
 
     def advance(self, now: float) -> None:
         """End the calls that have waited too long."""

@@ -58,6 +58,10 @@ _NUMBERS = itertools.count(1)
 name and boot."""
 _OUTCOMES = frozenset((Outcome,))
 _NO_ARGUMENTS: Mapping[str, Any] = {}
+STOOD_STILL = 0.05
+"""Delay of a timer from which this process counts as having stood still (s)."""
+LEAST_RESPITE = 0.25
+"""How much longer the peer then has at least (s), because it may have stood still, too."""
 AT_ONCE = 32
 """Calls that share one write: the peer works on them while the next ones are made."""
 
@@ -157,6 +161,7 @@ class Client:
         self._future = futures_of(self._loop)
         self._task: asyncio.Task[None] | None = None
         self._alarm = Alarm(self._advance)
+        self._excused = False
         self._flushing = False
         self._up = asyncio.Event()
         self._prefix = f"{caller.hello.name}/{caller.hello.boot}/"
@@ -266,6 +271,10 @@ class Client:
 
     def _advance(self) -> None:
         now = self.now()
+        # Not twice in turn: a process that is always late would never give up.
+        self._excused = self._alarm.late > STOOD_STILL and not self._excused
+        if self._excused:
+            self.caller.postpone(self._alarm.late + max(self._alarm.late, LEAST_RESPITE))
         self.caller.advance(now)
         self.flush(now)
 

@@ -128,11 +128,13 @@ class Alarm:
     """A timer of the running loop that calls `act`. An earlier time that is set stays: a call too
     many costs less than a timer for each message."""
 
-    __slots__ = ("_act", "_timer", "due")
+    __slots__ = ("_act", "_timer", "due", "late")
 
     def __init__(self, act: Callable[[], None]) -> None:
         self.due = math.inf
         """When `act` is called (s, clock of the loop)."""
+        self.late = 0.0
+        """How long after that it was called last (s): the loop was busy or had no processor."""
         self._act = act
         self._timer: asyncio.TimerHandle | None = None
 
@@ -150,6 +152,7 @@ class Alarm:
         self._timer, self.due = None, math.inf
 
     def _ring(self) -> None:
+        self.late = asyncio.get_running_loop().time() - self.due
         self.cancel()
         self._act()
 

@@ -259,6 +259,9 @@ class CanopenMaster(Generic[Link]):
         self._others_by_tpdo = {canopen.TPDO1_BASE + each.node: each for each in companions}
         self._axis = {drive.node: axis for axis, drive in enumerate(self.drives)}
         self._heard = dict.fromkeys([*self._axis, *self._companions], 0.0)
+        self._started: set[int] = set()
+        """Nodes that were operational since they were started. A boot-up message of another one may
+        be older than its start; if it is not, the node is silent from then on."""
         self._now = 0.0
         self._seen = -BY_THEMSELVES
         """When all drives answered last (s)."""
@@ -341,9 +344,13 @@ class CanopenMaster(Generic[Link]):
         node = frame.id - canopen.HEARTBEAT_BASE
         if node not in self._heard or len(frame.data) != 1:
             return
-        self._heard[node] = now
-        restarted = frame.data[0] == NmtState.BOOT_UP and self.phase is not MasterPhase.CONFIGURING
-        if restarted and self._needed(node):
+        state = frame.data[0]
+        if self.phase is MasterPhase.CONFIGURING:
+            self._heard[node] = now
+        elif state == NmtState.OPERATIONAL:
+            self._heard[node] = now
+            self._started.add(node)
+        elif state == NmtState.BOOT_UP and node in self._started and self._needed(node):
             self._report(Trouble("bus", self._axis.get(node), 0, f"node {node} has restarted"))
 
     def _emergency(self, frame: Frame) -> None:
@@ -425,6 +432,7 @@ class CanopenMaster(Generic[Link]):
         for drive in self.drives:
             drive.silent, drive.spoken = 0, False
         self._heard = dict.fromkeys(self._heard, now)
+        self._started.clear()
         return [canopen.nmt(NmtCommand.START)]
 
     # Supervision
@@ -453,7 +461,7 @@ class CanopenMaster(Generic[Link]):
         for node, heard in self._heard.items():
             if now - heard > patience and self._needed(node):
                 self._report(
-                    Trouble("bus", self._axis.get(node), 0, f"node {node} sends no heartbeat")
+                    Trouble("bus", self._axis.get(node), 0, f"node {node} is not operational")
                 )
         if self.phase is MasterPhase.STARTING and all(drive.spoken for drive in self.drives):
             self.phase = MasterPhase.RUNNING
