@@ -224,18 +224,18 @@ def test_a_call_without_accept_in_time_is_ended_and_cancelled() -> None:
     assert caller.messages(1.0) == [m.Cancel("1", "not_accepted")]
 
 
-def test_timeouts_can_be_postponed() -> None:
+def test_after_a_standstill_the_peer_has_as_long_as_for_accept() -> None:
     caller = _caller()
     caller.call(0.0, CALL)
     caller.command(0.0, m.Command("k", "status"))
     caller.messages(0.0)
-    caller.postpone(0.5)
-    caller.advance(1.4)
+    caller.stood_still(3600.0)
+    caller.advance(3600.9)
     assert caller.notices() == []
-    assert caller.due() == 1.5
-    caller.advance(1.5)
-    assert _ends(caller.notices()) == [("1", "not_accepted", Executed.UNKNOWN)]
-    assert caller.due() == 2.5
+    assert caller.due() == 3601.0
+    caller.advance(3601.0)
+    assert [type(notice) for notice in caller.notices()] == [m.Outcome, m.Answer]
+    assert caller.due() is None
 
 
 def test_the_deadline_is_watched_with_a_margin_for_the_nodes_stop_routine() -> None:

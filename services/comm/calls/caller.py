@@ -134,13 +134,13 @@ class PendingCalls(dict[str, PendingCall]):
             pending.result_due += pause
             heapq.heappush(self._results, (pending.result_due, id_))
 
-    def postpone(self, by: float) -> None:
-        """Let every timeout that is watched be due `by` s later."""
-        self._accepts = deque((due + by, id_) for due, id_ in self._accepts)
-        self._results = [(due + by, id_) for due, id_ in self._results]
+    def postpone(self, until: float) -> None:
+        """Let no timeout be due before `until` (s)."""
+        self._accepts = deque((max(due, until), id_) for due, id_ in self._accepts)
+        self._results = [(max(due, until), id_) for due, id_ in self._results]
         for pending in self.values():
-            pending.accept_due += by
-            pending.result_due += by
+            pending.accept_due = max(pending.accept_due, until)
+            pending.result_due = max(pending.result_due, until)
 
     def not_accepted(self, now: float) -> Iterator[str]:
         """Yield ids that have waited too long for ACCEPT."""
@@ -708,10 +708,12 @@ class Caller:
         if self._commands.pop(answer.id, None) is not None:
             self._notices.append(answer)
 
-    def postpone(self, by: float) -> None:
-        """Wait `by` s longer for ACCEPT, results and answers."""
-        self._pending.postpone(by)
-        self._commands = {id_: due + by for id_, due in self._commands.items()}
+    def stood_still(self, now: float) -> None:
+        """Wait from now on at least as long as for ACCEPT: the peer, perhaps on the same host, may
+        have stood still, too."""
+        until = now + self._patience.accept
+        self._pending.postpone(until)
+        self._commands = {id_: max(due, until) for id_, due in self._commands.items()}
 
     def advance(self, now: float) -> None:
         """End the calls that have waited too long."""

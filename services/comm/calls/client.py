@@ -60,8 +60,6 @@ _OUTCOMES = frozenset((Outcome,))
 _NO_ARGUMENTS: Mapping[str, Any] = {}
 STOOD_STILL = 0.05
 """Delay of a timer from which this process counts as having stood still (s)."""
-LEAST_RESPITE = 0.25
-"""How much longer the peer then has at least (s), because it may have stood still, too."""
 AT_ONCE = 32
 """Calls that share one write: the peer works on them while the next ones are made."""
 
@@ -274,7 +272,7 @@ class Client:
         # Not twice in turn: a process that is always late would never give up.
         self._excused = self._alarm.late > STOOD_STILL and not self._excused
         if self._excused:
-            self.caller.postpone(self._alarm.late + max(self._alarm.late, LEAST_RESPITE))
+            self.caller.stood_still(now)
         self.caller.advance(now)
         self.flush(now)
 
