@@ -117,8 +117,13 @@ class CallFailed(Exception):  # noqa: N818 - what happened, not a class of error
     """A service that the action needs answered ERROR; `result` is its answer."""
 
     def __init__(self, service: str, result: Result) -> None:
-        super().__init__(f"{service}: {result.status} {result.cause} {result.text}".rstrip())
+        super().__init__(service, result)
+        self.service = service
         self.result = result
+
+    def __str__(self) -> str:
+        result = self.result
+        return f"{self.service}: {result.status} {result.cause} {result.text}".rstrip()
 
 
 class CommandRefused(Exception):  # noqa: N818 - as above

@@ -72,8 +72,12 @@ class UnreachableError(Exception):
     """Nodes cannot be reached; `nodes` names them."""
 
     def __init__(self, nodes: Sequence[str], text: str) -> None:
-        super().__init__(text)
+        super().__init__(nodes, text)
         self.nodes = tuple(nodes)
+        self.text = text
+
+    def __str__(self) -> str:
+        return self.text
 
 
 class RealtimeMission:

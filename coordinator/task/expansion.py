@@ -46,10 +46,12 @@ class CircleError(ValueError):
     """A subnet that contains itself; `key` is that of the macro place in the task file."""
 
     def __init__(self, inside: tuple[str, ...], place: Place) -> None:
-        super().__init__(
-            f"subnet {place.subnet!r} contains itself by {' > '.join((*inside, place.subnet))}"
-        )
+        super().__init__(inside, place)
         self.key = f"subnets.{inside[-1]}.places.{place.name}.subnet"
+
+    def __str__(self) -> str:
+        inside, place = self.args
+        return f"subnet {place.subnet!r} contains itself by {' > '.join((*inside, place.subnet))}"
 
 
 def expand(task: Task) -> Task:

@@ -221,6 +221,8 @@ CUP_MARGIN = 0.005
 """m between cup and table."""
 ARM_MARGIN = 0.01
 """m between arm and table, and of every part to floor and pedestal."""
+BARELY = 0.1
+"""Share of the margins that is left to an arm that has to creep out of them."""
 NEAR = 0.02
 """rad of braking below which the path to rest is too short to need a check at its middle; 10 mm at
 the cup."""
@@ -315,6 +317,12 @@ class CollisionGuard:
         """Return a guard with only a share of the margins."""
         margins = share * self._cup_margin, share * self._arm_margin
         return CollisionGuard(self._puma, self._model, self._cell, *margins, self._workspace)
+
+    def barely(self) -> CollisionGuard:
+        """Return a guard that refuses contact only: without workspace, and with margins that cover
+        no more than the way between two checked poses of a slow arm."""
+        margins = BARELY * self._cup_margin, BARELY * self._arm_margin
+        return CollisionGuard(self._puma, self._model, self._cell, *margins)
 
     def place(self, q: Sequence[float]) -> Placement:
         """Return where forearm and cup are in a joint pose."""

@@ -43,6 +43,7 @@ class Steering:
         speeds."""
         self._guard = guard
         self._close_guard = guard.closer(CLOSER)
+        self._last_guard = guard.barely()
         self._retreat = retreat
         self._home = tuple(home)
         self._acceleration = acceleration
@@ -110,7 +111,8 @@ class Steering:
         """Step past the guard whose margins the present braking path satisfies.
 
         On a detour that is the closer guard. An arm that was switched on where neither guard is
-        satisfied may leave that pose, creeping.
+        satisfied leaves that pose creeping, and touches nothing; only where it touches already,
+        any way out is allowed.
         """
         trajectory = self.trajectory
         if self._via is None and not self._creeps and self._guard.stops_clear(trajectory):
@@ -122,6 +124,8 @@ class Steering:
             return self._close_guard.advance(trajectory)
         self._creeps = True
         trajectory.limit((CREEP * self._speed).tolist(), self._acceleration.tolist())
+        if self._last_guard.stops_clear(trajectory):
+            return self._last_guard.advance(trajectory)
         trajectory.accept(*trajectory.proposed())
         return ""
 

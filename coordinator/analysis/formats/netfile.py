@@ -24,13 +24,15 @@ class NetFileError(ValueError):
     """A file cannot be read or a net cannot be written: file, line, element, problem, remedy."""
 
     def __init__(
-        self, file: str, element: str, problem: str, remedy: str = "", *, line: int | None = None
+        self, file: str, element: str, problem: str, remedy: str = "", line: int | None = None
     ) -> None:
-        """Compose the one-line message."""
+        super().__init__(file, element, problem, remedy, line)
         self.file, self.element, self.problem, self.remedy = file, element, problem, remedy
         self.line = line
-        at = file if line is None else f"{file}:{line}"
-        super().__init__(f"{at}: {element}: {problem}" + (f"; {remedy}" if remedy else ""))
+
+    def __str__(self) -> str:
+        at = self.file if self.line is None else f"{self.file}:{self.line}"
+        return f"{at}: {self.element}: {self.problem}" + (f"; {self.remedy}" if self.remedy else "")
 
 
 @dataclass(frozen=True)

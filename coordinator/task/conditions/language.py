@@ -41,10 +41,14 @@ class ConditionError(ValueError):
     """The text is not a condition. `at` is the position of the fault in `source`, from 0."""
 
     def __init__(self, text: str, source: str, at: int) -> None:
-        super().__init__(f"{text} at column {at + 1}: {source[:at]}>>>{source[at:]}")
+        super().__init__(text, source, at)
         self.text = text
         self.source = source
         self.at = at
+
+    def __str__(self) -> str:
+        before, after = self.source[: self.at], self.source[self.at :]
+        return f"{self.text} at column {self.at + 1}: {before}>>>{after}"
 
 
 class ConditionFault(Exception):  # noqa: N818 - not a bug: the values at hand give the condition no truth value

@@ -17,13 +17,14 @@ class TaskFileError(ValueError):
     fault i (0: unknown)."""
 
     def __init__(self, source: str, faults: Sequence[Fault], lines: Sequence[int]) -> None:
+        super().__init__(source, faults, lines)
         self.source = source
         self.faults = tuple(faults)
         self.lines = tuple(lines)
-        places = (f"{source}:{n}" if n else source for n in lines)
-        super().__init__(
-            "\n".join(f"{place}: {fault}" for place, fault in zip(places, faults, strict=True))
-        )
+
+    def __str__(self) -> str:
+        places = (f"{self.source}:{n}" if n else self.source for n in self.lines)
+        return "\n".join(f"{at}: {fault}" for at, fault in zip(places, self.faults, strict=True))
 
 
 def key_lines(text: str) -> dict[str, int]:

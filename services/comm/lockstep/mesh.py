@@ -55,8 +55,11 @@ class PartyLostError(CellError):
     """A member of the cell is lost; `member` is its name."""
 
     def __init__(self, member: str, text: str) -> None:
-        super().__init__(f"{member}: {text}")
-        self.member = member
+        super().__init__(member, text)
+        self.member, self.text = member, text
+
+    def __str__(self) -> str:
+        return f"{self.member}: {self.text}"
 
 
 class TickLink:
