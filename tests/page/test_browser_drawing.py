@@ -234,7 +234,19 @@ async def test_the_stochastic_view_opens_beside_the_drawing(
     await expect(dialog.get_by_role("img")).to_be_visible()
     wide = "(image) => image.decode().then(() => image.naturalWidth)"
     assert await dialog.get_by_role("img").evaluate(wide) > 1000
+    hidden = "(s) => [s.scrollWidth - s.clientWidth, s.scrollHeight - s.clientHeight]"
+    assert await dialog.locator(".sheet").evaluate(hidden) == [0, 0]
     await tab.screenshot(path=shots / "stochastic.png")
+    await dialog.get_by_role("button", name="Full size").click()
+    assert max(await dialog.locator(".sheet").evaluate(hidden)) > 100
+    assert await dialog.locator(".sheet").evaluate("(s) => s.scrollTop") == 0
+    await dialog.get_by_role("button", name="Full size").click()
+    box = await dialog.get_by_role("img").bounding_box()
+    assert box is not None
+    await dialog.get_by_role("img").click(position={"x": 5, "y": box["height"] * 0.7})
+    beneath = "(s) => (s.scrollTop + s.clientHeight / 2) / s.scrollHeight"
+    assert await dialog.locator(".sheet").evaluate(beneath) == pytest.approx(0.7, abs=0.05)
+    await tab.screenshot(path=shots / "stochastic-full.png")
     await dialog.get_by_role("button", name="Close").click()
     await expect(dialog).to_be_hidden()
 

@@ -200,11 +200,20 @@ export async function exportAs(form, model, view, text) {
 }
 
 /** An SVG from the server in a dialog, as an image: nothing in it can run. */
+/** Show a picture in a dialog: the whole of it, or at full size around the point that was clicked. */
 function showPicture(title, name, svg) {
   const address = URL.createObjectURL(new Blob([svg], { type: "image/svg+xml" }));
-  const dialog = h("dialog", { "aria-label": title }, h("h2", {}, `${title} of ${words(name)}`),
-    h("img", { src: address, alt: "Timed transitions are boxes, immediate ones bars" }),
-    h("div", { class: "buttons" }, h("button", { type: "button", class: "small", onclick: () => dialog.close() }, "Close")));
+  const resize = (x, y) => {
+    size.setAttribute("aria-pressed", String(dialog.classList.toggle("full")));
+    sheet.scrollTo(x * sheet.scrollWidth - sheet.clientWidth / 2, y * sheet.scrollHeight - sheet.clientHeight / 2);
+  };
+  const size = h("button", { type: "button", class: "small", "aria-pressed": "false", onclick: () => resize(0, 0) }, "Full size");
+  const image = h("img", { src: address, alt: "Timed transitions are boxes, immediate ones bars", onclick: (e) => resize(e.offsetX / image.clientWidth, e.offsetY / image.clientHeight) });
+  const sheet = h("div", { class: "sheet" }, image);
+  const dialog = h("dialog", { "aria-label": title, class: "picture" }, h("h2", {}, `${title} of ${words(name)}`),
+    sheet, h("div", { class: "buttons" }, size,
+      h("button", { type: "button", class: "small", onclick: () => download(`${name}.gspn.svg`, svg, "image/svg+xml") }, "Save"),
+      h("button", { type: "button", class: "small", onclick: () => dialog.close() }, "Close")));
   dialog.addEventListener("cancel", () => dialog.close());
   dialog.addEventListener("close", () => URL.revokeObjectURL(address));
   openDialog(dialog);
