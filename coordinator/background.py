@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from petrobot.services.host.json_text import json_text
+from petrobot.services.host.parent_death import until_reaped
 
 HARD_END = 8
 """Seconds of processor time after which the kernel kills an analysis; results that it has already
@@ -110,7 +111,7 @@ class BackgroundProcess:
         process = self._process
         self._kill()
         if process is not None:
-            await process.wait()
+            await until_reaped(process)
 
     def _kill(self) -> None:
         if self._process is not None and self._process.returncode is None:
@@ -145,7 +146,7 @@ class BackgroundProcess:
             self._current = None
             if not ended:
                 self._kill()
-                await process.wait()
+                await until_reaped(process)
         return newest
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import json
 import os
 import signal
@@ -175,3 +176,26 @@ async def test_giving_up_an_order_ends_its_process(
     with pytest.raises(asyncio.CancelledError):
         await order
     assert apart.process is None
+
+
+@pytest.mark.processes
+async def test_a_process_that_is_killed_while_it_reads_leaves_nothing_to_be_logged(
+    apart: BackgroundProcess,
+) -> None:
+    said: list[str] = []
+    asyncio.get_running_loop().set_exception_handler(
+        lambda _loop, context: said.append(context["message"])
+    )
+    await apart.do("findings", FINDINGS)
+    assert apart.process is not None
+    os.kill(apart.process, signal.SIGSTOP)
+    long = {**FINDINGS, "text": CATCH_BALL + "#" * 2_000_000}
+    order = asyncio.create_task(apart.do("findings", long))
+    await asyncio.sleep(0)
+    os.kill(apart.process, signal.SIGKILL)
+    with pytest.raises(RefusedError):
+        await order
+    del order
+    await apart.do("findings", FINDINGS)  # in another process: the killed one is forgotten
+    gc.collect()
+    assert said == []

@@ -12,11 +12,16 @@ the time of a node, which first ends its own children.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import signal
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # the keeper process beside each worker does not need asyncio
+    from asyncio.subprocess import Process
 
 PR_SET_PDEATHSIG, PR_GET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 2, 36
 STOP_ROUTINE = signal.SIGQUIT
@@ -68,7 +73,6 @@ async def until_ended(process: int) -> None:
     The closed end of a pipe would not show it: a process that the child left running may hold the
     pipe open.
     """
-    # Imported here: the keeper process beside each worker does not need asyncio.
     import asyncio
 
     loop = asyncio.get_running_loop()
@@ -87,6 +91,19 @@ async def until_ended(process: int) -> None:
     finally:
         loop.remove_reader(number)
         os.close(number)
+
+
+async def until_reaped(process: Process) -> None:
+    """Wait for a child process that was killed; drop what it has not read of its input.
+
+    Its broken pipe is noticed here: CPython before 3.11.5 would log a traceback about it later.
+    """
+    assert process.stdin is not None
+    if not process.stdin.is_closing():
+        process.stdin.transport.abort()
+    with contextlib.suppress(ConnectionError):
+        await process.stdin.wait_closed()
+    await process.wait()
 
 
 def _runs(process: int) -> bool:

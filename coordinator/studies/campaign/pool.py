@@ -16,7 +16,7 @@ from typing import Any
 from petrobot.coordinator.run.supervisor import LAST_WORDS, output_pipe
 from petrobot.coordinator.studies.campaign.plan import CampaignError, CampaignPlan
 from petrobot.coordinator.studies.campaign.worker import answer
-from petrobot.services.host.parent_death import until_ended
+from petrobot.services.host.parent_death import until_ended, until_reaped
 
 RETIRES_AFTER = 200
 """Blocks after which a worker is replaced, so that leaks of a user's action or a native library do
@@ -113,9 +113,7 @@ class _Worker:
         session."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
-        assert self.process.stdin is not None
-        self.process.stdin.close()  # `wait` also waits for this
-        await self.process.wait()
+        await until_reaped(self.process)
         await self._closing.aclose()
 
 
