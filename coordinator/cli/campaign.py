@@ -413,8 +413,8 @@ def text_of(result: dict[str, Any]) -> str:
         shown = ", ".join(map(str, seeds[:4])) + (", ..." if len(seeds) > 4 else "")
         lines.append(
             f"  warning: the blocks with the seeds {shown} are copies of each other, to the "
-            "microsecond: they count as one observation. Let actions and drivers draw with "
-            "ctx.random and ports.random"
+            "microsecond, so one observation. Let actions and drivers draw with ctx.random and "
+            "ports.random"
         )
     speed = result["times_real_time_per_core"]
     lines.append(

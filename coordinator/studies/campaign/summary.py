@@ -4,6 +4,7 @@ action."""
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -135,8 +136,8 @@ class Summary:
     options: Mapping[str, Any] = field(default_factory=dict)
     """Options of the campaign's plan: target reliability and rho, if they were given."""
     mission_s: dict[int, float] = field(default_factory=dict)
-    seen: dict[int, tuple[str, int, Any]] = field(default_factory=dict)
-    """By block: its regime, its seed, and a digest of what happened in it."""
+    seen: dict[int, tuple[str, int, list[int]]] = field(default_factory=dict)
+    """By block: its regime, its seed, and a digest of what happened in each of its trials."""
 
     @classmethod
     def of(
@@ -166,20 +167,31 @@ class Summary:
         add_row(self.estimates, self.task, row, self.salt)
 
     def _see(self, row: TrialRow) -> None:
-        """Add to the digest of a block what its seed may change: which runs there were, how they
-        ended, and when."""
+        """Keep what the seed of a block may change: which runs there were, how they ended, when,
+        and with which values."""
         runs = () if row.trial is None else row.trial.runs
-        told = [(r.place, r.action, r.begun, r.took, r.status, r.cause) for r in runs]
-        _, _, before = self.seen.get(row.block, ("", 0, 0))
-        self.seen[row.block] = (row.regime, row.seed, hash((before, row.k, tuple(told))))
+        told = [
+            (r.place, r.action, r.begun, r.took, r.status, r.cause, *r.values.items()) for r in runs
+        ]
+        _, _, trials = self.seen.setdefault(row.block, (row.regime, row.seed, []))
+        trials.append(hash(tuple(told)))
 
     def copies(self) -> list[list[int]]:
         """Return the seeds of blocks in one regime that are copies of each other, as they are when
-        nothing draws from the seed."""
-        groups: dict[tuple[str, Any], set[int]] = {}
-        for regime, seed, digest in self.seen.values():
-            groups.setdefault((regime, digest), set()).add(seed)
-        return [sorted(seeds) for seeds in groups.values() if len(seeds) > 1]
+        nothing draws from the seed.
+
+        Where trials last one of a few times, blocks are equal by chance; but then other blocks have
+        the same trials, too, in another order.
+        """
+        groups: dict[tuple[str, tuple[int, ...]], set[int]] = {}
+        for regime, seed, trials in self.seen.values():
+            groups.setdefault((regime, tuple(trials)), set()).add(seed)
+        common = Counter((regime, one) for regime, trials in groups for one in set(trials))
+        return [
+            sorted(seeds)
+            for (regime, trials), seeds in groups.items()
+            if len(seeds) > 1 and any(common[regime, one] == 1 for one in trials)
+        ]
 
     def asked(self) -> dict[str, Question]:
         """Return by what the actions of each primitive task are judged."""

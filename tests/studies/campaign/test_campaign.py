@@ -41,8 +41,9 @@ from petrobot.coordinator.studies.campaign.summary import (
     result_of,
 )
 from petrobot.coordinator.studies.campaign.table import TABLE, read_table
-from petrobot.coordinator.studies.campaign.trials import Trial
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.campaign.worker import serve
+from petrobot.coordinator.task import Kind
 from tests.processes import alive
 from tests.studies.campaign.conftest import SERVICES, TASK, Conduct
 from tests.waiting import beat, until
@@ -561,6 +562,29 @@ def test_blocks_that_are_copies_are_warned_of(conduct: Conduct, tmp_path: Path) 
     assert len(result["copies"]) == 2 and all(len(seeds) == 2 for seeds in result["copies"])
     assert "copies of each other" in text_of(result) and "never began" not in text_of(result)
     assert "  3 more never began: their mission run" in text_of({**result, "not_begun": 3})
+
+
+def test_blocks_that_are_equal_by_chance_are_no_copies(conduct: Conduct) -> None:
+    """Trials that last 1 or 2 s make equal blocks, but each of them is found in other blocks."""
+    task = conduct("names", runs=1).bench.task
+    place = next(name for name, p in task.flat.places.items() if p.kind is Kind.ACTION)
+    action = task.primitive_task_of(place).alternatives[0]
+
+    def copies(*blocks: tuple[float, ...]) -> list[list[int]]:
+        return Summary.of(
+            task,
+            [
+                TrialRow(
+                    1, "A", 40 + i, k, i, 9.0, Trial(k, 0.0, runs=[RunEntry(place, action, t)])
+                )
+                for i, block in enumerate(blocks)
+                for k, t in enumerate(block, 1)
+            ],
+        ).copies()
+
+    assert copies((1.0, 2.0), (1.0, 2.0), (2.0, 1.0)) == []
+    assert copies((1.0, 2.0), (1.0, 2.0), (1.0, 3.0)) == [[40, 41]]
+    assert copies((1.0, 2.0), (1.0, 2.0)) == [[40, 41]]
 
 
 def test_the_summary_adds_up_what_the_score_counts_for_each_trial() -> None:
