@@ -31,6 +31,9 @@ from petrobot.services.comm.location_file import Directory, DirectoryError
 from petrobot.services.comm.protocol.messages import Call, Feedback, Outcome, Welcome
 
 _log = logging.getLogger(__package__)
+MOST_TOLD = 20_000
+"""Most entries of cycles, and of their open runs, that a score is told: 3,333 cycles without open
+runs. A message carries little more (docs/protocol.md)."""
 SERVICE_DEADLINE = 20.0
 TOLD_ERRORS = 6
 """How many of its last failed runs the result of a mission run that ended in ERROR names."""
@@ -343,9 +346,26 @@ class Mission:
         self.ended = ended
         if self.tally.cycles:
             self.tally.cycles[-1].ended = ended
-        cycles = [cycle.plain(now) | self._provisional(cycle) for cycle in self.tally.cycles]
+        cycles = self._cycles_to_score(now)
         asked = self._ask(now, "score", self.executor.task.score, {"cycles": cycles})
         self.stage = Stage.SCORING if asked else Stage.OVER
+
+    def _cycles_to_score(self, now: float) -> list[dict[str, Any]]:
+        """Return the cycles for the score, of a long mission run the newest that one call
+        carries."""
+        cycles: list[dict[str, Any]] = []
+        left = MOST_TOLD
+        for cycle in reversed(self.tally.cycles):
+            told = cycle.plain(now) | self._provisional(cycle)
+            left -= len(told) + sum(map(len, told.get("provisional", ())))
+            if left < 0:
+                self.remarks["scored"] = (
+                    f"the newest {len(cycles):,} of {len(self.tally.cycles):,} cycles: one call "
+                    "carries no more"
+                )
+                break
+            cycles.append(told)
+        return cycles[::-1]
 
     def _provisional(self, cycle: Cycle) -> dict[str, Any]:
         """Return what the score must know of a cycle's runs that have no verdict yet."""

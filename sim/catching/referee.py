@@ -43,6 +43,8 @@ PLOTS: Final = {
     },
 }
 """Pictures that reports draw of these results (docs/campaigns.md)."""
+MOST_ROWS: Final = 2_500
+"""Most throws of which one answer tells the details; no message carries 2,900."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +78,8 @@ class CatchReferee:
 
     def score(self, now: float, cycles: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
         """Return all throws so far as plain data: `throws` (see `_row`), with more detail
-        `courses` (see `_course`), and `balls`, counts for each of the caller's cycles.
+        `courses` (see `_course`), and `balls`, counts for each of the caller's cycles. Of more than
+        `MOST_ROWS` throws these lists have the newest, and `rows_left_off` counts the others.
 
         Of all balls `thrown`, those `over` are `caught` or `missed`; of the missed ones, the arm
         did not move for those `never_seen`. `reachable`: an estimate (sim/catching/oracle.py).
@@ -85,22 +88,25 @@ class CatchReferee:
         `cause`. A throw takes the status of the cycle in which it was released, None if it was
         released in none.
         """
-        rows = [_row(entry) | _status(entry.course, now, cycles) for entry in self._entries]
-        over = [row for row in rows if row["outcome"] != ThrowOutcome.ROLLING]
-        courses = [entry.course for entry in self._entries]
+        newest = self._entries[-MOST_ROWS:]
+        rows = [_row(entry) | _status(entry.course, now, cycles) for entry in newest]
+        over = [e for e in self._entries if e.course.outcome is not ThrowOutcome.ROLLING]
+        reachable = [entry.course for entry in over if entry.verdict.reachable]
+        left_off = len(self._entries) - len(newest)
         return {
             "seed": self._seed,
             "regime": self._regime,
             "throws": rows,
             "courses": [
                 _course(entry, self._began, status["run"])
-                for entry, status in zip(self._entries, rows, strict=True)
+                for entry, status in zip(newest, rows, strict=True)
             ],
+            **({"rows_left_off": left_off} if left_off else {}),
             "plots": PLOTS,
-            "balls": _balls(courses, [row["run"] for row in rows]),
-            **_counts(courses),
-            "reachable": sum(row["reachable"] for row in over),
-            "reachable_caught": sum(row["reachable"] and row["caught"] for row in over),
+            "balls": _balls([entry.course for entry in newest], [row["run"] for row in rows]),
+            **_counts([entry.course for entry in self._entries]),
+            "reachable": len(reachable),
+            "reachable_caught": sum(c.outcome is ThrowOutcome.CAUGHT for c in reachable),
         }
 
 
@@ -119,14 +125,10 @@ def _counts(courses: Sequence[ThrowCourse]) -> dict[str, int]:
 def _balls(courses: Sequence[ThrowCourse], runs: Sequence[int | None]) -> list[dict[str, Any]]:
     """Return the counts of each of the caller's cycles; `runs`: that of each throw, None: it was
     released in none."""
-    return [
-        {
-            "run": run,
-            "n": run,
-            **_counts([course for course, own in zip(courses, runs, strict=True) if own == run]),
-        }
-        for run in dict.fromkeys(runs)
-    ]
+    thrown: dict[int | None, list[ThrowCourse]] = {}
+    for course, run in zip(courses, runs, strict=True):
+        thrown.setdefault(run, []).append(course)
+    return [{"run": run, "n": run, **_counts(own)} for run, own in thrown.items()]
 
 
 def _status(course: ThrowCourse, now: float, cycles: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -378,6 +379,14 @@ def test_a_value_that_takes_long_to_read_is_neither_sent_nor_accepted(value: Any
         encode(m.Call("c", "s", {"v": value}))
     with pytest.raises(ProtocolError, match=r"malformed: .*more than"):
         decode(msgpack.packb([4, "c", "s", {"v": value}]))
+
+
+def test_a_result_may_have_more_values_than_a_call() -> None:
+    """Only its caller decodes it."""
+    long = m.Outcome("c", "success", {"v": [1] * 500_000}, "", "", Executed.YES, 0.0, 0.0)
+    assert decode(encode(long)) == long
+    with pytest.raises(ProtocolError, match=r"too_large: a Outcome: more than 524288 values"):
+        encode(dataclasses.replace(long, values={"v": [1] * 600_000}))
 
 
 def test_a_value_of_the_global_memory_fits() -> None:

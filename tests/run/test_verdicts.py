@@ -130,6 +130,18 @@ def test_the_score_receives_unjudged_runs_and_its_verdicts_are_not_in_the_result
     ]
 
 
+def test_the_score_of_a_long_mission_run_gets_the_newest_cycles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One call carries no more; before, the run ended without any result."""
+    monkeypatch.setattr("petrobot.coordinator.run.mission.MOST_TOLD", 35)
+    mission, _ = Cellar(tmp_path).begin()
+    result = mission.result("lockstep", 0.0)
+    assert [row["n"] for row in result["parts"]] == [3, 4, 5, 6]
+    assert result["scored"] == "the newest 4 of 6 cycles: one call carries no more"
+    assert result["status"] == "success" and len(mission.tally.cycles) == 6
+
+
 def test_a_replay_gives_the_same_verdicts(tmp_path: Path) -> None:
     cellar = Cellar(tmp_path)
     mission, _ = cellar.begin()

@@ -16,9 +16,11 @@ import pytest
 
 from petrobot.services.comm.lockstep.channels import images_wanted
 from petrobot.services.comm.lockstep.party import TICK
-from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.comm.protocol.codec import decode, encode
+from petrobot.services.comm.protocol.messages import Executed, Outcome
 from petrobot.services.host.numba_kernels import SWITCH
 from petrobot.sim.catching.course import ThrowOutcome
+from petrobot.sim.catching.referee import MOST_ROWS
 from petrobot.sim.catching.site import Site
 from petrobot.sim.catching.thrower import draw_throw
 from petrobot.sim.catching.truth import Scatter
@@ -358,6 +360,24 @@ def test_every_ball_is_counted(bench: Benches) -> None:
         {"run": 1, "n": 1, "thrown": 1, "over": 1, "caught": 1, "missed": 0, "never_seen": 0},
         {"run": 2, "n": 2, "thrown": 2, "over": 1, "caught": 0, "missed": 1, "never_seen": 1},
     ]
+
+
+def test_the_score_of_many_throws_can_be_sent(bench: Benches) -> None:
+    """All of them are counted; the newest are told in detail, as many as a message carries."""
+    here = bench(seed=1)
+    here.enable()
+    here.want_images(0.001)
+    here.catch_one()
+    referee = here.lab.referee
+    longest = [{"n": 1, "begun_ago": here.now, "ended_ago": 0.0, "status": "success"}]
+    referee._entries *= MOST_ROWS + 200
+    score = referee.score(here.now, longest)
+    assert (score["thrown"], score["caught"], score["reachable_caught"]) == (MOST_ROWS + 200,) * 3
+    assert len(score["throws"]) == len(score["courses"]) == MOST_ROWS
+    assert score["rows_left_off"] == 200 and score["balls"][0]["thrown"] == MOST_ROWS
+    score["balls"] = [{**score["balls"][0], "run": n} for n in range(MOST_ROWS)]
+    sent = Outcome("score", "success", score, "", "", Executed.YES, 0.0, 0.0)
+    assert decode(encode(sent)) == sent
 
 
 def test_a_throw_has_the_status_of_its_cycle(bench: Benches) -> None:

@@ -68,7 +68,12 @@ def run(todo: Sequence[FigureProof], jobs: int) -> bool:
             waiting = {pool.submit(prove, proof): proof for proof in group}
             for future in as_completed(waiting):
                 done += 1
-                data = future.result()
+                try:
+                    data = future.result()
+                except Exception as fault:  # the others are measured all the same
+                    print(f"{waiting[future].name}: NOT MEASURED: {fault}")
+                    good = False
+                    continue
                 good = good and data["holds"]
                 holds = "holds" if data["holds"] else "DOES NOT HOLD"
                 togo = (time.monotonic() - begun) / done * (len(todo) - done) / 60

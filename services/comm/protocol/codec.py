@@ -258,6 +258,8 @@ MAX_VALUES = 1 << 17
 Together with the limit of bytes it bounds how long other callers wait while one message is decoded:
 about 30 ms at worst.
 """
+MAX_VALUES_OF_OUTCOME = 1 << 19
+"""The same for a result: only its caller decodes it, and the score of a long mission run is one."""
 ENTRY = 6
 """How many values one entry of a map counts as: its key must be checked, hashed and inserted."""
 MAX_CONTAINERS_OF_TICK = 100_000
@@ -543,7 +545,7 @@ def _refuse_too_many(message: Message, row: Sequence[Any]) -> None:
     """Raise ProtocolError for a message with too many values; the receiver would break the
     connection for it."""
     try:
-        _count_in(row, _Counter(MAX_CONTAINERS))
+        _count_in(row, _Counter(MAX_CONTAINERS, _most_values(message.KIND)))
     except _FieldError as fault:
         raise ProtocolError("too_large", f"a {type(message).__name__}: {fault}") from None
 
@@ -706,9 +708,9 @@ class _Counter:
     """Count arrays and maps, and the values in them, while a large body is decoded (hook for
     msgpack)."""
 
-    def __init__(self, containers: int) -> None:
+    def __init__(self, containers: int, values: int) -> None:
         self.most = self.left = containers
-        self.values = MAX_VALUES
+        self.most_values = self.values = values
 
     def __call__(self, container: Any) -> Any:
         self.left -= 1
@@ -716,33 +718,35 @@ class _Counter:
             raise _FieldError(f"more than {self.most} arrays and maps")
         self.values -= len(container) * (ENTRY if isinstance(container, dict) else 1)
         if self.values < 0:
-            raise _FieldError(_TOO_MANY)
+            raise _FieldError(f"more than {self.most_values} values")
         return container
 
 
-_TOO_MANY = f"more than {MAX_VALUES} values"
+def _most_values(kind: int) -> int:
+    return MAX_VALUES_OF_OUTCOME if kind == m.Outcome.KIND else MAX_VALUES
 
 
 def _not_readable(fault: Exception) -> _FieldError:
     if isinstance(fault, (_FieldError, NotPlainError, ProtocolError)):
         return _FieldError(str(fault))
     if "exceeds max_" in str(fault):
-        return _FieldError(_TOO_MANY)
+        return _FieldError("more than a message may have values")
     # msgpack raises its own kinds, ValueError, UnicodeDecodeError and RecursionError on bad bytes.
     return _FieldError(f"not msgpack: {type(fault).__name__}")
 
 
 def _unpack_counted(body: bytes | memoryview, kind: int) -> Any:
     if kind == Tick.KIND:
-        counter = _Counter(MAX_CONTAINERS_OF_TICK) if len(body) > UNCOUNTED else None
+        counter = (
+            _Counter(MAX_CONTAINERS_OF_TICK, ENTRY * len(body)) if len(body) > UNCOUNTED else None
+        )
         hooks: dict[str, Any] = {"list_hook": counter, "object_hook": counter}
-        if counter is not None:
-            counter.values = ENTRY * len(body)
         return msgpack.unpackb(body, use_list=False, ext_hook=_extension_in, **hooks)
-    counter = _Counter(MAX_CONTAINERS)
+    most = _most_values(kind)
+    counter = _Counter(MAX_CONTAINERS, most)
     # The hooks count an array only when it is complete. Until then msgpack's own limits apply: no
     # single array may be longer than all arrays together.
-    longest = {"max_array_len": MAX_VALUES, "max_map_len": MAX_VALUES // ENTRY}
+    longest = {"max_array_len": most, "max_map_len": most // ENTRY}
     return msgpack.unpackb(
         body, ext_hook=no_extension, list_hook=counter, object_hook=counter, **longest
     )
