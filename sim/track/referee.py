@@ -35,7 +35,9 @@ DEPARTED: Final = 0.01
 OFF_BOARD: Final = 1.0
 """m beyond the board's edge at which a person stops the rover."""
 ROW_PERIOD: Final = 0.2
-"""s between two rows of the path."""
+"""s between two rows of the path, at first."""
+MOST_ROWS: Final = 5_000
+"""Most rows of the path: the score of a rover that stands for hours fits into a message, too."""
 _BEHIND, _AHEAD = 0.6, 1.2
 """m along the track by which the nearest point may have moved since the last look; more means
 another part of the track."""
@@ -84,6 +86,7 @@ class TrackReferee:
     """When it stopped at the T (s)."""
     finished: bool = False
     _path: list[tuple[float, float, float, float]] = field(default_factory=list)
+    _period: float = ROW_PERIOD
     _way: float = 0.0
     _off: float = 0.0
     _squares: float = 0.0
@@ -105,8 +108,7 @@ class TrackReferee:
     def watch(self, now: float, pose: FloorPose, speed: float) -> bool:
         """Process the body's pose and speed (m/s) at a moment (s). Return whether the rover has
         just left the board, where a person presses its emergency stop."""
-        if not self._path or now - self.began >= self._path[-1][0] + ROW_PERIOD - 1e-9:
-            self._path.append((now - self.began, *pose))
+        self._record(now - self.began, pose)
         if self.stopped is not None or self._removed:
             return False
         if self._first is None:
@@ -236,6 +238,15 @@ class TrackReferee:
                 for t, x, y, heading in self._path
             ],
         }
+
+    def _record(self, time: float, pose: FloorPose) -> None:
+        """Add a row to the path. Once it has `MOST_ROWS` every second one is dropped, and rows are
+        added half as often."""
+        if self._path and time < self._path[-1][0] + self._period - 1e-9:
+            return
+        if len(self._path) == MOST_ROWS:
+            self._path, self._period = self._path[::2], 2.0 * self._period
+        self._path.append((time, *pose))
 
     def _all_penalties(self, now: float, stopped_at_t: bool, overrun: bool) -> list[dict[str, Any]]:
         """Return the penalties so far, plus those that a run that ends now has earned."""

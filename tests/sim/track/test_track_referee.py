@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from itertools import pairwise
 from typing import Any
 
 import pytest
 
 from petrobot.sim.track.course import Track
 from petrobot.sim.track.elements import FloorPose
-from petrobot.sim.track.referee import TrackReferee
+from petrobot.sim.track.referee import MOST_ROWS, TrackReferee
 
 TRACK = Track.of((0, 3), 0, "SSSSSSS", (3,))  # along y = 7 from x = 0; no paint from x = 6 to x = 8
 DT, SPEED = 0.02, 0.5
@@ -199,3 +200,14 @@ def test_another_part_of_the_track_is_not_a_short_cut() -> None:
     referee, now = ride([(2.0, 3.0), (5.0, 3.0), (5.0, 5.0), (3.0, 5.0)], track)
     score = referee.score(now)
     assert kinds(score) == ["track_left", "interruption_missed"]
+
+
+def test_the_path_of_a_rover_that_stands_for_hours_stays_short() -> None:
+    referee = TrackReferee(TRACK, 1, "straight", 0.0)
+    for k in range(5 * 3 * 3600):
+        referee.watch(0.2 * k, FloorPose(0.0, 7.0, 0.0), 0.0)
+    times = [row[0] for row in referee.score(3 * 3600.0)["path"]]
+    assert MOST_ROWS / 2 <= len(times) <= MOST_ROWS
+    assert times[0] == 0.0 and times[-1] > 3 * 3600 - 10
+    gaps = [b - a for a, b in pairwise(times)]
+    assert max(gaps) <= 2.0 * min(gaps) + 1e-9
