@@ -110,8 +110,9 @@ async def test_a_node_killed_during_a_catch_is_an_error_and_the_task_continues(
     stream = mission.executor.directory.streams["catch_point"]
     assert arm["stale_executed"] == 0
     assert arm["oldest_executed"] <= PERIODS * stream.period
-    assert node == "motion" or arm["setpoint_count"] > 0, (
-        "a motion node that was killed counts anew"
+    moved = [r for r in runs if r.place == "catch_ball" and r.status is Status.SUCCESS]
+    assert arm["setpoint_count"] > 0 or node == "motion" or not moved, (
+        "a motion node that was killed counts anew; on a busy host no ball may come that far"
     )
 
 
