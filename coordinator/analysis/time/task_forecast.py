@@ -215,7 +215,8 @@ class Forecast:
         value = np.where(open_ & self.transient[self.chain.target], self.chain.probability, 0.0)
         direct = open_ & self.done.goal[self.chain.target]
         arrive = sum_by(self.chain.source[direct], self.chain.probability[direct], self.chain.n)
-        return float(solve(SolveOrder.of(self.chain.graph, self.transient), value, arrive)[0])
+        clean = solve(SolveOrder.of(self.chain.graph, self.transient), value, arrive)
+        return 1.0 if self.done.goal[0] else float(clean[0])
 
     @cached_property
     def worth(self) -> tuple[Worth, ...]:
