@@ -610,8 +610,8 @@ def _doubts(
     devices: Mapping[str, str] | None,
 ) -> list[str]:
     """Compare a forecast with the execution graph as a Markov chain, which follows the engine in
-    everything but durations. Return each figure that differs, with what the view assumes; where
-    there is no such chain, add a note.
+    everything but durations. Return which figures differ and what only one of the two assumes;
+    where there is no such chain, add a note.
 
     Both get as many phases for a duration as the chain can have, so only what they say about the
     order of events can differ.
@@ -633,14 +633,24 @@ def _doubts(
             raise KeyboardInterrupt from why
         notes.append(f"the forecast was not compared with the execution graph: {_why(why)}")
         return list(view.doubts)
-    exact, assumed = chain.figures, dict.fromkeys((*view.assumptions, *chain.assumptions))
-    told = [text for text in assumed if not text.endswith("not measured")]
-    told.append("conflicts that neither priority nor weight decides are drawn")
-    return list(view.doubts) + [
-        f"{name} is {value:.6g} here and {exact[name]:.6g} on the execution graph (both with at "
-        f"most {few} phase{'s' * (few > 1)} for a duration). Assumed: {'; '.join(told)}"
+    exact = chain.figures
+    off = [
+        f"{name} {value:.6g} here, {exact[name]:.6g} there"
         for name, value in found.figures.items()
         if abs(value - exact[name]) > AGREE * max(abs(value), abs(exact[name]))
+    ]
+    if not off:
+        return list(view.doubts)
+    # What both assume explains no difference.
+    ours = [a for a in view.assumptions if a not in chain.assumptions]
+    ours.append("conflicts that neither priority nor weight decides are drawn")
+    theirs = [a for a in chain.assumptions if a not in view.assumptions]
+    there = f"; there: {'; '.join(theirs)}" if theirs else ""
+    return [
+        *view.doubts,
+        f"the execution graph has other figures (both with at most {few} "
+        f"phase{'s' * (few > 1)} for a duration): {', '.join(off)}. "
+        f"Assumed here: {'; '.join(ours)}{there}",
     ]
 
 
