@@ -45,7 +45,7 @@ from petrobot.coordinator.analysis.time.whatif import (
     change_task,
     read_change,
 )
-from petrobot.coordinator.task import End, Kind, Place, Task, Transition
+from petrobot.coordinator.task import End, Kind, Place, Status, Task, Transition
 from petrobot.coordinator.task.net import Net
 from petrobot.services.host.whole_file import write_whole
 
@@ -349,8 +349,8 @@ def simulate_command(
                 timer_stages=stages,
                 devices=devices_of(cell),
             )
-            ends = OrdinaryView(model)
-            goal = goal_by_marking(lambda m: ends.is_final(view.projected(m)))
+            goal = goal_by_marking(lambda m: view.ended(m) is Status.SUCCESS)
+            lost = goal_by_marking(lambda m: view.ended(m) is Status.ERROR)
             seen = simulate(
                 view.gspn,
                 random,
@@ -358,6 +358,7 @@ def simulate_command(
                 horizon=horizon or np.inf,
                 warmup=warmup,
                 goal=goal,
+                lost=lost,
                 firings=firings,
                 progress=progress,
             )

@@ -7,7 +7,7 @@ answer, not in the question.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from petrobot.coordinator.task import Task
@@ -127,7 +127,8 @@ def may_run(task: Task, cell: Cell | None = None, budget: Budget | None = None) 
     if broken or budget is None:
         return MayRun(task, report, None)
     analysis = _search(task, budget, devices_of(cell))
-    return MayRun(task, _with_contests(report, analysis), analysis)
+    report = _with_contests(report, analysis)
+    return MayRun(task, report, replace(analysis, refused=not report.ok))
 
 
 def _search(task: Task, budget: Budget, devices: Mapping[str, str] | None) -> Analysis:

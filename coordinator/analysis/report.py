@@ -48,7 +48,7 @@ from petrobot.coordinator.analysis.net.structure import (
 from petrobot.coordinator.analysis.net.verdict import PropertyVerdict
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.analysis.time.markov import LongRun, long_run
-from petrobot.coordinator.analysis.time.stochastic import Measured, stochastic_view
+from petrobot.coordinator.analysis.time.stochastic import STAGES, Measured, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.net import Marking, Net
@@ -155,6 +155,11 @@ class Analysis:
     """Tasks only: what N proves of progress, where the execution graph is not complete."""
     ends: EndsNet | None = None
     """Tasks only: N."""
+    doubts: tuple[str, ...] = ()
+    """Why the figures of `forecast` are not those of the executed task; empty if nothing speaks
+    against them."""
+    refused: bool = False
+    """Whether the task may not run for a reason beyond these verdicts (`may_run`)."""
 
     @cached_property
     def hand_notes(self) -> list[str]:
@@ -168,6 +173,13 @@ class Analysis:
         named = self.verdicts()
         known = ("bounded", "deadlock_free", "one_run_each")
         return not self.objections and all(named[n].holds for n in known if n in named)
+
+    @cached_property
+    def odds(self) -> Odds:
+        """Probability and mean time of each way back; none for a task that may not run."""
+        if self.refused or self.objections or self.progress is None:
+            return Odds({}, 0, (), "the task may not run")
+        return self.progress.odds
 
     @property
     def objections(self) -> dict[str, PropertyVerdict]:
@@ -250,9 +262,8 @@ class Analysis:
             out["structure"] = self.structure.to_json()
             out["notes"] += self.structure.gaps()
         if self.progress is not None:
-            odds = self.progress.odds
-            out["recoveries"] = [_recovery(r, odds) for r in self.progress.recoveries]
-            out["no_probability"] = odds.missing
+            out["recoveries"] = [_recovery(r, self.odds) for r in self.progress.recoveries]
+            out["no_probability"] = self.odds.missing
             out["mended"] = {n: v.to_json() for n, v in self.progress.mended.items()}
         return out | self._numbers()
 
@@ -279,7 +290,7 @@ class Analysis:
                 "throughput": self.forecast.throughput,
                 "mean_tokens": self.forecast.mean_tokens,
                 "residual": self.forecast.done.residual,
-                "forecast": self.forecast.to_json(),
+                "forecast": self.forecast.to_json() | {"doubts": list(self.doubts)},
             }
         return {"throughput": None, "mean_tokens": None, "residual": None}
 
@@ -287,18 +298,12 @@ class Analysis:
         """Return the numbers by which two analyses are compared."""
         if self.forecast is not None:
             f = self.forecast
-            goal = {} if f.goal_reliability is None else {"R_goal": f.goal_reliability}
             shape = (
                 {"90 % quantile of the time (s)": f.completion_time().quantile(0.9)}
                 if f.completion_probability > 0
                 else {}
             )
-            own = {
-                "P_complete": f.completion_probability,
-                **goal,
-                "R_conj": f.conjunctive_reliability,
-            }
-            return own | {"mean time (s)": f.done.mean} | shape
+            return f.figures | shape
         if self.run is not None:
             return {f"throughput of {t} (1/s)": x for t, x in self.run.throughput.items()}
         return {"markings": len(self.qualitative.space)}
@@ -354,7 +359,7 @@ class Analysis:
             lines += [
                 f"  dead end       {d.count} x: {d.reason}" for d in self.progress.dead_ends[:SHOWN]
             ]
-            lines += _recovery_lines(self.progress)
+            lines += _recovery_lines(self.progress.recoveries, self.odds)
         assumed = dict.fromkeys(  # a net of another tool is not executed
             v.assumption
             for v in self.verdicts().values()
@@ -391,11 +396,14 @@ class Analysis:
             f"{done.residual:.1e}"
         )
         never = "  no run ever reaches `final`, so there is no mean time"
+        several = f" of a mission run of {f.trials} trials" if f.trials > 1 else ""
         return [
             "",
-            f"forecast: P_complete {done.probability:.9f}, {goal}R_conj "
+            f"forecast{several}: P_complete {done.probability:.9f}, {goal}R_conj "
             f"{f.conjunctive_reliability:.6f}",
             time if done.probability else never,
+            *([f"  one trial: {_figures(f.one_trial.figures)}"] if several else []),
+            *(f"doubtful: {text}" for text in self.doubts),
             *_missing_lines(self),
             *(["worth improving:", *rows] if done.probability else []),
             *(f"approximated: {text}" for text in f.approximations),
@@ -527,6 +535,7 @@ def _analyse_task(
     devices: Mapping[str, str] | None,
 ) -> Analysis:
     ordinary, n, notes = OrdinaryView(task), ends_net(task), list[str]()
+    doubts = list[str]()
     found = _examined(n.net, limits, engine, notes, partial(judged, n))
     progress = numbers = None
     shown: Mapping[str, PropertyVerdict] = {}
@@ -544,6 +553,8 @@ def _analyse_task(
                 shown = proven(n, found.space, ordinary)
         if view == "gspn" and CUT not in notes:
             numbers = _forecast(task, measured, stages, limits, notes, devices)
+        if numbers is not None:
+            doubts = _doubts(numbers, progress, measured, stages, limits, notes, devices)
     except KeyboardInterrupt:
         notes.append(CUT)
     return Analysis(
@@ -560,6 +571,7 @@ def _analyse_task(
         CUT in notes,
         shown,
         n,
+        tuple(doubts),
     )
 
 
@@ -581,6 +593,69 @@ def _forecast(
         return None
     _ = found.worth, found.recovery_time, found.throughput, found.mean_tokens
     return found
+
+
+AGREE = 1e-6
+"""Relative difference up to which a figure of two models counts as the same: both are solved to
+about 1e-12."""
+
+
+def _doubts(
+    found: Forecast,
+    progress: Progress | None,
+    measured: Measured | None,
+    stages: int,
+    limits: SearchLimits | None,
+    notes: list[str],
+    devices: Mapping[str, str] | None,
+) -> list[str]:
+    """Compare a forecast with the execution graph as a Markov chain, which follows the engine in
+    everything but durations. Return which figures differ and what only one of the two assumes;
+    where there is no such chain, add a note.
+
+    Both get as many phases for a duration as the chain can have, so only what they say about the
+    order of events can differ.
+    """
+    view = found.view
+    try:
+        if progress is None or not progress.x.complete:
+            raise ValueError("it is not complete")
+        if isinstance(chain := progress.chain, str):
+            raise ValueError(chain)
+        few = chain.stages
+        if (few, few) != (stages, STAGES):
+            same = stochastic_view(
+                view.task, measured, stages=few, timer_stages=few, devices=devices
+            )
+            found = forecast(same, limits=limits)
+    except (ValueError, ArithmeticError, MemoryError) as why:
+        if INTERRUPTED in str(why):
+            raise KeyboardInterrupt from why
+        notes.append(f"the forecast was not compared with the execution graph: {_why(why)}")
+        return list(view.doubts)
+    exact = chain.figures
+    off = [
+        f"{name} {value:.6g} here, {exact[name]:.6g} there"
+        for name, value in found.figures.items()
+        if abs(value - exact[name]) > AGREE * max(abs(value), abs(exact[name]))
+    ]
+    if not off:
+        return list(view.doubts)
+    # What both assume explains no difference.
+    ours = [a for a in view.assumptions if a not in chain.assumptions]
+    ours.append("conflicts that neither priority nor weight decides are drawn")
+    theirs = [a for a in chain.assumptions if a not in view.assumptions]
+    there = f"; there: {'; '.join(theirs)}" if theirs else ""
+    return [
+        *view.doubts,
+        f"the execution graph has other figures (both with at most {few} "
+        f"phase{'s' * (few > 1)} for a duration): {', '.join(off)}. "
+        f"Assumed here: {'; '.join(ours)}{there}",
+    ]
+
+
+def _figures(figures: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {value:.6f}" for name, value in figures.items())
 
 
 def _why(error: Exception) -> str:
@@ -683,10 +758,9 @@ def _mended_line(verdict: PropertyVerdict) -> str:
     return f"{'':26}if the operator repairs it: {_word(verdict.holds)}, {verdict.reason}"
 
 
-def _recovery_lines(progress: Progress) -> list[str]:
+def _recovery_lines(found: Sequence[Recovery], odds: Odds) -> list[str]:
     """Return the way back from each error exit; those that fire only while another error is
     handled come last."""
-    found, odds = progress.recoveries, progress.odds
     if not found:
         return []
     wide = max(14, *(len(r.name) for r in found))

@@ -553,7 +553,8 @@ def test_tokens_of_action_places_are_active_or_finished_runs(task: Task) -> None
     for place in task.places.values():
         if place.kind is Kind.ACTION:
             own = space.tokens(index[place.name])
-            parts = sum(space.tokens(index[f"{place.name}.{s}"]) for s in ("going", *Status))
+            ended = [p for s in Status for p in ended_places(view, place.name, s)]
+            parts = sum(space.tokens(index[p]) for p in (f"{place.name}.going", *ended))
             assert (own == parts).all()
 
 
@@ -571,12 +572,19 @@ def timed(task: Task) -> Task:
     return replace(task, primitive_tasks=primitives, events=events, transitions=moves)
 
 
-def parts_of_the_view(task: Task) -> list[tuple[str, ...]]:
+def ended_places(view: StochasticView, place: str, *statuses: Status) -> tuple[str, ...]:
+    """Return the places of runs that ended so, with each set of internal events."""
+    stems = {f"{place}.{s}" for s in statuses}
+    return tuple(p for p in view.gspn.net.places if p.partition(" ")[0] in stems)
+
+
+def parts_of_the_view(task: Task, view: StochasticView) -> list[tuple[str, ...]]:
     """Return places of the stochastic view whose tokens the ends net has, too: those of each place,
     of an action place those that are active, that ended normally and that ended with ERROR."""
     found = list[tuple[str, ...]]()
     for p in task.places.values():
-        normal, error = (f"{p.name}.success", f"{p.name}.failure"), (f"{p.name}.error",)
+        normal = ended_places(view, p.name, Status.SUCCESS, Status.FAILURE)
+        error = ended_places(view, p.name, Status.ERROR)
         found += [(f"{p.name}.going",), normal, error] if p.kind is Kind.ACTION else [(p.name,)]
     return found
 
@@ -610,7 +618,7 @@ def view_is_within_the_ends_net(task: Task) -> bool:
     ours, theirs = explore(view.gspn.net, limits=limits), explore(n.net, limits=limits)
     if not ours.complete or not theirs.complete or n.left_out:
         return False
-    parts, their_parts = parts_of_the_view(task), parts_of_the_ends_net(n)
+    parts, their_parts = parts_of_the_view(task, view), parts_of_the_ends_net(n)
     allowed = {held(n.net, theirs.marking(i), their_parts) for i in range(len(theirs))}
     for i in range(len(ours)):
         marking = ours.marking(i)
@@ -618,7 +626,7 @@ def view_is_within_the_ends_net(task: Task) -> bool:
         tokens = dict(zip(ours.net.places, marking, strict=True))
         for p in (p for p in task.places.values() if p.kind is Kind.ACTION):
             name = p.name
-            stopped = tokens.get(f"{name}.preempted", 0)
+            stopped = tokens.get(f"{name}.preempted", 0) + tokens.get(f"{name}.lost", 0)
             active = tokens[f"{name}.going"] + stopped - tokens[f"{name}.begin"]
             assert active <= p.most_active, ours.path(i)
     return True

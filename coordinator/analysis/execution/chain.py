@@ -27,24 +27,27 @@ from petrobot.coordinator.analysis.time.linear import SolveOrder, solve, station
 from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit
 from petrobot.coordinator.analysis.time.stochastic import Measured, NoEstimate, Numbers, is_cause
 from petrobot.coordinator.engine import (
+    CancelRun,
     Chosen,
     EventOccurred,
     Mode,
     Run,
     RunEnded,
     RunRaised,
+    RunRecorded,
     State,
     StopConfirmed,
     TimerFired,
     VariableChanged,
 )
 from petrobot.coordinator.engine.state import ACTIVE
-from petrobot.coordinator.task import Kind, Status
+from petrobot.coordinator.task import Counts, Kind, Status
 
 SIZE = 20_000
 """The most states of a chain; they take about a second."""
 STAGES = 8
 """The most phases of a duration; fewer where the chain would have more than SIZE states."""
+BAD = (Status.FAILURE, Status.ERROR)
 FIXED = 1e-9
 """Seconds for a timer of 0 s."""
 
@@ -64,12 +67,14 @@ class TooLarge(ValueError):  # noqa: N818 - a limit of the analysis
 class _Outcome:
     """One outcome of a stimulus: the next state, the number of the edge (-1 if it has none), for
     each clock of the next state the clock of the present state that continues as it (-1: a new
-    clock), and the probability of this outcome."""
+    clock), the probability of this outcome, and whether a run is recorded that did not end with
+    SUCCESS."""
 
     state: int
     edge: int
     kept: tuple[int, ...]
     share: float = 1.0
+    spoils: bool = False
 
 
 @dataclass(frozen=True)
@@ -97,10 +102,28 @@ class ExecutionChain:
     edge: NDArray[np.int32]
     """By edge of the chain: its edge of the execution graph; -1 for a phase."""
     probability: Values
+    spoils: Mask
+    """By edge of the chain: whether a run ends with FAILURE or ERROR."""
     sojourn: Values
     stages: int
     """The most phases of a duration."""
     assumptions: tuple[str, ...]
+
+    @cached_property
+    def figures(self) -> dict[str, float]:
+        """P_complete, R_goal (if the task names goals and a runs place), R_conj and the mean time
+        to completion (s; nan if it never completes), as `time.task_forecast` defines them."""
+        x, task = self.x, self.x.engine.compiled.task
+        h, y = self._reach(x.final)
+        found = {"P_complete": float(h[0])}
+        if task.goal_transitions and task.runs_place:
+            goals = [sum(f in task.goal_transitions for f in s.firings) for s in x.steps]
+            met = np.append(np.array([*goals, 0])[x.label], 0)[self.edge]  # edge -1: none
+            first = sum(f in task.goal_transitions for f in x.first)
+            runs = task.net.initial[task.net.place_index[task.runs_place]]
+            found |= {"R_goal": (first + float(self.taken @ met)) / runs} if runs else {}
+        found["R_conj"] = float(self._arrival(x.final, ~self.spoils)[3][0])
+        return found | {"mean time (s)": float(y[0] / h[0]) if h[0] else float("nan")}
 
     @property
     def taken(self) -> Values:
@@ -161,16 +184,22 @@ class ExecutionChain:
         chain: the first-step equations of `time.completion`."""
         if self._known and np.array_equal(self._known[0][0], goal):
             return self._known[0][1:]
+        inside, plan, value, h = self._arrival(goal, np.ones(len(self.edge), np.bool_))
+        y = solve(plan, value, np.where(inside, self.sojourn * h, 0.0))
+        self._known[:] = [(goal, h, y)]
+        return h, y
+
+    def _arrival(self, goal: Mask, allowed: Mask) -> tuple[Mask, SolveOrder, Values, Values]:
+        """Return the states from which the goal can be reached, the order and the matrix of their
+        equations, and the probability of reaching the goal by allowed edges only."""
         graph, there = self.graph, goal[self.at]
         inside = graph.backward(there) & ~there
-        plan, open_ = SolveOrder.of(graph, inside), inside[graph.source]
+        plan, open_ = SolveOrder.of(graph, inside), inside[graph.source] & allowed
         value = np.where(open_ & inside[graph.target], self.probability, 0.0)
         direct = np.where(open_ & there[graph.target], self.probability, 0.0)
         h = solve(plan, value, sum_by(graph.source, direct, graph.n))
-        y = solve(plan, value, np.where(inside, self.sojourn * h, 0.0))
         h[there] = 1.0
-        self._known[:] = [(goal, h, y)]
-        return h, y
+        return inside, plan, value, h
 
     @cached_property
     def _known(self) -> list[tuple[Mask, Values, Values]]:
@@ -228,12 +257,12 @@ class _Builder:
         self.draws: dict[tuple[str, str], Draw] = {}
         self.number: dict[tuple[int, tuple[Clock, ...]], int] = {}
         self.states: list[tuple[int, tuple[Clock, ...]]] = []
-        self.edges: list[tuple[int, int, int, float]] = []
+        self.edges: list[tuple[int, int, int, float, bool]] = []
         self.sojourn: list[float] = []
         self.index(0, ())
         if self.plan(0).slots:  # the chain begins in one state, without clocks, and draws them
             for p, clocks in self.drawn(0, (), ()):
-                self.edges.append((0, self.index(0, clocks), -1, p))
+                self.edges.append((0, self.index(0, clocks), -1, p, False))
             self.sojourn.append(0.0)
         i = len(self.sojourn)
         while i < len(self.states):
@@ -241,8 +270,8 @@ class _Builder:
                 keep_time("recovery")
             self.sojourn.append(self.leave(i))
             i += 1
-        source, target, edge, probability = (
-            zip(*self.edges, strict=True) if self.edges else ((),) * 4
+        source, target, edge, probability, spoils = (
+            zip(*self.edges, strict=True) if self.edges else ((),) * 5
         )
         return ExecutionChain(
             self.x,
@@ -250,6 +279,7 @@ class _Builder:
             np.array([state for state, _ in self.states], np.int32),
             np.array(edge, np.int32),
             np.array(probability, np.float64),
+            np.array(spoils, np.bool_),
             np.array(self.sojourn, np.float64),
             stages,
             tuple(dict.fromkeys(self.numbers.assumptions)),
@@ -278,11 +308,13 @@ class _Builder:
                 later = (*clocks[:k], (what, left - 1, rate), *clocks[k + 1 :])
                 phases.append((rate, self.index(state, later)))
             elif rate and (outcomes := plan.ends.get((k, what))):
-                ends.append((rate, outcomes))
+                # where no condition reads the status, a FAILURE takes the edge of a SUCCESS
+                bad = what in BAD
+                ends.append((rate, [replace(o, spoils=o.spoils or bad) for o in outcomes]))
         total = sum(rate for rate, _ in phases) + sum(rate for rate, _ in ends)
         if not total:
             return 0.0
-        self.edges += [(i, j, -1, rate / total) for rate, j in phases]
+        self.edges += [(i, j, -1, rate / total, False) for rate, j in phases]
         self.add(i, clocks, ends, total)
         return 1.0 / total
 
@@ -298,7 +330,7 @@ class _Builder:
             for one in outcomes:
                 for p, after in self.drawn(one.state, one.kept, clocks):
                     j = self.index(one.state, after)
-                    self.edges.append((i, j, one.edge, p * one.share * rate / total))
+                    self.edges.append((i, j, one.edge, p * one.share * rate / total, one.spoils))
 
     def drawn(
         self, state: int, kept: tuple[int, ...], clocks: tuple[Clock, ...]
@@ -425,7 +457,18 @@ class _Builder:
             elif isinstance(stimulus, EventOccurred):
                 self.event(state, stimulus.event, outcome, number, ends, events)
             elif isinstance(stimulus, RunRaised):
-                if outcome.edge >= 0:
+                run = state.run(stimulus.run)
+                assert run is not None
+                waiting = {
+                    t.name
+                    for t in x.engine.compiled.transitions
+                    for a in t.actions
+                    if a.name == run.place and stimulus.event in a.raised
+                }
+                drawn = {name for name in waiting if (run.place, name) in self.causes}
+                for name in drawn:
+                    ends[number["run", run.id], f"by.{name}"] = [outcome]
+                if waiting - drawn and outcome.edge >= 0:
                     events.append((self.rate(stimulus.event), outcome))
             elif isinstance(stimulus, VariableChanged):
                 raise NoEstimate(f"no rate at which the variable `{stimulus.name}` changes")
@@ -533,11 +576,19 @@ class _Builder:
     def outcome(self, i: int, cause: Cause, number: dict[tuple[str, str], int]) -> _Outcome:
         """Let the engine handle the stimulus, and find its edge and the clocks that continue."""
         before = self.x.states[i]
-        state, j, edge = self.x.follow(i, cause)
+        state, said, j, edge = self.x.follow(i, cause)
         kept = tuple(
             number.get((kind, name), -1)
             if kind == "run" or before.timers.get(name) == state.timers[name]
             else -1
             for kind, name in self.slots(state)
         )
-        return _Outcome(j, edge, kept)
+        # A cancelled run is recorded when it has stopped; by then the graph has dropped how it
+        # counts.
+        spoils = any(
+            r.status in BAD
+            if isinstance(r, RunRecorded) and not isinstance(cause.stimulus, StopConfirmed)
+            else isinstance(r, CancelRun) and r.counts in (Counts.FAILURE, Counts.ERROR)
+            for r in said
+        )
+        return _Outcome(j, edge, kept, spoils=spoils)

@@ -165,16 +165,16 @@ class ExecutionGraph:
             found.append(came[1])
         return [Begin(), *reversed(found)]
 
-    def follow(self, state: int, cause: Cause) -> tuple[State, int, int]:
+    def follow(self, state: int, cause: Cause) -> tuple[State, tuple[Instruction, ...], int, int]:
         """Let the engine handle a stimulus in an expanded state. Return the engine's next state
-        with its own ids, the number of that state in the graph, and the edge; -1 if nothing
-        changes."""
+        with its own ids, its instructions, the number of that state in the graph, and the edge; -1
+        if nothing changes."""
         before = self.states[state]
         after, said = self.engine.handle(before, cause.stimulus)
         orders = self.names.next_orders(before, self.orders[state], after)
         number = self.index[self.names.key(after, orders), _endless(said)]
         step = self._numbers.get(Step(cause.text, _fired(said)), -1)
-        return after, number, self._edges.get((state, number, step), -1)
+        return after, said, number, self._edges.get((state, number, step), -1)
 
     @cached_property
     def _numbers(self) -> dict[Step, int]:

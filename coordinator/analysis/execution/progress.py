@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.execution.causes import describe, explain, settled
-from petrobot.coordinator.analysis.execution.chain import TooLarge, chain_of
+from petrobot.coordinator.analysis.execution.chain import ExecutionChain, TooLarge, chain_of
 from petrobot.coordinator.analysis.execution.graph import (
     ExecutionGraph,
     Step,
@@ -579,8 +579,10 @@ class Progress:
         declared numbers."""
         if not self.recoveries:
             return Odds({}, 0)
+        chain = self.chain
+        if isinstance(chain, str):
+            return Odds({}, 0, (), chain)
         try:
-            chain = chain_of(self.x, self.measured)
             found = {}
             for r in self.recoveries:
                 edges, _ = self._first_errors(r.error_exit, r.cause)
@@ -588,8 +590,16 @@ class Progress:
                 if back is not None:
                     found[r.name] = (1.0 if r.almost_sure.holds else back[0], back[1])
             return Odds(found, chain.stages, chain.assumptions)
-        except (NoEstimate, TooLarge, OutOfTime, ArithmeticError, MemoryError) as why:
+        except (OutOfTime, ArithmeticError, MemoryError) as why:
             return Odds({}, 0, (), str(why) or "the memory was used up")
+
+    @cached_property
+    def chain(self) -> ExecutionChain | str:
+        """The complete execution graph as a Markov chain, or why there is none."""
+        try:
+            return chain_of(self.x, self.measured)
+        except (NoEstimate, TooLarge, OutOfTime, ArithmeticError, MemoryError) as why:
+            return str(why) or "the memory was used up"
 
     # --- words -----------------------------------------------------------------------------------
 

@@ -148,12 +148,14 @@ def simulate(
     horizon: float = np.inf,
     warmup: float = 0.0,
     goal: Stop | None = None,
+    lost: Stop | None = None,
     firings: int = 10_000_000,
     confidence: float = 0.95,
     progress: Callable[[int, float], None] | None = None,
     engine: Literal["numpy", "numba"] = "numpy",
 ) -> Simulation:
-    """Play replicas from the initial marking until `horizon` (s) or their goal.
+    """Play replicas from the initial marking until `horizon` (s), or until they rest in a marking
+    of `goal` or `lost`: these end, too, but without having reached the goal.
 
     All replicas together fire at most `firings` times. Throughput and mean tokens count from
     `warmup` (s) on. Without a horizon a goal is required; replicas that are dead before it count as
@@ -170,7 +172,7 @@ def simulate(
         return _compiled(
             gspn, random, replicas, horizon, warmup, goal, firings, confidence, progress
         )
-    play = _Play(gspn, random, replicas, horizon, warmup, goal)
+    play = _Play(gspn, random, replicas, horizon, warmup, goal, lost)
     try:
         while len(play.alive) and play.fired < firings:
             play.step()
@@ -270,8 +272,10 @@ class _Play:
         horizon: float,
         warmup: float,
         goal: Stop | None,
+        lost: Stop | None,
     ) -> None:
-        self.random, self.horizon, self.warmup, self.goal = random, horizon, warmup, goal
+        self.random, self.horizon, self.warmup = random, horizon, warmup
+        self.goal, self.lost = goal, lost
         self.state = _Replicas(gspn, count)
         self.count, self.alive = count, np.arange(count)
         self.now = np.zeros(count)
@@ -281,7 +285,6 @@ class _Play:
         self.area = np.zeros((len(gspn.net.places), count))
         self.observed = np.zeros(count)
         self.reached = np.full(count, np.nan)
-        self._arrive()
 
     def step(self) -> None:
         """Fire once in every replica that is still played.
@@ -290,6 +293,12 @@ class _Play:
         The transition is drawn by comparing one uniform number with the cumulative amounts.
         """
         amount, tangible = self.state.amounts()
+        open_ = ~self._arrived(tangible)
+        if not open_.all():
+            self._keep(open_)
+            amount, tangible = amount[:, open_], tangible[open_]
+        if not len(self.alive):
+            return
         total = np.add.accumulate(amount, axis=0)
         whole = total[-1]
         stay = np.zeros(len(self.alive))
@@ -309,7 +318,6 @@ class _Play:
         self.fires[chosen[counted], self.alive[counted]] += 1
         self.fired += len(chosen)
         self.steps += 1
-        self._arrive()
 
     def _observe(self, until: Values) -> None:
         span = np.maximum(0.0, until - np.maximum(self.now[self.alive], self.warmup))
@@ -318,12 +326,15 @@ class _Play:
             self.area[:, self.alive] += self.state.tokens * span
             self.observed[self.alive] += span
 
-    def _arrive(self) -> None:
-        if self.goal is not None and len(self.alive):
-            there = self.goal(self.state.tokens)
-            if there.any():
-                self.reached[self.alive[there]] = self.now[self.alive[there]]
-                self._keep(~there)
+    def _arrived(self, tangible: Mask) -> Mask:
+        """Return which replicas have ended, and note when they reached the goal."""
+        ended = np.zeros(len(self.alive), dtype=np.bool_)
+        if self.goal is not None:
+            ended |= tangible & self.goal(self.state.tokens)
+            self.reached[self.alive[ended]] = self.now[self.alive[ended]]
+        if self.lost is not None:
+            ended |= tangible & self.lost(self.state.tokens)
+        return ended
 
     def _keep(self, which: Mask) -> None:
         self.alive = self.alive[which]

@@ -19,11 +19,12 @@ chosen its action waits until it is free. Devices that never have to be waited f
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations, combinations_with_replacement, product
 
+from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.structure import (
     exclusive_places,
     place_bounds,
@@ -32,24 +33,35 @@ from petrobot.coordinator.analysis.net.structure import (
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit, gamma_quantile
 from petrobot.coordinator.task import (
+    Counts,
+    EarlyEvent,
     End,
     Estimate,
+    Event,
     Kind,
     Place,
+    Scope,
     Start,
     Status,
     Task,
     Transition,
 )
-from petrobot.coordinator.task.compiled_task import ActionArc, compile_transitions
+from petrobot.coordinator.task.compiled_task import (
+    ActionArc,
+    CompiledTransition,
+    compile_transitions,
+)
 from petrobot.coordinator.task.conditions.regions import can_hold
 from petrobot.coordinator.task.net import Marking, Net
-from petrobot.coordinator.task.validation import condition_domains
+from petrobot.coordinator.task.validation import condition_domains, is_pulse
 
-FLUSH, CHOICE = 3_000_000, 2_000_000
-"""Priorities of flushing and choosing, far above those of the task's transitions, which are TASK
-plus their own priority: choices are made before the task fires again."""
-TASK = 1_000_000
+FLUSH, TASK, CHOICE = 3_000_000, 1_000_000, 500_000
+"""Priorities of flushing, of the task's transitions (TASK and twice their own) and of choosing. As
+in the engine, runs begin when no transition can fire any more; one whose token is taken before that
+never began."""
+SERVE, CALL = 1_500_000, 4_000_000
+"""Priorities of the transitions that a pulse serves together, and of finding out which these are:
+all are found in the marking in which the pulse comes."""
 STAGES = 8
 """Default limit of the phases of one duration. Phases of parallel runs multiply the number of
 markings, so it is small."""
@@ -115,6 +127,60 @@ def contended(task: Task, devices: Mapping[str, str]) -> frozenset[str]:
         for device, places in users.items()
         if any(pair not in never for pair in combinations(sorted(places), 2))
     )
+
+
+KEPT, LOST = "preempted", "lost"
+"""Places `p.preempted` and `p.lost`: a run of p was preempted and counts as nothing or as SUCCESS,
+or as FAILURE or ERROR."""
+
+
+def _cut(counts: Counts | None) -> str:
+    return LOST if counts in (Counts.FAILURE, Counts.ERROR) else KEPT
+
+
+Needs = tuple[dict[int, int], dict[int, int]]
+"""By place: the tokens that it must have at least, and the number that it must have less than."""
+
+
+def _both(case: Needs, other: Needs) -> Needs | None:
+    """Return what satisfies both; None if nothing does."""
+    least, below = dict(case[0]), dict(case[1])
+    for p, n in other[0].items():
+        least[p] = max(n, least.get(p, 0))
+    for p, n in other[1].items():
+        below[p] = min(n, below.get(p, n))
+    return None if any(least.get(p, 0) >= n for p, n in below.items()) else (least, below)
+
+
+def _disabled(x: CompiledTransition) -> Iterator[Needs]:
+    """Yield when a transition is not enabled, by the first thing that it lacks."""
+    case: Needs = ({}, {})
+    conditions = [(0, p, w) for p, w in x.needs] + [(1, p, n) for p, n in x.bars]
+    for kind, p, n in conditions:
+        holds: Needs = ({p: n}, {}) if kind == 0 else ({}, {p: n})
+        lacks: Needs = ({}, {p: n}) if kind == 0 else ({p: n}, {})
+        if (found := _both(case, lacks)) is not None:
+            yield found
+        if (after := _both(case, holds)) is None:
+            return
+        case = after
+
+
+def _none_enabled(waiting: Sequence[CompiledTransition]) -> Iterator[Needs]:
+    """Yield cases, of which no two hold together, in which none of the transitions is enabled."""
+    cases: list[Needs] = [({}, {})]
+    for x in waiting:
+        found = (_both(case, lacks) for case in cases for lacks in _disabled(x))
+        cases = [case for case in found if case is not None]
+    yield from cases
+
+
+def _some_enabled(waiting: Sequence[CompiledTransition]) -> Iterator[Needs]:
+    """Yield cases, of which no two hold together, in which some of the transitions is enabled."""
+    for i, x in enumerate(waiting):
+        for case in _none_enabled(waiting[:i]):
+            if (found := _both(case, (dict(x.needs), dict(x.bars)))) is not None:
+                yield found
 
 
 class NoEstimate(ValueError):  # noqa: N818 - names what is missing
@@ -194,10 +260,39 @@ class StochasticView:
     sources: Mapping[str, str] = field(default_factory=dict)
     """By transition of the GSPN: where its rate or weight comes from, in words. Transitions whose
     weight is 1 because the net gives them no choice are not in it."""
+    spoils: frozenset[str] = frozenset()
+    """Transitions of the GSPN by which a run ends that counts as FAILURE or ERROR."""
+    doubts: tuple[str, ...] = ()
+    """Numbers that do not measure what the view takes them for."""
 
     def projected(self, marking: Marking) -> Marking:
         """Return the marking of the ordinary net that a marking of the GSPN projects to."""
         return marking[: len(self.task.net.places)]
+
+    def ended(self, marking: Marking) -> Status | None:
+        """Return how the mission run ends if it rests in a marking of the GSPN, by the rule of the
+        engine (docs/semantics.md, section 10): SUCCESS by `final`, ERROR by `final_error`. None
+        while a run is active that does not only listen, or if neither holds."""
+        if any(marking[p] for p in self._busy):
+            return None
+        own = self.projected(marking)
+        if own not in self._known:
+            ends = OrdinaryView(self.task)
+            given_up = Status.ERROR if ends.is_final_error(own) else None
+            self._known[own] = Status.SUCCESS if ends.is_final(own) else given_up
+        return self._known[own]
+
+    @cached_property
+    def _known(self) -> dict[Marking, Status | None]:
+        return {}
+
+    @cached_property
+    def _busy(self) -> tuple[int, ...]:
+        """Places of the GSPN that hold the active and queued runs which a mission run waits for."""
+        index, places = self.gspn.net.place_index, self.task.places.values()
+        return tuple(
+            index[f"{p.name}.going"] for p in places if p.kind is Kind.ACTION and not p.listen
+        )
 
     @cached_property
     def numbers(self) -> dict[str, tuple[str, ...]]:
@@ -262,6 +357,7 @@ class _Derivation:
         self.weights: dict[str, float] = {}
         self.servers: dict[str, int | None] = {}
         self.origin: dict[str, str] = {}
+        self.spoils: set[str] = set()
         self.statuses: dict[str, tuple[str, str, Status]] = {}
         self.numbers = Numbers(task, measured)
         self.assumptions = self.numbers.assumptions
@@ -269,9 +365,21 @@ class _Derivation:
         self.possible: dict[str, set[Status]] = {}
         self.sources: dict[str, str] = {}
         self.phases: dict[str, list[str]] = {}
+        self.waiting: set[str] = set()
+        """Places in which a run waits for its device."""
+        self.raised: dict[str, tuple[str, ...]] = {}
+        """By action place: internal events of its runs that some arc waits for."""
+        self.doubts: list[str] = []
         self.by: dict[tuple[str, str], str] = {}
         self.compiled = compile_transitions(task)
         self.domains = condition_domains(task)
+        self.flags: set[str] = set()
+        """Latched events with a place of their own, `event e`."""
+        self.served: dict[str, int] = {}
+        """Their priorities."""
+        self.called: dict[str, str] = {}
+        """By transition that waits for a pulse together with others: the place that says that the
+        pulse serves it."""
         self.queues = frozenset(
             p.name
             for p, bound in zip(task.places.values(), place_bounds(net), strict=True)
@@ -287,6 +395,9 @@ class _Derivation:
         for place in task.places.values():
             if place.kind is Kind.ACTION:
                 self._action_place(place)
+        for event in task.events.values():
+            if event.scope is Scope.EXTERNAL:
+                self._event(event)
         for transition in task.transitions.values():
             self._transition(transition)
 
@@ -307,7 +418,15 @@ class _Derivation:
         gspn = Gspn.of(net, self.rates, weights=self.weights, servers=self.servers)
         assumed = tuple(dict.fromkeys(self.assumptions))
         return StochasticView(
-            self.task, gspn, self.origin, self.statuses, assumed, self.errors, self.sources
+            self.task,
+            gspn,
+            self.origin,
+            self.statuses,
+            assumed,
+            self.errors,
+            self.sources,
+            frozenset(self.spoils),
+            tuple(self.doubts),
         )
 
     # Transitions of the GSPN.
@@ -341,9 +460,7 @@ class _Derivation:
 
     def _action_place(self, place: Place) -> None:
         name = place.name
-        for suffix in ("begin", "going", *Status):
-            self.places[f"{name}.{suffix}"] = 0
-        self.places[f"{name}.begin"] = self.places[f"{name}.going"] = place.tokens
+        self.places |= {f"{name}.begin": place.tokens, f"{name}.going": place.tokens}
         if name in self.queues:
             self.places[f"{name}.server"] = place.most_active
         self.possible[name], self.phases[name] = set(), []
@@ -353,6 +470,7 @@ class _Derivation:
             (name, action) in self.measured.preempted for action in alternatives
         ):
             self._causes(place, alternatives)
+        self._awaited(place)
         for action, chosen in alternatives.items():
             self._choice(place, action, chosen)
             known = {s: e for s, e in self.numbers.estimates(place, action).items() if e.share > 0}
@@ -365,19 +483,63 @@ class _Derivation:
                     self._takes(begun, place, device, [begun])
             elif device:  # it may wait there
                 self.phases[name].append(begun)
-        preempted = any(
-            a.place == name and a.end is End.PREEMPT
+                self.waiting.add(begun)
+        preempted = {
+            _cut(a.counts)
             for t in self.task.transitions.values()
             for a in t.inputs
-        )
+            if a.place == name and a.end is End.PREEMPT
+        }
         if preempted and place.most_active > 1:
             raise ValueError(
                 f"places.{name}: it has {place.servers} servers and a preempting transition, but a "
                 "GSPN does not know which of its runs is the oldest; give the place one server for "
                 "the forecast, or measure with mission runs"
             )
-        if preempted:
-            self._flush(name)
+        for how in sorted(preempted):
+            self._flush(name, how)
+        self._raises(name)
+
+    def _awaited(self, place: Place) -> None:
+        """Find the internal events that arcs wait for. They are latched to the run: `p.raised e`
+        while it is active, then its place says with which it ended."""
+        name = place.name
+        arcs = [(x.name, a) for x in self.compiled for a in x.actions if a.name == name]
+        events = {e for t, a in arcs if (name, t) not in self.by for e in a.raised}
+        self.raised[name] = tuple(sorted(events))
+        if events and place.most_active > 1:
+            raise ValueError(
+                f"places.{name}: it has {place.servers} servers and internal events, but a GSPN "
+                "does not know which of its runs raised one; give the place one server for the "
+                "forecast, or measure with mission runs"
+            )
+        for status in Status:
+            self.places |= {self._ended(name, status, raised): 0 for raised in self._sets(name)}
+        self.places |= {f"{name}.raised {e}": 0 for e in self.raised[name]}
+
+    def _sets(self, name: str) -> list[tuple[str, ...]]:
+        """Return the sets of internal events that a run of the place may have raised."""
+        events = self.raised[name]
+        return [s for n in range(len(events) + 1) for s in combinations(events, n)]
+
+    def _ended(self, name: str, status: Status, raised: Iterable[str]) -> str:
+        """Return the place of runs that have ended with a status after they raised some events."""
+        return " ".join([f"{name}.{status}", *raised])
+
+    def _raises(self, name: str) -> None:
+        """Let an active run raise each event once, after an exponential wait; what a preempted run
+        has raised is forgotten."""
+        active = [p for p in self.phases[name] if p not in self.waiting]
+        for event in self.raised[name]:
+            flag, mean = f"{name}.raised {event}", self.numbers.wait(event)
+            source = self._wait_source(event)
+            for phase in active:
+                label = f"{name}.raises {event} in {phase}"
+                self._timed(label, {phase: 1}, {phase: 1, flag: 1}, 1.0 / mean, source)
+                self.inhibit[label] = {flag: 1}
+            forget = f"{name}.forgets {event}"
+            self._immediate(forget, {flag: 1}, {}, 1.0, FLUSH - 1)
+            self.inhibit[forget] = dict.fromkeys(active, 1)
 
     def _device(self, action: str) -> str:
         """Return the place of the device that a run may have to wait for; empty if it need not."""
@@ -518,8 +680,15 @@ class _Derivation:
                 self._timed(f"{stem}{i}", {f"{stem}{i}": 1}, {f"{stem}{i + 1}": 1}, rate, source)
             need = {f"{stem}{longest}": 1, f"{place.name}.going": 1}
             need |= {device: 1} if device else {}
-            give = {f"{place.name}.{status}": 1, **self._server(place.name)}
-            self._timed(f"{stem}{longest}", need, give, rate, source)
+            for raised in self._sets(place.name):
+                label = " ".join([f"{stem}{longest}", *raised])
+                flags = {e: f"{place.name}.raised {e}" for e in self.raised[place.name]}
+                give = {self._ended(place.name, status, raised): 1, **self._server(place.name)}
+                self._timed(label, need | {flags[e]: 1 for e in raised}, give, rate, source)
+                if status is not Status.SUCCESS:
+                    self.spoils.add(label)
+                if others := {flags[e]: 1 for e in flags if e not in raised}:
+                    self.inhibit[label] = others
             entries += [(f"{stem}{longest - b.stages + 1}", b.probability) for b in branches]
         return entries
 
@@ -527,23 +696,105 @@ class _Derivation:
         """Return what a run of a place takes to begin and gives back when it ends."""
         return {f"{name}.server": 1} if name in self.queues else {}
 
-    def _flush(self, name: str) -> None:
+    def _flush(self, name: str, how: str) -> None:
         """Remove what is left of a preempted run at once, and release its server and device. The
-        active run began first, so it goes before those that wait for a server."""
-        preempted = f"{name}.preempted"
-        self.places[preempted] = 0
+        active run began first, so it goes before those that have not begun."""
+        taken = f"{name}.{how}"
+        self.places[taken] = 0
         for p in self.phases[name]:
-            need = {p: 1, preempted: 1} | ({self.held[p]: 1} if p in self.held else {})
-            self._immediate(f"flush {p}", need, self._server(name), 1.0, FLUSH)
-        if name in self.queues:
-            begin = f"{name}.begin"
-            self._immediate(f"flush {begin}", {begin: 1, preempted: 1}, {}, 1.0, FLUSH - 1)
+            need = {p: 1, taken: 1} | ({self.held[p]: 1} if p in self.held else {})
+            label = f"flush {p}" if how == KEPT else f"flush lost {p}"
+            self._immediate(label, need, self._server(name), 1.0, FLUSH)
+            if how == LOST and p not in self.waiting:
+                self.spoils.add(label)
+        begin, label = f"{name}.begin", f"flush {name}.{how} begin"
+        self._immediate(label, {begin: 1, taken: 1}, {}, 1.0, FLUSH - 1)
+
+    # External events.
+
+    def _event(self, event: Event) -> None:
+        """Give an event a place of its own where a wait of its transition after its arcs are
+        satisfied would be wrong: where one occurrence concerns several transitions, or where a
+        latched event may come before."""
+        waiting = [
+            x
+            for x in self.compiled
+            if event.name in (x.pulse, *x.flags)
+            and not x.never
+            and not any((a.name, x.name) in self.by for a in x.actions)
+        ]
+        kept = event.early is EarlyEvent.KEEP
+        before = not is_pulse(event) and any(
+            kept
+            or len(x.flags) + bool(x.pulse) > 1
+            or any(a.takes_done or a.end in (End.NORMAL, End.ERROR) for a in x.actions)
+            for x in waiting
+        )
+        if not waiting or not (before or self._together(waiting)):
+            return
+        flag, rate = f"event {event.name}", 1.0 / self.numbers.wait(event.name)
+        self.places[flag] = 0
+        source = self._wait_source(event.name)
+        cases: list[Needs] = [({}, {})] if kept else list(_some_enabled(waiting))
+        for i, case in enumerate(cases):
+            name = f"{flag} comes" if len(cases) == 1 else f"{flag} comes {i + 1}"
+            need, self.inhibit[name] = self._named(case)
+            self.inhibit[name][flag] = 1
+            self._timed(name, need, {**need, flag: 1}, rate, source, 1)
+        if is_pulse(event):
+            self._pulse(flag, waiting)
+            return
+        self.flags.add(event.name)
+        for i, case in enumerate([] if kept else list(_none_enabled(waiting))):
+            need, inhibit = self._named(case)
+            self._immediate(f"{flag} dropped {i + 1}", {**need, flag: 1}, need, 1.0, FLUSH - 2)
+            self.inhibit[f"{flag} dropped {i + 1}"] = inhibit
+
+    def _pulse(self, flag: str, waiting: Sequence[CompiledTransition]) -> None:
+        """Let a pulse serve each transition that is fireable when it comes, once."""
+        # Weights draw among equals, else the first in the file wins; arrival decides no pulse.
+        drawn = all(x.weight is not None for x in waiting)
+        ranks = sorted({(x.rank, 0 if drawn else x.index) for x in waiting}, reverse=True)
+        for x in waiting:
+            self.served[x.name] = SERVE + 1 + ranks.index((x.rank, 0 if drawn else x.index))
+            called = self.called[x.name] = f"{x.name}.called"
+            self.places[called] = 0
+            for i, (need, _) in enumerate(self._cases(self.task.transitions[x.name])):
+                name, test = f"{called} {i + 1}", {**need, flag: 1}
+                self._immediate(name, test, {**test, called: 1}, 1.0, CALL)
+                self.inhibit[name] = {**self._named(({}, dict(x.bars)))[1], called: 1}
+            self._immediate(f"{called} no more", {called: 1}, {}, 1.0, SERVE)
+        self._immediate(f"{flag} over", {flag: 1}, {}, 1.0, CALL - 1)
+
+    def _together(self, waiting: Sequence[CompiledTransition]) -> bool:
+        """Return whether several of the transitions may be enabled together."""
+        return any(
+            not any(tuple(sorted((p, q))) in self.never for p, _ in x.needs for q, _ in y.needs)
+            for x, y in combinations(waiting, 2)
+        )
+
+    @cached_property
+    def never(self) -> set[tuple[int, int]]:
+        """Pairs of places that are never marked together."""
+        return exclusive_places(self.task.net, place_semiflows(self.task.net))
+
+    def _named(self, case: Needs) -> tuple[Weights, Weights]:
+        """Return the least tokens, and the inhibitors, by the names of their places."""
+        places = self.task.net.places
+        least, below = ({places[p]: n for p, n in part.items() if n} for part in case)
+        return least, below
 
     # Transitions of the task.
 
     def _transition(self, t: Transition) -> None:
         if self.compiled[self.task.net.transition_index[t.name]].never:
             return
+        measured = [e for e in t.events if e in self.measured.waits]
+        if measured and any(a.end in (End.NORMAL, End.ERROR) for a in t.inputs):
+            self.doubts.append(
+                f"{', '.join(measured)}: the measured wait is that of {t.name} since its tokens "
+                "came, and so contains its run; it is taken for the wait for the event"
+            )
         cases = list(self._cases(t))
         for i, (need, give) in enumerate(cases):
             name = t.name if len(cases) == 1 else f"{t.name} {i + 1}"
@@ -582,26 +833,34 @@ class _Derivation:
         """Return how an arc may take its runs: (place, common status if any, taken, given back)."""
         p, w, going = arc.name, arc.weight, f"{arc.name}.going"
         if arc.end is End.GOING:
-            return [(p, None, {going: w}, {going: w})]
+            flags = {f"{p}.raised {e}": w for e in arc.raised}
+            return [(p, None, {going: w, **flags}, {going: w})]
         if (p, t.name) in self.by:
             if arc.takes_done:
                 self.assumptions.append(
                     f"{t.name}: that it also takes a run of {p} which has ended was not measured; "
                     "it is left out"
                 )
+            if _cut(arc.counts) == LOST:
+                self.spoils.add(t.name)
             return [(p, None, {going: w, self.by[p, t.name]: w}, self._server(p))]
-        ended = [
-            s
+        kinds: list[tuple[Status | None, str]] = [
+            (s, self._ended(p, s, raised))
             for s in Status
             if s in self.possible[p]
             and (arc.takes_done or arc.end is (End.ERROR if s is Status.ERROR else End.NORMAL))
+            for raised in self._sets(p)
+            if set(arc.raised) <= set(raised)
         ]
-        kinds: list[Status | None] = [*ended, *([None] if arc.end is End.PREEMPT else [])]
+        kinds += [(None, going)] if arc.end is End.PREEMPT else []
         out: list[tuple[str, Status | None, Weights, Weights]] = []
         for chosen in combinations_with_replacement(kinds, w):
-            taken = Counter(going if s is None else f"{p}.{s}" for s in chosen)
-            given = {f"{p}.preempted": taken[going]} if taken[going] else {}
-            out.append((p, chosen[0] if len(set(chosen)) == 1 else None, dict(taken), given))
+            taken = Counter(label for _, label in chosen)
+            given = {f"{p}.{_cut(arc.counts)}": taken[going]} if taken[going] else {}
+            flags = {f"{p}.raised {e}": taken[going] for e in arc.raised if taken[going]}
+            statuses = {status for status, _ in chosen}
+            one = chosen[0][0] if len(statuses) == 1 else None
+            out.append((p, one, taken | flags, given))
         return out
 
     def _may_hold(self, t: Transition, status: Mapping[str, Status]) -> bool:
@@ -616,24 +875,36 @@ class _Derivation:
         )
         return can_hold(t.when, values, t.when.names - set(values), self.domains)
 
+    def _awaited_event(self, t: Transition) -> str:
+        """Return the external event for which a transition waits once its arcs are satisfied;
+        empty if there is none. (Of several events all but a pulse have places of their own.)"""
+        events = (self.task.events[e] for e in t.events if e not in self.flags)
+        return next((e.name for e in events if e.scope is Scope.EXTERNAL), "")
+
     def _fires(self, t: Transition, name: str, need: Weights, give: Weights) -> None:
         """Add a case: it fires at once, after an exponential wait for its events, or after a
         timer."""
         share = self._switch(t)
+        # Among equals a run's end comes before a preemption, unless weights are declared.
+        preempts = t.weight is None and any(a.end is End.PREEMPT for a in t.inputs)
+        priority = TASK + 2 * t.priority - preempts
+        if not any((a.place, t.name) in self.by for a in t.inputs):
+            need = need | {f"event {e}": 1 for e in t.events if e in self.flags}
         if any((a.place, t.name) in self.by for a in t.inputs):
-            self._immediate(name, need, give, 1.0, TASK + t.priority)
+            self._immediate(name, need, give, 1.0, priority)
         elif t.after is not None:
             self._timer(t, name, need, give)
-        elif t.events:
-            measured = all(event in self.measured.waits for event in t.events)
-            source = "measured mean wait" if measured else "mean wait declared in the task file"
-            self._timed(name, need, give, share / self._wait(t), source, 1)
+        elif t.name in self.called:
+            self._immediate(name, need | {self.called[t.name]: 1}, give, share, self.served[t.name])
+        elif event := self._awaited_event(t):
+            rate = share / self.numbers.wait(event)
+            self._timed(name, need, give, rate, self._wait_source(event), 1)
         else:
             weight = share * (t.weight if t.weight is not None else 1.0)
             source = "weight declared in the task file" if t.weight is not None else ""
             if t.name in self.measured.switches:
                 source = "measured frequency of its condition"
-            self._immediate(name, need, give, weight, TASK + t.priority, source)
+            self._immediate(name, need, give, weight, priority, source)
 
     def _switch(self, t: Transition) -> float:
         """Return how often a condition on variables is true, relative to its competitors."""
@@ -644,24 +915,16 @@ class _Derivation:
             self.assumptions.append(
                 f"{t.name}: its condition is assumed to be true as often as those it competes with"
             )
-        return 1.0 if known is None else known
+        if known is None or not t.events:
+            return 1.0 if known is None else known
+        # The rate of an event is multiplied by it, so it must be 1 on average.
+        rivals = [u.name for u in self.task.transitions.values() if set(u.events) & set(t.events)]
+        shares = [self.measured.switches[u] for u in rivals if u in self.measured.switches]
+        return known * len(shares) / sum(shares)
 
-    def _wait(self, t: Transition) -> float:
-        """Return the mean time (s) until all events of a transition have occurred.
-
-        The mean of the maximum of independent exponentials, by inclusion and exclusion over all
-        non-empty subsets: E[max] = sum of (-1)^(size + 1) / (sum of the rates in the subset).
-        """
-        means = [self.numbers.wait(event) for event in t.events]
-        if len(means) > 1:
-            self.assumptions.append(
-                f"{t.name}: the wait for all its events is approximated by one exponential"
-            )
-        whole = 0.0
-        for chosen in range(1, 1 << len(means)):
-            rate = sum(1 / m for i, m in enumerate(means) if chosen >> i & 1)
-            whole += (-1) ** (chosen.bit_count() + 1) / rate
-        return whole
+    def _wait_source(self, event: str) -> str:
+        measured = event in self.measured.waits
+        return "measured mean wait" if measured else "mean wait declared in the task file"
 
     def _timer(self, t: Transition, name: str, need: Weights, give: Weights) -> None:
         """Add a fixed delay as Erlang phases, counted by tokens in a place of its own.

@@ -4,6 +4,9 @@
 - R_goal: expected number of met goals per run token.
 - R_conj: probability that the task completes and every run ends with SUCCESS.
 
+P_complete, R_conj and times are those of a whole mission run, with all its run tokens; campaigns
+count trials, which have one run token each: `Forecast.one_trial`.
+
 Long-run numbers assume that mission runs follow each other without a pause. By the renewal reward
 theorem they are the expected firings (or tokens times time) of one mission run, divided by its mean
 length.
@@ -12,8 +15,8 @@ length.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -37,7 +40,7 @@ from petrobot.coordinator.analysis.time.sensitivity import (
     time_slopes,
 )
 from petrobot.coordinator.analysis.time.stochastic import StochasticView
-from petrobot.coordinator.task import Counts, End, Status
+from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.net import Marking
 
 MATTERS = 0.01
@@ -71,6 +74,32 @@ class Forecast:
     transient: Mask
     flow: Values
     """Expected number of times that a mission run takes each edge."""
+
+    @property
+    def trials(self) -> int:
+        """Run tokens of a mission run; 1 for a task without a runs place."""
+        net, place = self.chain.gspn.net, self.view.task.runs_place
+        return net.initial[net.place_index[place]] if place else 1
+
+    @cached_property
+    def one_trial(self) -> Forecast:
+        """The forecast of a mission run with one run token: what a campaign measures, whose figures
+        are per trial. Its long-run numbers do not hold for missions of several trials."""
+        if self.trials == 1 or not self.view.task.runs_place:
+            return self
+        alone = self.view.gspn.marked({self.view.task.runs_place: 1})
+        return forecast(replace(self.view, gspn=alone))
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """P_complete, R_goal (if it is defined), R_conj and the mean time to completion (s)."""
+        goal = self.goal_reliability
+        return {
+            "P_complete": self.completion_probability,
+            **({} if goal is None else {"R_goal": goal}),
+            "R_conj": self.conjunctive_reliability,
+            "mean time (s)": self.done.mean,
+        }
 
     @property
     def completion_probability(self) -> float:
@@ -180,36 +209,14 @@ class Forecast:
     @cached_property
     def conjunctive_reliability(self) -> float:
         """R_conj: probability of completing while every run ends with SUCCESS."""
-        spoilt = np.isin(self.chain.label, self._spoiling)
+        index = self.chain.gspn.net.transition_index
+        spoilt = np.isin(self.chain.label, [index[name] for name in self.view.spoils])
         open_ = self.transient[self.chain.source] & ~spoilt
         value = np.where(open_ & self.transient[self.chain.target], self.chain.probability, 0.0)
         direct = open_ & self.done.goal[self.chain.target]
         arrive = sum_by(self.chain.source[direct], self.chain.probability[direct], self.chain.n)
-        return float(solve(SolveOrder.of(self.chain.graph, self.transient), value, arrive)[0])
-
-    @property
-    def _spoiling(self) -> list[int]:
-        """Transitions of the GSPN by which a run ends without SUCCESS.
-
-        A preempted run counts only if its arc declares that it counts as a failure or an error.
-        """
-        net, flat = self.chain.gspn.net, self.view.task.flat
-        index = net.transition_index
-        bad = {Counts.FAILURE, Counts.ERROR}
-        lost = {
-            t.name
-            for t in flat.transitions.values()
-            if any(a.counts in bad for a in t.inputs if a.end is End.PREEMPT)
-        }
-        ends = {
-            net.place_index[f"{place}.{status}"]
-            for place, _, status in self.view.statuses.values()
-            if status is not Status.SUCCESS
-        }
-        spoilt = [
-            t for t in range(len(net.transitions)) if any(p in ends for p, _ in net.produce[t])
-        ]
-        return spoilt + [index[case] for case, name in self.view.origin.items() if name in lost]
+        clean = solve(SolveOrder.of(self.chain.graph, self.transient), value, arrive)
+        return 1.0 if self.done.goal[0] else float(clean[0])
 
     @cached_property
     def worth(self) -> tuple[Worth, ...]:
@@ -318,6 +325,8 @@ class Forecast:
             "mean": self.done.mean,
             "standard_deviation": self.done.variance**0.5,
             "quantiles": {f"{q:g}": shape.quantile(q) for q in quantiles} if shape else {},
+            "trials": self.trials,
+            "one_trial": self.one_trial.figures,
             "mission_time": self.mission_time,
             "recovery_time": self.recovery_time,
             "firings": self.firings,
@@ -339,18 +348,26 @@ def forecast(view: StochasticView, *, limits: SearchLimits | None = None) -> For
     Raises ValueError if its space is not complete within the limits (then simulate).
     """
     chain = Chain.of(view.gspn, limits=limits)
-    ordinary = OrdinaryView(view.task)
-    known: dict[Marking, bool] = {}
-
-    def final(marking: Marking) -> bool:
-        own = view.projected(marking)
-        if own not in known:
-            known[own] = ordinary.is_final(own)
-        return known[own]
-
-    goal = chain.space.where(final) & ~chain.vanishing
+    goal, given_up = (
+        chain.space.where(partial(_ends, view, status)) & ~chain.vanishing
+        for status in (Status.SUCCESS, Status.ERROR)
+    )
+    kept = ~(goal | given_up)[chain.source]  # a mission run that has ended stays where it is
+    chain = Chain(
+        chain.gspn,
+        chain.space,
+        chain.source[kept],
+        chain.target[kept],
+        chain.label[kept],
+        chain.amount[kept],
+        chain.vanishing,
+    )
     transient = ~chain.graph.bottom[chain.graph.components] & ~goal
     visits = np.where(transient, visits_before(chain, transient), 0.0)
     return Forecast(
         view, chain, completion(chain, goal), transient, visits[chain.source] * chain.probability
     )
+
+
+def _ends(view: StochasticView, status: Status, marking: Marking) -> bool:
+    return view.ended(marking) is status

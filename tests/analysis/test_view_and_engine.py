@@ -1,0 +1,388 @@
+"""The stochastic view against the engine: random tasks with listening branches, internal events,
+latched events and ends of both kinds have the same figures in the view, on the execution graph as a
+Markov chain, and in missions that the engine plays by a clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import sqrt
+
+import numpy as np
+import pytest
+from hypothesis import assume, event, example, given, settings
+from hypothesis import strategies as st
+
+from petrobot.coordinator.analysis.execution.chain import TooLarge, chain_of
+from petrobot.coordinator.analysis.execution.graph import execute
+from petrobot.coordinator.analysis.may_run import BUDGET, may_run
+from petrobot.coordinator.analysis.net.space import SearchLimits
+from petrobot.coordinator.analysis.report import analyse
+from petrobot.coordinator.analysis.time.simulate import goal_by_marking, simulate
+from petrobot.coordinator.analysis.time.stochastic import Measured, stochastic_view
+from petrobot.coordinator.analysis.time.task_forecast import forecast
+from petrobot.coordinator.engine import (
+    ArmTimer,
+    Begin,
+    CancelRun,
+    Choose,
+    Chosen,
+    Engine,
+    EventOccurred,
+    Finished,
+    Instruction,
+    Mode,
+    RunEnded,
+    RunRaised,
+    RunRecorded,
+    StartRun,
+    StopConfirmed,
+    TimerFired,
+)
+from petrobot.coordinator.engine.stimuli import Stimulus
+from petrobot.coordinator.task import Scope, Status, Task
+from petrobot.coordinator.task.file import loads
+from tests.analysis.test_execution_graph import COMMON
+from tests.analysis.test_views import timed
+from tests.engine.test_properties import tasks as any_tasks
+
+STEPS = 6_000
+"""Stimuli and firings for one graph; random tasks that need more are left out."""
+SECONDS = {"work": (2.0, 1.0, 1.5), "wave": (1.0, 1.2, 0.5)}
+"""By primitive task: mean duration of a run that ends in success, failure, error."""
+SHARES = {"work": (0.7, 0.1, 0.2), "wave": (0.6, 0.1, 0.3)}
+
+
+def head(name: str) -> str:
+    estimates = (
+        f"{s} = {{ share = {share}, mean = {mean} }}\n"
+        for s, share, mean in zip(Status, SHARES[name], SECONDS[name], strict=True)
+    )
+    return (
+        f'[primitive_tasks.{name}]\ngoal = "g"\nalternatives = ["{name}_a"]\ndeadline = 99.0\n'
+        f"[primitive_tasks.{name}.estimates]\n{''.join(estimates)}"
+    )
+
+
+def arcs(name: str, take: str, give: str, more: str = "") -> str:
+    """A transition; `take` and `give` are places with a comma between them."""
+    quoted = (", ".join(f'"{p}"' for p in part.split(",") if p) for part in (take, give))
+    return "{} = {{ in = [{}], out = [{}]{} }}\n".format(name, *quoted, more)
+
+
+@dataclass
+class Text:
+    """A task file in the making."""
+
+    parts: int = 1
+    button: str = ""
+    places: list[str] = field(default_factory=list)
+    moves: list[str] = field(default_factory=list)
+    rest: str = ""
+    final_error: str = ""
+    done: str = ""
+
+    def task(self) -> Task:
+        """Return the task: parts are worked on one after the other, and branches may listen."""
+        text = (
+            'schema = 1\n[task]\nname = "t"\nfinal = "parts == 0 and arm == 1"\n'
+            f'runs_place = "parts"\ngoal_transitions = ["did"]\n{self.final_error}\n'
+            f"{head('work')}{head('wave')}"
+            f'[events.button]\nscope = "external"\nmean_wait = 3.0\n{self.button}\n'
+            '[events.bell]\nscope = "external"\nmean_wait = 1.5\n'
+            '[events.ready]\nscope = "internal"\nby = "work"\nmean_wait = 1.7\n'
+            f'[places]\nparts = {{ kind = "control", tokens = {self.parts} }}\n'
+            'arm = { kind = "resource", tokens = 1 }\n'
+            f'work = {{ kind = "action", task = "work" }}\n{"".join(self.places)}'
+            f"[transitions]\n{arcs('start', 'parts,arm', 'work')}"
+            f"{arcs('did', 'work:normal', 'arm', self.done)}{''.join(self.moves)}{self.rest}"
+        )
+        return loads(text, "t.toml")
+
+
+def listening(text: Text, n: int, kind: str, event_: str) -> None:
+    """Add a branch that waits for an event."""
+    on = f', event = "{event_}"'
+    here, wave = f"here{n}", f"wave{n}"
+    text.places.append(f"{here} = {{ tokens = 1, listen = true }}\n")
+    if kind.startswith("preempt"):
+        take = f"{here},work:{kind}"
+        back = f"{here},work" if kind.endswith("none") else f"{here},arm"
+        text.moves.append(arcs(f"pressed{n}", take, back, on))
+    elif kind == "going":
+        text.places.append(f"seen{n} = {{ listen = true }}\n")
+        text.moves.append(arcs(f"pressed{n}", f"{here},work:going", f"seen{n}", on))
+    elif kind == "subnet":
+        text.places.append(f'in{n} = {{ kind = "macro", subnet = "sub{n}" }}\n')
+        text.moves += [
+            arcs(f"enter{n}", here, f"in{n}"),
+            arcs(f"waved{n}", f"in{n}:normal", here),
+            arcs(f"tired{n}", f"in{n}:error", here),
+        ]
+        text.rest += (
+            f'[subnets.sub{n}]\nentry = "hear"\nnormal = "good"\nerror = "bad"\n'
+            f"[subnets.sub{n}.places]\nhear = {{ listen = true }}\ngood = {{}}\nbad = {{}}\n"
+            'wave = { kind = "action", task = "wave", listen = true }\n'
+            f"[subnets.sub{n}.transitions]\n{arcs('pressed', 'hear', 'wave', on)}"
+            f"{arcs('waved', 'wave:normal', 'good')}{arcs('tired', 'wave:error', 'bad')}"
+        )
+    else:
+        listens = "" if kind == "ends" else ", listen = true"
+        text.places.append(f'{wave} = {{ kind = "action", task = "wave"{listens} }}\n')
+        back = "" if kind == "gives nothing back" else here
+        text.moves += [
+            arcs(f"pressed{n}", here, wave, on),
+            arcs(f"waved{n}", f"{wave}:normal", back),
+            arcs(f"tired{n}", f"{wave}:error", back),
+        ]
+
+
+KINDS = (
+    "gives back",
+    "gives nothing back",
+    "ends",
+    "preempt=failure",
+    "preempt=none",
+    "going",
+    "subnet",
+)
+INTERNAL = {
+    "": "",
+    "only exit": ', event = "ready"',
+    "before": arcs("early", "work:normal", "arm", ', event = "ready", priority = 1'),
+    "preempt": arcs("early", "work:preempt=error", "arm", ', event = "ready"'),
+    "late": arcs("late", "work:normal", "arm", ", after = 1.0"),
+}
+
+
+@st.composite
+def tasks(draw: st.DrawFn) -> Task:
+    """One or two parts, one or two listening branches, and what else may come."""
+    memories = ("", 'memory = "latched"', 'memory = "latched"\nearly = "keep"')
+    text = Text(draw(st.integers(1, 2)), draw(st.sampled_from(memories)))
+    for n in range(draw(st.integers(1, 2))):
+        listening(text, n, draw(st.sampled_from(KINDS)), draw(st.sampled_from(("button", "bell"))))
+    internal = draw(st.sampled_from(sorted(INTERNAL)))
+    if internal in ("only exit", "late"):
+        text.done = INTERNAL["only exit"]
+    if internal != "only exit":
+        text.moves.append(INTERNAL[internal])
+    if draw(st.booleans()):
+        text.moves.append(arcs("bad", "work:error", "arm"))
+    else:
+        text.places.append("broken = { }\n")
+        text.moves.append(arcs("bad", "work:error", "broken"))
+        text.final_error = 'final_error = "broken == 1"'
+        if draw(st.booleans()):  # too late: the mission run has ended
+            text.moves.append(arcs("mended", "broken", "arm", ', event = "bell"'))
+    return text.task()
+
+
+def never_begun() -> Task:
+    """A button that is kept while the first run waits for a timer preempts the second run before it
+    begins: that run is not recorded."""
+    text = Text(2, 'memory = "latched"\nearly = "keep"', done=", after = 1.0")
+    listening(text, 0, "preempt=failure", "button")
+    text.moves.append(arcs("bad", "work:error", "arm"))
+    return text.task()
+
+
+def figures_agree(task: Task) -> None:
+    """Compare the view with the execution graph as a Markov chain, where no conflict is left to
+    the order of waiting or of the file."""
+    x = execute(task, limit=STEPS)
+    assume(x.complete and not x.livelocks)
+    assume(not execute(task, limit=STEPS, free_choice=True).contests)
+    try:
+        chain = chain_of(x, size=2_000)
+        view = stochastic_view(task, stages=chain.stages, timer_stages=chain.stages)
+        found = forecast(view, limits=SearchLimits(states=20_000))
+    except TooLarge:
+        assume(False)
+    except ValueError as fault:  # what the view refuses
+        assert "one server" in str(fault) or "the search stopped" in str(fault)
+        assume(False)
+    assert found.figures == pytest.approx(chain.figures, rel=1e-9, abs=1e-12, nan_ok=True)
+    event(f"completes: {found.completion_probability > 1 - 1e-9}")
+
+
+@settings(COMMON, max_examples=25)
+@given(tasks())
+@example(never_begun())
+def test_the_view_has_the_figures_of_the_execution_graph(task: Task) -> None:
+    figures_agree(task)
+
+
+@pytest.mark.proof
+@settings(COMMON, max_examples=3000)
+@given(tasks())
+def test_the_view_has_the_figures_of_the_execution_graph_at_length(task: Task) -> None:
+    figures_agree(task)
+
+
+@settings(COMMON, max_examples=25)
+@given(any_tasks())
+def test_the_view_of_any_task_has_the_figures_of_its_graph(task: Task) -> None:
+    """Joins, weights, capacities, inhibitors, priorities, servers; without conditions that no view
+    of markings keeps."""
+    figures_agree(timed(task))
+
+
+@pytest.mark.proof
+@settings(COMMON, max_examples=2000)
+@given(any_tasks())
+def test_the_view_of_any_task_has_the_figures_of_its_graph_at_length(task: Task) -> None:
+    figures_agree(timed(task))
+
+
+class Clock:
+    """The world of one mission run: runs, events and timers at exponential or fixed times."""
+
+    def __init__(self, engine: Engine, random: np.random.Generator) -> None:
+        self.engine, self.random, self.now = engine, random, 0.0
+        self.due: list[tuple[float, Stimulus]] = []
+        self.good, self.ended = True, Status.ERROR
+        self.task = engine.compiled.task
+
+    def play(self) -> None:
+        """Play until the mission run has ended."""
+        state, said = self.engine.handle(self.engine.initial(), Begin())
+        for event_ in self.task.events.values():
+            if event_.scope is Scope.EXTERNAL:
+                self.comes(event_.name)
+        while self.now < 1e3:  # a mission that is stuck never ends
+            self.hear(said)
+            if state.mode is Mode.FINISHED:
+                return
+            self.now, stimulus = min(self.due, key=lambda one: one[0])
+            self.due.remove((self.now, stimulus))
+            state, said = self.engine.handle(state, stimulus)
+            if isinstance(stimulus, EventOccurred):
+                self.comes(stimulus.event)
+
+    def comes(self, name: str) -> None:
+        """Let an event come after an exponential time, whether or not it is awaited."""
+        self.after(self.task.events[name].mean_wait or 0.0, EventOccurred(name))
+
+    def after(self, mean: float, stimulus: Stimulus) -> None:
+        self.due.append((self.now + self.random.exponential(mean), stimulus))
+
+    def hear(self, said: tuple[Instruction, ...]) -> None:
+        """Do what the engine orders, and note what it records."""
+        for one in said:
+            if isinstance(one, Choose):
+                self.due.append((self.now, Chosen(one.key, one.alternatives[0])))
+            elif isinstance(one, StartRun):
+                name = one.primitive_task
+                i = int(self.random.choice(3, p=SHARES[name]))
+                self.after(SECONDS[name][i], RunEnded(one.run, list(Status)[i]))
+                if name == "work":
+                    self.after(
+                        self.task.events["ready"].mean_wait or 0, RunRaised(one.run, "ready")
+                    )
+            elif isinstance(one, CancelRun):
+                self.due.append((self.now, StopConfirmed(one.run)))
+            elif isinstance(one, ArmTimer):
+                self.due.append((self.now + one.seconds, TimerFired(one.key)))
+            elif isinstance(one, RunRecorded):
+                self.good &= one.status in (None, Status.SUCCESS)
+            elif isinstance(one, Finished):
+                self.ended = one.status
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_missions_of_the_engine_have_the_figures_of_the_view(kind: str) -> None:
+    """Shares and mean within five standard errors of 600 missions."""
+    text = Text(2)
+    listening(text, 0, kind, "button")
+    listening(text, 1, "gives back", "button")
+    text.moves += [arcs("bad", "work:error", "arm"), INTERNAL["before"]]
+    task, random, n = text.task(), np.random.default_rng(7), 600
+    found = forecast(stochastic_view(task)).figures
+    engine, times, good = Engine(task), list[float](), 0
+    for _ in range(n):
+        world = Clock(engine, random)
+        world.play()
+        assert world.ended is Status.SUCCESS
+        times.append(world.now)
+        good += world.good
+    assert found["P_complete"] == pytest.approx(1.0, abs=1e-9)
+    mean, error = float(np.mean(times)), float(np.std(times)) / sqrt(n)
+    assert abs(mean - found["mean time (s)"]) < 5 * error
+    p = found["R_conj"]
+    assert abs(good / n - p) < 5 * sqrt(p * (1 - p) / n)
+
+
+def test_a_simulated_mission_that_has_given_up_is_over() -> None:
+    """Otherwise its listening branch would be played for ever."""
+    text = Text(1, final_error='final_error = "broken == 1"')
+    listening(text, 0, "gives back", "button")
+    text.places.append("broken = { }\n")
+    text.moves.append(arcs("bad", "work:error", "broken"))
+    view = stochastic_view(text.task())
+    seen = simulate(
+        view.gspn,
+        np.random.default_rng(3),
+        replicas=400,
+        goal=goal_by_marking(lambda m: view.ended(m) is Status.SUCCESS),
+        lost=goal_by_marking(lambda m: view.ended(m) is Status.ERROR),
+        firings=100_000,
+    )
+    assert seen.complete and seen.completed is not None
+    assert seen.completed.low < forecast(view).completion_probability < seen.completed.high
+
+
+def test_a_task_that_begins_at_its_end_has_no_bad_run() -> None:
+    found = forecast(stochastic_view(Text(0).task())).figures
+    assert (found["P_complete"], found["R_conj"], found["mean time (s)"]) == (1.0, 1.0, 0.0)
+
+
+def test_figures_of_one_trial_stand_beside_those_of_the_mission() -> None:
+    """Campaigns count trials: a mission of three is all SUCCESS as often as three trials are."""
+    text = Text(3)
+    listening(text, 0, "ends", "button")
+    text.moves.append(arcs("bad", "work:error", "arm"))
+    found = analyse(text.task(), view="gspn")
+    assert found.forecast is not None and found.forecast.trials == 3 and not found.doubts
+    one = found.forecast.one_trial
+    alone = forecast(stochastic_view(Text(1, places=text.places, moves=text.moves).task()))
+    assert one.figures == alone.figures and one.one_trial is one
+    assert one.conjunctive_reliability > found.forecast.conjunctive_reliability
+    assert "forecast of a mission run of 3 trials:" in found.text()
+    assert f"one trial: P_complete 1.000000, R_goal {one.figures['R_goal']:.6f}" in found.text()
+    assert found.to_json(structure=False)["forecast"]["one_trial"] == one.figures
+
+
+def test_a_figure_that_the_execution_graph_contradicts_is_doubtful() -> None:
+    """In the engine the first in the file gets the first part, and who has waited longer gets the
+    second one; the view draws."""
+    text = Text(2)
+    text.places += ["spoon = { tokens = 1, listen = true }\n", "full = { listen = true }\n"]
+    text.moves += [
+        arcs("bad", "work:error", "arm"),
+        arcs("eat", "spoon,parts,arm", "full,arm"),
+    ]
+    found = analyse(text.task(), view="gspn")
+    (doubt,) = found.doubts
+    assert "mean time (s) " in doubt and "conflicts that neither priority nor weight" in doubt
+    assert "doubtful: " in found.text()
+    assert found.to_json(structure=False)["forecast"]["doubts"] == list(found.doubts)
+
+
+def test_a_refused_task_has_no_odds() -> None:
+    """A deadlock refuses the task; its error exits keep their verdicts, without numbers."""
+    text = Text(1)
+    text.moves.append(arcs("bad", "work:error", ""))
+    judged = may_run(text.task(), None, BUDGET)
+    assert not judged.ok and judged.analysis is not None
+    data = judged.analysis.to_json(structure=False)
+    assert data["no_probability"] == "the task may not run"
+    assert data["recoveries"] and all(r["probability"] is None for r in data["recoveries"])
+
+
+def test_a_measured_wait_that_contains_the_run_is_doubtful() -> None:
+    """The measured wait of a transition with a normal arc counts from the token's entry."""
+    text = Text(1, done=', event = "ready"')
+    text.moves.append(arcs("bad", "work:error", "arm"))
+    found = analyse(text.task(), view="gspn", measured=Measured(waits={"ready": 2.0}))
+    assert any("ready" in text for text in found.doubts)
+    assert not analyse(text.task(), view="gspn").doubts
