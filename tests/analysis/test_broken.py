@@ -63,7 +63,7 @@ def replayed(task: Task, firings: Sequence[str]) -> dict[str, int]:
 def test_broken_variants_are_caught(name: str, kind: str, tmp_path: Path) -> None:
     """Each variant has a witness that the net replays, and a picture that shows where it leads."""
     task = VARIANTS[kind](load(TASKS / f"{name}.toml"))
-    found = judged(task)
+    found = judged(task, steps=10_000)  # what is wrong shows early
     assert not found.ok
     bad = dict(refused(found))
     against = next(verdict for verdict in bad if verdict in EXPECTED[kind])
