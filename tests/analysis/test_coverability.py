@@ -71,6 +71,25 @@ def test_the_effort_is_limited_and_reported() -> None:
     assert found.bounded is None and "50 nodes" in found.reason and not found.complete
 
 
+def test_what_a_tree_that_was_cut_shows() -> None:
+    """The leak was found before the effort ran out; how many tokens `late` may hold was not."""
+    switches = range(10)
+    places = {"go": 1, "leak": 0, "late": 0}
+    places |= {f"off{i}": 1 for i in switches} | {f"on{i}": 0 for i in switches}
+    on = {f"on{i}": 1 for i in switches}
+    net = Net.build(
+        places,
+        {
+            "drip": ({"go": 1}, {"go": 1, "leak": 1}),
+            "last": (on, {**on, "late": 1}),
+            **{f"turn{i}": ({f"off{i}": 1}, {f"on{i}": 1}) for i in switches},
+        },
+    )
+    found = coverability(net, effort=100)
+    assert (found.bounded, found.complete, found.grows) == (False, False, ("leak",))
+    assert found.bounds == (1, None, None, *(1,) * 20) and not found.never
+
+
 def test_known_nets() -> None:
     assert coverability(philosophers(3)).bounds == (1,) * 15
     leak = Net.build({"p": 1, "q": 0}, {"t": ({"p": 1}, {"p": 1, "q": 1})})
