@@ -325,7 +325,7 @@ ASSERTING = {"raises", "warns", "fail", "expect", "left"}
 def called(node: ast.AST) -> set[str]:
     """Return the names of all functions that are called or passed on in it."""
     return {
-        getattr(part, "attr", None) or getattr(part, "id", "")
+        str(getattr(part, "attr", "") or getattr(part, "id", ""))
         for n in ast.walk(node)
         if isinstance(n, ast.Call)
         for part in (n.func, *n.args)
