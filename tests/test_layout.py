@@ -318,6 +318,68 @@ def test_the_rule_of_limits_tells_waits_apart(source: str, limited: bool) -> Non
     assert isinstance(loop, ast.While) and has_limit(loop, timed=False) is limited
 
 
+ASSERTING = {"raises", "warns", "fail", "expect", "left"}
+"""What fails by itself: of pytest, of Playwright, and of `tests.waiting.Limit`."""
+
+
+def called(node: ast.AST) -> set[str]:
+    """Return the names of all functions that are called or passed on in it."""
+    return {
+        str(getattr(part, "attr", "") or getattr(part, "id", ""))
+        for n in ast.walk(node)
+        if isinstance(n, ast.Call)
+        for part in (n.func, *n.args)
+    }
+
+
+def asserts(function: ast.AST) -> bool:
+    """Whether a function has an assertion of its own."""
+    return bool(called(function) & ASSERTING) or any(
+        isinstance(n, ast.Assert) or (isinstance(n, ast.Raise) and "Error" in ast.unparse(n))
+        for n in ast.walk(function)
+    )
+
+
+def functions(tree: ast.Module) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
+    """Every function of a module."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield node
+
+
+def test_every_test_asserts_something() -> None:
+    """Each test asserts, or calls a helper of the tests that does: else it only shows that nothing
+    raises."""
+    trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in TESTS}
+    helpers = {f.name for tree in trees.values() for f in functions(tree) if asserts(f)}
+    idle = []
+    for path, tree in trees.items():
+        others = {f.name for f in functions(tree) if not asserts(f)}
+        idle += [
+            f"{path.relative_to(ROOT)}:{test.lineno}: {test.name}"
+            for test in functions(tree)
+            if test.name.startswith("test_")
+            and not asserts(test)
+            and not called(test) & helpers - others
+        ]
+    assert not idle, "\n".join(["no assertion:", *idle])
+
+
+@pytest.mark.parametrize(
+    ("source", "asserting"),
+    [
+        ("def f(): assert x", True),
+        ("def f():\n with pytest.raises(E): x()", True),
+        ("def f(): raise AssertionError", True),
+        ("def f(): x()", False),
+        ("def f(): raise", False),
+    ],
+)
+def test_the_rule_of_assertions_tells_functions_apart(source: str, asserting: bool) -> None:
+    """What the rule above takes for an assertion."""
+    assert asserts(ast.parse(source)) is asserting
+
+
 def test_every_mutation_still_finds_its_text() -> None:
     """Else the next run of `tools.proof.mutations` stops there, long after the change."""
     lost = [

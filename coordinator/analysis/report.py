@@ -18,7 +18,7 @@ from petrobot.coordinator.analysis.execution.progress import (
     progress_of,
 )
 from petrobot.coordinator.analysis.limits import OutOfTime
-from petrobot.coordinator.analysis.net.coverability import Coverability, find_pump, settle_bounds
+from petrobot.coordinator.analysis.net.coverability import Coverability, coverability, find_pump
 from petrobot.coordinator.analysis.net.deadlocks import (
     PlaceSets,
     controlled_siphons,
@@ -475,11 +475,12 @@ def _search(
         if first.complete or len(first) < LOOK:
             return first, None
         proven = place_bounds(net)
-        cover = settle_bounds(net, proven) if None in proven else None
+        cover = coverability(net, bounds=proven) if None in proven else None
         if cover is not None and cover.bounded is False:
             return replace(first, reason=ENDLESS), cover
         if cover is not None and cover.bounded is None and find_pump(first) is not None:
             return replace(first, reason=ENDLESS), cover
+        return explore(net, limits=limits, engine=engine), cover
     return explore(net, limits=limits, engine=engine), None
 
 

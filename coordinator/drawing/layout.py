@@ -108,12 +108,18 @@ class Layers:
         inward, columns = (
             (self.before, self.columns[1:]) if forward else (self.next, self.columns[-2::-1])
         )
+        row = self._rows()
         for column in columns:
-            self._sort(column, inward)
+            self._sort(column, inward, row)
+            row.update((spot, i) for i, spot in enumerate(column))
         self._exchange()
 
-    def _sort(self, column: list[Spot], inward: Mapping[Spot, Sequence[Spot]]) -> None:
-        row = self._rows()
+    def _sort(
+        self,
+        column: list[Spot],
+        inward: Mapping[Spot, Sequence[Spot]],
+        row: Mapping[Spot, int],
+    ) -> None:
         mean = {
             s: sum(row[n] for n in inward[s]) / len(inward[s]) if inward[s] else row[s]
             for s in column

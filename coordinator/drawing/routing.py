@@ -26,7 +26,6 @@ _SAMPLES = 24
 """Points on an arc that are tested for collisions."""
 _LEVEL = 36.0
 """How far an arc may run level on both sides of a path point."""
-_REACH = RADIUS + _CLEARANCE
 _AROUND = 80.0
 """How far from its node a label may be, besides its own width."""
 FONT = 12.5
@@ -62,18 +61,23 @@ class ArcPath:
 
     def point(self, s: float) -> Point:
         """Return the point at s, from 0 at the start to 1 at the end."""
-        n = len(self.controls)
-        i = min(int(s * n), n - 1)
-        u = s * n - i
-        (x0, y0), (x1, y1), (x2, y2) = self.pieces()[i]
-        a, b, c = (1 - u) ** 2, 2 * u * (1 - u), u * u
-        return a * x0 + b * x1 + c * x2, a * y0 + b * y1 + c * y2
+        return _point(self.pieces(), s)
 
     @property
     def points(self) -> list[Point]:
         """Points along the curve, close enough to detect the nodes that it crosses."""
         n = _SAMPLES + 8 * (len(self.controls) - 1)
-        return [self.point(i / n) for i in range(n + 1)]
+        pieces = self.pieces()
+        return [_point(pieces, i / n) for i in range(n + 1)]
+
+
+def _point(pieces: Sequence[tuple[Point, Point, Point]], s: float) -> Point:
+    n = len(pieces)
+    i = min(int(s * n), n - 1)
+    u = s * n - i
+    (x0, y0), (x1, y1), (x2, y2) = pieces[i]
+    a, b, c = (1 - u) ** 2, 2 * u * (1 - u), u * u
+    return a * x0 + b * x1 + c * x2, a * y0 + b * y1 + c * y2
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,23 +194,17 @@ def _cost(nodes: Mapping[str, DrawnNode], path: ArcPath, used: set[float], twins
     """
     ends = (path.arc.source, path.arc.target)
     points = path.points
-    left, right = min(x for x, _ in points) - _REACH, max(x for x, _ in points) + _REACH
-    top, bottom = min(y for _, y in points) - _REACH, max(y for _, y in points) + _REACH
-    near = [
-        n
-        for n in nodes.values()
-        if left < n.at[0] < right and top < n.at[1] < bottom and n.name not in ends
-    ]
-    hits = sum(any(_near(node, p) for p in points) for node in near)
+    box = _box_of(points)
+    hits = 0
+    for node in nodes.values():
+        (x, y), (w, h) = node.at, node.half
+        clear = x - w - _CLEARANCE, y - h - _CLEARANCE, x + w + _CLEARANCE, y + h + _CLEARANCE
+        if _touch(box, clear) and node.name not in ends:
+            hits += bool(_inside(clear, points))
     sense = 1.0 if path.arc.source < path.arc.target else -1.0
     alone = len(path.controls) == 1
     taken = alone and (path.bend * sense in used or (twins and path.bend == 0.0))
     return 1000.0 * hits + 1500.0 * taken + abs(path.bend) - 0.5 * (not alone)
-
-
-def _near(node: DrawnNode, p: Point) -> bool:
-    w, h = node.half
-    return abs(p[0] - node.at[0]) < w + _CLEARANCE and abs(p[1] - node.at[1]) < h + _CLEARANCE
 
 
 def place_words(nodes: Mapping[str, DrawnNode], paths: Sequence[ArcPath]) -> list[Words]:
@@ -216,7 +214,7 @@ def place_words(nodes: Mapping[str, DrawnNode], paths: Sequence[ArcPath]) -> lis
     they have the fewest free positions; those of places before those of transitions.
     """
     solid = [_around(n) for n in nodes.values()]
-    curves = [w.points for w in paths]
+    curves = [(_box_of(points), points) for points in (w.points for w in paths)]
     placed: list[Words] = []
     for node in sorted(
         nodes.values(), key=lambda n: (not n.is_place, -max(map(len, n.lines), default=0))
@@ -224,7 +222,11 @@ def place_words(nodes: Mapping[str, DrawnNode], paths: Sequence[ArcPath]) -> lis
         region = _region(node)
         others = [b for b in solid if _touch(b, region) and b != _around(node)]
         others += [w.box for w in placed if _touch(w.box, region)]
-        near = [near for c in curves if (near := [p for p in c if _holds(region, p)])]
+        near = [
+            near
+            for box, points in curves
+            if _touch(box, region) and (near := _inside(region, points))
+        ]
         spots = list(_spots(node))
         costs = [_cover(w.box, others, near) + 0.4 * i for i, w in enumerate(spots)]
         placed.append(spots[costs.index(min(costs))])
@@ -242,8 +244,14 @@ def _touch(a: Box, b: Box) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def _holds(box: Box, p: Point) -> bool:
-    return box[0] < p[0] < box[2] and box[1] < p[1] < box[3]
+def _inside(box: Box, points: Sequence[Point]) -> list[Point]:
+    left, top, right, bottom = box
+    return [p for p in points if left < p[0] < right and top < p[1] < bottom]
+
+
+def _box_of(points: Sequence[Point]) -> Box:
+    x, y = [p[0] for p in points], [p[1] for p in points]
+    return min(x), min(y), max(x), max(y)
 
 
 def badge_spot(node: DrawnNode, paths: Sequence[ArcPath]) -> Point:
@@ -305,7 +313,8 @@ def _cover(box: Box, others: Sequence[Box], curves: Sequence[Sequence[Point]]) -
         down = min(box[3], other[3]) - max(box[1], other[1])
         if across > -3 and down > -1:
             cost += 200.0 + max(across, 0.0) * max(down, 0.0)
+    around = box[0] - 2, box[1] - 1, box[2] + 2, box[3] + 1
     for curve in curves:
-        inside = sum(box[0] - 2 < x < box[2] + 2 and box[1] - 1 < y < box[3] + 1 for x, y in curve)
+        inside = len(_inside(around, curve))
         cost += 25.0 * (inside > 0) + 4.0 * inside
     return cost

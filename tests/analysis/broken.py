@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from petrobot.coordinator.analysis.execution.graph import STEPS
 from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.report import Analysis, analyse
 from petrobot.coordinator.cli.analyse import picture, refused
@@ -103,9 +104,9 @@ def damaged(task: Task) -> Iterator[tuple[str, Task]]:
             yield f"{p.name} holds one more", replace(task, places={**task.places, p.name: more})
 
 
-def judged(task: Task) -> Analysis:
+def judged(task: Task, steps: int = STEPS) -> Analysis:
     """Return the analysis of a variant; of an unbounded one it ends early."""
-    return analyse(task, limits=LIMITS)
+    return analyse(task, limits=LIMITS, steps=steps)
 
 
 def main(folder: Path, names: list[str]) -> None:

@@ -243,6 +243,7 @@ async def test_a_long_running_node_checks_every_day(
     monkeypatch.setattr("petrobot.services.comm.calls.server.look_again", look)
     async with asyncio.timeout(60.0), node(made(tmp_path, LIFE)):
         await again.wait()
+    assert all(one.tzinfo is not None for one in looked)
 
 
 @pytest.mark.parametrize(("node_left", "own_left"), [(-DAY, LIFE), (LIFE, -DAY)])

@@ -35,7 +35,7 @@ port = {port}
 [devices.slide]
 node = "hub"
 driver = "toy_cell.drivers:Slide"
-period = 0.004
+period = 0.02
 speed = 4.0
 [streams.points]
 to = "slide"

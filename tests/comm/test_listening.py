@@ -108,7 +108,8 @@ def test_a_free_address_is_accepted(tmp_path: Path) -> None:
     """It is free again afterwards."""
     [port] = free_ports(1)
     refuse_unusable(directory_in(tmp_path, "127.0.0.1", port), "left")
-    socket.create_server(("127.0.0.1", port)).close()
+    with socket.create_server(("127.0.0.1", port)) as again:
+        assert again.getsockname()[1] == port
 
 
 @pytest.mark.parametrize(

@@ -495,11 +495,13 @@ def feed(data: bytes) -> None:
             connection = Connection(side, "vision", key=key, nonce=bytes(32) if key else b"")
             if side is Side.CLIENT:
                 connection.send(HELLO)
-            with contextlib.suppress(ProtocolError):
+            try:
                 for message in connection.receive_data(data):
                     if isinstance(message, m.Hello):
                         connection.send(m.Welcome(2, "vision", "v1"))
                 connection.receive_data(data)
+            except ProtocolError as refused:
+                assert refused.code and refused.text, "a refusal says why"
 
 
 @given(st.binary(max_size=600), st.integers(0, 200), st.integers(0, 15))

@@ -34,12 +34,12 @@ port = {right}
 [devices.gauge]
 node = "left"
 driver = "toy_cell.drivers:Slide"
-period = 0.004
+period = 0.02
 follow = false
 [devices.slide]
 node = "right"
 driver = "toy_cell.drivers:Slide"
-period = 0.004
+period = 0.02
 follow = false
 """
 KEYS = '[keys]\nfile = "cell.key"\n'

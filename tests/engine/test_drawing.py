@@ -16,6 +16,7 @@ from petrobot.coordinator.drawing.routing import Words, place_words, route
 from petrobot.coordinator.drawing.scene import scene_of_task
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import load
+from tests.drawing.test_quality import unplaced
 
 SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks"
 Tasks = Callable[..., Task]
@@ -34,16 +35,6 @@ def elements(svg: str, tag: str, style: str) -> list[ElementTree.Element]:
 def texts(svg: str) -> set[str]:
     """Return all texts."""
     return {e.text or "" for e in ElementTree.fromstring(svg).iter(SVG + "text")}
-
-
-def unplaced(task: Task) -> Task:
-    """Return the task without positions."""
-    places = {n: replace(p, x=None, y=None) for n, p in task.places.items()}
-    return replace(
-        task,
-        places=places,
-        transitions={n: replace(t, x=None, y=None) for n, t in task.transitions.items()},
-    )
 
 
 @pytest.mark.parametrize("errors", [True, False])

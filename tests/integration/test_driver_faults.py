@@ -24,7 +24,7 @@ port = {port}
 [devices.base]
 node = "only"
 driver = "toy_cell.drivers:Broken"
-period = 0.004
+period = 0.02
 breaks = "step"
 [actions.drive]
 run = "toy_cell.actions:order"

@@ -20,23 +20,9 @@ from petrobot.coordinator.learning.session import LearningSession, LearningSetti
 from petrobot.coordinator.run.journal import JournalWriter, read_journal
 from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task import Status
-from tests.learning.cell import TASK_FILE, directory, run, sorting
+from tests.learning.cell import HEAD, TASK_FILE, directory, run, sorting
 from tests.learning.conftest import tally_of
 
-SERVICES = """
-schema = 1
-[nodes.node]
-host = "127.0.0.1"
-port = 7998
-[timers.go]
-node = "node"
-period = 0.04
-[timers.jam]
-node = "node"
-period = 1.24
-[services.memory]
-node = "node"
-"""
 MOCK = """
 schema = 1
 [actions.pick_fast]
@@ -67,7 +53,7 @@ def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         for p in sorting().primitive_tasks.values()
         for a in p.alternatives
     )
-    (tmp_path / "services.toml").write_text(SERVICES + actions, encoding="utf-8")
+    (tmp_path / "services.toml").write_text(HEAD + actions, encoding="utf-8")
     (tmp_path / "mock.toml").write_text(MOCK, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.run.interfaces import FirstAlternative
@@ -28,8 +27,8 @@ from petrobot.services.mobile.detection import (
     detect_ridge,
 )
 from petrobot.services.mobile.floor import ScanGrid
-from petrobot.services.mobile.sight import Sight
 from tests.mobile.conftest import DrawnFloor, DrawnPose, Photographer
+from tests.mobile.test_detection import off_line
 
 ROOT = Path(__file__).parents[2]
 TASK = ROOT / "coordinator" / "tasks" / "follow_track.toml"
@@ -102,7 +101,7 @@ def _judge(
         sight = detector(grid, grid.sample(image), 0.05, None)
         cpu += time.process_time() - begun
         if sight.seen:
-            median = float(np.median(_off(sight, floor, pose, s)))
+            median = float(np.median(off_line(sight, floor, pose, s)))
             right += median < GOOD
             off.append(median)
     return right / len(cases), float(np.median(off)) if off else math.nan, cpu / len(cases)
@@ -119,19 +118,6 @@ def _cases() -> Iterator[tuple[DrawnFloor, DrawnPose, float, int]]:
             s,
             seed,
         )
-
-
-def _off(sight: Sight, floor: DrawnFloor, pose: DrawnPose, s: float) -> NDArray[np.float64]:
-    line = [floor.at(s + 0.3 + 0.005 * i) for i in range(260)]
-    near = sight.x <= sight.x[0] + 0.5
-    cos, sin = math.cos(pose.heading), math.sin(pose.heading)
-    x = pose.x + sight.x[near] * cos - sight.y[near] * sin
-    y = pose.y + sight.x[near] * sin + sight.y[near] * cos
-    lx, ly = np.array([p.x for p in line]), np.array([p.y for p in line])
-    off: NDArray[np.float64] = np.hypot(x[:, None] - lx[None, :], y[:, None] - ly[None, :]).min(
-        axis=1
-    )
-    return off
 
 
 # --- runs -------------------------------------------------------------------------------------

@@ -84,7 +84,7 @@ class OneNode:
         self.process.communicate(timeout=PATIENCE)
 
 
-def device(name: str, action: str = "order", period: str = "period = 0.004") -> str:
+def device(name: str, action: str = "order", period: str = "period = 0.02") -> str:
     return DEVICE.format(name=name, action=action, period=period)
 
 
@@ -96,11 +96,12 @@ def cell(*devices: str) -> str:
 def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OneNode]:
     """A node with a device for each fault, and devices on which a command of the node itself
     fails."""
-    names = [*FAULTS, "stop", "hold", "picture", "command", "good"]
+    names = [*FAULTS, "stop", "hold", "picture", "command"]
+    good = device("good", period="period = 0.004")
     direct = device("plain_stop", "order_directly", "").replace(
         'breaks = "plain_stop"', 'breaks = "stop"'
     )
-    one = OneNode(tmp_path_factory.mktemp("heard"), cell(*map(device, names), direct))
+    one = OneNode(tmp_path_factory.mktemp("heard"), cell(*map(device, names), good, direct))
     one.until_ready()
     yield one
     one.stop()

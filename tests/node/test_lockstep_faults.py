@@ -268,4 +268,5 @@ def test_an_ended_thread_does_not_crash_the_watchdog() -> None:
         thread.start()
         thread.join()
         watched.look()
+        assert not watched._attempts
     watched.close()

@@ -37,7 +37,7 @@ port = {port}
 [devices.slide]
 node = "only"
 driver = "toy_cell.drivers:Slide"
-period = 0.004
+period = 0.02
 [streams.points]
 to = "slide"
 period = 0.02

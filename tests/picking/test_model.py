@@ -47,7 +47,8 @@ def test_every_slot_can_be_reached(arm: str) -> None:
     for tray in cell_named().trays.values():
         for slot in tray.slots:
             for z in (0.004, 0.065):
-                numbers.over(*slot, z, 0.0)
+                tip = numbers.tool(numbers.over(*slot, z, 0.0))[0]
+                assert math.dist(tip, (*slot, z)) < 1e-3
 
 
 @given(st.lists(ANGLE, min_size=5, max_size=5))

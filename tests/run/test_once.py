@@ -193,24 +193,24 @@ SOME = [
 OPERATIONS = st.lists(st.one_of(SOME), max_size=30)
 
 
-def _live_through(operations: list[tuple[object, ...]]) -> None:
+def _live_through(operations: list[tuple[object, ...]]) -> World:
     world = World()
     for name, *arguments in operations:
         getattr(world, str(name))(*arguments)
-    world.end()
+    return world
 
 
 @settings(max_examples=300, deadline=None)
 @given(OPERATIONS)
 def test_nothing_runs_twice(operations: list[tuple[object, ...]]) -> None:
-    _live_through(operations)
+    assert _live_through(operations).end(), "no run was recorded"
 
 
 @pytest.mark.proof
 @settings(max_examples=50_000, deadline=None)
 @given(OPERATIONS)
 def test_nothing_runs_twice_in_full(operations: list[tuple[object, ...]]) -> None:
-    _live_through(operations)
+    assert _live_through(operations).end(), "no run was recorded"
 
 
 @pytest.mark.parametrize("accepted", [True, False], ids=["accepted", "accept lost"])

@@ -13,7 +13,7 @@ import pytest
 
 from petrobot.coordinator.run.supervisor import LaunchError, Program, Supervisor
 from tests.processes import alive, kill
-from tests.waiting import beat
+from tests.waiting import beat, until
 
 pytestmark = pytest.mark.processes
 STEADY = "print('ready', flush=True); import signal; signal.pause()"
@@ -129,9 +129,8 @@ async def test_a_child_process_left_running_does_not_hide_its_parents_death(
         async with Supervisor([program("a", leaver)], tmp_path) as keeper:
             os.kill(keeper.process_ids()["a"], signal.SIGKILL)
             await until_died(caplog, 1)
-            async with asyncio.timeout(60.0):
-                while keeper.starts("a") < 2 or not keeper.process_ids():
-                    await beat(0.01)
+            await until(lambda: keeper.starts("a") > 1 and keeper.process_ids(), "another start")
+            assert alive(keeper.process_ids()["a"])
     finally:
         lines = (tmp_path / "a.log").read_text().splitlines()
         kill(int(line) for line in lines if line.isdigit())

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import ge
 
 import numpy as np
 
@@ -26,8 +27,8 @@ from petrobot.coordinator.analysis.net.space import Space
 from petrobot.coordinator.analysis.net.structure import place_bounds
 from petrobot.coordinator.task.net import Marking, Net
 
-OMEGA = -1
-"""Arbitrarily many tokens, in a marking of the tree."""
+OMEGA = 1 << 62
+"""Arbitrarily many tokens, in a marking of the tree: at least as many as any number."""
 EFFORT = 20_000
 """The most nodes of the tree."""
 COMPARISONS = 100
@@ -58,30 +59,17 @@ class Coverability:
     """Whether every transition outside `never` can fire: complete tree and no priorities."""
 
 
-def settle_bounds(
-    net: Net, bounds: Sequence[int | None] | None = None, *, effort: int = EFFORT
-) -> Coverability:
-    """Return the complete tree if the effort allows, else stop at the first unbounded place."""
-    whole = coverability(net, effort=effort, bounds=bounds)
-    return (
-        whole
-        if whole.complete
-        else coverability(net, effort=effort, bounds=bounds, first_omega=True)
-    )
-
-
 def coverability(
     net: Net,
     *,
     effort: int = EFFORT,
     bounds: Sequence[int | None] | None = None,
-    first_omega: bool = False,
 ) -> Coverability:
     """Return the bounds of all places by the Karp-Miller tree.
 
     `bounds` are proven bounds of places (by default those of the P-invariants); inhibited places
-    need them. With `first_omega` the search ends at the first unbounded place: then `bounded` is
-    known, but not every bound.
+    need them. If the effort runs out after an unbounded place was found, the net is known to be
+    unbounded, and no other bound is known but the proven ones.
     """
     proven = list(bounds) if bounds is not None else place_bounds(net)
     limits = [dict(bars) for bars in net.compiled.bars]
@@ -95,22 +83,13 @@ def coverability(
         )
     plain = _complemented(net, limits, proven)
     tree = _Tree(plain, len(net.places))
-    if not tree.grow(effort, first_omega):
-        return Coverability(
-            None,
-            tuple(proven),
-            f"the coverability tree exceeds {effort} nodes",
-            len(tree.nodes),
-            False,
-        )
-    return _verdict(net, tree, first_omega)
-
-
-def _verdict(net: Net, tree: _Tree, first_omega: bool) -> Coverability:
-    bounds = tree.bounds()
-    prefix, pump, grows = tree.witness(net)
+    complete = tree.grow(effort)
     unbounded, ranked = tree.omega is not None, len(set(net.priority)) > 1
-    complete = not (unbounded and first_omega)
+    if not complete and not unbounded:
+        reason = f"the coverability tree exceeds {effort} nodes"
+        return Coverability(None, tuple(proven), reason, len(tree.nodes), False)
+    found = tree.bounds() if complete else tuple(proven)
+    prefix, pump, grows = tree.witness(net)
     never = (
         tuple(name for t, name in enumerate(net.transitions) if t not in tree.fired)
         if complete
@@ -119,7 +98,7 @@ def _verdict(net: Net, tree: _Tree, first_omega: bool) -> Coverability:
     if unbounded and ranked:
         reason = "unbounded without its priorities; with them it may be bounded"
         return Coverability(
-            None, bounds, reason, len(tree.nodes), complete, prefix, pump, grows, never
+            None, found, reason, len(tree.nodes), complete, prefix, pump, grows, never
         )
     reason = (
         f"{', '.join(grows)} can grow without end"
@@ -128,7 +107,7 @@ def _verdict(net: Net, tree: _Tree, first_omega: bool) -> Coverability:
     )
     exact = complete and not ranked
     return Coverability(
-        not unbounded, bounds, reason, len(tree.nodes), complete, prefix, pump, grows, never, exact
+        not unbounded, found, reason, len(tree.nodes), complete, prefix, pump, grows, never, exact
     )
 
 
@@ -190,7 +169,7 @@ class _Tree:
         self.fired: set[int] = set()
         self.compared = 0
 
-    def grow(self, effort: int, first_omega: bool) -> bool:
+    def grow(self, effort: int) -> bool:
         """Build the tree; return False if the effort ran out."""
         expanded: set[Marking] = set()
         queue = deque([0])
@@ -209,14 +188,13 @@ class _Tree:
                     return False
                 self.fired.add(t)
                 self._add(i, t, after)
-                if self.omega is not None and first_omega:
-                    return True
                 queue.append(len(self.nodes) - 1)
         return True
 
     def _fire(self, marking: Marking, t: int) -> Marking | None:
-        if any(marking[p] != OMEGA and marking[p] < w for p, w in self.net.compiled.needs[t]):
-            return None
+        for p, w in self.net.compiled.needs[t]:
+            if marking[p] < w:
+                return None
         after = list(marking)
         for p, change in self.net.compiled.changes[t]:
             if after[p] != OMEGA:
@@ -228,9 +206,7 @@ class _Tree:
         while up >= 0:
             older = self.nodes[up].marking
             self.compared += 1
-            if older != covered and all(
-                _at_least(a, b) for a, b in zip(covered, older, strict=True)
-            ):
+            if older != covered and all(map(ge, covered, older)):
                 wider = tuple(OMEGA if a != b else a for a, b in zip(covered, older, strict=True))
                 if wider != covered:
                     if node.ancestor < 0:
@@ -268,10 +244,6 @@ class _Tree:
             names.append(self.net.transitions[self.nodes[last].fired])
             last = self.nodes[last].parent
         return tuple(reversed(names))
-
-
-def _at_least(a: int, b: int) -> bool:
-    return a == OMEGA or (b != OMEGA and a >= b)
 
 
 # Pumps among the markings found: firing sequences that can be repeated for ever and leave more

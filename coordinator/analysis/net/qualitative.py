@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.coordinator.analysis.net.coverability import Coverability, find_pump, settle_bounds
+from petrobot.coordinator.analysis.net.coverability import Coverability, coverability, find_pump
 from petrobot.coordinator.analysis.net.deadlocks import (
     Hunt,
     controlled_siphons,
@@ -178,7 +178,7 @@ def boundedness(
             _safe(space, max((b or 0 for b in proven), default=0) <= 1),
             cover,
         )
-    cover = cover or settle_bounds(space.net, proven)
+    cover = cover or coverability(space.net, bounds=proven)
     pump = (cover.prefix, cover.pump, cover.grows) if cover.bounded is False else find_pump(space)
     known = tuple(lower(b, c) for b, c in zip(proven, cover.bounds, strict=True))
     if pump is not None:
