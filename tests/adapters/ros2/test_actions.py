@@ -143,6 +143,37 @@ def test_feedback_is_progress_variables_and_set_points() -> None:
     assert {stream for _, stream, _ in played.published} == {"gap"}
 
 
+@pytest.mark.parametrize("remaining", ["distance", "distance_remaining", "distance.positions"])
+def test_feedback_of_another_form_is_progress_without_a_share(remaining: str) -> None:
+    """What it has is passed on, and the goal goes on to its end."""
+    bridge, link = robot()
+    played = rehearse(
+        actions.goal,
+        device=bridge,
+        streams={"gap": 0.05, "age": 0.05},
+        action="/other",
+        action_type="a/action/B",
+        remaining=remaining,
+        to_memory={"state": "state", "joint": "joint_names.0"},
+        to_streams={"gap": ["distance"], "age": ["distance.positions.0"]},
+    )
+    assert said(played.result) == ("success", "", "yes"), played.result
+    assert len(played.progress) >= 3 and {share for _, share in played.progress} == {0.0}
+    assert {name: kept.value for name, kept in played.memory.values().items()} == {"joint": "a"}
+    assert {stream for _, stream, _ in played.published} == {"age"}
+    assert [m["op"] for m in link.fake.log] == ["send_action_goal"]
+
+
+def test_a_goal_is_cancelled_when_its_feedback_cannot_be_passed_on() -> None:
+    """The run ends in ERROR; without its run the robot must not move on."""
+    bridge, link = robot()
+    played = play("/slow", bridge, to_memory={"": "distance"})
+    assert said(played.result)[:2] == ("error", "exception")
+    bridge.step(60.0)
+    assert [m["op"] for m in link.fake.log] == ["send_action_goal", "cancel_action_goal"]
+    assert bridge.stopped()
+
+
 @pytest.mark.parametrize("name", ["/slow", "/silent"])
 def test_a_cancelled_run_cancels_its_goal(name: str) -> None:
     bridge, link = robot()
