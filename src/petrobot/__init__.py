@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from petrobot.services.device import Driver, Ports, Remote, Setpoint, key, numbers
     from petrobot.services.joint_motion import JointMotion
     from petrobot.services.rehearsal import Rehearsal, rehearse
+    from petrobot.services.session_thread import SessionThread
 
 __all__ = [
     "ByteLine",
@@ -48,6 +49,7 @@ __all__ = [
     "Rehearsal",
     "Remote",
     "Result",
+    "SessionThread",
     "Setpoint",
     "Status",
     "check_driver",
@@ -67,6 +69,7 @@ _HOMES = {
     ),
     "JointMotion": "petrobot.services.joint_motion",
     **dict.fromkeys(("DriverCheck", "check_driver"), "petrobot.services.conformance"),
+    "SessionThread": "petrobot.services.session_thread",
     **dict.fromkeys(("Rehearsal", "rehearse"), "petrobot.services.rehearsal"),
 }
 

@@ -18,7 +18,6 @@ from typing import Any
 import pytest
 
 from petrobot.services.adapters.ros2 import __main__ as offering
-from petrobot.services.adapters.ros2.link import Item
 from petrobot.services.adapters.ros2.protocol import ExchangePhase
 from tests.adapters.ros2.conftest import FakeProcess
 from tests.adapters.ros2.test_link import bridge_to
@@ -65,15 +64,21 @@ class Link:
     """A scripted rosbridge."""
 
     def __init__(self) -> None:
-        self.inbox: list[Item] = [("up", 1)]
+        self.inbox: list[tuple[str, Any]] = [("up", None)]
+        self.up, self.count, self.why = False, 0, ""
         self.sent: list[dict[str, Any]] = []
 
-    def poll(self, now: float) -> list[Item]:
+    def news(self) -> Iterator[tuple[str, Any]]:
         items, self.inbox = self.inbox, []
-        return items
+        for kind, item in items:
+            self.up = kind != "down"
+            yield kind, item
 
-    def send(self, now: float, epoch: int, messages: list[dict[str, Any]]) -> None:
-        self.sent += json.loads(json.dumps(messages))
+    def send(self, item: dict[str, Any]) -> None:
+        self.sent.append(json.loads(json.dumps(item)))
+
+    def close(self) -> None:
+        """Do nothing."""
 
     def say(self, op: str, goal: str, **more: Any) -> None:
         self.inbox.append(("message", {"op": op, "id": goal, "action": "/rest", **more}))
@@ -220,7 +225,7 @@ def test_a_run_is_aborted_when_its_client_or_link_is_lost(lost: str) -> None:
             page.gone = True
             await until(link.results, "the result")
         elif lost == "link":
-            link.inbox += [("down", "pulled"), ("up", 2)]
+            link.inbox += [("down", "pulled"), ("up", None)]
             await until(lambda: page.state == "aborted", "the abort")
             await until(link.results, "a result")
 
@@ -346,7 +351,7 @@ def test_petrobot_starts_petrobot(offered: FakeProcess) -> None:
     """Our client starts our offered task through rosbridge: success, cancel and refusal of real
     runs."""
     bridge = bridge_to(offered.url)
-    bridge.until(lambda: bridge.epoch, "the connection")
+    bridge.until(lambda: bridge.connected, "the connection")
     bridge.goal("/rest", "first")
     bridge.until_phase(ExchangePhase.SUCCEEDED, "first")
     one = bridge.exchanges.open["first"]
