@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from petrobot.services.conformance import DriverCheck, check_driver
     from petrobot.services.device import Driver, Ports, Remote, Setpoint, key, numbers
     from petrobot.services.joint_motion import JointMotion
+    from petrobot.services.perform import perform
     from petrobot.services.rehearsal import Rehearsal, rehearse
     from petrobot.services.session_thread import SessionThread
 
@@ -57,6 +58,7 @@ __all__ = [
     "failure",
     "key",
     "numbers",
+    "perform",
     "provisional",
     "rehearse",
     "success",
@@ -69,6 +71,7 @@ _HOMES = {
     ),
     "JointMotion": "petrobot.services.joint_motion",
     **dict.fromkeys(("DriverCheck", "check_driver"), "petrobot.services.conformance"),
+    "perform": "petrobot.services.perform",
     "SessionThread": "petrobot.services.session_thread",
     **dict.fromkeys(("Rehearsal", "rehearse"), "petrobot.services.rehearsal"),
 }

@@ -42,9 +42,11 @@ async def goal(
 
     Of the feedback, `remaining` is the path of a number that falls to 0 (progress); `to_memory`
     names variables of the global memory, `to_streams` streams of set points, with the paths of
-    their values; what a message does not have is left out. Causes of ERROR: `link_down`, `bad_goal`, `rejected` (nothing was executed);
-    `aborted`, `cancelled` (by another client), `timeout`, `bad_result`; `link_lost`, `unanswered`
-    (it is unknown what was executed).
+    their values; what a message does not have is left out.
+
+    Causes of ERROR: `link_down`, `bad_goal`, `rejected` (nothing was executed); `aborted`,
+    `cancelled` (by another client), `timeout`, `bad_result`; `link_lost`, `unanswered` (it is
+    unknown what was executed).
     """
     try:
         args = _request(goal, fields, arguments)

@@ -4,7 +4,7 @@ The driver plans each motion itself, checks its whole path, and streams joint se
 to a short program on the controller. That program stops the arm if they stop coming. Commands:
 
     {"do": "enable"}     power on, release brakes, start the program; unlocks a protective stop
-    {"do": "move", "q": six angles (rad), "speed": 0 to 1}            all joints arrive together
+    {"do": "move", "joints": six angles (rad), "speed": 0 to 1}       all joints arrive together
     {"do": "linear", "pose": x, y, z (m), rotation vector (rad), "speed": 0 to 1}     straight line
     {"do": "output", "bit": 0 to 7, "value": true or false}           digital output
     {"do": "rest"}       stop and stay there
@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import partial
+from operator import sub
 from typing import Any
 
 from petrobot import Driver, JointMotion, Link, Ports, key, numbers
@@ -37,6 +38,8 @@ POWER_OFF, IDLE, RUNNING = 3, 5, 7
 SAFETY = {1: "normal", 2: "reduced", 3: "protective_stop", 4: "recovery", 5: "safeguard_stop",
           6: "emergency_stop", 7: "emergency_stop", 8: "violation", 9: "fault"}  # fmt: skip
 MAY_MOVE = (1, 2)
+FASTEST = 3.14
+"""Greatest speed of the joints (rad/s)."""
 STANDING = 0.01
 """Speed below which a joint stands still (rad/s)."""
 IN_PLACE = 0.003
@@ -99,10 +102,8 @@ class Arm(Driver):
         if self.model not in kinematics.MODELS:
             known = ", ".join(kinematics.MODELS)
             raise ValueError(f"model: expected one of {known}, found {self.model!r}")
-        if not (0.0 < self.top_speed <= 3.14 and 0.0 < self.acceleration <= 20.0):
-            raise ValueError(
-                "expected top_speed in (0, 3.14] rad/s, acceleration in (0, 20] rad/s^2"
-            )
+        if self.top_speed > FASTEST:
+            raise ValueError(f"top_speed: expected at most {FASTEST} rad/s")
         self._arm = kinematics.Geometry(self.model, numbers(self.tool, 3, "tool"))
         addresses = self.rtde_port, self.dashboard_port, self.program_port
         self._link, self._dashboard, self._program = (
@@ -132,7 +133,7 @@ class Arm(Driver):
         if what == "enable":
             self._wanted, self._fault, self._reason, self._ask_at = True, "", "", now
         elif what == "move":
-            self._go([numbers(body.get("q"), 6, "q")], body)
+            self._go([numbers(body.get("joints"), 6, "joints")], body)
         elif what == "linear":
             self._go(self._straight(numbers(body.get("pose"), 6, "pose")), body)
         elif what == "output":
@@ -159,7 +160,7 @@ class Arm(Driver):
         for part in range(1, parts + 1):
             place = kinematics.between(begin, pose, part / parts)
             found = self._arm.joints(place, way[-1])
-            if found is None or _apart(found, way[-1]) > 0.2:
+            if found is None or max(map(abs, map(sub, found, way[-1]))) > 0.2:
                 x, y, z = place[:3]
                 raise ValueError(
                     f"linear: the arm cannot pass x = {x:.3f}, y = {y:.3f}, z = {z:.3f} m"
@@ -264,19 +265,19 @@ class Arm(Driver):
 
     def state(self) -> Mapping[str, Any]:
         """Return what actions, operator and report see; docs/robots/ur.md explains the keys."""
-        data, q, motion = self._rtde.data, self._q(), self._motion
+        data, q = self._rtde.data, self._q()
+        there = self._motion.reached(q, IN_PLACE)
+        mode = "hold" if there or self._motion.goal is None else "move"
         return {
-            "enabled": self._enabled,
-            "mode": ("hold" if motion.arrived or motion.goal is None else "move")
-            if self._enabled
-            else "off",
+            "ready": self._enabled,
+            "mode": mode if self._enabled else "off",
             "reason": self._reason,
-            "fault": self._fault,
+            "faults": {self._fault: self._reason} if self._fault else {},
             "connected": self._link.up and self._now - self._seen < STALE,
             "safety": SAFETY.get(data.get("safety_mode", 0), "unknown"),
             "q": q,
             "tool": self._arm.tool(q),
-            "in_place": motion.arrived and _apart(q, motion.q) < IN_PLACE,
+            "at_goal": there,
             "inputs": data.get("actual_digital_input_bits", 0),
             "outputs": self._pretended
             if self.dry_run
@@ -313,7 +314,3 @@ class Arm(Driver):
         """Close the connections; the program on the controller then stops the arm."""
         for link in (self._link, self._dashboard, self._program):
             link.close()
-
-
-def _apart(a: list[float], b: list[float]) -> float:
-    return max(abs(one - other) for one, other in zip(a, b, strict=True))
