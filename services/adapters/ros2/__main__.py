@@ -4,6 +4,8 @@
     python -m petrobot.services.adapters.ros2 deliver --page ADDRESS --url ws://ROBOT:9090
 
 This is a client of the operator's protocol (docs/operator-protocol.md) and of rosbridge.
+
+Its type is RunTask.action, beside this file. With another type, give its file with --definition.
 """
 
 from __future__ import annotations

@@ -38,8 +38,6 @@ POWER_OFF, IDLE, RUNNING = 3, 5, 7
 SAFETY = {1: "normal", 2: "reduced", 3: "protective_stop", 4: "recovery", 5: "safeguard_stop",
           6: "emergency_stop", 7: "emergency_stop", 8: "violation", 9: "fault"}  # fmt: skip
 MAY_MOVE = (1, 2)
-FASTEST = 3.14
-"""Greatest speed of the joints (rad/s)."""
 STANDING = 0.01
 """Speed below which a joint stands still (rad/s)."""
 IN_PLACE = 0.003
@@ -102,8 +100,8 @@ class Arm(Driver):
         if self.model not in kinematics.MODELS:
             known = ", ".join(kinematics.MODELS)
             raise ValueError(f"model: expected one of {known}, found {self.model!r}")
-        if self.top_speed > FASTEST:
-            raise ValueError(f"top_speed: expected at most {FASTEST} rad/s")
+        if self.top_speed > 3.14 or self.acceleration > 20.0:
+            raise ValueError("expected top_speed up to 3.14 rad/s, acceleration up to 20 rad/s^2")
         self._arm = kinematics.Geometry(self.model, numbers(self.tool, 3, "tool"))
         addresses = self.rtde_port, self.dashboard_port, self.program_port
         self._link, self._dashboard, self._program = (
@@ -123,7 +121,8 @@ class Arm(Driver):
         self._wanted = self._enabled = self._quick = False
         self._fault = self._reason = ""
         self._unseen_until, self._now = -math.inf, 0.0
-        self._outputs, self._pretended = list[dict[str, int]](), 0
+        self._pretended = 0
+        """Digital outputs as they would be, in a dry run."""
 
     # Commands
 
@@ -150,7 +149,9 @@ class Arm(Driver):
             )
         if not self._rtde.running:
             raise ValueError(f"output: no connection to the controller ({self._link.why})")
-        self._outputs.append(dict(zip(DIGITAL, (1 << bit, value << bit), strict=True)))
+        self._pretended = self._pretended & ~(1 << bit) | value << bit
+        if not self.dry_run:
+            self._rtde.send(1, dict(zip(DIGITAL, (1 << bit, value << bit), strict=True)))
 
     def _straight(self, pose: list[float]) -> list[list[float]]:
         """Joint poses along the straight way of the tool from where the arm rests."""
@@ -252,11 +253,6 @@ class Arm(Driver):
             follows = int(self._enabled and not self._quick)
             values = (self._beat, follows, *self._motion.q)
             self._rtde.send(0, dict(zip(SETPOINT, values, strict=True)))
-        for mask, value in (tuple(each.values()) for each in self._outputs):
-            self._pretended = self._pretended & ~mask | value
-            if not self.dry_run:
-                self._rtde.send(1, dict(zip(DIGITAL, (mask, value), strict=True)))
-        self._outputs.clear()
         self._link.send(now, self._rtde.drain())
 
     def _q(self) -> list[float]:

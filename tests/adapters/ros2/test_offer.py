@@ -7,7 +7,6 @@ import asyncio
 import importlib.util
 import json
 import os
-import re
 import subprocess
 import sys
 import time
@@ -25,11 +24,7 @@ from tests.ports import free_ports
 from tests.waiting import until
 
 ROOT = Path(__file__).parents[3]
-RUN_TASK = re.search(
-    r"```\n(# RunTask.action.*?)```",
-    (ROOT / "docs" / "robots" / "ros2.md").read_text(encoding="utf-8"),
-    re.DOTALL,
-)
+RUN_TASK = Path(offering.__file__).with_name("RunTask.action").read_text(encoding="utf-8")
 
 
 class Page:
@@ -254,11 +249,10 @@ def test_messages_fit_the_definition(tmp_path: Path) -> None:
     assert shapes == {"action_feedback": {"places"}, "action_result": {"state"}}
 
 
-def test_the_definition_in_the_page_is_what_is_sent() -> None:
+def test_the_shipped_definition_is_what_is_sent() -> None:
     from petrobot.services.adapters.ros2.definitions import faults, read
 
-    assert RUN_TASK is not None
-    known = read(offering.TYPE, RUN_TASK[1], "ros2.md")
+    known = read(offering.TYPE, RUN_TASK, "RunTask.action")
 
     async def steps(page: Page, link: Link) -> None:
         link.say("send_action_goal", "g1", args={})
