@@ -30,7 +30,10 @@ class JointMotion:
     ) -> None:
         """`limits`: least and greatest position of each joint by name. `speed` (1/s) and
         `acceleration` (1/s^2): greatest ones of the joint that has the longest way. `point`: where
-        the tool (x, y, z in m) is at given positions; without it there is no workspace."""
+        the tool (x, y, z in m) is at given positions; without it there is no workspace. Raises
+        ValueError."""
+        if not (speed > 0.0 and acceleration > 0.0):
+            raise ValueError(f"expected a speed and acceleration above 0: {speed}, {acceleration}")
         self.limits = limits
         self.q = [0.0] * len(limits)
         """The set point."""
@@ -56,6 +59,10 @@ class JointMotion:
         """Whether the set point is at its goal."""
         return self.goal is not None and not self._way
 
+    def reached(self, measured: Sequence[float], tolerance: float) -> bool:
+        """Return whether the joints are at the goal, where they are measured."""
+        return self.arrived and largest_change(measured, self.q) <= tolerance
+
     def begin(self, positions: Sequence[Any], share: Any = 1.0) -> None:
         """Begin to move from the set point through these positions, at this share of the speed.
 
@@ -74,7 +81,7 @@ class JointMotion:
         self._check(way)
         self._way, self._far = way, [0.0]
         for begin, end in pairwise(way):
-            self._far.append(self._far[-1] + _apart(begin, end))
+            self._far.append(self._far[-1] + largest_change(begin, end))
         self._at, self.goal = 0.0, goal
         self._most = part * self._driver.speed * self._speed
 
@@ -83,7 +90,7 @@ class JointMotion:
         if self._point is None or not self._driver.workspace.bounds:
             return
         for begin, end in pairwise(way):
-            parts = math.ceil(_apart(begin, end) / PART) or 1
+            parts = math.ceil(largest_change(begin, end) / PART) or 1
             for part in range(1, parts + 1):
                 at = self._point(_between(begin, end, part / parts))
                 if outside := self._driver.workspace.outside(at):
@@ -133,8 +140,8 @@ class JointMotion:
         self.q, self.goal, self._way, self._rate = list(positions), None, [], 0.0
 
 
-def _apart(begin: Sequence[float], end: Sequence[float]) -> float:
-    """The way of the joint that moves most."""
+def largest_change(begin: Sequence[float], end: Sequence[float]) -> float:
+    """Return the way of the joint that moves most."""
     return max(abs(b - a) for a, b in zip(begin, end, strict=True))
 
 

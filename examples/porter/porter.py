@@ -12,24 +12,27 @@ class Base(Driver):
     """Drives along a corridor, never faster than the stream `limit` allows."""
 
     period = 0.02
-    speed: float = key(1.0, "m/s")
+    obeys = ("speed", "workspace", "dry_run")
+    top_speed: float = key(1.0, "m/s")
     blind: float = key(0.4, "m/s while nobody watches the corridor")
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         super().__init__(config, ports)
-        self.limit = ports.stream("limit")
+        self.allowed = ports.stream("limit")
         self.at = self.goal = 0.0
         self.share, self.paused = 1.0, False
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
         if body.get("to") not in STATIONS:
             raise ValueError(f"to: {body.get('to')!r} is none of {', '.join(STATIONS)}")
+        if outside := self.workspace.outside((STATIONS[body["to"]], 0.0, 0.0)):
+            raise ValueError(outside)
         self.goal, self.share = STATIONS[body["to"]], body.get("share", 1.0)
 
     def step(self, now: float) -> None:
-        limit = self.blind if self.limit.values is None else self.limit.values[0]
+        limit = self.blind if self.allowed.values is None else self.allowed.values[0]
         if not self.paused:
-            most = min(self.speed * self.share, limit) * self.period
+            most = self.speed * min(self.top_speed * self.share, limit) * self.period
             self.at += max(-most, min(most, self.goal - self.at))
 
     def state(self) -> Mapping[str, Any]:
@@ -50,9 +53,10 @@ class Base(Driver):
 
 
 class Gripper(Driver):
-    """Opens and closes; some parts slip."""
+    """Opens and closes; some parts slip. In a dry run it moves, but grips nothing."""
 
     period = 0.02
+    obeys = ("speed", "dry_run")
     slips: float = key(0.2, "share of the parts that slip out")
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
@@ -62,10 +66,10 @@ class Gripper(Driver):
     def command(self, now: float, body: Mapping[str, Any]) -> None:
         if body.get("do") not in ("close", "open", "wave"):
             raise ValueError(f"do: {body.get('do')!r} is none of close, open, wave")
-        self.left = 0.3
+        self.left = 0.3 / self.speed
         if body["do"] != "wave":
             slipped = self.ports.random("slip").random() < self.slips
-            self.holds = body["do"] == "close" and not slipped
+            self.holds = body["do"] == "close" and not slipped and not self.dry_run
 
     def step(self, now: float) -> None:
         self.left = max(0.0, self.left - self.period)
@@ -94,6 +98,7 @@ class Button(Driver):
     """Somebody presses it now and then; a real one would read a pin in `step`."""
 
     period = 0.1
+    obeys = ("dry_run",)  # it moves nothing
     every: float = key(6.0, "s, mean time between two presses")
 
     def step(self, now: float) -> None:

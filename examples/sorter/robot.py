@@ -9,10 +9,12 @@ STATIONS = {"home": 0.0, "belt": 0.2, "left": 0.5, "right": 0.8}  # m along the 
 
 
 class Arm(Driver):
-    """Moves along a rail. A real one would send its speed to a motor in `step`."""
+    """Moves along a rail. A real one would send its speed to a motor in `step`, but not in a
+    `dry_run`."""
 
     period = 0.01  # s between two steps
-    speed: float = key(0.5, "m/s")
+    obeys = ("speed", "workspace", "dry_run")  # keys of its table for its first motions
+    top_speed: float = key(0.5, "m/s")
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         super().__init__(config, ports)
@@ -22,11 +24,13 @@ class Arm(Driver):
     def command(self, now: float, body: Mapping[str, Any]) -> None:
         if body.get("to") not in STATIONS:
             raise ValueError(f"to: {body.get('to')!r} is none of {', '.join(STATIONS)}")
+        if outside := self.workspace.outside((STATIONS[body["to"]], 0.0, 0.0)):
+            raise ValueError(outside)
         self.goal = STATIONS[body["to"]]
 
     def step(self, now: float) -> None:
         if not self.paused:
-            most = self.speed * self.period
+            most = self.speed * self.top_speed * self.period
             self.at += max(-most, min(most, self.goal - self.at))
 
     def state(self) -> Mapping[str, Any]:

@@ -4,7 +4,7 @@ arms. To add your own arm, add a class to ARMS."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 from petrobot.services.picking.model import Gripper
 
@@ -23,36 +23,41 @@ class ArmState(NamedTuple):
     fault: str
 
 
-class Commands(Protocol):
-    """The commands of one kind of driver."""
+class Commands:
+    """The commands of drivers of arms, and those of one kind of gripper."""
 
     def enable(self) -> Mapping[str, Any]:
         """Switch on, and clear faults."""
+        return {"do": "enable"}
 
     def move(self, joints: Sequence[float]) -> Mapping[str, Any]:
         """Move to joint angles (rad)."""
+        return {"do": "move", "joints": list(joints)}
 
     def open(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
         """Open the fingers to a gap (m)."""
+        raise NotImplementedError
 
     def close(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
         """Close the fingers on what is between them, but not below a gap (m) if the gripper accepts
         one."""
+        raise NotImplementedError
+
+    def fingers(
+        self, gripper: Gripper, state: Mapping[str, Any]
+    ) -> tuple[float | None, bool, bool]:
+        """Read `grip`, `held` and `gripped` of `ArmState`."""
+        raise NotImplementedError
 
     def state(self, gripper: Gripper, state: Mapping[str, Any]) -> ArmState:
         """Read the driver's state."""
+        faults = "; ".join(state["faults"].values())
+        on, q = state["ready"] and not faults, tuple(state["q"])
+        return ArmState(on, q, state["at_goal"], *self.fingers(gripper, state), faults)
 
 
-class So101:
+class So101(Commands):
     """`petrobot.services.adapters.so101`: the gripper is a joint, and closes until it squeezes."""
-
-    def enable(self) -> Mapping[str, Any]:
-        """See `Commands`."""
-        return {"do": "reset"}
-
-    def move(self, joints: Sequence[float]) -> Mapping[str, Any]:
-        """See `Commands`."""
-        return {"do": "move", "joints": list(joints)}
 
     def open(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
         """See `Commands`."""
@@ -62,33 +67,19 @@ class So101:
         """See `Commands`. It closes until it squeezes and ignores the gap."""
         return {"do": "close", "squeeze": gripper.numbers["squeeze"]}
 
-    def state(self, gripper: Gripper, state: Mapping[str, Any]) -> ArmState:
+    def fingers(
+        self, gripper: Gripper, state: Mapping[str, Any]
+    ) -> tuple[float | None, bool, bool]:
         """See `Commands`."""
         jaw = state["gripper"]
         grip = max(0.0, jaw["angle"] * gripper.numbers["gap_per_rad"])
-        faults = "; ".join(state["faults"].values())
-        return ArmState(
-            state["torque"] and not faults,
-            tuple(state["q"]),
-            state["at_goal"],
-            grip,
-            jaw["holding"] and grip > CLOSED,
-            jaw["open"] or jaw["holding"] or jaw["closed"],
-            faults,
-        )
+        held = jaw["holding"] and grip > CLOSED
+        return grip, held, jaw["open"] or jaw["holding"] or jaw["closed"]
 
 
-class Ur:
+class Ur(Commands):
     """`petrobot.services.adapters.ur`: the gripper is connected to digital output 0 (close) and
     inputs 0 (holds something) and 1 (its fingers have stopped), and does not measure its gap."""
-
-    def enable(self) -> Mapping[str, Any]:
-        """See `Commands`."""
-        return {"do": "enable"}
-
-    def move(self, joints: Sequence[float]) -> Mapping[str, Any]:
-        """See `Commands`."""
-        return {"do": "move", "q": list(joints)}
 
     def open(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
         """See `Commands`. It opens as far as it can."""
@@ -98,18 +89,12 @@ class Ur:
         """See `Commands`."""
         return {"do": "output", "bit": 0, "value": True}
 
-    def state(self, gripper: Gripper, state: Mapping[str, Any]) -> ArmState:
+    def fingers(
+        self, gripper: Gripper, state: Mapping[str, Any]
+    ) -> tuple[float | None, bool, bool]:
         """See `Commands`."""
         inputs = state["inputs"]
-        return ArmState(
-            state["enabled"],
-            tuple(state["q"]),
-            state["in_place"],
-            None,
-            bool(inputs & 1) and bool(state["outputs"] & 1),
-            bool(inputs & 2),
-            state["fault"],
-        )
+        return None, bool(inputs & 1) and bool(state["outputs"] & 1), bool(inputs & 2)
 
 
 CLOSED: Final = 0.003

@@ -32,7 +32,9 @@ if TYPE_CHECKING:
     from petrobot.services.conformance import DriverCheck, check_driver
     from petrobot.services.device import Driver, Ports, Remote, Setpoint, key, numbers
     from petrobot.services.joint_motion import JointMotion
+    from petrobot.services.perform import perform
     from petrobot.services.rehearsal import Rehearsal, rehearse
+    from petrobot.services.session_thread import SessionThread
 
 __all__ = [
     "ByteLine",
@@ -48,6 +50,7 @@ __all__ = [
     "Rehearsal",
     "Remote",
     "Result",
+    "SessionThread",
     "Setpoint",
     "Status",
     "check_driver",
@@ -55,6 +58,7 @@ __all__ = [
     "failure",
     "key",
     "numbers",
+    "perform",
     "provisional",
     "rehearse",
     "success",
@@ -67,6 +71,8 @@ _HOMES = {
     ),
     "JointMotion": "petrobot.services.joint_motion",
     **dict.fromkeys(("DriverCheck", "check_driver"), "petrobot.services.conformance"),
+    "perform": "petrobot.services.perform",
+    "SessionThread": "petrobot.services.session_thread",
     **dict.fromkeys(("Rehearsal", "rehearse"), "petrobot.services.rehearsal"),
 }
 

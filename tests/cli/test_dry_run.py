@@ -8,13 +8,19 @@ from pathlib import Path
 
 import pytest
 
+from petrobot import check_driver, rehearse
 from petrobot.coordinator.cli import main
+from petrobot.coordinator.cli.loading import load_directory
+from petrobot.services.adapters.ros2.topics import TopicDriver
 from petrobot.services.comm.calls.peers import Peers
 from petrobot.services.comm.location_file import dry, load, parse, resolve
 from petrobot.services.comm.protocol.messages import Hello, Refuse
 from petrobot.services.device import LIMITS, can_move, keys_of
+from petrobot.services.rehearsal import TestPorts
+from petrobot.services.worker.setpoints import SetpointReceiver
 from tests.ports import free_ports
 
+ROOT = Path(__file__).parents[2]
 ROBOT = '''
 from pathlib import Path
 from petrobot import Context, Driver, Remote, success
@@ -130,23 +136,84 @@ def test_a_dry_run_is_refused_where_a_driver_cannot(
     assert "Sensor" not in told
 
 
+SHIPPED: dict[tuple[str, str], tuple[str, ...]] = {
+    ("", "petrobot.services.motion.arm:Arm"): LIMITS,
+    ("services/mobile", "petrobot.services.mobile.rover:Rover"): LIMITS,
+    ("services/picking", "petrobot.services.adapters.so101.arm:Arm"): LIMITS,
+    ("services/picking", "petrobot.services.adapters.ur.arm:Arm"): LIMITS,
+    ("examples/so101", "petrobot.services.adapters.so101.arm:Arm"): LIMITS,
+    ("examples/ur", "petrobot.services.adapters.ur.arm:Arm"): LIMITS,
+    ("examples/ros2", "petrobot.services.adapters.ros2.bridge:Bridge"): LIMITS,
+    ("examples/opcua", "petrobot.services.adapters.opcua.session:OpcUaSession"): ("dry_run",),
+    ("examples/sorter", "robot:Arm"): LIMITS,
+    ("examples/porter", "porter:Base"): LIMITS,
+    ("examples/porter", "porter:Gripper"): ("speed", "dry_run"),
+    ("examples/porter", "porter:Button"): ("dry_run",),
+}
+"""What docs/first-motion.md promises: by folder of its location file, each driver that may move
+something, and what it obeys."""
+
+
+@pytest.mark.processes
+def test_every_shipped_driver_of_what_moves_obeys(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So no shipped cell refuses a dry run, and none ignores one. The table names all of them."""
+    found = dict[tuple[str, str], tuple[str, ...]]()
+    monkeypatch.syspath_prepend(ROOT)  # and takes back what the files add
+    cells = [f for top in ("services", "examples") for f in (ROOT / top).rglob("*services.toml")]
+    for path in [ROOT / "services.toml", *cells]:
+        directory = load_directory(path, dry_run=True)  # raises where a driver does not obey
+        for device in directory.devices.values():
+            driver = resolve(device.driver)
+            if can_move(driver):
+                folder = str(path.parent.relative_to(ROOT)).removeprefix(".")
+                found[folder, device.driver] = tuple(n for n in LIMITS if n in driver.obeys)
+                # as a key of its own it would mean something else
+                assert not set(LIMITS) & set(keys_of(driver)), device.driver
+    assert found == SHIPPED
+    assert set(TopicDriver.obeys) == set(LIMITS)  # the base class of topics over DDS
+
+
+@pytest.mark.processes
+def test_a_new_driver_and_a_new_robot_obey(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "driver", "dry_gripper"]) == main(["new", "robot", "dry_carrier"]) == 0
+    monkeypatch.syspath_prepend(tmp_path)
+    assert set(resolve("dry_gripper:DryGripper").obeys) == set(LIMITS)
+    monkeypatch.chdir("dry_carrier")
+    run = ["run", "dry_carrier.toml", "--mode", "lockstep", "--quiet", "--no-page"]
+    assert main([*run, "--dry-run", "--json", "out.json"]) == 0, capsys.readouterr()
+    assert json.loads(Path("out.json").read_text())["status"] == "success"
+
+
 @pytest.mark.parametrize(
-    ("driver", "limits"),
+    ("folder", "driver", "commands"),
     [
-        ("motion.arm:Arm", LIMITS),
-        ("mobile.rover:Rover", LIMITS),
-        ("adapters.so101.arm:Arm", LIMITS),
-        ("adapters.ur.arm:Arm", LIMITS),
-        ("adapters.ros2.bridge:Bridge", LIMITS),
-        ("adapters.ros2.topics:TopicDriver", LIMITS),
-        ("adapters.opcua.session:OpcUaSession", ("dry_run",)),
+        ("sorter", "robot:Arm", [{"to": "right"}, {"to": "home"}]),
+        ("porter", "porter:Base", [{"to": "shelf"}, {"to": "dock"}]),
+        ("porter", "porter:Gripper", []),
+        ("porter", "porter:Button", []),
     ],
 )
-def test_every_shipped_driver_of_what_moves_obeys(driver: str, limits: tuple[str, ...]) -> None:
-    """So no cell of them refuses a dry run."""
-    found = resolve(f"petrobot.services.{driver}")
-    assert can_move(found) and set(found.obeys) == set(limits)
-    assert "speed" not in keys_of(found)  # as a key of its own it would mean something else
+def test_the_drivers_of_the_examples_keep_the_rules(
+    folder: str, driver: str, commands: list[dict[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With those of speed, workspace and dry run; the other shipped drivers have such a test with
+    their simulated devices."""
+    monkeypatch.syspath_prepend(ROOT / "examples" / folder)
+    kind, silent = resolve(driver), SetpointReceiver(1.0, lambda: 0.0)
+    ports = TestPorts(lambda: 0.0, [], lambda name: silent)
+    found = check_driver(lambda **keys: kind(keys, ports), commands, seconds=8.0, simulated=True)
+    assert found.faults == []
+
+
+def test_a_gripper_grips_nothing_in_a_dry_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "examples" / "porter")
+    grasp, kind = resolve("porter:grasp"), resolve("porter:Gripper")
+    for dry_run, ended in ((False, "success"), (True, "error")):
+        device = kind({"slips": 0.0, "dry_run": dry_run}, None)
+        assert rehearse(grasp, device=device).result.status == ended
 
 
 @pytest.mark.parametrize("mode", [["--mode", "lockstep"], ["--up"]])

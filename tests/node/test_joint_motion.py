@@ -123,3 +123,20 @@ def test_a_second_way_waits_for_the_first_to_stop() -> None:
     assert motion.q == [0.0, 0.0]
     motion.halt([0.3, 0.3])
     assert motion.q == [0.3, 0.3] and not motion.moving and not motion.arrived
+
+
+def test_it_has_reached_its_goal_where_the_joints_are_measured() -> None:
+    motion = moved()
+    assert not motion.reached(motion.q, 0.1)  # there is no goal yet
+    motion.begin([[0.5, 0.0]])
+    assert not motion.reached([0.5, 0.0], 0.1)  # the set point is still on its way
+    arrive(motion)
+    assert motion.reached([0.51, 0.0], 0.011) and not motion.reached([0.51, 0.0], 0.009)
+
+
+@pytest.mark.parametrize(("speed", "acceleration"), [(0.0, 1.0), (1.0, 0.0), (-1.0, 1.0)])
+def test_without_speed_or_acceleration_it_would_never_move(
+    speed: float, acceleration: float
+) -> None:
+    with pytest.raises(ValueError, match="speed and acceleration above 0"):
+        JointMotion(Bare({}, None), LIMITS, speed, acceleration)  # type: ignore[arg-type]

@@ -7,22 +7,17 @@ failed.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import ipaddress
-import queue
-import threading
 from collections.abc import Mapping
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from petrobot import Driver, Ports, key
+from petrobot import Driver, Ports, SessionThread, key
 
-RETRY: Final = (0.5, 8.0)
-"""Shortest and longest pause between two attempts to connect (s)."""
 LOOK: Final = 0.3
 """Time between two checks of the connection (s)."""
-DOWN: Final = "no session yet"
+UNKNOWN: Final = "the session was lost: it is unknown whether it was written"
 
 
 class OpcUaSession(Driver):
@@ -54,16 +49,10 @@ class OpcUaSession(Driver):
         names = (self.certificate, self.private_key, self.server_certificate)
         self._files = [(name, ports.file(name)) for name in names] if self.certificate else []
         self.values: dict[str, Any] = {}
-        self.faults: dict[str, str] = {"session": DOWN}
+        self.faults = {"session": "no session yet"}
         self._asked = self._done = 0
         self._write_fault = ""
-        self._news: queue.SimpleQueue[tuple[str, Any, Any]] = queue.SimpleQueue()
-        self._loop = asyncio.new_event_loop()
-        self._jobs: asyncio.Queue[tuple[int, dict[str, Any]] | None] = asyncio.Queue()
-        self._by_id: dict[Any, str] = {}
-        self._was_up = False
-        self._thread = threading.Thread(target=self._run, name="opcua", daemon=True)
-        self._thread.start()
+        self._session = SessionThread(self._serve)
 
     def _check_keys(self) -> None:
         host = urlsplit(self.url).hostname
@@ -104,21 +93,22 @@ class OpcUaSession(Driver):
         self._asked += 1
         if self.dry_run:  # its machine would answer: here nothing changes
             self._done, self._write_fault = self._asked, ""
-            return
-        self._loop.call_soon_threadsafe(self._jobs.put_nowait, (self._asked, values))
+        else:
+            self._session.send(values)
 
     def step(self, now: float) -> None:
         """Take over what the session's thread has received; raise events for changed values."""
-        while not self._news.empty():
-            kind, name, value = self._news.get()
+        for kind, item in self._session.news():
             if kind == "up":
-                self.faults = value
+                self.faults = item
             elif kind == "down":
-                self.faults = {"session": value}
-                self.values = {}
+                self.faults, self.values = {"session": f"{item}; trying again"}, {}
+                if self._done < self._asked:
+                    self._done, self._write_fault = self._asked, UNKNOWN
             elif kind == "done":
-                self._done, self._write_fault = name, value
+                self._done, self._write_fault = self._done + 1, item
             else:
+                name, value = item
                 known, before = name in self.values, self.values.get(name)
                 self.values[name] = value
                 # The first value of a session is not a change: the value before it is unknown.
@@ -151,48 +141,16 @@ class OpcUaSession(Driver):
 
     def close(self) -> None:
         """End the session."""
-        with contextlib.suppress(RuntimeError):  # the thread has ended: closed a second time
-            self._loop.call_soon_threadsafe(self._jobs.put_nowait, None)
-        self._thread.join(self.patience)
+        self._session.close(self.patience)
 
     # --- the session's thread -------------------------------------------------------------------
 
-    def _run(self) -> None:
-        asyncio.set_event_loop(self._loop)
-        with contextlib.closing(self._loop):
-            self._loop.run_until_complete(self._serve())
-
-    async def _serve(self) -> None:
-        """Connect again and again, until `close`."""
-        pause, over = RETRY[0], False
-        while not over:
-            try:
-                over = await self._session()
-                pause = RETRY[0]
-            except Exception as fault:  # the library raises many kinds of exceptions
-                text = str(fault) or type(fault).__name__
-                self._news.put(("down", "", f"{text}; trying again"))
-                pause = RETRY[0] if self._was_up else min(2 * pause, RETRY[1])
-            self._drop_writes()
-            if not over:
-                with contextlib.suppress(TimeoutError):  # a write between two sessions fails
-                    over = await asyncio.wait_for(self._jobs.get(), pause) is None
-
-    def _drop_writes(self) -> None:
-        while not self._jobs.empty():
-            job = self._jobs.get_nowait()
-            if job is None:
-                self._jobs.put_nowait(None)
-                return
-            self._news.put(("done", job[0], "the session was lost"))
-
-    async def _session(self) -> bool:
-        """One session; True when it was closed here."""
+    async def _serve(self, session: SessionThread) -> None:
+        """One session."""
         from asyncua import Client, ua
         from asyncua.crypto import security_policies
         from asyncua.crypto.uacrypto import CertProperties
 
-        self._was_up = False
         client = Client(self.url, timeout=self.patience)
         client.application_uri = self.application_uri
         if self._files:
@@ -202,68 +160,68 @@ class OpcUaSession(Driver):
             policy = security_policies.SecurityPolicyBasic256Sha256
             await client.set_security(policy, mine, secret, server_certificate=server)
         async with client:
-            nodes: dict[str, Any] = {}
-            kinds: dict[str, Any] = {}
+            nodes: dict[str, tuple[Any, Any]] = {}
             faults: dict[str, str] = {}
-            subscription = await client.create_subscription(1000 * self.interval, self)
-            self._by_id = {}
+            heard = _Notifications(session)
+            subscription = await client.create_subscription(1000 * self.interval, heard)
             for name, text in self.nodes.items():
                 try:
                     node = client.get_node(text)
-                    kinds[name] = await node.read_data_type_as_variant_type()
-                    self._by_id[node.nodeid] = name
+                    kind = await node.read_data_type_as_variant_type()
+                    heard.names[node.nodeid] = name
                     await subscription.subscribe_data_change(node)
-                    nodes[name] = node
+                    nodes[name] = node, kind
                 except (ua.UaError, ValueError) as fault:
                     faults[name] = f"{text}: {fault}"
-            self._news.put(("up", "", faults))
-            self._was_up = True
+            session.opened(faults)
             while True:
                 try:
-                    job = await asyncio.wait_for(self._jobs.get(), LOOK)
+                    values = await session.get(LOOK)
                 except TimeoutError:
                     await client.check_connection()
                     continue
-                if job is None:
-                    return True
-                wrong = "the session was lost: it is unknown whether it was written"
-                try:
-                    wrong = await self._written(job[1], nodes, kinds, faults)
-                finally:
-                    self._news.put(("done", job[0], wrong))
+                if values is None:
+                    return
+                session.tell("done", await _written(values, nodes, faults))
 
-    async def _written(
-        self,
-        values: Mapping[str, Any],
-        nodes: Mapping[str, Any],
-        kinds: Mapping[str, Any],
-        faults: Mapping[str, str],
-    ) -> str:
-        """Write nodes, but none if one of the values does not fit; return what is wrong."""
-        from asyncua import ua
-        from asyncua.ua.ua_binary import variant_to_binary
 
-        wanted = {}
-        for name, value in values.items():
-            if name not in nodes:
-                return f"{name}: {faults[name]}"
-            kind = kinds[name]
-            try:
-                # A value that cannot be encoded would end the session.
-                variant_to_binary(ua.Variant(value, kind))
-            except Exception:
-                return f"{name}: expected {kind.name}, found {value!r:.40}"
-            wanted[name] = ua.Variant(value, kind)
-        for name, variant in wanted.items():
-            try:
-                await nodes[name].write_value(variant)
-            except ua.UaStatusCodeError as fault:
-                return f"{name}: {fault}"
-        return ""
+class _Notifications:
+    """What asyncua calls in the session's thread."""
+
+    def __init__(self, session: SessionThread) -> None:
+        self.names: dict[Any, str] = {}
+        self._session = session
 
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
-        """Take a notification (called by asyncua, in the session's thread)."""
-        self._news.put(("value", self._by_id[node.nodeid], _plain(value)))
+        """Take a new value."""
+        self._session.tell("value", (self.names[node.nodeid], _plain(value)))
+
+
+async def _written(
+    values: Mapping[str, Any],
+    nodes: Mapping[str, tuple[Any, Any]],
+    faults: Mapping[str, str],
+) -> str:
+    """Write nodes, but none if one of the values does not fit; return what is wrong."""
+    from asyncua import ua
+    from asyncua.ua.ua_binary import variant_to_binary
+
+    wanted = {}
+    for name, value in values.items():
+        if name not in nodes:
+            return f"{name}: {faults[name]}"
+        node, kind = nodes[name]
+        wanted[name] = node, ua.Variant(value, kind)
+        try:
+            variant_to_binary(wanted[name][1])  # one that cannot be encoded would end the session
+        except Exception:
+            return f"{name}: expected {kind.name}, found {value!r:.40}"
+    for name, (node, variant) in wanted.items():
+        try:
+            await node.write_value(variant)
+        except ua.UaStatusCodeError as fault:
+            return f"{name}: {fault}"
+    return ""
 
 
 def _plain(value: Any) -> Any:

@@ -4,6 +4,8 @@
     python -m petrobot.services.adapters.ros2 deliver --page ADDRESS --url ws://ROBOT:9090
 
 This is a client of the operator's protocol (docs/operator-protocol.md) and of rosbridge.
+
+Its type is RunTask.action, beside this file. With another type, give its file with --definition.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from typing import Any
 import aiohttp
 
 from petrobot.services.adapters.ros2 import definitions
-from petrobot.services.adapters.ros2.link import WebSocketLink
+from petrobot.services.adapters.ros2.link import RosbridgeLink, connect
 
 _log = logging.getLogger(__name__)
 LOOK = 0.2
@@ -71,14 +73,13 @@ class OfferedTask:
     """One task as one action server; one goal at a time."""
 
     def __init__(
-        self, link: WebSocketLink, page: OperatorPage, options: argparse.Namespace
+        self, link: RosbridgeLink, page: OperatorPage, options: argparse.Namespace
     ) -> None:
         self._link, self._page, self._options = link, page, options
         self._fields: Mapping[str, Mapping[str, Any]] = {}
         if options.definition is not None:
             text = options.definition.read_text(encoding="utf-8")
             self._fields = definitions.read(options.type, text, str(options.definition))
-        self._epoch = 0
         self._goal = ""
         """Id of the active goal."""
         self._why = ""
@@ -90,13 +91,12 @@ class OfferedTask:
         """Serve goals until `stop`; then abort the active one."""
         action = {"action": self._options.action}
         while not stop.is_set():
-            for kind, item in self._link.poll(0.0):
+            for kind, item in self._link.news():
                 if kind == "up":
-                    self._epoch = item
                     self._send({"op": "advertise_action", **action, "type": self._options.type})
                     print(f"{self._options.action} is offered", flush=True)
                 elif kind == "down":
-                    self._epoch, self._why = 0, "lost"
+                    self._why = "lost"
                     print(f"no connection to rosbridge: {item}", file=sys.stderr, flush=True)
                 elif kind == "message" and item.get("action") == self._options.action:
                     self._take(item)
@@ -197,14 +197,14 @@ class OfferedTask:
         self._send({"op": op, "action": self._options.action, "id": goal, "values": values, **more})
 
     def _send(self, message: dict[str, Any]) -> None:
-        if self._epoch:
-            self._link.send(0.0, self._epoch, [message])
+        if self._link.up:
+            self._link.send(message)
 
 
 async def main(arguments: list[str]) -> int:
     """Read the options and serve."""
     parser = argparse.ArgumentParser(prog="python -m petrobot.services.adapters.ros2")
-    parser.description = "OfferedTask a task to ROS 2 as an action."
+    parser.description = "Offer a task to ROS 2 as an action."
     parser.add_argument("task", help="name of a task that the page offers")
     parser.add_argument(
         "--page",
@@ -227,7 +227,7 @@ async def main(arguments: list[str]) -> int:
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     timeout = aiohttp.ClientTimeout(10.0)
     async with aiohttp.ClientSession(trust_env=False, timeout=timeout) as http:
-        link = WebSocketLink(options.url, 10.0)
+        link = connect(options.url, 10.0)
         try:
             await OfferedTask(link, OperatorPage(options.page, http), options).serve(stop)
         except (OSError, ValueError) as fault:

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
-from petrobot import Cancelled, CommandRefused, Context, Remote, Result, Status, error, success
+from petrobot import CommandRefused, Context, Remote, Result, Status, error, success
 from petrobot.services.adapters.ros2.protocol import RUNNING, ExchangePhase, filled, pick
 from petrobot.services.adapters.ros2.topics import fits
 
@@ -41,9 +42,11 @@ async def goal(
 
     Of the feedback, `remaining` is the path of a number that falls to 0 (progress); `to_memory`
     names variables of the global memory, `to_streams` streams of set points, with the paths of
-    their values. Causes of ERROR: `link_down`, `bad_goal`, `rejected` (nothing was executed);
-    `aborted`, `cancelled` (by another client), `timeout`, `bad_result`; `link_lost`, `unanswered`
-    (it is unknown what was executed).
+    their values; what a message does not have is left out.
+
+    Causes of ERROR: `link_down`, `bad_goal`, `rejected` (nothing was executed); `aborted`,
+    `cancelled` (by another client), `timeout`, `bad_result`; `link_lost`, `unanswered` (it is
+    unknown what was executed).
     """
     try:
         args = _request(goal, fields, arguments)
@@ -228,20 +231,22 @@ class _Feedback:
         self, ctx: Context, remaining: str, memory: Paths, streams: Mapping[str, Sequence[str]]
     ) -> None:
         self.ctx, self.remaining, self.memory, self.streams = ctx, remaining, memory, streams
-        self.whole = 0.0
+        self.whole = self.fraction = 0.0
 
     async def take(self, feedback: Mapping[str, Any]) -> None:
-        """Pass on one feedback message. Raises ValueError for a path that is not in it."""
-        fraction = 0.0
-        if self.remaining:
+        """Pass on one feedback message. What is not in it, or is not a number, is left out: a goal
+        does not end because a server reports in another form."""
+        with suppress(ValueError, TypeError):
             left = float(pick(feedback, self.remaining))
             self.whole = max(self.whole, left)
-            fraction = min(1.0, max(0.0, 1.0 - left / self.whole)) if self.whole > 0 else 0.0
-        self.ctx.progress(fraction, feedback=feedback)
+            self.fraction = min(1.0, max(0.0, 1.0 - left / self.whole)) if self.whole > 0 else 0.0
+        self.ctx.progress(self.fraction, feedback=feedback)
         for stream, paths in self.streams.items():
-            self.ctx.publish(stream, [float(pick(feedback, path)) for path in paths])
+            with suppress(ValueError, TypeError):
+                self.ctx.publish(stream, [float(pick(feedback, path)) for path in paths])
         for name, path in self.memory.items():
-            await self.ctx.put(name, pick(feedback, path))
+            with suppress(ValueError):
+                await self.ctx.put(name, pick(feedback, path))
 
 
 def _request(base: Any, fields: Paths | None, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -306,7 +311,7 @@ async def _exchange(
         if late:
             await ctx.command({"cancel": ctx.run})
             await ctx.wait(ended, CANCEL)
-    except Cancelled:
+    except BaseException:  # Cancelled, or feedback that cannot be passed on: nothing moves on alone
         ctx.device.send({"cancel": ctx.run})
         raise
     finally:

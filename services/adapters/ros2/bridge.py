@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from petrobot import Ports, key
-from petrobot.services.adapters.ros2.link import SimulatedLink, WebSocketLink
+from petrobot.services.adapters.ros2.link import RosbridgeLink, SimulatedLink, connect
 from petrobot.services.adapters.ros2.protocol import MOVING, ExchangePhase, Exchanges, Message
 from petrobot.services.adapters.ros2.topics import TopicDriver
 
@@ -23,28 +23,29 @@ class Bridge(TopicDriver):
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         super().__init__(config, ports)
         self.exchanges = Exchanges(self.patience)
-        self.epoch, self.down = 0, "not connected yet"
-        """Number of the connection (0: none), and why there is none."""
         self.advertised: dict[str, str] = {}
-        simulated = "://" not in self.url
-        self.link = (
-            SimulatedLink(self.url) if simulated else WebSocketLink(self.url, self.heartbeat)
+        self.now = 0.0
+        """Time of the present step (s)."""
+        self.link: RosbridgeLink = (
+            connect(self.url, self.heartbeat)
+            if "://" in self.url
+            else SimulatedLink(self.url, lambda: self.now)
         )
 
     @property
     def connected(self) -> bool:
         """Whether there is a connection to rosbridge."""
-        return bool(self.epoch)
+        return self.link.up
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
         """Obey `goal` or `call` (a request, with `run` and `keep`), `cancel`, `forget`, and the
         commands of topics."""
         if "cancel" in body:
-            self._send(now, self.exchanges.cancel(now, body["cancel"]))
+            self._send(self.exchanges.cancel(now, body["cancel"]))
         elif "forget" in body:
             self.exchanges.forget(body["forget"])
-        elif not self.epoch:
-            raise ValueError(f"no connection to {self.url}: {self.down}")
+        elif not self.link.up:
+            raise ValueError(f"no connection to {self.url}: {self.link.why}")
         elif "goal" in body or "call" in body:
             verb, answer = ("goal", "Result") if "goal" in body else ("call", "Response")
             request, keep = dict(body[verb]), body.get("keep")
@@ -60,18 +61,17 @@ class Bridge(TopicDriver):
             if self.dry_run:
                 self.exchanges.open[body["run"]].phase = ExchangePhase.SUCCEEDED
             else:
-                self._send(now, [sent])
+                self._send([sent])
         else:
             super().command(now, body)
 
     def step(self, now: float) -> None:
         """Process received messages, and send those that are due."""
-        for kind, item in self.link.poll(now):
+        self.now = now
+        for kind, item in self.link.news():
             if kind == "up":
-                self.epoch = item
-                self._send(now, [*self._subscriptions(), *self.exchanges.link(now, True)])
+                self._send([*self._subscriptions(), *self.exchanges.link(now, True)])
             elif kind == "down":
-                self.epoch, self.down = 0, str(item)
                 self.advertised.clear()
                 self.topics.clear()  # values from before the link was lost
                 self.exchanges.link(now, False)
@@ -81,7 +81,7 @@ class Bridge(TopicDriver):
                 self.arrive(now, item.get("topic"), item.get("msg"))
             elif fault := self.exchanges.receive(now, item):
                 self.refuse(fault)
-        self._send(now, self.exchanges.advance(now))
+        self._send(self.exchanges.advance(now))
         super().step(now)
 
     def _subscriptions(self) -> list[Message]:
@@ -91,16 +91,16 @@ class Bridge(TopicDriver):
             for name, sub in self.subscribe.items()
         ]
 
-    def transmit(self, now: float, topic: str, interface: str, message: Message) -> None:
+    def transmit(self, topic: str, interface: str, message: Message) -> None:
         """Publish a message, after advertising its topic on this connection."""
-        first = self.advertised.get(topic) != interface
-        self.advertised[topic] = interface
-        self._send(now, [{"op": "advertise", "topic": topic, "type": interface}] * first)
-        self._send(now, [{"op": "publish", "topic": topic, "msg": message}])
+        if self.advertised.get(topic) != interface:
+            self.advertised[topic] = interface
+            self._send([{"op": "advertise", "topic": topic, "type": interface}])
+        self._send([{"op": "publish", "topic": topic, "msg": message}])
 
-    def _send(self, now: float, messages: list[Message]) -> None:
-        if messages and self.epoch:
-            self.link.send(now, self.epoch, messages)
+    def _send(self, messages: list[Message]) -> None:
+        for message in messages if self.link.up else ():
+            self.link.send(message)
 
     def state(self) -> Mapping[str, Any]:
         """Return the state of topics, why the link is `down`, and goals and calls by run
@@ -116,7 +116,7 @@ class Bridge(TopicDriver):
             }
             for name, one in self.exchanges.open.items()
         }
-        down = "" if self.epoch else self.down
+        down = "" if self.link.up else self.link.why
         return {**super().state(), "down": down, "exchanges": exchanges}
 
     def stop(self, now: float) -> None:
@@ -124,7 +124,7 @@ class Bridge(TopicDriver):
         for name in list(self.exchanges.open):
             if cancelled := self.exchanges.cancel(now, name):
                 self.exchanges.open[name].text = self.left
-                self._send(now, cancelled)
+                self._send(cancelled)
         super().stop(now)
 
     def stopped(self) -> bool:

@@ -131,7 +131,7 @@ class Topics(TopicDriver):
             self._writers[name, interface] = DataWriter(self._participant, topic, self._writing)
         return self._writers[name, interface]
 
-    def transmit(self, now: float, topic: str, interface: str, message: Message) -> None:
+    def transmit(self, topic: str, interface: str, message: Message) -> None:
         """Write a message. A subscriber that was not discovered before misses the first ones."""
         self._writer(topic, interface).write(self._types.make(interface, message))
 

@@ -1,5 +1,5 @@
 """The rosbridge protocol (version 2), sans-I/O: checks of messages, and the phases of a goal or
-service call as a table."""
+service call."""
 
 from __future__ import annotations
 
@@ -129,51 +129,14 @@ class ExchangePhase(StrEnum):
     """After LOST: the server has ended it, or had enough time to do so."""
 
 
-class Word(StrEnum):
-    """Event in the life of a goal."""
-
-    FEEDBACK = "feedback"
-    SUCCEEDED = "succeeded"
-    CANCELLED = "cancelled"
-    ABORTED = "aborted"
-    REFUSED = "refused"
-    """rosbridge answers `result: false`: rejected, no such server, wrong fields."""
-    CANCEL = "cancel"
-    DOWN = "down"
-    UP = "up"
-    SILENCE = "silence"
-
-
 RUNNING = frozenset({ExchangePhase.PENDING, ExchangePhase.ACTIVE, ExchangePhase.CANCELLING})
 MOVING = RUNNING | {ExchangePhase.LOST, ExchangePhase.RECALLED}
 """Phases in which the robot may move because of it."""
-
-_ENDS = {
-    Word.SUCCEEDED: ExchangePhase.SUCCEEDED,
-    Word.CANCELLED: ExchangePhase.CANCELLED,
-    Word.ABORTED: ExchangePhase.ABORTED,
-    Word.DOWN: ExchangePhase.LOST,
+_STATUS: Mapping[float, ExchangePhase] = {
+    4: ExchangePhase.SUCCEEDED,
+    5: ExchangePhase.CANCELLED,
+    6: ExchangePhase.ABORTED,
 }
-TABLE: Mapping[tuple[ExchangePhase, Word], ExchangePhase] = {
-    **{(phase, word): end for phase in RUNNING for word, end in _ENDS.items()},
-    (ExchangePhase.PENDING, Word.FEEDBACK): ExchangePhase.ACTIVE,
-    (ExchangePhase.PENDING, Word.REFUSED): ExchangePhase.REJECTED,
-    (ExchangePhase.ACTIVE, Word.REFUSED): ExchangePhase.ABORTED,
-    (ExchangePhase.CANCELLING, Word.REFUSED): ExchangePhase.ABORTED,
-    (ExchangePhase.PENDING, Word.CANCEL): ExchangePhase.CANCELLING,
-    (ExchangePhase.ACTIVE, Word.CANCEL): ExchangePhase.CANCELLING,
-    (ExchangePhase.CANCELLING, Word.SILENCE): ExchangePhase.UNANSWERED,
-    (ExchangePhase.LOST, Word.UP): ExchangePhase.RECALLED,
-    (ExchangePhase.RECALLED, Word.DOWN): ExchangePhase.LOST,
-    (ExchangePhase.RECALLED, Word.SILENCE): ExchangePhase.GONE,
-    **{
-        (ExchangePhase.RECALLED, word): ExchangePhase.GONE
-        for word in (Word.SUCCEEDED, Word.CANCELLED, Word.ABORTED, Word.REFUSED)
-    },
-}
-"""Next phase by phase and event; a pair that is not listed changes nothing."""
-
-_STATUS: Mapping[float, Word] = {4: Word.SUCCEEDED, 5: Word.CANCELLED, 6: Word.ABORTED}
 """action_msgs/msg/GoalStatus."""
 
 
@@ -200,6 +163,37 @@ class Exchange:
     read: bool = False
     """Whether its action no longer needs it."""
 
+    def end(self, phase: ExchangePhase) -> None:
+        """End it. The first end counts: one that was lost stays lost, whatever the server says."""
+        if self.phase is ExchangePhase.RECALLED:
+            self.phase = ExchangePhase.GONE
+        elif self.phase in RUNNING:
+            self.phase = phase
+
+    def refuse(self, why: Any) -> None:
+        """End it because rosbridge answers `result: false`, or reports an error: rejected, no such
+        server, wrong fields."""
+        self.text = words(why)[:500]
+        begun = self.phase is not ExchangePhase.PENDING
+        self.end(ExchangePhase.ABORTED if begun else ExchangePhase.REJECTED)
+
+    def finish(self, said: Any, status: Any) -> None:
+        """End it with the values and the status of a result; None is success."""
+        phase = ExchangePhase.SUCCEEDED
+        if status is not None:
+            known = status if isinstance(status, int | float) else 0
+            phase = _STATUS.get(known, ExchangePhase.ABORTED)
+        if phase is ExchangePhase.ABORTED:
+            self.text = f"the goal ended with status {status}"
+        if isinstance(said, str):
+            self.text, said = words(said)[:500], {}
+        values = said or {}
+        if self.keep is not None and isinstance(values, dict):
+            values = {name: value for name, value in values.items() if name in self.keep}
+        self.fault = unfit(values)
+        self.values = {} if self.fault else values
+        self.end(phase)
+
 
 class Exchanges:
     """The goals and calls of one client, by a name that the client chooses. Ids in messages are
@@ -224,18 +218,16 @@ class Exchanges:
         return message
 
     def cancel(self, now: float, name: str) -> list[Message]:
-        """Cancel a goal, or forget a call, which cannot be cancelled; return the messages to
+        """Cancel a goal, or give up a call, which cannot be cancelled; return the messages to
         send."""
         one = self.open.get(name)
-        if one is None or one.phase not in RUNNING:
+        if one is None or one.phase not in RUNNING or one.phase is ExchangePhase.CANCELLING:
             return []
         if one.request["op"] == "call_service":
             one.phase = ExchangePhase.UNANSWERED
             return []
-        if one.phase is ExchangePhase.CANCELLING:
-            return []
-        self._move(one, Word.CANCEL)
-        return [self._cancel(now, one)]
+        one.phase, one.heard = ExchangePhase.CANCELLING, now
+        return [_cancel(now, one)]
 
     def forget(self, name: str) -> None:
         """Forget a goal or call that the client no longer needs; it is kept while the robot may
@@ -248,11 +240,12 @@ class Exchanges:
         goals."""
         sent = []
         for one in self.open.values():
-            before = self._move(one, Word.UP if up else Word.DOWN)
-            if one.phase is not before and one.request["op"] == "call_service":
-                one.phase = ExchangePhase.GONE
-            elif up and one.phase is ExchangePhase.RECALLED:
-                sent.append(self._cancel(now, one))
+            if up and one.phase is ExchangePhase.LOST:
+                one.phase, one.heard = ExchangePhase.RECALLED, now
+                sent.append(_cancel(now, one))
+            elif not up and one.phase in MOVING:
+                call = one.request["op"] == "call_service"
+                one.phase = ExchangePhase.GONE if call else ExchangePhase.LOST
         return sent
 
     def advance(self, now: float) -> list[Message]:
@@ -264,11 +257,9 @@ class Exchanges:
             if one.phase not in (ExchangePhase.CANCELLING, ExchangePhase.RECALLED):
                 continue
             if now - one.heard >= self._patience:
-                self._move(one, Word.SILENCE)
+                one.end(ExchangePhase.UNANSWERED)
             elif now - one.asked >= REPEAT:
-                heard = one.heard
-                sent.append(self._cancel(now, one))
-                one.heard = heard
+                sent.append(_cancel(now, one))
         return sent
 
     def receive(self, now: float, message: Message) -> str:
@@ -281,52 +272,25 @@ class Exchanges:
         one.heard = now
         op, said = message["op"], message.get("values")
         if op == "action_feedback":
-            self._move(one, Word.FEEDBACK)
+            if one.phase is ExchangePhase.PENDING:
+                one.phase = ExchangePhase.ACTIVE
             if fault := unfit(said):
                 return f"feedback: {fault}"
-            one.feedback, one.count = dict(said or {}), one.count + 1
-        elif op == "status":
-            if message.get("level") == "error":
-                one.text = words(message.get("msg"))[:500]
-                self._move(one, Word.REFUSED)
+            one.feedback, one.count = said or {}, one.count + 1
+        elif op == "status" and message.get("level") == "error":
+            one.refuse(message.get("msg"))
         elif op in ("action_result", "service_response"):
-            self._end(one, message)
+            status = message.get("status")
+            if status is None and isinstance(said, dict) and set(said) == {"status", "result"}:
+                status, said = said["status"], said["result"]  # an older rosbridge
+            if message.get("result") is False and status not in (5, 6):
+                one.refuse(said or "rosbridge gives no reason")
+            else:
+                one.finish(said, None if op == "service_response" else status)
         return ""
 
-    def _end(self, one: Exchange, message: Message) -> None:
-        said, status = message.get("values"), message.get("status")
-        nested = isinstance(said, dict) and set(said) == {"status", "result"}
-        # An older rosbridge sends the status inside the result.
-        if nested and status is None and isinstance(said, dict):
-            said, status = said["result"], said["status"]
-        if message.get("result") is False and status not in (5, 6):
-            one.text = words(said or "rosbridge gives no reason")[:500]
-            self._move(one, Word.REFUSED)
-            return
-        if message["op"] == "service_response" or status is None:
-            word = Word.SUCCEEDED
-        else:
-            word = _STATUS.get(int(status) if isinstance(status, int | float) else 0, Word.ABORTED)
-            if word is Word.ABORTED:
-                one.text = f"the goal ended with status {status}"
-        if isinstance(said, str):
-            one.text, said = words(said)[:500], {}
-        values = said if said else {}
-        if one.keep is not None and isinstance(values, dict):
-            values = {name: value for name, value in values.items() if name in one.keep}
-        one.fault = unfit(values)
-        if not one.fault:
-            one.values = values
-        self._move(one, word)
 
-    @staticmethod
-    def _move(one: Exchange, word: Word) -> ExchangePhase:
-        before = one.phase
-        one.phase = TABLE.get((before, word), before)
-        return before
-
-    @staticmethod
-    def _cancel(now: float, one: Exchange) -> Message:
-        one.heard = one.asked = now
-        request = one.request
-        return {"op": "cancel_action_goal", "id": request["id"], "action": request["action"]}
+def _cancel(now: float, one: Exchange) -> Message:
+    one.asked = now
+    request = one.request
+    return {"op": "cancel_action_goal", "id": request["id"], "action": request["action"]}

@@ -77,7 +77,7 @@ class TopicDriver(Driver):
         """Whether messages can be sent."""
         return True
 
-    def transmit(self, now: float, topic: str, interface: str, message: Message) -> None:
+    def transmit(self, topic: str, interface: str, message: Message) -> None:
         """Send a message to a topic."""
         raise NotImplementedError
 
@@ -92,7 +92,7 @@ class TopicDriver(Driver):
             self.check(message["msg"], message["type"])
             limited = self.limited(message["msg"], message["type"])
             if not self.dry_run:
-                self.transmit(now, message["topic"], message["type"], limited)
+                self.transmit(message["topic"], message["type"], limited)
         else:
             raise ValueError(f"unknown command {sorted(body)}: publish or drive")
 
@@ -200,7 +200,7 @@ class TopicDriver(Driver):
                 moving = False
         self.sent[name] = (port.count, not moving)
         if not self.dry_run:
-            self.transmit(now, out["topic"], out["type"], message)
+            self.transmit(out["topic"], out["type"], message)
 
     def state(self) -> Mapping[str, Any]:
         """`connected`, whether it is a `dry_run`, how the robot has `left` its workspace, messages

@@ -1,7 +1,8 @@
-"""Primitive actions of the SO-101: move_joints, move_to, grasp, release, reset, calibrate.
+"""Primitive actions of the SO-101: move_joints, move_to, grasp, release, enable, calibrate.
 
-Error causes: `arm_fault` (the driver reports it), `unreachable`, `not_reached`, `command_refused`.
-`grasp` fails with `empty`.
+Error causes: `unreachable`, `late`, `command_refused`, and the faults of the driver: `missing`,
+`heat`, `overload`, `voltage`, `current`, `sensor`, `power`, `workspace`, `uncalibrated`. `grasp`
+fails with `empty`.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from petrobot import Context, Remote, Result, error, failure, success
+from petrobot import Context, Remote, Result, error, failure, perform, success
 from petrobot.services.adapters.so101.kinematics import forward, inverse
 
 State = Mapping[str, Any]
@@ -23,7 +24,7 @@ async def move_joints(
 ) -> Result:
     """Move the five joints to these angles (rad), with this share of the arm's speed."""
     command = {"do": "move", "joints": list(joints), "speed": speed}
-    return await _do(ctx, command, lambda state: state["at_goal"], timeout) or success()
+    return await _do(ctx, command, lambda state: state["at_goal"], timeout)
 
 
 async def move_to(
@@ -56,22 +57,22 @@ async def grasp(
     `angle` (rad) is its final opening. FAILURE `empty` if it closed to less than `thinnest` rad."""
     ends = ("holding", "closed")
     command = {"do": "close", "squeeze": squeeze}
-    fault = await _do(ctx, command, lambda state: any(state["gripper"][e] for e in ends), timeout)
+    result = await _do(ctx, command, lambda state: any(state["gripper"][e] for e in ends), timeout)
     gripper = ctx.device.state["gripper"]
-    if fault is None and (gripper["angle"] < thinnest or not gripper["holding"]):
+    if not result.cause and (gripper["angle"] < thinnest or not gripper["holding"]):
         return failure("empty", "the gripper closed on nothing", angle=gripper["angle"])
-    return fault or success(angle=gripper["angle"])
+    return result if result.cause else success(angle=gripper["angle"])
 
 
 async def release(ctx: Context[Remote], *, angle: float = 1.0, timeout: float = 4.0) -> Result:
     """Open the gripper to an angle (rad)."""
     command = {"do": "open", "angle": angle}
-    return await _do(ctx, command, lambda state: state["gripper"]["open"], timeout) or success()
+    return await _do(ctx, command, lambda state: state["gripper"]["open"], timeout)
 
 
-async def reset(ctx: Context[Remote]) -> Result:
+async def enable(ctx: Context[Remote]) -> Result:
     """Clear faults and switch torque on at the present position."""
-    return await _do(ctx, {"do": "reset"}, lambda state: state["ready"], 2.0) or success()
+    return await _do(ctx, {"do": "enable"}, lambda state: state["ready"], 2.0)
 
 
 async def calibrate(ctx: Context[Remote], *, pose: Sequence[float] = (0.0,) * 6) -> Result:
@@ -83,13 +84,7 @@ async def calibrate(ctx: Context[Remote], *, pose: Sequence[float] = (0.0,) * 6)
 
 async def _do(
     ctx: Context[Remote], command: State, done: Callable[[State], bool], timeout: float
-) -> Result | None:
-    """Send a command and wait until it is done. Return the result of an error, None if there was
-    none."""
+) -> Result:
     device = ctx.device
     await ctx.wait(lambda: bool(device.state["ready"] or device.state["faults"]), STARTING)
-    await ctx.command(command)
-    await ctx.wait(lambda: done(device.state) or bool(device.state["faults"]), timeout)
-    if device.state["faults"]:
-        return error("arm_fault", "; ".join(device.state["faults"].values()))
-    return None if done(device.state) else error("not_reached", f"not within {timeout:g} s")
+    return await perform(ctx, command, done, timeout)

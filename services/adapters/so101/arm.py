@@ -7,7 +7,8 @@ and angle. Commands are plain data; the key `do` names them:
     {"do": "calibrate", "pose": six angles (rad)}   the arm is in this pose now (default: all 0);
                                         the zero positions are written to the calibration file
     {"do": "free"}                      torque off: the arm falls unless it is held
-    {"do": "reset"}                     clear faults, torque on at the present position
+    {"do": "enable"}                    clear faults, torque on at the present position
+    {"do": "rest"}                      stop and stay there
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from petrobot import Driver, JointMotion, Link, Ports, key, numbers
 from petrobot.services.adapters.so101 import bus
 from petrobot.services.adapters.so101.kinematics import JOINTS, forward
 
+BAUD: Final = 1_000_000
+"""bit/s, as the servos are delivered."""
 LOST: Final = 0.3
 """Time without an answer after which a servo counts as missing (s)."""
 STILL, CREEP = 5, 5
@@ -48,10 +51,11 @@ UNREAD: Final = bus.Reading(False, 2048, 2048, 0, 0.0, 0.0, 0)
 
 @dataclass
 class Joint:
-    """One servo: its last report, and its set point (rad)."""
+    """One joint: the last report of its servo, and its set point (rad)."""
 
     name: str
     servo: int
+    """1 to 6 from shoulder_pan to gripper, as LeRobot numbers them."""
     low: float
     high: float
     sign: int = 1
@@ -119,15 +123,13 @@ class Arm(Driver):
     """A SO-101 on a serial port. Its workspace bounds the gripper's tip, in the frame of
     `kinematics`."""
 
+    period = 0.02
     obeys = ("speed", "workspace", "dry_run")
     port: str = key(text="serial port, as /dev/ttyACM0")
-    baud: int = key(1_000_000, "bit/s")
-    period: float = key(0.02, "s between two set points")
-    ids: list[int] = key([1, 2, 3, 4, 5, 6], "servos, from shoulder_pan to gripper")
     calibration: str = key("", "file of the zero positions, written by the command calibrate")
     limits: dict[str, Any] = key({}, "joints with other limits, as { gripper = [0.0, 1.5] } (rad)")
     reverse: list[str] = key([], "joints whose servo turns the other way")
-    fastest: float = key(1.5, "rad/s")
+    top_speed: float = key(1.5, "rad/s")
     acceleration: float = key(6.0, "rad/s^2")
     overload: float = key(0.9, "load from which a joint gives way, share of the stall torque")
     squeeze: float = key(0.5, "greatest load of the gripper, share of the stall torque")
@@ -142,15 +144,15 @@ class Arm(Driver):
         self._check_keys()
         self.joints = [
             Joint(name, servo, low, high, -1 if name in self.reverse else 1)
-            for servo, name in zip(self.ids, JOINTS, strict=True)
+            for servo, name in enumerate(JOINTS, 1)
             for low, high in [self.limits.get(name, JOINTS[name])]
         ]
         self.arm, self.gripper = self.joints[:5], self.joints[5]
         self.faults: dict[str, str] = {}
-        """By code: what is wrong, until `reset`."""
+        """By code: what is wrong, until `enable`."""
         self._calibrated = self._read_calibration()
         self._on = self.enable
-        speeds = self.fastest, self.acceleration
+        speeds = self.top_speed, self.acceleration
         self.motion = JointMotion(self, _limits(self.arm), *speeds, lambda q: forward(q)[:3])
         self.jaw = JointMotion(self, _limits([self.gripper]), *speeds)
         self._hand = ""
@@ -162,11 +164,9 @@ class Arm(Driver):
         first among them, so that a missing servo does not hide another."""
         self._split = bus.PacketSplitter()
         self._begun = ports.now
-        self._link = Link(ports.now, partial(ports.serial, self.port, self.baud))
+        self._link = Link(ports.now, partial(ports.serial, self.port, BAUD))
 
     def _check_keys(self) -> None:
-        if len(set(self.ids)) != 6 or not all(type(i) is int and 0 <= i < 254 for i in self.ids):
-            raise ValueError(f"ids: expected six different numbers of 0 to 253, found {self.ids}")
         for name in (*self.limits, *self.reverse):
             if name not in JOINTS:
                 raise ValueError(f"no joint {name!r}; there are {', '.join(JOINTS)}")
@@ -174,13 +174,9 @@ class Arm(Driver):
             low, high = numbers(pair, 2, f"limits.{name}")
             if not -math.pi <= low < high <= math.pi:
                 raise ValueError(f"limits.{name}: expected [low, high] in rad, found {pair}")
-        for name in ("period", "fastest", "acceleration", "overload", "squeeze"):
-            most = 1.0 if name in ("overload", "squeeze") else math.inf
-            if not 0.0 < getattr(self, name) <= most:
-                raise ValueError(f"{name}: expected a number above 0, at most {most:g}")
-        busy = 10 * (6 * 33 + 80) / self.baud
-        if self.period < busy:
-            raise ValueError(f"period: expected at least {busy:.3f} s at {self.baud} baud")
+        for name in ("overload", "squeeze"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise ValueError(f"{name}: expected a number above 0, at most 1")
         if self.on_estop not in ("hold", "off"):
             raise ValueError(f'on_estop: expected "hold" or "off", found {self.on_estop!r}')
 
@@ -189,21 +185,13 @@ class Arm(Driver):
         if not self.calibration:
             return True  # as LeRobot leaves the servos: 2048 in the middle
         try:
-            text = self.ports.file(self.calibration).decode()
-            found = tomllib.loads(text)
+            found = tomllib.loads(self.ports.file(self.calibration).decode())
+            zeros = numbers(found.get("zero"), 6, "zero")
         except FileNotFoundError:
             return False
         except ValueError as fault:
-            raise ValueError(f"calibration: {self.calibration}: {fault}") from fault
-        try:
-            zeros = numbers(found.get("zero"), 6, "zero")
-            if found.get("ids") != self.ids:
-                raise ValueError(f"ids: expected {self.ids}, found {found.get('ids')}")
-        except ValueError as fault:
-            raise ValueError(
-                f"calibration: {self.calibration}: {fault}; is it this arm's file? The command "
-                "calibrate writes a new one"
-            ) from fault
+            text = "is it an arm's file? The command calibrate writes a new one"
+            raise ValueError(f"calibration: {self.calibration}: {fault}; {text}") from fault
         for joint, zero in zip(self.joints, zeros, strict=True):
             joint.zero = round(zero)
         return True
@@ -215,16 +203,16 @@ class Arm(Driver):
         do = body.get("do")
         known = {
             "move": self._move, "open": self._open, "close": self._close, "free": self._free,
-            "calibrate": self._calibrate, "reset": self._reset,
+            "calibrate": self._calibrate, "enable": self._enable, "rest": self._rest,
         }  # fmt: skip
         if do not in known:
             raise ValueError(f"unknown command {dict(body)!r:.80}; do: {', '.join(known)}")
-        if missing := self._missing(now):
+        if do != "rest" and (missing := self._missing(now)):
             raise ValueError(missing)
         if do in ("move", "open", "close"):
             if self.faults or not self._on:
                 why = "; ".join(self.faults.values()) or "its torque is off"
-                raise ValueError(f'{why}: send {{"do": "reset"}} when that is mended')
+                raise ValueError(f'{why}: send {{"do": "enable"}} when that is mended')
             if not self._calibrated:
                 raise ValueError(f"{self.calibration} is not there yet: calibrate the arm first")
             if not all(joint.ready for joint in self.joints):
@@ -258,7 +246,7 @@ class Arm(Driver):
             joint.read.position - joint.sign * round(angle / bus.RAD)
             for joint, angle in zip(self.joints, pose, strict=True)
         ]
-        text = f"# Zero positions of a SO-101 (steps)\nids = {self.ids}\nzero = {zeros}\n"
+        text = f"# Zero positions of a SO-101 (steps)\nzero = {zeros}\n"
         self.ports.write_file(self.calibration, text.encode())
         for joint, zero in zip(self.joints, zeros, strict=True):
             joint.zero = zero
@@ -271,7 +259,10 @@ class Arm(Driver):
         self._on, self._hand = False, ""
         self._freeze()
 
-    def _reset(self, body: Mapping[str, Any]) -> None:
+    def _rest(self, body: Mapping[str, Any]) -> None:
+        self.stop(self.ports.now)
+
+    def _enable(self, body: Mapping[str, Any]) -> None:
         self.faults.clear()
         self._freeze()
         self._on = True
@@ -391,7 +382,7 @@ class Arm(Driver):
                 goals[joint.servo] = bus.word(joint.steps(joint.aim + joint.trim))
             elif self._on:
                 limit = self.squeeze if joint is self.gripper else 1.0
-                speed = min(round(1.5 * self.fastest / bus.RAD), 32767)
+                speed = min(round(1.5 * self.top_speed / bus.RAD), 32767)
                 start[joint.servo] = bus.setup(joint.steps(joint.aim), speed, round(1000 * limit))
                 joint.started = True
             elif joint.read.torque:
@@ -458,8 +449,7 @@ class Arm(Driver):
             "temperature": [joint.read.temperature for joint in self.joints],
             "voltage": min(joint.read.voltage for joint in self.joints),
             "moving": not missing and not self.stopped(),
-            "at_goal": self.motion.arrived
-            and all(abs(j.q - j.aim) <= REACHED for j in arm)
+            "at_goal": self.motion.reached([joint.q for joint in arm], REACHED)
             and not any(map(self._untrimmed, arm)),
             "gripper": {
                 "angle": gripper.q,

@@ -1,6 +1,6 @@
 """Actions of a UR arm: enable, moves, digital outputs, a gripper on an output.
 
-Causes of an ERROR: `refused` (the text says why), `protective_stop`, `emergency_stop`,
+Causes of an ERROR: `command_refused` (the text says why), `protective_stop`, `emergency_stop`,
 `safeguard_stop`, `link_lost`, `program_lost`, `power_off`, `stopped` (it stopped at another place)
 and `late`.
 """
@@ -10,24 +10,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from petrobot import CommandRefused, Context, Remote, Result, error, failure, success
+from petrobot import Context, Remote, Result, error, failure, perform, success
 
 
 async def enable(ctx: Context[Remote], *, timeout: float = 30.0) -> Result:
     """Power on, release the brakes and start the program; unlocks a protective stop."""
-    await ctx.command({"do": "enable"})
-    state = ctx.device
-    await ctx.wait(lambda: state.state["enabled"] or bool(state.state["fault"]), timeout)
-    if state.state["enabled"]:
-        return success()
-    return error(state.state["fault"] or "late", state.state["reason"])
+    return await perform(ctx, {"do": "enable"}, lambda state: state["ready"], timeout)
 
 
 async def move_joints(
-    ctx: Context[Remote], *, q: list[float], speed: float = 1.0, timeout: float = 30.0
+    ctx: Context[Remote], *, joints: list[float], speed: float = 1.0, timeout: float = 30.0
 ) -> Result:
     """Move to six joint angles (rad), all arriving together, at a share of the speed."""
-    return await _move(ctx, {"do": "move", "q": q, "speed": speed}, timeout)
+    return await _move(ctx, {"do": "move", "joints": joints, "speed": speed}, timeout)
 
 
 async def move_linear(
@@ -38,31 +33,16 @@ async def move_linear(
 
 
 async def _move(ctx: Context[Remote], command: Mapping[str, Any], timeout: float) -> Result:
-    try:
-        await ctx.command(command)
-    except CommandRefused as fault:
-        return error("refused", str(fault))
-    device = ctx.device
-    ended = await ctx.wait(
-        lambda: device.state["in_place"] or device.state["mode"] != "move", timeout
-    )
-    # the arm follows the last set points with a small delay
-    await ctx.wait(lambda: device.state["in_place"] or device.state["mode"] == "off", 1.0)
-    state = device.state
-    if state["in_place"]:
-        return success(q=state["q"], tool=state["tool"])
-    if not ended:
-        await ctx.command({"do": "rest"})
-        return error("late", f"not there after {timeout:g} s")
-    return error(state["fault"] or "stopped", state["reason"] or "it rests on its way")
+    ended = await perform(ctx, command, lambda state: state["mode"] != "move", timeout)
+    state = ctx.device.state
+    if ended.cause or state["at_goal"]:
+        return ended if ended.cause else success(q=state["q"], tool=state["tool"])
+    return error("stopped", state["reason"] or "it rests on its way")
 
 
 async def set_digital_out(ctx: Context[Remote], *, bit: int, value: bool) -> Result:
     """Set a digital output, and wait until the controller reports it."""
-    try:
-        await ctx.command({"do": "output", "bit": bit, "value": value})
-    except CommandRefused as fault:
-        return error("refused", str(fault))
+    await ctx.command({"do": "output", "bit": bit, "value": value})
     if not await ctx.wait(lambda: bool(ctx.device.state["outputs"] >> bit & 1) is value, 1.0):
         return error("late", f"the controller does not report output {bit} as {value}")
     return success()
@@ -74,7 +54,7 @@ async def gripper(
     """Close or open a gripper on a digital output; `holds` is the digital input that shows that it
     holds something (-1: none). FAILURE `empty`: it closed on nothing."""
     done = await set_digital_out(ctx, bit=bit, value=close)
-    if done.status != "success":
+    if done.cause:
         return done
     await ctx.sleep(seconds)
     if close and holds >= 0 and not ctx.device.state["inputs"] >> holds & 1:

@@ -4,7 +4,7 @@ The driver plans each motion itself, checks its whole path, and streams joint se
 to a short program on the controller. That program stops the arm if they stop coming. Commands:
 
     {"do": "enable"}     power on, release brakes, start the program; unlocks a protective stop
-    {"do": "move", "q": six angles (rad), "speed": 0 to 1}            all joints arrive together
+    {"do": "move", "joints": six angles (rad), "speed": 0 to 1}       all joints arrive together
     {"do": "linear", "pose": x, y, z (m), rotation vector (rad), "speed": 0 to 1}     straight line
     {"do": "output", "bit": 0 to 7, "value": true or false}           digital output
     {"do": "rest"}       stop and stay there
@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import partial
+from operator import sub
 from typing import Any
 
 from petrobot import Driver, JointMotion, Link, Ports, key, numbers
@@ -99,10 +100,8 @@ class Arm(Driver):
         if self.model not in kinematics.MODELS:
             known = ", ".join(kinematics.MODELS)
             raise ValueError(f"model: expected one of {known}, found {self.model!r}")
-        if not (0.0 < self.top_speed <= 3.14 and 0.0 < self.acceleration <= 20.0):
-            raise ValueError(
-                "expected top_speed in (0, 3.14] rad/s, acceleration in (0, 20] rad/s^2"
-            )
+        if self.top_speed > 3.14 or self.acceleration > 20.0:
+            raise ValueError("expected top_speed up to 3.14 rad/s, acceleration up to 20 rad/s^2")
         self._arm = kinematics.Geometry(self.model, numbers(self.tool, 3, "tool"))
         addresses = self.rtde_port, self.dashboard_port, self.program_port
         self._link, self._dashboard, self._program = (
@@ -122,7 +121,8 @@ class Arm(Driver):
         self._wanted = self._enabled = self._quick = False
         self._fault = self._reason = ""
         self._unseen_until, self._now = -math.inf, 0.0
-        self._outputs, self._pretended = list[dict[str, int]](), 0
+        self._pretended = 0
+        """Digital outputs as they would be, in a dry run."""
 
     # Commands
 
@@ -132,7 +132,7 @@ class Arm(Driver):
         if what == "enable":
             self._wanted, self._fault, self._reason, self._ask_at = True, "", "", now
         elif what == "move":
-            self._go([numbers(body.get("q"), 6, "q")], body)
+            self._go([numbers(body.get("joints"), 6, "joints")], body)
         elif what == "linear":
             self._go(self._straight(numbers(body.get("pose"), 6, "pose")), body)
         elif what == "output":
@@ -149,7 +149,9 @@ class Arm(Driver):
             )
         if not self._rtde.running:
             raise ValueError(f"output: no connection to the controller ({self._link.why})")
-        self._outputs.append(dict(zip(DIGITAL, (1 << bit, value << bit), strict=True)))
+        self._pretended = self._pretended & ~(1 << bit) | value << bit
+        if not self.dry_run:
+            self._rtde.send(1, dict(zip(DIGITAL, (1 << bit, value << bit), strict=True)))
 
     def _straight(self, pose: list[float]) -> list[list[float]]:
         """Joint poses along the straight way of the tool from where the arm rests."""
@@ -159,7 +161,7 @@ class Arm(Driver):
         for part in range(1, parts + 1):
             place = kinematics.between(begin, pose, part / parts)
             found = self._arm.joints(place, way[-1])
-            if found is None or _apart(found, way[-1]) > 0.2:
+            if found is None or max(map(abs, map(sub, found, way[-1]))) > 0.2:
                 x, y, z = place[:3]
                 raise ValueError(
                     f"linear: the arm cannot pass x = {x:.3f}, y = {y:.3f}, z = {z:.3f} m"
@@ -251,11 +253,6 @@ class Arm(Driver):
             follows = int(self._enabled and not self._quick)
             values = (self._beat, follows, *self._motion.q)
             self._rtde.send(0, dict(zip(SETPOINT, values, strict=True)))
-        for mask, value in (tuple(each.values()) for each in self._outputs):
-            self._pretended = self._pretended & ~mask | value
-            if not self.dry_run:
-                self._rtde.send(1, dict(zip(DIGITAL, (mask, value), strict=True)))
-        self._outputs.clear()
         self._link.send(now, self._rtde.drain())
 
     def _q(self) -> list[float]:
@@ -264,19 +261,19 @@ class Arm(Driver):
 
     def state(self) -> Mapping[str, Any]:
         """Return what actions, operator and report see; docs/robots/ur.md explains the keys."""
-        data, q, motion = self._rtde.data, self._q(), self._motion
+        data, q = self._rtde.data, self._q()
+        there = self._motion.reached(q, IN_PLACE)
+        mode = "hold" if there or self._motion.goal is None else "move"
         return {
-            "enabled": self._enabled,
-            "mode": ("hold" if motion.arrived or motion.goal is None else "move")
-            if self._enabled
-            else "off",
+            "ready": self._enabled,
+            "mode": mode if self._enabled else "off",
             "reason": self._reason,
-            "fault": self._fault,
+            "faults": {self._fault: self._reason} if self._fault else {},
             "connected": self._link.up and self._now - self._seen < STALE,
             "safety": SAFETY.get(data.get("safety_mode", 0), "unknown"),
             "q": q,
             "tool": self._arm.tool(q),
-            "in_place": motion.arrived and _apart(q, motion.q) < IN_PLACE,
+            "at_goal": there,
             "inputs": data.get("actual_digital_input_bits", 0),
             "outputs": self._pretended
             if self.dry_run
@@ -313,7 +310,3 @@ class Arm(Driver):
         """Close the connections; the program on the controller then stops the arm."""
         for link in (self._link, self._dashboard, self._program):
             link.close()
-
-
-def _apart(a: list[float], b: list[float]) -> float:
-    return max(abs(one - other) for one, other in zip(a, b, strict=True))

@@ -16,7 +16,7 @@ import pytest
 
 from petrobot import Ports, check_driver, rehearse
 from petrobot.services.adapters.opcua.actions import handshake, write
-from petrobot.services.adapters.opcua.session import OpcUaSession
+from petrobot.services.adapters.opcua.session import OpcUaSession, _Notifications
 from petrobot.services.comm.protocol.plain import plain
 from tests.ports import free_ports
 from tests.waiting import Limit
@@ -192,9 +192,10 @@ def test_it_keeps_the_rules_of_drivers(cell: Cell) -> None:
 def test_values_of_any_type_are_plain(cell: Cell) -> None:
     """A list of dates would make the state one that cannot be published, and break the driver."""
     driver = cell.driver()
-    driver._by_id = {"node": "count"}
+    heard = _Notifications(driver._session)
+    heard.names["node"] = "count"
     dates = [datetime.datetime(2026, 11, 23), [datetime.datetime(2026, 11, 24)], 3]
-    driver.datachange_notification(SimpleNamespace(nodeid="node"), dates, None)
+    heard.datachange_notification(SimpleNamespace(nodeid="node"), dates, None)
     driver.step(0.0)
     told = plain(driver.state())["values"]["count"]
     assert told == ["2026-11-23 00:00:00", ["2026-11-24 00:00:00"], 3]

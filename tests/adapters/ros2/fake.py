@@ -39,7 +39,7 @@ class Fake:
     The name of an action server decides what it does: /ok, /aborts, /rejects, /absent, /silent,
     /slow (until cancelled), /stubborn (does not obey a cancel), /races (has succeeded when a cancel
     comes), /late (rosbridge does not know the goal for 0.3 s, so ignores its cancel), /nan, /nested
-    (as the first servers answered), /wide (a result too large).
+    (as the first servers answered), /wide (a result too large), /other (feedback of another type).
     """
 
     def __init__(self) -> None:
@@ -86,11 +86,14 @@ class Fake:
         said = []
         for identity, (goal, begun, told) in list(self.goals.items()):
             name, age = goal["action"], now - begun
-            if name in ("/ok", "/aborts", "/nan", "/nested", "/wide") and age > 4 * PERIOD:
+            ends = ("/ok", "/aborts", "/nan", "/nested", "/wide", "/other")
+            if name in ends and age > 4 * PERIOD:
                 said.append(self.ended(goal, name))
             elif name != "/silent" and now - told >= PERIOD:
                 self.goals[identity] = (goal, begun, now)
-                left = {"distance": max(0.0, 1.0 - age), "state": "moving"}
+                left: Message = {"distance": max(0.0, 1.0 - age), "state": "moving"}
+                if name == "/other":  # that of control_msgs/action/FollowJointTrajectory
+                    left = {"joint_names": ["a"], "distance": {"positions": [age]}}
                 reply = {"op": "action_feedback", "action": name, "id": identity}
                 said.append({**reply, "values": left})
         return said

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import pytest
@@ -11,7 +11,6 @@ import pytest
 from petrobot import Rehearsal, Result, check_driver, rehearse
 from petrobot.services.adapters.ros2 import actions
 from petrobot.services.adapters.ros2.bridge import Bridge
-from petrobot.services.adapters.ros2.link import Item
 from tests.adapters.ros2.fake import Fake, Message
 
 HERE = "tests.adapters.ros2.fake:Fake"
@@ -20,28 +19,32 @@ HERE = "tests.adapters.ros2.fake:Fake"
 class ScriptedLink:
     """A fake server behind a link that the test breaks and restores."""
 
-    def __init__(self) -> None:
-        self.fake, self.epoch, self.now = Fake(), 1, 0.0
-        self.inbox: list[Item] = [("up", 1)]
+    def __init__(self, bridge: Bridge) -> None:
+        self.fake, self.bridge, self.there = Fake(), bridge, True
+        self.up, self.count, self.why = False, 0, "not connected yet"
+        self.inbox: list[tuple[str, Any]] = [("up", None)]
 
-    def poll(self, now: float) -> list[Item]:
-        told = self.fake.step(now)
-        if self.epoch:
+    def news(self) -> Iterator[tuple[str, Any]]:
+        told = self.fake.step(self.bridge.now)
+        if self.there:
             self.inbox += [("message", message) for message in told]
         items, self.inbox = self.inbox, []
-        return items
+        for kind, item in items:
+            if kind in ("up", "down"):
+                self.up, self.why = kind == "up", str(item)
+            yield kind, item
 
-    def send(self, now: float, epoch: int, messages: list[Message]) -> None:
-        for message in messages:
-            assert epoch == self.epoch
-            self.inbox += [("message", said) for said in self.fake.receive(now, message)]
+    def send(self, item: Message) -> None:
+        if self.there:
+            told = self.fake.receive(self.bridge.now, item)
+            self.inbox += [("message", message) for message in told]
 
     def pull(self) -> None:
-        self.epoch, self.inbox = 0, [("down", "pulled")]
+        self.there, self.inbox = False, [("down", "pulled")]
 
     def mend(self) -> None:
-        self.epoch = 2
-        self.inbox.append(("up", 2))
+        self.there = True
+        self.inbox.append(("up", None))
 
     def close(self) -> None:
         """Do nothing."""
@@ -141,6 +144,37 @@ def test_feedback_is_progress_variables_and_set_points() -> None:
     assert len(shares) >= 3 and shares == sorted(shares) and 0 < shares[-1] < 1
     assert played.memory.values()["robot_state"].value == "moving"
     assert {stream for _, stream, _ in played.published} == {"gap"}
+
+
+@pytest.mark.parametrize("remaining", ["distance", "distance_remaining", "distance.positions"])
+def test_feedback_of_another_form_is_progress_without_a_share(remaining: str) -> None:
+    """What it has is passed on, and the goal goes on to its end."""
+    bridge, link = robot()
+    played = rehearse(
+        actions.goal,
+        device=bridge,
+        streams={"gap": 0.05, "age": 0.05},
+        action="/other",
+        action_type="a/action/B",
+        remaining=remaining,
+        to_memory={"state": "state", "joint": "joint_names.0"},
+        to_streams={"gap": ["distance"], "age": ["distance.positions.0"]},
+    )
+    assert said(played.result) == ("success", "", "yes"), played.result
+    assert len(played.progress) >= 3 and {share for _, share in played.progress} == {0.0}
+    assert {name: kept.value for name, kept in played.memory.values().items()} == {"joint": "a"}
+    assert {stream for _, stream, _ in played.published} == {"age"}
+    assert [m["op"] for m in link.fake.log] == ["send_action_goal"]
+
+
+def test_a_goal_is_cancelled_when_its_feedback_cannot_be_passed_on() -> None:
+    """The run ends in ERROR; without its run the robot must not move on."""
+    bridge, link = robot()
+    played = play("/slow", bridge, to_memory={"": "distance"})
+    assert said(played.result)[:2] == ("error", "exception")
+    bridge.step(60.0)
+    assert [m["op"] for m in link.fake.log] == ["send_action_goal", "cancel_action_goal"]
+    assert bridge.stopped()
 
 
 @pytest.mark.parametrize("name", ["/slow", "/silent"])
@@ -252,13 +286,14 @@ BUTTON = {"topic": "/button", "type": "std_msgs/msg/Bool"}
 
 def shown(bridge: Bridge, *messages: Any, topic: str = "/button") -> None:
     told = [("message", {"op": "publish", "topic": topic, "msg": m}) for m in messages]
-    bridge.link.inbox += told  # type: ignore[union-attr]
+    assert isinstance(bridge.link, ScriptedLink)
+    bridge.link.inbox += told
     bridge.step(0.0)
 
 
 def wired(ports: Ports, **config: Any) -> tuple[Bridge, ScriptedLink]:
-    bridge, link = Bridge({"url": HERE, **config}, ports), ScriptedLink()  # type: ignore[arg-type]
-    bridge.link = link  # type: ignore[assignment]
+    bridge = Bridge({"url": HERE, **config}, ports)  # type: ignore[arg-type]
+    bridge.link = link = ScriptedLink(bridge)
     return bridge, link
 
 
@@ -368,8 +403,9 @@ ACTION = "float64[] joints\n---\nint32 code\n---\nfloat64 left\n"
 def test_goals_are_checked_against_the_users_file() -> None:
     ports = Ports({"a.action": ACTION})
     config = {"url": HERE, "definitions": {"a/action/B": "a.action"}}
-    bridge, link = Bridge(config, ports), ScriptedLink()  # type: ignore[arg-type]
-    bridge.link, bridge.ports = link, None  # type: ignore[assignment]
+    bridge = Bridge(config, ports)  # type: ignore[arg-type]
+    bridge.link = link = ScriptedLink(bridge)
+    bridge.ports = None  # type: ignore[assignment]
     for more, wrong in (
         ({"goal": {"joint": [1]}}, "did you mean 'joints'?"),
         ({"goal": {"joints": ["a"]}}, "joints.0: expected float64"),

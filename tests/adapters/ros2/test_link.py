@@ -53,7 +53,7 @@ def bridge_to(url: str, **config: Any) -> Stepped:
 @pytest.fixture
 def bridge(fake: FakeProcess) -> Iterator[Stepped]:
     made = bridge_to(fake.url)
-    made.until(lambda: made.epoch, "the first connection")
+    made.until(lambda: made.connected, "the first connection")
     yield made
     made.close()
 
@@ -78,11 +78,11 @@ def test_goals_through_a_socket(bridge: Stepped, fake: FakeProcess) -> None:
 def test_no_server_at_first() -> None:
     (port,) = free_ports(1)
     bridge = bridge_to(f"ws://127.0.0.1:{port}")
-    bridge.until(lambda: "not connected" not in bridge.down, "a refused connection")
+    bridge.until(lambda: "not connected" not in bridge.link.why, "a refused connection")
     with pytest.raises(ValueError, match="no connection to"):
         bridge.goal("/ok")
     later = FakeProcess(port)
-    bridge.until(lambda: bridge.epoch, "the server")
+    bridge.until(lambda: bridge.connected, "the server")
     bridge.goal("/ok")
     bridge.until_phase(ExchangePhase.SUCCEEDED)
     bridge.close()
@@ -105,7 +105,7 @@ def test_a_killed_server_and_its_successor() -> None:
     `patience`."""
     fake = FakeProcess()
     bridge = bridge_to(fake.url, patience=1.2)
-    bridge.until(lambda: bridge.epoch, "the connection")
+    bridge.until(lambda: bridge.connected, "the connection")
     bridge.goal("/slow")
     bridge.until_phase(ExchangePhase.ACTIVE)
     fake.end()
@@ -121,7 +121,7 @@ def test_a_killed_server_and_its_successor() -> None:
 
 def test_a_frozen_server_is_a_lost_link(fake: FakeProcess) -> None:
     bridge = bridge_to(fake.url, heartbeat=0.4)
-    bridge.until(lambda: bridge.epoch, "the connection")
+    bridge.until(lambda: bridge.connected, "the connection")
     bridge.goal("/slow")
     bridge.until_phase(ExchangePhase.ACTIVE)
     os.kill(fake.process.pid, signal.SIGSTOP)
@@ -162,7 +162,7 @@ def test_invalid_messages_change_nothing(bridge: Stepped, fake: FakeProcess) -> 
         fake.post("send", text)
     fake.post("send", json.dumps({"op": "publish", "topic": "/b", "msg": {"x": 1}}))
     bridge.until(lambda: "b" in bridge.topics, "the message after it")
-    assert bridge.topics["b"] == {"msg": {"x": 1}, "count": 1} and bridge.epoch == 1
+    assert bridge.topics["b"] == {"msg": {"x": 1}, "count": 1} and bridge.link.count == 1
     assert bridge.phase() is ExchangePhase.ACTIVE and bridge.refused == 11
     plain(bridge.state(), "state")  # or the driver would die of it
 
@@ -183,7 +183,7 @@ def test_odd_values_of_an_active_goal(bridge: Stepped, fake: FakeProcess, values
 
 def test_a_message_that_is_too_long_ends_only_the_link(bridge: Stepped, fake: FakeProcess) -> None:
     fake.post("send", "x" * (5 << 20))
-    bridge.until(lambda: bridge.epoch == 2, "the next connection")
+    bridge.until(lambda: bridge.link.count == 2, "the next connection")
     bridge.goal("/ok")
     bridge.until_phase(ExchangePhase.SUCCEEDED)
 
@@ -193,9 +193,10 @@ def test_a_full_send_buffer_ends_the_connection(bridge: Stepped, fake: FakeProce
     os.kill(fake.process.pid, signal.SIGSTOP)
     message = {"text": "x" * 60_000}
     limit = Limit("a full queue")
-    while bridge.epoch == 1 and limit.left():
+    while bridge.connected and limit.left():
         body = {"topic": "/t", "type": "a/msg/B", "msg": message}
         bridge.command(time.monotonic(), {"publish": body})
         bridge.step(time.monotonic())
+    assert "does not take what it is sent" in bridge.link.why
     os.kill(fake.process.pid, signal.SIGCONT)
-    bridge.until(lambda: bridge.epoch == 2, "the next connection")
+    bridge.until(lambda: bridge.link.count == 2, "the next connection")

@@ -7,7 +7,6 @@ import asyncio
 import importlib.util
 import json
 import os
-import re
 import subprocess
 import sys
 import time
@@ -18,7 +17,6 @@ from typing import Any
 import pytest
 
 from petrobot.services.adapters.ros2 import __main__ as offering
-from petrobot.services.adapters.ros2.link import Item
 from petrobot.services.adapters.ros2.protocol import ExchangePhase
 from tests.adapters.ros2.conftest import FakeProcess
 from tests.adapters.ros2.test_link import bridge_to
@@ -26,11 +24,7 @@ from tests.ports import free_ports
 from tests.waiting import until
 
 ROOT = Path(__file__).parents[3]
-RUN_TASK = re.search(
-    r"```\n(# RunTask.action.*?)```",
-    (ROOT / "docs" / "robots" / "ros2.md").read_text(encoding="utf-8"),
-    re.DOTALL,
-)
+RUN_TASK = Path(offering.__file__).with_name("RunTask.action").read_text(encoding="utf-8")
 
 
 class Page:
@@ -65,15 +59,21 @@ class Link:
     """A scripted rosbridge."""
 
     def __init__(self) -> None:
-        self.inbox: list[Item] = [("up", 1)]
+        self.inbox: list[tuple[str, Any]] = [("up", None)]
+        self.up, self.count, self.why = False, 0, ""
         self.sent: list[dict[str, Any]] = []
 
-    def poll(self, now: float) -> list[Item]:
+    def news(self) -> Iterator[tuple[str, Any]]:
         items, self.inbox = self.inbox, []
-        return items
+        for kind, item in items:
+            self.up = kind != "down"
+            yield kind, item
 
-    def send(self, now: float, epoch: int, messages: list[dict[str, Any]]) -> None:
-        self.sent += json.loads(json.dumps(messages))
+    def send(self, item: dict[str, Any]) -> None:
+        self.sent.append(json.loads(json.dumps(item)))
+
+    def close(self) -> None:
+        """Do nothing."""
 
     def say(self, op: str, goal: str, **more: Any) -> None:
         self.inbox.append(("message", {"op": op, "id": goal, "action": "/rest", **more}))
@@ -220,7 +220,7 @@ def test_a_run_is_aborted_when_its_client_or_link_is_lost(lost: str) -> None:
             page.gone = True
             await until(link.results, "the result")
         elif lost == "link":
-            link.inbox += [("down", "pulled"), ("up", 2)]
+            link.inbox += [("down", "pulled"), ("up", None)]
             await until(lambda: page.state == "aborted", "the abort")
             await until(link.results, "a result")
 
@@ -249,11 +249,10 @@ def test_messages_fit_the_definition(tmp_path: Path) -> None:
     assert shapes == {"action_feedback": {"places"}, "action_result": {"state"}}
 
 
-def test_the_definition_in_the_page_is_what_is_sent() -> None:
+def test_the_shipped_definition_is_what_is_sent() -> None:
     from petrobot.services.adapters.ros2.definitions import faults, read
 
-    assert RUN_TASK is not None
-    known = read(offering.TYPE, RUN_TASK[1], "ros2.md")
+    known = read(offering.TYPE, RUN_TASK, "RunTask.action")
 
     async def steps(page: Page, link: Link) -> None:
         link.say("send_action_goal", "g1", args={})
@@ -346,7 +345,7 @@ def test_petrobot_starts_petrobot(offered: FakeProcess) -> None:
     """Our client starts our offered task through rosbridge: success, cancel and refusal of real
     runs."""
     bridge = bridge_to(offered.url)
-    bridge.until(lambda: bridge.epoch, "the connection")
+    bridge.until(lambda: bridge.connected, "the connection")
     bridge.goal("/rest", "first")
     bridge.until_phase(ExchangePhase.SUCCEEDED, "first")
     one = bridge.exchanges.open["first"]

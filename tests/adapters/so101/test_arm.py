@@ -91,7 +91,7 @@ def test_its_duration_follows_from_speed_and_acceleration(keys: Any, seconds: fl
     arm.command(begin, {"do": "move", "joints": [1.0, 0, 0, 0, 0]})
     while arm.joints[0].aim != 1.0 and arm.ports.now < begin + 10.0:
         arm.run(arm.period)
-    fastest, rate = arm.fastest * arm.speed, arm.acceleration
+    fastest, rate = arm.top_speed * arm.speed, arm.acceleration
     due = 1.0 / fastest + fastest / rate if fastest**2 / rate < 1.0 else 2 * math.sqrt(1.0 / rate)
     assert arm.ports.now - begin == pytest.approx(due, abs=0.1) and due > 0.8 * seconds
 
@@ -119,7 +119,7 @@ def test_a_load_does_not_keep_it_from_its_goal() -> None:
         ({"do": "move", "joints": [0] * 5, "speed": 2.0}, "speed: expected a share"),
         ({"do": "open", "angle": 3.0}, "gripper: expected -0.175 to 1.745, found 3"),
         ({"do": "close", "squeeze": 0.9}, "squeeze: expected at most 0.5"),
-        ({"do": "dance"}, "do: move, open, close, free, calibrate, reset"),
+        ({"do": "dance"}, "do: move, open, close, free, calibrate, enable, rest"),
         ({"do": "calibrate"}, "calibration ="),
     ],
 )
@@ -133,14 +133,14 @@ def test_a_command_outside_its_limits_is_refused(body: Any, words: str) -> None:
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
-        ({"ids": [1, 2, 3]}, "ids: expected six different numbers"),
         ({"limits": {"elbow": [0.0, 1.0]}}, "no joint 'elbow'"),
         ({"limits": {"gripper": [1.0, 0.0]}}, "limits.gripper"),
         ({"reverse": ["nose"]}, "no joint 'nose'"),
         ({"speed": 0.0}, "speed: expected a number above 0"),
-        ({"baud": 9600}, "period: expected at least"),
+        ({"overload": 1.5}, "overload: expected a number above 0"),
+        ({"acceleration": 0.0}, "expected a speed and acceleration above 0"),
         ({"on_estop": "fall"}, "on_estop"),
-        ({"bauds": 9600}, "unknown key 'bauds'"),
+        ({"baud": 9600}, "unknown key 'baud'"),
     ],
 )
 def test_a_wrong_key_is_refused_with_its_name(keys: Any, words: str) -> None:
@@ -176,8 +176,8 @@ def test_zero_positions_are_calibrated_by_a_command_and_kept(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("zero = [1, 2]\nids = [1, 2, 3, 4, 5, 6]", r"arm.toml: zero: expected 6 finite numbers"),
-        ("zero = [1, 2, 3, 4, 5, 6]\nids = [1, 2, 3, 4, 5, 7]", "is it this arm's"),
+        ("zero = [1, 2]", r"arm.toml: zero: expected 6 finite numbers, .*; is it an arm's file"),
+        ("ids = [1, 2, 3, 4, 5, 6]", r"arm.toml: zero: expected 6 finite numbers"),
         ("nothing", "arm.toml: "),
         ("\xff", "arm.toml: "),
     ],
@@ -312,11 +312,11 @@ def test_trouble_stops_it_until_a_reset(kind: str) -> None:
     arm.run(2.0)
     assert list(arm.state()["faults"]) == [kind] and arm.stopped()
     assert abs(servo.duty) < 0.2  # it gave way
-    with pytest.raises(ValueError, match="reset"):
+    with pytest.raises(ValueError, match="enable"):
         arm.command(arm.ports.now, BACK)
     servo.heat, servo.voltage, servo.high = 30.0, 7.4, math.inf
     arm.run(0.1)
-    arm.command(arm.ports.now, {"do": "reset"})
+    arm.command(arm.ports.now, {"do": "enable"})
     arm.run(0.3)
     arm.command(arm.ports.now, BACK)
     arm.run(3.0)
@@ -387,7 +387,7 @@ def test_move_to_brings_the_tip_there() -> None:
     [
         (actions.move_to, {"x": 0.7, "y": 0.0, "z": 0.0}, "unreachable"),
         (actions.move_joints, {"joints": [0, 9, 0, 0, 0]}, "command_refused"),
-        (actions.move_joints, {"joints": [1, 0, 0, 0, 0], "timeout": 0.2}, "not_reached"),
+        (actions.move_joints, {"joints": [1, 0, 0, 0, 0], "timeout": 0.2}, "late"),
     ],
 )
 def test_an_action_says_why_it_failed(action: Any, arguments: Any, cause: str) -> None:
@@ -399,7 +399,7 @@ def test_an_action_ends_when_the_arm_has_a_fault() -> None:
     rig = Rig()
     rig.bus.servos[2].high = 2148.0
     found = played(actions.move_joints, rig, joints=[0, 1, 0, 0, 0])
-    assert (found.result.status, found.result.cause) == ("error", "arm_fault")
+    assert (found.result.status, found.result.cause) == ("error", "overload")
     assert "shoulder_lift" in found.result.text and found.seconds < 2.0
 
 
@@ -426,7 +426,7 @@ def test_the_arm_is_reset_and_calibrated_by_actions(tmp_path: Path) -> None:
     arm.run(0.3)
     pose = [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]
     assert rehearse(actions.calibrate, device=arm, pose=pose).result.status == "success"
-    assert rehearse(actions.reset, device=arm).result.status == "success"
+    assert rehearse(actions.enable, device=arm).result.status == "success"
     assert arm.state()["q"][0] == pytest.approx(0.1, abs=0.002) and arm.state()["torque"]
 
 
