@@ -69,7 +69,7 @@ COMMANDS = (
     Subcommand(
         "pause", "pause the active run; each node reports whether its devices hold", "operate.pause"
     ),
-    Subcommand("continue", "continue the paused run", "operate.go_on"),
+    Subcommand("continue", "continue the paused run", "operate.continue_"),
     Subcommand("step", "fire one transition of the paused run", "operate.step"),
     Subcommand(
         "break", "pause before a transition fires or when a place is entered", "operate.breakpoints"

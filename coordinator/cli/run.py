@@ -141,7 +141,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
     )
     add_learning_arguments(parser)
-    add_departing_arguments(parser)
+    add_start_from_arguments(parser)
     parser.add_argument(
         "--json", metavar="FILE", help="write the result as JSON (- for standard output)"
     )
@@ -215,11 +215,11 @@ def add_learning_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_departing_arguments(parser: argparse.ArgumentParser) -> None:
+def add_start_from_arguments(parser: argparse.ArgumentParser) -> None:
     """Add `--from` and `--going`."""
     parser.add_argument(
         "--from",
-        dest="departs",
+        dest="starts_from",
         metavar="RUN[:RECORD]",
         help="start from a recorded run: simulate its task from the state after one of its "
         "records, in lock step, as a new run (`petrobot log` numbers the records; default: 0, the "
@@ -237,7 +237,7 @@ def add_departing_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Check the task, run it, print and write its result."""
-    if options.departs is not None:
+    if options.starts_from is not None:
         return conduct(_from_record(options), options, "lockstep")
     if options.task is None:
         raise CommandError(2, "give a task to run, or a recorded run with --from")
@@ -348,8 +348,8 @@ async def _page(session: RunSession, options: argparse.Namespace) -> AsyncIterat
     """Serve the operator's page, or with --no-page the operator's protocol alone, while the run is
     active."""
     from petrobot.coordinator.cli.loading import SHIPPED, own_tasks
-    from petrobot.coordinator.operator.door_file import Door
     from petrobot.coordinator.operator.history import JournalHistory
+    from petrobot.coordinator.operator.run_address import RunAddress
     from petrobot.coordinator.operator.station import offered
     from petrobot.coordinator.page.server import start_page
 
@@ -371,7 +371,7 @@ async def _page(session: RunSession, options: argparse.Namespace) -> AsyncIterat
     if not options.no_page:
         print(f"page: {page.url}", file=sys.stderr, flush=True)
     services = str(directory.source.resolve())
-    session.door = Door(session.identity, page.base, page.token, os.getpid(), services)
+    session.address = RunAddress(session.identity, page.base, page.token, os.getpid(), services)
     try:
         yield
     finally:
@@ -489,7 +489,7 @@ def _from_record(options: argparse.Namespace) -> Callable[[], RunSession]:
         raise CommandError(
             2, "--from only simulates, in one process: a real cell is not in the recorded state"
         )
-    name, record = _named(options.departs)
+    name, record = _named(options.starts_from)
     found: Recorded = recorded(name)
 
     def make() -> RunSession:

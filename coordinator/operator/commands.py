@@ -39,7 +39,7 @@ from petrobot.coordinator.operator.controls import Answer, Controls, refusal
 from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
 from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.observation import TrialWatch, Watching, shown_selectors
-from petrobot.coordinator.operator.run_state import Narrator
+from petrobot.coordinator.operator.run_state import ChangePublisher
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Mission, Stage
@@ -103,7 +103,7 @@ class Operation:
         self._live = mode == "realtime"
         began = shell.now()
         where = {name: entry.node for name, entry in self.executor.directory.actions.items()}
-        self.narrator = Narrator(self.feed, self.executor.task, where, began)
+        self.narrator = ChangePublisher(self.feed, self.executor.task, where, began)
         self.narrator.begin(
             self.executor.mission,
             mode,

@@ -52,7 +52,7 @@ _GOING = ACTIVE | {Phase.STOPPING, Phase.STUCK}
 _LEVEL = {Severity.NOTE: "info", Severity.WARNING: "warning", Severity.ERROR: "error"}
 
 
-class Narrator:
+class ChangePublisher:
     """Publishes changes on a feed. `where` gives the node of each action. Implements
     `coordinator.run.interfaces.Observer`.
 

@@ -48,8 +48,8 @@ from petrobot.coordinator.learning.session import (
 )
 from petrobot.coordinator.operator.commands import Operation
 from petrobot.coordinator.operator.controls import Controls
-from petrobot.coordinator.operator.door_file import Door, door_open
 from petrobot.coordinator.operator.feed import Feed
+from petrobot.coordinator.operator.run_address import RunAddress, published
 from petrobot.coordinator.operator.start_from import (
     AGAIN,
     Recorded,
@@ -350,7 +350,7 @@ class RunSession(ABC):
         if timeline is None:
             mission.executor.observers.append(self.timeline)
         self.operation: Operation | None = None
-        self.door: Door | None = None
+        self.address: RunAddress | None = None
         """Where the run can be controlled; the address is in the run's folder while the run is
         active."""
         self.origin: Mapping[str, Any] = {}
@@ -398,8 +398,8 @@ class RunSession(ABC):
         self._led = True
         _log.info("run %s: started (%s, task %s)", self.identity, self.mode, self._task.name)
         try:
-            door = self.folder is not None and self.door is not None
-            with door_open(self.folder, self.door) if door else nullcontext():  # type: ignore[arg-type]
+            address = self.folder is not None and self.address is not None
+            with published(self.folder, self.address) if address else nullcontext():  # type: ignore[arg-type]
                 await self._lead(watch)
         except BaseException as fault:
             _log.info("run %s: stopped by %s: %s", self.identity, type(fault).__name__, fault)

@@ -68,7 +68,7 @@ def read_start(task: Task, data: Mapping[str, Any], estimates: Path) -> RunReque
     )
 
 
-def read_depart(task: Task, data: Mapping[str, Any]) -> RunRequest:
+def read_start_from(task: Task, data: Mapping[str, Any]) -> RunRequest:
     """Read a start with `from`: {run, record, going}; the default seed is that of the recorded run.
     Raises ValueError."""
     _refuse_unknown(data)

@@ -44,7 +44,7 @@ from petrobot.coordinator.engine import (
 )
 from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.port import FREE
-from petrobot.coordinator.operator.run_state import Narrator
+from petrobot.coordinator.operator.run_state import ChangePublisher
 from petrobot.coordinator.run.folder import JOURNAL, header
 from petrobot.coordinator.run.journal import JournalWriter
 from petrobot.coordinator.run.recording import JournalStore
@@ -108,7 +108,7 @@ class Stage:
         self.feed = Feed()
         self.controls = Controls()
         self.commands: list[tuple[str, str, Mapping[str, Any]]] = []
-        self.narrator: Narrator | None = None
+        self.narrator: ChangePublisher | None = None
         self.clock = 0.0
         self._playing: dict[str, _Playing] = {}
         self._timers: dict[str, float] = {}
@@ -279,7 +279,7 @@ class Stage:
         self._playing, self._timers = {}, {}
         self.engine = Engine(task)
         self.state = self.engine.initial()
-        self.narrator = Narrator(self.feed, task, self.where)
+        self.narrator = ChangePublisher(self.feed, task, self.where)
         selectors = {
             name: {
                 "alternatives": [
