@@ -77,7 +77,7 @@ COMMANDS = (
     Subcommand("token", "add or remove tokens of a control place", "operate.tokens"),
     Subcommand("raise", "raise an external event by hand", "operate.events"),
     Subcommand(
-        "force", "take a token out of an action place, whatever its run does", "operate.force"
+        "force", "take a token out of an action place, even of an active run", "operate.force"
     ),
     Subcommand("override", "choose the action of a primitive task by hand", "operate.override"),
     Subcommand("remark", "write a remark into the journal of the active run", "operate.remark"),

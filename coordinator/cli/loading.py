@@ -78,7 +78,7 @@ def measurements(file: Path | None) -> Callable[[Task, Cell | None], Measured] |
         found = measured_from(task, kept.estimates, kinds=kept.kinds, devices=devices)
         if not found.runs:
             known = ", ".join(sorted({k.primitive_task for k in kept.estimates.tallies})) or "none"
-            text = f"{file}: nothing was measured of {task.name}; it knows: {known}"
+            text = f"{file}: nothing was measured of {task.name}; it has: {known}"
             raise CommandError(2, text)
         return found
 

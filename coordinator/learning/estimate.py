@@ -518,7 +518,7 @@ class TrialSums:
     """Sums over trials of a whole task. Immutable; can be merged."""
 
     n: int = 0
-    """Trials that began and are over."""
+    """Trials that have begun and ended."""
     success: int = 0
     """Trials that completed and in which every run was a SUCCESS."""
     goals: int = 0

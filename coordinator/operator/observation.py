@@ -271,10 +271,10 @@ class Watching:
         self._feed.emit("report", name=key, report=report)
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
-        """Do nothing: the narrator reports it."""
+        """Do nothing: the publisher reports it."""
 
     def progress(self, now: float, run: str, notice: Feedback) -> None:
-        """Do nothing: the narrator reports it."""
+        """Do nothing: the publisher reports it."""
 
     def settled(self, now: float, state: State) -> None:
-        """Do nothing: the narrator reports it."""
+        """Do nothing: the publisher reports it."""

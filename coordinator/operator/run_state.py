@@ -192,7 +192,7 @@ class ChangePublisher:
             )
         self._seen = state
 
-    def adopt(self, now: float, state: State) -> None:
+    def recover(self, now: float, state: State) -> None:
         """Take over and publish the whole state that another process left."""
         time = now - self.origin
         self._marking(time, (-1,) * len(state.marking), state.marking)

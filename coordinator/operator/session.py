@@ -264,9 +264,9 @@ def _refuse_other_physics(found: Recorded) -> None:
     if now and not same_physics(then, now):
         raise RequestError(
             f"{found.journal.path}: recorded with the physics {then or FIRST_PHYSICS!r}, but this "
-            f"computer's laboratory has {now!r}: it would go on as another run; write the same "
-            "`physics` in services.toml ([nodes.NAME] of the simulated node), or resume it where "
-            "that physics is installed"
+            f"computer's laboratory has {now!r}: the run would continue differently; write the "
+            "same `physics` in services.toml ([nodes.NAME] of the simulated node), or resume it "
+            "where that physics is installed"
         )
 
 
@@ -620,7 +620,7 @@ class LockstepSession(RunSession):
 @contextmanager
 def interruptible() -> Iterator[None]:
     """Let Ctrl-C raise KeyboardInterrupt in code that blocks the event loop: the handler of
-    `asyncio.run` would only cancel the task once it lets go of the loop."""
+    `asyncio.run` would only cancel the task when it returns to the loop."""
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread receives signals
         return

@@ -191,7 +191,7 @@ class Station:
         if text.name != self._loaded:
             self._forget(text.name)
         self._revision = text.revision
-        self._narrator(task).begin("", "realtime", **self._kept(task))
+        self._publisher(task).begin("", "realtime", **self._kept(task))
         self._tell_file()
 
     def _tell_file(self) -> None:
@@ -320,7 +320,7 @@ class Station:
         notice = {"level": "error", "text": text, "at": self.feed.state["time"]}
         self.feed.emit("notice", notice=notice)
 
-    def _narrator(self, task: Task) -> ChangePublisher:
+    def _publisher(self, task: Task) -> ChangePublisher:
         return ChangePublisher(
             self.feed, task, {a: entry.node for a, entry in self.directory.actions.items()}
         )

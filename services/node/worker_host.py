@@ -325,7 +325,7 @@ class WorkerHost:
                         self._take_message(item)
                 except (ValueError, TypeError, IndexError, KeyError, AttributeError):
                     # The user's code has written into the pipe, or a copy of the process has.
-                    child.kill("it wrote into its pipe what is no message, and was killed")
+                    child.kill("it wrote data into its pipe that is not a message, and was killed")
         self._changed(plain_ends)
 
     def _name(self) -> str:

@@ -1,5 +1,5 @@
-"""Fire an outgoing transition of an action place, whatever its run does. The run counts neither as
-success nor as failure."""
+"""Fire an outgoing transition of an action place, even while its run is active. The run counts
+neither as success nor as failure."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def _snapshot(client: OperatorClient) -> str:
     tokens = ", ".join(f"{place} {n}" for place, n in client.state["marking"].items() if n)
     return (
         f"{mission['id']}: {mission['state']}; controls: "
-        f"{controls['holder'] or 'nobody'}; tokens: {tokens}"
+        f"{controls['holder'] or 'no operator'}; tokens: {tokens}"
     )
 
 

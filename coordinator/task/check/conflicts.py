@@ -99,8 +99,8 @@ Trigger = tuple[str, str]
 
 def conflicts(task: Task) -> Iterator[Finding]:
     """Find conflicts that the arcs suggest: those that the task does not decide (warnings), and
-    those that the order of arrival decides (notes). Whether any comes to pass is for the execution
-    graph."""
+    those that the order of arrival decides (notes). The execution graph shows whether any of them
+    can occur."""
     domains, flows, net = condition_domains(task), semiflows(task), task.net
     for t, u in combinations(task.transitions.values(), 2):
         shared = sorted(_shared(task, t, u))

@@ -96,7 +96,8 @@ def _ask_process(question: str, seconds: float) -> tuple[list[Facts], str]:
         text, _ = process.communicate()
         why = f"importing it took longer than {seconds:g} s"
     lines = [line for line in text.splitlines() if line.endswith("}")]
-    return [json.loads(line) for line in lines], f"{why}; a module only defines, it does nothing"
+    remedy = "a module may define functions and classes, but must do nothing when it is imported"
+    return [json.loads(line) for line in lines], f"{why}; {remedy}"
 
 
 _ask_once = functools.lru_cache(maxsize=8)(_ask_process)

@@ -94,7 +94,7 @@ class CaptureImages:
             raise ConnectionError(self._fault)
 
     def stop(self) -> None:
-        """Deliver no more images. The camera stays open for the next start."""
+        """Stop delivering images. The camera stays open for the next start."""
         with self._lock:
             self._newest, self._rate = None, 0.0
 
@@ -186,7 +186,7 @@ class RecordedImages:
         self._begin, self._rate, self._sequence = self._clock(), rate, 0
 
     def stop(self) -> None:
-        """Deliver no more images."""
+        """Stop delivering images."""
         self._rate = 0.0
 
     def close(self) -> None:
