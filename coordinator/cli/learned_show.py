@@ -11,7 +11,7 @@ from math import inf, isfinite, isnan
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.loading import write_json
+from petrobot.coordinator.cli.loading import UNKNOWN, write_json
 
 if TYPE_CHECKING:
     from petrobot.coordinator.learning.estimate import Tally
@@ -403,11 +403,11 @@ def _warnings(about: Mapping[str, Any]) -> list[str]:
     lines, run = [], [row for row in own if row["runs"]]
     if len(own) < len(about["actions"]):
         lines.append(
-            f"judged by the runs of plant {about['source'] or 'unknown'} alone: those of other "
+            f"judged by the runs of plant {about['source'] or UNKNOWN} alone: those of other "
             "plants are never pooled with them"
         )
     if about["prior"] is not None:
-        of, trials = about["prior"]["source"] or "unknown", about["prior"]["trials"]
+        of, trials = about["prior"]["source"] or UNKNOWN, about["prior"]["trials"]
         lines.append(
             f"prior: the selectors also count the runs of plant {of}, as {trials:g} trials of each "
             "action"

@@ -104,7 +104,7 @@ class FileContents:
     """Number of mission runs learned from so far."""
     physics: str = ""
     """Name and version of the physics of the simulated laboratory in which all of it was learned;
-    empty: not said."""
+    empty: unknown."""
     plant: str = ""
     """Plant of the runs in `estimates`, `kinds` and `states`; empty: unknown."""
     plants: dict[str, Estimates] = field(default_factory=dict)
@@ -449,7 +449,7 @@ class EstimatesFile:
 
     def _note_physics(self, db: sqlite3.Connection, physics: str, plant: str = "") -> None:
         """Note the physics of what is added, or refuse it if that of the contents is another. Only
-        simulated runs have one; runs of which nothing is said count as simulated here."""
+        simulated runs have one; runs of an unknown plant count as simulated here."""
         if not has_physics(plant):
             return
         if _simulated(db):

@@ -217,7 +217,7 @@ class WorkerHost:
         self._retiring: Child | None = None
         """A process that was ordered to exit because it ran out of memory."""
         self._emergency = False
-        """Whether the device is in emergency stop; its next process is told so at its start."""
+        """Whether the device is in emergency stop; its next process is notified at its start."""
 
     # --- processes ----------------------------------------------------------------------------
 

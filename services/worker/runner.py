@@ -329,8 +329,8 @@ class Runner:
         self._reports.append(report)
 
     def due(self) -> float | None:
-        """When `advance` has something to do at the latest (s), None if only something that comes
-        in can matter."""
+        """When `advance` has something to do at the latest (s); None: not before a message
+        arrives."""
         if not self._runs:  # nor is a stream open
             return None
         held = self._held_since is not None

@@ -589,7 +589,7 @@ def test_mock_runs_do_not_move_what_was_learned_in_a_simulation(
     assert main(["forecast", str(TASK_FILE), *more]) == 2
     assert "several plants, which are never pooled: mock, simulated" in capsys.readouterr().err
     assert main(["analyse", str(TASK_FILE), "--estimates", "learned.db", "--json", "-"]) in (0, 1)
-    assert "its simulated runs, not pooled with: mock" in capsys.readouterr().err
+    assert "those of plant simulated, not pooled with: mock" in capsys.readouterr().err
 
 
 def test_a_file_that_does_not_say_its_plant_is_shown_so(

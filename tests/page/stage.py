@@ -1,5 +1,5 @@
-"""A mission for tests and measurements: the real engine and publisher, with scripted actions instead
-of nodes."""
+"""A mission for tests and measurements: the real engine and the state for viewers, with scripted
+actions instead of nodes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """Conflicts found on the structure: which pairs of transitions can compete for a token, and what
-settles them.
+decides between them.
 
 Two transitions compete when one stimulus, or what had come before it, can make both fireable for
 the same token. So what can come *last* before each can fire is compared: a pulse can only come

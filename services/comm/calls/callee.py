@@ -164,7 +164,7 @@ class Retention:
 
 
 _weigh = msgpack.Packer(default=lambda value: None, unicode_errors="surrogatepass").pack
-"""Packs data to learn its length on the wire; what cannot be sent counts as nothing."""
+"""Packs data to learn its length on the wire; what cannot be sent counts 0 bytes."""
 
 
 _DIGITS = "0123456789"

@@ -109,7 +109,7 @@ def code_faults(directory: Directory, code: Mapping[str, Facts], text: str) -> t
     faults, told = Faults(text, str(directory.source)), set[tuple[str, str]]()
 
     def unread(key: str, path: str) -> None:
-        """Say why a path cannot be imported; what is wrong in its module is said once."""
+        """Report why a path cannot be imported; a fault of its module is reported once."""
         why = code.get(path, {}).get("import", "")
         module = (path.partition(":")[0], why)
         if why and module not in told:

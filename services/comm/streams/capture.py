@@ -32,7 +32,7 @@ OPEN_LIMIT = 10.0
 
 @dataclass(frozen=True, slots=True)
 class CaptureSettings:
-    """What a camera is asked for. Zero, empty or None: what it does by itself."""
+    """Settings of a camera. Zero, empty or None: the camera keeps its own setting."""
 
     fps: float = 0.0
     """Images/s that it takes; 0: the rate of the first `start`."""
@@ -41,7 +41,8 @@ class CaptureSettings:
     fourcc: str = ""
     """Pixel format, four characters such as "MJPG"."""
     exposure: float | None = None
-    """Exposure in the unit of its driver (V4L2: 100 us); given, it is no longer automatic."""
+    """Exposure in the unit of its driver (V4L2: 100 us); if given, the camera does not set it
+    automatically."""
     colour: bool = False
     """Images of shape (height, width, 3), blue green red, instead of grey levels."""
     latency: float = 0.0
