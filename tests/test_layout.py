@@ -332,7 +332,7 @@ def test_every_mutation_still_finds_its_text() -> None:
     [
         ("services.worker.process", ("numpy", "scipy", "asyncio")),
         ("services.__main__", ("numpy", "scipy")),
-        ("coordinator.operator.session", ("scipy", "aiohttp", "rich")),
+        ("coordinator.operator.prepare", ("scipy", "aiohttp", "rich")),
         ("coordinator.cli", ("numpy", "scipy", "asyncio", "rich", "aiohttp")),
     ],
 )

@@ -45,7 +45,8 @@ from petrobot.services.host.command_line import (
 
 if TYPE_CHECKING:
     from petrobot.coordinator.learning.session import LearningSetting
-    from petrobot.coordinator.operator.session import RunRequest, RunSession
+    from petrobot.coordinator.operator.prepare import RunRequest
+    from petrobot.coordinator.operator.session import RunSession
     from petrobot.coordinator.operator.start_from import Recorded
     from petrobot.coordinator.task import Task
     from petrobot.services.comm.location_file import Directory
@@ -263,7 +264,7 @@ def run(options: argparse.Namespace) -> int:
     text = task_path(options.task).read_text(encoding="utf-8")
 
     def make() -> RunSession:
-        from petrobot.coordinator.operator.session import prepare
+        from petrobot.coordinator.operator.prepare import prepare
 
         return prepare(request, task, text, directory)
 
@@ -413,7 +414,12 @@ def _refuse_stopped(directory: Directory) -> None:
 
 
 def _request(task: Task, directory: Directory, options: argparse.Namespace) -> RunRequest:
-    from petrobot.coordinator.operator.session import JOINED, LAUNCHED, ONE_PROCESS, RunRequest
+    from petrobot.coordinator.operator.prepare import (
+        JOINED,
+        LAUNCHED,
+        ONE_PROCESS,
+        RunRequest,
+    )
 
     chosen = dict(pairs("--use", options.use))
     for primitive, action in chosen.items():
@@ -493,7 +499,7 @@ def _from_record(options: argparse.Namespace) -> Callable[[], RunSession]:
     found: Recorded = recorded(name)
 
     def make() -> RunSession:
-        from petrobot.coordinator.operator.session import RecordedPoint, RunRequest, prepare_from
+        from petrobot.coordinator.operator.prepare import RecordedPoint, RunRequest, prepare_from
         from petrobot.coordinator.run.folder import DEFAULT
 
         run = found.journal.path.parent.name

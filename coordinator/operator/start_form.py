@@ -22,14 +22,8 @@ from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.learning.learner import usual_contexts
 from petrobot.coordinator.learning.selectors import CREDITS, DEFAULT, RULES
 from petrobot.coordinator.learning.session import LearningSetting
-from petrobot.coordinator.operator.session import (
-    LOCKSTEP,
-    MODES,
-    REALTIME,
-    SEED,
-    RecordedPoint,
-    RunRequest,
-)
+from petrobot.coordinator.operator.prepare import SEED, RecordedPoint, RunRequest
+from petrobot.coordinator.operator.session import LOCKSTEP, MODES, REALTIME
 from petrobot.coordinator.operator.start_from import AGAIN
 from petrobot.coordinator.page.task_store import StoreError, TaskStore
 from petrobot.coordinator.task import Task

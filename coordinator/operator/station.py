@@ -22,15 +22,10 @@ from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
 from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.operator.observation import shown_selectors
+from petrobot.coordinator.operator.prepare import RunRequest, prepare, prepare_from
 from petrobot.coordinator.operator.run_address import RunAddress
 from petrobot.coordinator.operator.run_state import ChangePublisher
-from petrobot.coordinator.operator.session import (
-    LOCKSTEP,
-    RunRequest,
-    RunSession,
-    prepare,
-    prepare_from,
-)
+from petrobot.coordinator.operator.session import LOCKSTEP, RunSession
 from petrobot.coordinator.operator.start_form import read_start, read_start_from
 from petrobot.coordinator.operator.start_from import read_recorded
 from petrobot.coordinator.page.task_store import StoreError, TaskStore, TaskText

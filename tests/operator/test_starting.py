@@ -19,7 +19,7 @@ from petrobot.coordinator.operator import station
 from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP
 from petrobot.coordinator.operator.history import opened
 from petrobot.coordinator.operator.observation import TASK_REPORT
-from petrobot.coordinator.operator.session import RunRequest
+from petrobot.coordinator.operator.prepare import RunRequest
 from petrobot.coordinator.operator.start_form import read_start, read_start_from, start_form
 from petrobot.coordinator.operator.station import Station
 from petrobot.coordinator.page.task_store import TaskStore
