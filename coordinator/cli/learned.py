@@ -131,7 +131,7 @@ def _print(found: dict[str, Any]) -> None:
     console.print(table)
     for key, words in (
         ("R_conj", "every run a success"),
-        ("product", "product of the primitive tasks' R (R_conj of a mere series)"),
+        ("product", "product of the primitive tasks' R (R_conj, if they run in series)"),
         ("R_goal", "met goals for each run"),
         ("P_complete", "reaches its final marking"),
         ("cost", "expected cost of one run of the task" + _why_no_cost(found)),

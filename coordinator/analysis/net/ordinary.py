@@ -29,7 +29,7 @@ class OrdinaryView:
         return self._holds(self.task.flat.final, marking)
 
     def is_final_error(self, marking: Marking) -> bool:
-        """Whether the task has given up honestly."""
+        """Whether the task has given up as designed (further entries are ignored)."""
         return self._holds(self.task.flat.final_error, marking)
 
     def is_end(self, marking: Marking) -> bool:
