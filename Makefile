@@ -61,7 +61,7 @@ bench: $(VENV)/.ready
 	$(BIN)/python tools/bench/wire.py
 	$(BIN)/python tools/bench/faults.py
 	$(BIN)/python tools/bench/estop.py
-	$(BIN)/python tools/bench/doors.py
+	$(BIN)/python tools/bench/attacks.py
 	$(BIN)/python tools/bench/journal.py
 	$(BIN)/python tools/bench/durability.py
 	$(BIN)/python -m tools.bench.analysis --write docs/figures-analysis.md

@@ -204,8 +204,8 @@ def lockstep_member(
 ) -> tuple[Member, CoordinatorParty]:
     """The coordinator's process of a cell in which each node has a process of its own.
 
-    With `begin` it joins a cell that goes on, in place of a coordinator that died, and begins by
-    that.
+    With `begin` it joins an active cell in place of a coordinator that died; `begin` is called
+    first.
     """
     watching = None if watch is None else lambda now: watch(mission, now)
     coordinator = CoordinatorParty(directory, mission, watching, begin)
@@ -250,7 +250,8 @@ def resumed_mission(
     now: float,
     selector: Selector | None = None,
 ) -> tuple[Mission, Callable[[float], None]]:
-    """A mission run as its journal left it, and what makes it go on once the nodes are there.
+    """Return a mission run as its journal left it, and the function that continues it once the
+    nodes are connected.
 
     A selector that learns has to be among the observers too: the recorded steps bring it to where
     it was. Raises ReplayError when the engine does not derive what the journal says.
@@ -258,7 +259,7 @@ def resumed_mission(
     header = journal.header
     engine = as_recorded(engine, header)
     writer = JournalWriter(journal.path)
-    journal = writer.found  # as it is now that nobody else can write it
+    journal = writer.found  # as it is now that no other process can write it
     epoch = last_epoch(journal) + 1
     try:
         steps = list(replay(journal, engine))

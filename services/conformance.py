@@ -312,7 +312,7 @@ class _Check:
             if share > SLOWED:
                 self.fault(
                     f"speed = {asked:g}: {dict(there)} moves it at {share:.2f} of its usual speed; "
-                    "if it does not reach that on so short a way, give commands farther apart"
+                    "if the way is too short to reach its usual speed, give commands farther apart"
                 )
             self.move(back, seconds / SLOW)
         if "workspace" in obeys:
@@ -405,7 +405,7 @@ class _Check:
         self.stands(what, positions)
 
     def stands(self, what: str, positions: Mapping[str, float] | None = None) -> None:
-        """Check that it reports to stand still within the limit, and does stand still."""
+        """Check that `stopped` is True within the limit, and that no position changes then."""
         self.run(self.within, self.driver.stopped)
         if not self.driver.stopped():
             self.fault(f"{what}: stopped() is still False after {self.within:g} s")
@@ -415,8 +415,8 @@ class _Check:
     def cable(
         self, cable: Callable[[bool], None], commands: Sequence[Command], seconds: float
     ) -> None:
-        """Check that without its cable the driver raises, or no longer reports to stand still, and
-        that a new driver works with the cable."""
+        """Check that without its cable the driver raises or `stopped` is False, and that a new
+        driver works with the cable."""
         for command in commands[-1:]:
             self.move(command, seconds)
         cable(False)

@@ -67,10 +67,10 @@ class Ports(Protocol):
         port does not exist."""
 
     def tcp(self, host: str, port: int) -> ByteLine:
-        """Open a TCP connection to an IP address, or "unix:PATH" at a simulated laboratory; again
-        after it was lost. It is made while the driver goes on: what is sent meanwhile waits, and
-        `receive` raises ConnectionError if it cannot be made. In lock step it is the laboratory's
-        whatever it says. Raises ValueError for a host that is no address."""
+        """Open a TCP connection to an IP address, or with "unix:PATH" to a simulated laboratory;
+        call it again after the connection was lost. The call does not wait for the connection: what
+        is sent meanwhile waits, and `receive` raises ConnectionError if it cannot be made. In lock
+        step it always leads to the laboratory. Raises ValueError if `host` is not an address."""
 
     def images(self) -> ImageSource:
         """The image source of this device."""

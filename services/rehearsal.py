@@ -101,7 +101,7 @@ def _last_acts(played: Rehearsal) -> str:
     return "; ".join(acts) or "it called and published nothing"
 
 
-class _Prop:
+class _StillDevice:
     """Makes any object the device of a rehearsal; it counts as standing still."""
 
     def __init__(self, handle: Any) -> None:
@@ -167,7 +167,7 @@ class _Stage:
             {NAME: ActionEntry(NAME, "", "", "")},
             clock=lambda: self.now,
             driver=driver,
-            remote=_Prop(device) if driver is None and device is not None else None,
+            remote=_StillDevice(device) if driver is None and device is not None else None,
             streams=streams,
             substitutes={NAME: action},
             virtual=True,

@@ -36,7 +36,7 @@ class ScriptError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Cue:
+class ScriptedEvent:
     """An event that a scripted run raises, so many seconds after its begin."""
 
     after: float
@@ -45,7 +45,7 @@ class Cue:
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class ScriptedRun:
     """What one run does: status, cause and values after a time drawn from `seconds` = (shortest,
     longest)."""
 
@@ -54,7 +54,7 @@ class Line:
     values: Mapping[str, Any] = field(default_factory=dict)
     cause: str = ""
     text: str = ""
-    events: tuple[Cue, ...] = ()
+    events: tuple[ScriptedEvent, ...] = ()
     deferred: bool = False
     """Its status is provisional."""
 
@@ -63,7 +63,7 @@ class Scripted:
     """A callable action that plays its lines one run after the other, over and over. Takes any
     arguments."""
 
-    def __init__(self, lines: Iterable[Line]) -> None:
+    def __init__(self, lines: Iterable[ScriptedRun]) -> None:
         self._lines = tuple(lines)
         self._runs = 0
 
@@ -74,7 +74,7 @@ class Scripted:
         return _play(ctx, line)
 
 
-async def _play(ctx: Context, line: Line) -> Result:
+async def _play(ctx: Context, line: ScriptedRun) -> Result:
     begun = ctx.now
     shortest, longest = line.seconds
     seconds = (
@@ -121,7 +121,7 @@ def _top_faults(data: Mapping[str, Any]) -> Iterable[str]:
         yield "actions: write [actions.NAME] tables"
 
 
-def _line(table: Any) -> Line:
+def _line(table: Any) -> ScriptedRun:
     if not isinstance(table, dict):
         raise ValueError(f"is {table!r}; write a table with {', '.join(_KEYS)}")
     for key in table:
@@ -138,7 +138,7 @@ def _line(table: Any) -> Line:
     deferred = table.get("deferred", False)
     if not isinstance(deferred, bool):
         raise ValueError(f"deferred is {deferred!r}; write true if its status is provisional")
-    return Line(
+    return ScriptedRun(
         Status(status), _seconds(table.get("seconds", 0.0)), values, cause, text, cues, deferred
     )
 
@@ -151,11 +151,11 @@ def _seconds(value: Any) -> tuple[float, float]:
     return float(pair[0]), float(pair[1])
 
 
-def _cue(table: Any) -> Cue:
+def _cue(table: Any) -> ScriptedEvent:
     if (
         not isinstance(table, dict)
         or set(table) - set(_EVENT_KEYS)
         or not isinstance(table.get("name"), str)
     ):
         raise ValueError(f"event {table!r}; write {{ after = seconds, name = text, data = table }}")
-    return Cue(_seconds(table.get("after", 0.0))[0], table["name"], table.get("data", {}))
+    return ScriptedEvent(_seconds(table.get("after", 0.0))[0], table["name"], table.get("data", {}))

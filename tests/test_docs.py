@@ -18,6 +18,7 @@ NAMED = re.compile(
 )
 IN_SHORT = re.compile(r"`((?:[\w-]+/)*[\w-]+\.(?:py|js))`")
 DOTTED = re.compile(r"`((?:coordinator|services|sim|tests|tools)(?:\.[A-Za-z_]\w*)+)")
+CLASS = re.compile(r"`([A-Z][a-z0-9]+(?:[A-Z][a-z0-9]*)+)(?:\([^`]*\))?`")
 LINK = re.compile(r"\]\((?!https?:)([^)#]+)(?:#[^)]*)?\)")
 LONGEST_PAGE = 300
 LONGER = {"protocol.md": 350}
@@ -61,6 +62,19 @@ def test_files_named_in_short_exist() -> None:
         for page in [*PAGES, ROOT / "CHANGELOG.md"]
         for name in IN_SHORT.findall(page.read_text(encoding="utf-8"))
         if not any(path.endswith(f"/{name}") for path in known)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_classes_named_by_pages_exist() -> None:
+    """A name in capitals and small letters: a class, or a word of an error message or a file."""
+    source = "\n".join(path.read_text(encoding="utf-8") for path in _sources("*.py", "*.js"))
+    known = set(re.findall(r"\w+", source))
+    wrong = [
+        f"{page.relative_to(ROOT)}: {name}"
+        for page in PAGES
+        for name in CLASS.findall(page.read_text(encoding="utf-8"))
+        if name not in known
     ]
     assert not wrong, "\n".join(wrong)
 

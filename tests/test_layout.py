@@ -1,4 +1,4 @@
-"""The arrows of the house: who may import whom, also inside functions; pure rooms stay pure."""
+"""Which folder may import which, also inside functions; folders without side effects stay so."""
 
 from __future__ import annotations
 
@@ -87,8 +87,6 @@ PURE = (
     "services.comm.protocol.wire",
     "services.comm.calls.caller",
     "services.comm.calls.callee",
-    "services.comm.calls.pending",
-    "services.comm.calls.runs",
     "services.comm.calls.peers",
     "services.comm.calls.events",
     "services.motion.kinematics",
@@ -122,7 +120,7 @@ ROBOT_WORDS = {"throw", "throws", "puma", "ball", "camera", "cup", "track", "rov
 
 
 def modules() -> Iterator[tuple[str, Path]]:
-    """Every module of the house with its dotted name."""
+    """Every module of the source with its dotted name."""
     for top in sorted(TOP_LEVEL):
         for path in sorted((ROOT / top).rglob("*.py")):
             parts = path.relative_to(ROOT).with_suffix("").parts
@@ -396,7 +394,7 @@ def test_every_mutation_still_finds_its_text() -> None:
     [
         ("services.worker.process", ("numpy", "scipy", "asyncio")),
         ("services.__main__", ("numpy", "scipy")),
-        ("coordinator.operator.session", ("scipy", "aiohttp", "rich")),
+        ("coordinator.operator.prepare", ("scipy", "aiohttp", "rich")),
         ("coordinator.cli", ("numpy", "scipy", "asyncio", "rich", "aiohttp")),
     ],
 )

@@ -69,7 +69,7 @@ COMMANDS = (
     Subcommand(
         "pause", "pause the active run; each node reports whether its devices hold", "operate.pause"
     ),
-    Subcommand("continue", "continue the paused run", "operate.go_on"),
+    Subcommand("continue", "continue the paused run", "operate.continue_"),
     Subcommand("step", "fire one transition of the paused run", "operate.step"),
     Subcommand(
         "break", "pause before a transition fires or when a place is entered", "operate.breakpoints"
@@ -77,7 +77,7 @@ COMMANDS = (
     Subcommand("token", "add or remove tokens of a control place", "operate.tokens"),
     Subcommand("raise", "raise an external event by hand", "operate.events"),
     Subcommand(
-        "force", "take a token out of an action place, whatever its run does", "operate.force"
+        "force", "take a token out of an action place, even of an active run", "operate.force"
     ),
     Subcommand("override", "choose the action of a primitive task by hand", "operate.override"),
     Subcommand("remark", "write a remark into the journal of the active run", "operate.remark"),

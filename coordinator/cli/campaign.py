@@ -56,7 +56,7 @@ def _add_trials(parser: argparse.ArgumentParser) -> None:
         type=whole(most=MOST_RUNS),
         default=100,
         metavar="N",
-        help="in all regimes together (%(default)s)",
+        help="number of runs in all regimes together (%(default)s)",
     )
     parser.add_argument(
         "--regime",
@@ -120,7 +120,7 @@ def _add_execution(parser: argparse.ArgumentParser) -> None:
         type=whole(0, LARGEST_SEED),
         default=1,
         metavar="S",
-        help="of all random numbers (%(default)s)",
+        help="seed of all random numbers (%(default)s)",
     )
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task"

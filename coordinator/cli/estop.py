@@ -14,8 +14,8 @@ from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import add_services_argument, load_directory, write_json
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.operator.door_file import Door
     from petrobot.coordinator.operator.emergency_stop import Stopped
+    from petrobot.coordinator.operator.run_address import RunAddress
 
 EXAMPLE = "petrobot estop"
 COORDINATOR_PATIENCE = 1.0
@@ -59,8 +59,10 @@ def run(options: argparse.Namespace) -> int:
     from petrobot.services.comm.protocol.messages import COORDINATOR
     from petrobot.services.comm.tls.credentials import credentials
 
-    door = _door(options)
-    path = options.services or (Path(door.services) if door is not None and door.services else None)
+    address = _address(options)
+    path = options.services or (
+        Path(address.services) if address is not None and address.services else None
+    )
     directory = load_directory(path)
     verb = CLEAR if options.clear else STOP
     begun = time.perf_counter()
@@ -69,49 +71,51 @@ def run(options: argparse.Namespace) -> int:
     )
     took = time.perf_counter() - begun
     coordinator = (
-        asyncio.run(_tell(door, options.journal)) if door is not None and not options.clear else ""
+        asyncio.run(_tell(address, options.journal))
+        if address is not None and not options.clear
+        else ""
     )
     _show(options, answers, coordinator, took)
     return 0 if answers and all(answer.answered or answer.cleared for answer in answers) else 3
 
 
-def _door(options: argparse.Namespace) -> Door | None:
-    """Return the door of the active run, or None. The run names the cell, and its coordinator is
+def _address(options: argparse.Namespace) -> RunAddress | None:
+    """Return the address of the active run, or None. The run names the cell, and its coordinator is
     notified."""
-    from petrobot.coordinator.operator.door_file import find_door
+    from petrobot.coordinator.operator.run_address import find_address
     from petrobot.coordinator.run.folder import NoRunError
 
     try:
-        return find_door(options.run, options.journal)
+        return find_address(options.run, options.journal)
     except NoRunError as fault:
         if options.run is not None:
             raise CommandError(2, str(fault)) from fault
         return None
 
 
-async def _tell(door: Door, folder: Path) -> str:
+async def _tell(address: RunAddress, folder: Path) -> str:
     """Ask the coordinator to abort its run, so that it starts no recovery. Return what happened, in
     words."""
-    from petrobot.coordinator.cli.operate.hand import connect
+    from petrobot.coordinator.cli.operate.command import connect
     from petrobot.coordinator.operator.client import OperatorError
 
     try:
-        async with asyncio.timeout(COORDINATOR_PATIENCE), connect(door, None) as client:
+        async with asyncio.timeout(COORDINATOR_PATIENCE), connect(address, None) as client:
             answer = await client.command("estop")
     except (OperatorError, TimeoutError):
-        return f"{door.run}: " + (
-            "the coordinator does not answer" if _is_active(door, folder) else "has ended"
+        return f"{address.run}: " + (
+            "the coordinator does not answer" if _is_active(address, folder) else "has ended"
         )
-    return f"{door.run}: aborted" if answer.get("ok") else f"{door.run}: {answer.get('text')}"
+    return f"{address.run}: aborted" if answer.get("ok") else f"{address.run}: {answer.get('text')}"
 
 
-def _is_active(door: Door, folder: Path) -> bool:
+def _is_active(address: RunAddress, folder: Path) -> bool:
     """Whether the run is still active: a run whose devices are stopped may end by itself."""
-    from petrobot.coordinator.operator.door_file import find_door
+    from petrobot.coordinator.operator.run_address import find_address
     from petrobot.coordinator.run.folder import NoRunError
 
     try:
-        return find_door(door.run, folder) == door
+        return find_address(address.run, folder) == address
     except NoRunError:
         return False
 

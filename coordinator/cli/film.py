@@ -32,14 +32,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=number(least=0.0),
         default=0.0,
         metavar="S",
-        help="where in the run it begins (default: %(default)g)",
+        help="time of the run at which the film begins (default: %(default)g)",
     )
     parser.add_argument(
         "--seconds",
         type=number(above=0.0),
         default=10.0,
         metavar="S",
-        help="its longest duration (default: %(default)g)",
+        help="longest duration of the film (default: %(default)g)",
     )
     parser.add_argument(
         "--fps",
@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=whole(1, 100),
         default=75,
         metavar="Q",
-        help="of .webp, 1 to 100 (default: %(default)s)",
+        help="quality of a .webp film, 1 to 100 (default: %(default)s)",
     )
 
 

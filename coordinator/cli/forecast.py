@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plant",
         metavar="NAME",
-        help="of an estimates file with runs of several plants: real, simulated or mock",
+        help="which runs of an estimates file with several plants: real, simulated or mock",
     )
     add_services_argument(parser)
     parser.add_argument(
@@ -58,10 +58,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=whole(),
         default=1000,
         metavar="N",
-        help="that will be run in each regime (%(default)s)",
+        help="number of further runs in each regime (%(default)s)",
     )
     parser.add_argument(
-        "--regime", default="", metavar="A,B", help="only these (default: all that were measured)"
+        "--regime",
+        default="",
+        metavar="A,B",
+        help="forecast only these regimes (default: all that were measured)",
     )
     parser.add_argument(
         "--choose",
@@ -80,18 +83,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=whole(20),
         default=400,
         metavar="B",
-        help="of the bootstrap (%(default)s)",
+        help="number of bootstrap samples (%(default)s)",
     )
     parser.add_argument(
-        "--seed", type=whole(0), default=1, metavar="S", help="of the simulation (%(default)s)"
+        "--seed", type=whole(0), default=1, metavar="S", help="seed of the simulation (%(default)s)"
     )
     parser.add_argument(
-        "--out", metavar="FILE", type=Path, help="register the forecast here; never written over"
+        "--out",
+        metavar="FILE",
+        type=Path,
+        help="register the forecast in this file, which must not exist yet",
     )
     parser.add_argument(
         "--doubtful",
         action="store_true",
-        help="register it although it does not repeat even its own training",
+        help="register the forecast even if it does not repeat its own training",
     )
     parser.add_argument(
         "--compare",
@@ -150,7 +156,7 @@ def _forecast(options: argparse.Namespace) -> int:
         kept = (
             ""
             if options.out is None
-            else f"; {options.out} is not written, --doubtful registers it all the same"
+            else f"; {options.out} is not written; --doubtful registers it anyway"
         )
         print(f"petrobot forecast: DOUBTFUL, see above{kept}", file=sys.stderr)
         return 1
@@ -273,7 +279,7 @@ def _refuse_other_runs(task: Task, rows: Iterable[TrialRow], path: Path) -> None
             raise CommandError(
                 2,
                 f"{path / TABLE}: runs: {task.name} has no action place {place}; the task "
-                "file is another one: train anew",
+                "file has changed: train again",
             )
         _refuse_other_actions(task, known.task, found, path / TABLE)
 
@@ -286,7 +292,7 @@ def _refuse_other_actions(task: Task, primitive: str, actions: Iterable[str], so
                 2,
                 f"{source}: runs: {primitive} of {task.name} has no action {action} "
                 f"({', '.join(offered)}); the task file is "
-                "another one: train anew",
+                "changed: train again",
             )
 
 

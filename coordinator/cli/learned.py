@@ -131,7 +131,7 @@ def _print(found: dict[str, Any]) -> None:
     console.print(table)
     for key, words in (
         ("R_conj", "every run a success"),
-        ("product", "product of the primitive tasks' R (R_conj of a mere series)"),
+        ("product", "product of the primitive tasks' R (R_conj, if they run in series)"),
         ("R_goal", "met goals for each run"),
         ("P_complete", "reaches its final marking"),
         ("cost", "expected cost of one run of the task" + _why_no_cost(found)),
@@ -187,7 +187,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "more",
         nargs="*",
         metavar="FILE|TASK",
-        help="merge: files to take in; else: primitive tasks (all)",
+        help="merge: files to merge into it; else: primitive tasks (all)",
     )
     parser.add_argument(
         "--context",
@@ -217,7 +217,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--budget",
         type=number(above=0.0),
         metavar="C",
-        help="what reliability may be had for this cost at most",
+        help="find the most reliable actions that cost at most this",
     )
     parser.add_argument(
         "--rho",
@@ -276,7 +276,7 @@ def _merge(file: EstimatesFile, options: argparse.Namespace) -> int:
         file.merge(Path(other))
     kept = file.read()
     runs = sum(t.runs + t.censored for e in kept.plants.values() for t in e.tallies.values())
-    print(f"{options.file}: {len(options.more)} taken in; {runs} runs known")
+    print(f"{options.file}: {len(options.more)} merged; {runs} runs in all")
     return 0
 
 
@@ -292,8 +292,7 @@ def _refuse_unknown(kept: FileContents, options: argparse.Namespace) -> None:
         if task not in _tasks(kept):
             raise CommandError(
                 2,
-                f"{options.file} knows no primitive task {task!r}; it knows: "
-                f"{', '.join(_tasks(kept))}",
+                f"{options.file} has no primitive task {task!r}; it has: {', '.join(_tasks(kept))}",
             )
 
 

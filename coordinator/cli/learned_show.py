@@ -11,7 +11,7 @@ from math import inf, isfinite, isnan
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.loading import write_json
+from petrobot.coordinator.cli.loading import UNKNOWN, write_json
 
 if TYPE_CHECKING:
     from petrobot.coordinator.learning.estimate import Tally
@@ -121,7 +121,7 @@ def refuse_unknown_context(
         there = ", ".join(repr(c) for c in sorted(known)) or "none"
         raise CommandError(
             2,
-            f"--context {options.context!r}: {options.file} knows no run in it; it knows the "
+            f"--context {options.context!r}: {options.file} has no run in it; it has the "
             f"contexts {there}",
         )
 
@@ -349,7 +349,7 @@ def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> Non
     columns = [
         "action",
         "runs",
-        *(["source"] if several else []),
+        *(["plant"] if several else []),
         "R",
         "R 95 %",
         "C",
@@ -403,13 +403,14 @@ def _warnings(about: Mapping[str, Any]) -> list[str]:
     lines, run = [], [row for row in own if row["runs"]]
     if len(own) < len(about["actions"]):
         lines.append(
-            f"judged by the {about['source'] or 'not said'} runs alone: those of other sources are "
-            "never pooled with them"
+            f"judged by the runs of plant {about['source'] or UNKNOWN} alone: those of other "
+            "plants are never pooled with them"
         )
     if about["prior"] is not None:
-        of, trials = about["prior"]["source"] or "not said", about["prior"]["trials"]
+        of, trials = about["prior"]["source"] or UNKNOWN, about["prior"]["trials"]
         lines.append(
-            f"prior: the selectors also count the {of} runs of each action, as {trials:g} trials"
+            f"prior: the selectors also count the runs of plant {of}, as {trials:g} trials of each "
+            "action"
         )
     if about["level_with_best"]:
         lines.append(

@@ -24,6 +24,8 @@ SHIPPED = Path(__file__).parents[1] / "tasks"
 """Tasks that come with petrobot; a command accepts their names without a path."""
 SHIPPED_CELL = (Path(__file__).parents[2] / "services.toml").resolve()
 """The location file that comes with petrobot: that of the catching cell."""
+UNKNOWN = "unknown"
+"""Plant of runs in files that were written before plants were stored."""
 OWN = Path("tasks")
 """Folder of the user's own tasks; the operator's page saves there."""
 
@@ -56,7 +58,7 @@ def measurements(file: Path | None) -> Callable[[Task, Cell | None], Measured] |
     if file is None:
         return None
     from petrobot.coordinator.analysis.may_run import devices_of
-    from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, said
+    from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
     from petrobot.coordinator.learning.propagation import measured_from
 
     file = estimates_path(file)
@@ -65,11 +67,11 @@ def measurements(file: Path | None) -> Callable[[Task, Cell | None], Measured] |
     except EstimatesError as fault:
         raise CommandError(2, str(fault)) from fault
 
-    others = [said(p) for p, found in kept.plants.items() if found.tallies and p != kept.plant]
+    others = [p or UNKNOWN for p, found in kept.plants.items() if found.tallies and p != kept.plant]
     if others:
         print(
-            f"{file}: the measurements are its {said(kept.plant)} runs, not pooled with: "
-            f"{', '.join(sorted(others))}",
+            f"{file}: the measurements are those of plant {kept.plant or UNKNOWN}, not pooled "
+            f"with: {', '.join(sorted(others))}",
             file=sys.stderr,
         )
 
@@ -78,7 +80,7 @@ def measurements(file: Path | None) -> Callable[[Task, Cell | None], Measured] |
         found = measured_from(task, kept.estimates, kinds=kept.kinds, devices=devices)
         if not found.runs:
             known = ", ".join(sorted({k.primitive_task for k in kept.estimates.tallies})) or "none"
-            text = f"{file}: nothing was measured of {task.name}; it knows: {known}"
+            text = f"{file}: nothing was measured of {task.name}; it has: {known}"
             raise CommandError(2, text)
         return found
 

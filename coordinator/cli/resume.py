@@ -52,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
         return 0 if result["status"] == "success" else 1
 
     def make() -> RunSession:
-        from petrobot.coordinator.operator.session import resume
+        from petrobot.coordinator.operator.prepare import resume
 
         return resume(found)
 

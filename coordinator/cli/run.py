@@ -45,7 +45,8 @@ from petrobot.services.host.command_line import (
 
 if TYPE_CHECKING:
     from petrobot.coordinator.learning.session import LearningSetting
-    from petrobot.coordinator.operator.session import RunRequest, RunSession
+    from petrobot.coordinator.operator.prepare import RunRequest
+    from petrobot.coordinator.operator.session import RunSession
     from petrobot.coordinator.operator.start_from import Recorded
     from petrobot.coordinator.task import Task
     from petrobot.services.comm.location_file import Directory
@@ -141,7 +142,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
     )
     add_learning_arguments(parser)
-    add_departing_arguments(parser)
+    add_start_from_arguments(parser)
     parser.add_argument(
         "--json", metavar="FILE", help="write the result as JSON (- for standard output)"
     )
@@ -215,11 +216,11 @@ def add_learning_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_departing_arguments(parser: argparse.ArgumentParser) -> None:
+def add_start_from_arguments(parser: argparse.ArgumentParser) -> None:
     """Add `--from` and `--going`."""
     parser.add_argument(
         "--from",
-        dest="departs",
+        dest="starts_from",
         metavar="RUN[:RECORD]",
         help="start from a recorded run: simulate its task from the state after one of its "
         "records, in lock step, as a new run (`petrobot log` numbers the records; default: 0, the "
@@ -237,7 +238,7 @@ def add_departing_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Check the task, run it, print and write its result."""
-    if options.departs is not None:
+    if options.starts_from is not None:
         return conduct(_from_record(options), options, "lockstep")
     if options.task is None:
         raise CommandError(2, "give a task to run, or a recorded run with --from")
@@ -263,7 +264,7 @@ def run(options: argparse.Namespace) -> int:
     text = task_path(options.task).read_text(encoding="utf-8")
 
     def make() -> RunSession:
-        from petrobot.coordinator.operator.session import prepare
+        from petrobot.coordinator.operator.prepare import prepare
 
         return prepare(request, task, text, directory)
 
@@ -348,8 +349,8 @@ async def _page(session: RunSession, options: argparse.Namespace) -> AsyncIterat
     """Serve the operator's page, or with --no-page the operator's protocol alone, while the run is
     active."""
     from petrobot.coordinator.cli.loading import SHIPPED, own_tasks
-    from petrobot.coordinator.operator.door_file import Door
     from petrobot.coordinator.operator.history import JournalHistory
+    from petrobot.coordinator.operator.run_address import RunAddress
     from petrobot.coordinator.operator.station import offered
     from petrobot.coordinator.page.server import start_page
 
@@ -371,7 +372,7 @@ async def _page(session: RunSession, options: argparse.Namespace) -> AsyncIterat
     if not options.no_page:
         print(f"page: {page.url}", file=sys.stderr, flush=True)
     services = str(directory.source.resolve())
-    session.door = Door(session.identity, page.base, page.token, os.getpid(), services)
+    session.address = RunAddress(session.identity, page.base, page.token, os.getpid(), services)
     try:
         yield
     finally:
@@ -413,7 +414,12 @@ def _refuse_stopped(directory: Directory) -> None:
 
 
 def _request(task: Task, directory: Directory, options: argparse.Namespace) -> RunRequest:
-    from petrobot.coordinator.operator.session import JOINED, LAUNCHED, ONE_PROCESS, RunRequest
+    from petrobot.coordinator.operator.prepare import (
+        JOINED,
+        LAUNCHED,
+        ONE_PROCESS,
+        RunRequest,
+    )
 
     chosen = dict(pairs("--use", options.use))
     for primitive, action in chosen.items():
@@ -489,11 +495,11 @@ def _from_record(options: argparse.Namespace) -> Callable[[], RunSession]:
         raise CommandError(
             2, "--from only simulates, in one process: a real cell is not in the recorded state"
         )
-    name, record = _named(options.departs)
+    name, record = _named(options.starts_from)
     found: Recorded = recorded(name)
 
     def make() -> RunSession:
-        from petrobot.coordinator.operator.session import RecordedPoint, RunRequest, prepare_from
+        from petrobot.coordinator.operator.prepare import RecordedPoint, RunRequest, prepare_from
         from petrobot.coordinator.run.folder import DEFAULT
 
         run = found.journal.path.parent.name

@@ -127,7 +127,7 @@ async def _page(
             history=JournalHistory(runs),
             starts=station.form,
         )
-    station.door = _doors(station.directory, page)
+    station.address = _addresses(station.directory, page)
     try:
         print(f"page: {page.url}\nCtrl-C stops it", flush=True)
         await stop.wait()
@@ -136,9 +136,9 @@ async def _page(
         await page.close()
 
 
-def _doors(directory: Directory, page: Page) -> Any:
-    from petrobot.coordinator.operator.door_file import Door
+def _addresses(directory: Directory, page: Page) -> Any:
+    from petrobot.coordinator.operator.run_address import RunAddress
 
-    return lambda run: Door(
+    return lambda run: RunAddress(
         run, page.base, page.token, os.getpid(), str(directory.source.resolve())
     )

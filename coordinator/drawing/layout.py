@@ -440,7 +440,7 @@ def _apart(above: Spot, below: Spot) -> float:
 
 
 def _wish(spot: Spot, layers: Layers, row: Mapping[Spot, float]) -> tuple[float, float]:
-    """Return the mean height of the neighbours of a spot, and the weight of that wish."""
+    """Return the mean height of the neighbours of a spot, and the weight of that height."""
     steps = [
         (row[n], _STRAIGHT[isinstance(spot, tuple) + isinstance(n, tuple)])
         for n in (*layers.before[spot], *layers.next[spot])
@@ -450,7 +450,8 @@ def _wish(spot: Spot, layers: Layers, row: Mapping[Spot, float]) -> tuple[float,
 
 
 def _spaced(column: Sequence[Spot], wishes: Sequence[tuple[float, float]]) -> list[float]:
-    """Return the heights closest to the wishes (least squares) that keep the minimum distances.
+    """Return the heights closest to the wished ones (least squares) that keep the minimum
+    distances.
 
     Subtracting the minimum distances turns the task into isotonic regression, which the
     pool-adjacent-violators algorithm solves exactly: neighbours in the wrong order are merged into

@@ -81,7 +81,7 @@ def _point(pieces: Sequence[tuple[Point, Point, Point]], s: float) -> Point:
 
 
 @dataclass(frozen=True, slots=True)
-class Words:
+class LabelBox:
     """The label of a node: start of its first baseline, text anchor, and the box that it covers."""
 
     node: DrawnNode
@@ -207,7 +207,7 @@ def _cost(nodes: Mapping[str, DrawnNode], path: ArcPath, used: set[float], twins
     return 1000.0 * hits + 1500.0 * taken + abs(path.bend) - 0.5 * (not alone)
 
 
-def place_words(nodes: Mapping[str, DrawnNode], paths: Sequence[ArcPath]) -> list[Words]:
+def place_words(nodes: Mapping[str, DrawnNode], paths: Sequence[ArcPath]) -> list[LabelBox]:
     """Place the label of each node where it covers least.
 
     Covering nodes and other labels costs most, then arcs. Long labels are placed first, because
@@ -215,7 +215,7 @@ def place_words(nodes: Mapping[str, DrawnNode], paths: Sequence[ArcPath]) -> lis
     """
     solid = [_around(n) for n in nodes.values()]
     curves = [(_box_of(points), points) for points in (w.points for w in paths)]
-    placed: list[Words] = []
+    placed: list[LabelBox] = []
     for node in sorted(
         nodes.values(), key=lambda n: (not n.is_place, -max(map(len, n.lines), default=0))
     ):
@@ -273,7 +273,7 @@ def text_width(text: str) -> float:
     return len(text) * FONT * _CHARACTER
 
 
-def _spots(node: DrawnNode) -> Iterator[Words]:
+def _spots(node: DrawnNode) -> Iterator[LabelBox]:
     """Yield candidate positions of a label, the usual ones first."""
     width = max(map(text_width, node.lines), default=0.0)
     height = LINE * len(node.lines)
@@ -295,9 +295,9 @@ def _spots(node: DrawnNode) -> Iterator[Words]:
 
 def _words(
     node: DrawnNode, x: float, top: float, anchor: str, width: float, height: float
-) -> Words:
+) -> LabelBox:
     left = {"middle": x - width / 2, "start": x, "end": x - width}[anchor]
-    return Words(node, x, top + FONT * 0.85, anchor, (left, top, left + width, top + height))
+    return LabelBox(node, x, top + FONT * 0.85, anchor, (left, top, left + width, top + height))
 
 
 def _around(node: DrawnNode) -> Box:

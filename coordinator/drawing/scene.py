@@ -70,7 +70,7 @@ def sheet_of(task: Task, inside: str, error_branches: bool, marking: Marking | N
 
 def expanded(task: Task) -> Task:
     """Return the net that is executed, to be drawn: nothing is written in short and no macro place
-    is closed. Its elements are laid out anew if it has more of them than the task file."""
+    is closed. It gets a new layout if it has more elements than the task file."""
     flat = task.flat
     if set(flat.places) == set(task.places) and set(flat.transitions) == set(task.transitions):
         return task

@@ -11,7 +11,7 @@ from petrobot.coordinator.drawing.routing import (
     FONT,
     LINE,
     ArcPath,
-    Words,
+    LabelBox,
     badge_spot,
     place_words,
     route,
@@ -126,7 +126,7 @@ def _description(scene: Scene) -> str:
 
 
 def _frame(
-    scene: Scene, paths: Sequence[ArcPath], words: Sequence[Words]
+    scene: Scene, paths: Sequence[ArcPath], words: Sequence[LabelBox]
 ) -> tuple[float, float, float, float]:
     """Return left, top, width and height of a frame around everything."""
     points = [
@@ -235,7 +235,7 @@ def _pieces(path: ArcPath, end: Point) -> Iterator[str]:
         yield f"Q{cx:.1f} {cy:.1f} {x:.1f} {y:.1f}"
 
 
-def _words(words: Words) -> Iterator[str]:
+def _words(words: LabelBox) -> Iterator[str]:
     style = "" if words.node.is_place else "event"
     for i, line in enumerate(words.node.lines):
         yield from _text(line, words.x, words.y + i * LINE, words.anchor, style)

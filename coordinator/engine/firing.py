@@ -124,8 +124,8 @@ def awaited_place(draft: Draft, x: CompiledTransition) -> int | None:
 
 
 def token_enabled(draft: Draft, x: CompiledTransition) -> bool:
-    """Return whether tokens, inhibitors and capacities enable the transition, whatever the state of
-    its runs."""
+    """Return whether tokens, inhibitors and capacities enable the transition; the state of its
+    runs is not considered."""
     return _marking_allows(draft, x, _NOTHING)
 
 
@@ -157,8 +157,8 @@ def waiting_for(draft: Draft) -> str:
 
 
 class Obstacle(NamedTuple):
-    """What keeps a transition from firing, events and time aside. `place` is the place that holds
-    too few tokens or too many, or no run that the arc may take."""
+    """What keeps a transition from firing, apart from events and time. `place` is the place that
+    holds too few tokens or too many, or no run that the arc may take."""
 
     place: int | None
     kind: str

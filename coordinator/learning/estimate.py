@@ -5,7 +5,7 @@ immutable and can be merged: the tally of two sets of runs is the merge of their
 several machines add up. Reliability R is the relative frequency of SUCCESS among the runs that were
 executed and not censored (paper, section 3). An ERROR counts as not successful, also with `executed
 = unknown`. An ERROR of a run that never executed lowers only the availability A. A preempted run
-that counts `none` is censored: it tells only that the run lasted at least so long.
+that counts `none` is censored: it only shows that the run lasted at least so long.
 """
 
 from __future__ import annotations
@@ -294,7 +294,7 @@ class Tally:
         """Return the tally with one more run. `salt` names the session that counts, so that the
         samples of several sessions differ.
 
-        A run that was cancelled before it began tells nothing and changes nothing.
+        A run that was cancelled before it began is not counted.
         """
         if seen.executed is Executed.NO:
             if seen.status is None or seen.preempted_by is not None:
@@ -518,7 +518,7 @@ class TrialSums:
     """Sums over trials of a whole task. Immutable; can be merged."""
 
     n: int = 0
-    """Trials that began and are over."""
+    """Trials that have begun and ended."""
     success: int = 0
     """Trials that completed and in which every run was a SUCCESS."""
     goals: int = 0

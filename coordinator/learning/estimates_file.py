@@ -3,7 +3,7 @@ several machines.
 
 Each file has its own origin (a random name) and stores the sums of each origin separately. A merge
 takes the later version of each origin's sums, so merging is idempotent, commutative and
-associative: no run counts twice, however often and in whatever order files travel. What was reset
+associative: no run counts twice, however often and in which order files are merged. What was reset
 stays forgotten, because the file remembers the reset origins. A copy of a file gets a new origin as
 soon as something is added to it, so two copies that both grow lose nothing when they are merged.
 The runs of a campaign have a closed origin: it is the same in every file that counts the campaign,
@@ -104,9 +104,9 @@ class FileContents:
     """Number of mission runs learned from so far."""
     physics: str = ""
     """Name and version of the physics of the simulated laboratory in which all of it was learned;
-    empty: not said."""
+    empty: unknown."""
     plant: str = ""
-    """Where the runs took place that `estimates`, `kinds` and `states` tell of; empty: not said."""
+    """Plant of the runs in `estimates`, `kinds` and `states`; empty: unknown."""
     plants: dict[str, Estimates] = field(default_factory=dict)
     """The estimates of every plant of the file."""
     selectors: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
@@ -158,8 +158,8 @@ class EstimatesFile:
     # --- reading ------------------------------------------------------------------------------
 
     def read(self, plant: str | None = None) -> FileContents:
-        """Read the whole file. `plant`: of which plant `estimates` shall be; None: the one that
-        matters most among those in the file (real, then simulated, not said, mock; of several real
+        """Read the whole file. `plant`: the plant of `estimates`; None: the one that
+        matters most among those in the file (real, then simulated, unknown, mock; of several real
         ones the one with the most runs). Raises EstimatesError."""
         if not self.path.exists():
             return FileContents(plant=plant or "")
@@ -449,7 +449,7 @@ class EstimatesFile:
 
     def _note_physics(self, db: sqlite3.Connection, physics: str, plant: str = "") -> None:
         """Note the physics of what is added, or refuse it if that of the contents is another. Only
-        simulated runs have one; runs of which nothing is said count as simulated here."""
+        simulated runs have one; runs of an unknown plant count as simulated here."""
         if not has_physics(plant):
             return
         if _simulated(db):

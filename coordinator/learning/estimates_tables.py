@@ -385,8 +385,8 @@ def tally_of(row: Sequence[Any]) -> Tally:
 
 
 def _agree(changes: int, version: int) -> None:
-    """Check the version: a version that is too high would win every merge, whatever it stands
-    for."""
+    """Check the version: a version that is too high would win every merge, whatever the
+    contents."""
     if changes != version:
         raise ValueError(f"expected version {changes}, the number of changes, got {version}")
 

@@ -83,7 +83,7 @@ class Figures:
     j_lower: float = nan
     j_upper: float = nan
     """Bounds of the confidence interval of J for that rho, from the joint spread of success and
-    cost over the same runs; nan where the cost of a single run says nothing of its spread."""
+    cost over the same runs; nan where a single run gives no spread of the cost."""
     cost_lower: float = nan
     cost_upper: float = nan
     """Bounds of the confidence interval of C."""

@@ -2,7 +2,7 @@
 read R, C and J of the task from its solution.
 
 The net decides how numbers compose: branches, loops, races and recoveries are handled by the
-stochastic view (docs/analysis.md). If the net is a mere series, the results must equal the
+stochastic view (docs/analysis.md). If the primitive tasks run in series, the results must equal the
 conjunctive product R = R_1 R_2 ..., C = C_1 + C_2 + ..., which is computed as a cross-check.
 """
 
@@ -386,7 +386,7 @@ class Propagated:
     j: Uncertain
     product: float
     """Product of R over the primitive tasks that every mission run contains; equal to R_conj if the
-    net is a mere series."""
+    they run in series."""
 
     @property
     def conjunctive(self) -> float:

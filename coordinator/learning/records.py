@@ -72,7 +72,7 @@ class Passage:
 
 @dataclass(frozen=True, slots=True)
 class TrialEnd:
-    """A trial of the task is over."""
+    """A trial of the task has ended."""
 
     context: str
     success: bool

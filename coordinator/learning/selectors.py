@@ -260,7 +260,7 @@ class RuleSelector:
     ) -> None:
         """Take the sums from estimates, which may contain runs of other machines; rules that fade
         their sums keep their own. `prior`: estimates of another plant, each of which counts as so
-        many `trials` at most; its availability says nothing of this plant."""
+        many `trials` at most; its availability is not used, because it is that of other nodes."""
         batch = self.learner(context)
         if self.frozen or (isinstance(self.rule, Tracking) and (not prior or batch.k[0] > 0)):
             return

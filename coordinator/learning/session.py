@@ -28,8 +28,8 @@ from petrobot.services.comm.location_file import Directory
 
 PRIOR_TRIALS = 10.0
 """Trials for which a prior counts unless the user says otherwise. The error of a simulator is not
-known beforehand; one whose R of an action is off by 0.1 (standard deviation) tells of an action
-with R = 0.9 as much as 0.9 * 0.1 / 0.1^2 = 9 real runs do, and 25 of one with R = 0.5."""
+known beforehand. If its R of an action has an error of 0.1 (standard deviation), it is worth
+0.9 * 0.1 / 0.1^2 = 9 real runs of an action with R = 0.9, and 25 of one with R = 0.5."""
 
 
 def plant_of(directory: Directory, *, scripted: bool, lockstep: bool) -> str:

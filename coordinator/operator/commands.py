@@ -39,7 +39,7 @@ from petrobot.coordinator.operator.controls import Answer, Controls, refusal
 from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
 from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.observation import TrialWatch, Watching, shown_selectors
-from petrobot.coordinator.operator.run_state import Narrator
+from petrobot.coordinator.operator.run_state import ChangePublisher
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Mission, Stage
@@ -103,8 +103,8 @@ class Operation:
         self._live = mode == "realtime"
         began = shell.now()
         where = {name: entry.node for name, entry in self.executor.directory.actions.items()}
-        self.narrator = Narrator(self.feed, self.executor.task, where, began)
-        self.narrator.begin(
+        self.publisher = ChangePublisher(self.feed, self.executor.task, where, began)
+        self.publisher.begin(
             self.executor.mission,
             mode,
             starts=starts,
@@ -113,8 +113,8 @@ class Operation:
             nodes=dict(self.feed.state["nodes"]),
         )
         if self.executor.state.stimuli:
-            self.narrator.adopt(began, self.executor.state)
-        self.executor.observers.extend([self.narrator, self])
+            self.publisher.recover(began, self.executor.state)
+        self.executor.observers.extend([self.publisher, self])
         self.watching = Watching(shell, self.feed, selector, began, lambda: self.feed.watched)
         trials = TrialWatch(self.executor.task, self.executor.directory, self.feed)
         self.executor.observers.extend([self.watching, trials])
@@ -255,7 +255,7 @@ class Operation:
     async def _do_remark(self, who: str, data: Mapping[str, Any]) -> Answer:
         store, now = self.executor.store, self.shell.now()
         if self.mission.stage is Stage.OVER:
-            return refusal("idle", "the mission run is over")
+            return refusal("idle", "the mission run has finished")
         if not isinstance(store, JournalStore):
             return refusal(
                 "no_journal", "this run keeps no journal; start it with --journal FOLDER"
@@ -266,7 +266,7 @@ class Operation:
         except JournalError as fault:
             self.shell.fail(fault)
             return refusal("journal", str(fault))
-        time = round(now - self.narrator.origin, 4)
+        time = round(now - self.publisher.origin, 4)
         notice = {"level": "info", "text": remark.told, "at": time}
         self.feed.emit("notice", time=time, notice=notice)
         return {"ok": True}

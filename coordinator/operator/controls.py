@@ -30,7 +30,7 @@ class Controls:
             return None
         return refusal(
             "not_holder",
-            f"{self.holder or 'nobody'} holds the controls; take or ask for them first",
+            f"{self.holder or 'no operator'} holds the controls; take or ask for them first",
         )
 
     def take(self, who: str) -> Answer:

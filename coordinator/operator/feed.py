@@ -35,7 +35,7 @@ class Feed:
 
     @property
     def watched(self) -> bool:
-        """Whether there is a subscriber, or somebody has just read a snapshot."""
+        """Whether there is a subscriber, or a client has just read a snapshot."""
         return bool(self._receivers) or monotonic() - self._read < READ_FOR
 
     def emit(self, kind: str, *, time: float | None = None, **fields: Any) -> None:

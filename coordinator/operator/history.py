@@ -83,7 +83,7 @@ def opened(path: Path, run: str) -> dict[str, Any]:
     except (JournalError, TaskFileError, KeyError) as fault:
         return {"id": run, "fault": f"{fault}", "task": None, "initial": {}, "records": []}
     engine = Engine(task, journal.header.get("devices") or _devices(journal))
-    teller = _Teller(task)
+    teller = _StepDescriber(task)
     records: list[dict[str, Any]] = []
     fault_text = (
         f"a torn tail of {journal.torn_bytes} bytes was dropped" if journal.torn_bytes else ""
@@ -148,7 +148,7 @@ def _devices(journal: Journal) -> dict[str, str]:
     return {a.name: a.device for a in directory.actions.values() if a.device}
 
 
-class _Teller:
+class _StepDescriber:
     """Converts steps to records; keeps the action of each run, for the reasons of firings."""
 
     def __init__(self, task: Task) -> None:

@@ -64,8 +64,8 @@ class TrialWatch(TrialLog):
         self._task, self._feed, self._shown = task, feed, 0
 
     def settled(self, now: float, state: State) -> None:
-        """Show the figures after each trial; of many, after each 2 % more, since all are counted
-        again (a verdict may come late)."""
+        """Show the figures after each trial, or with many trials after each
+        further 2 %, since all are counted again (a verdict may come late)."""
         over = state.mode is Mode.FINISHED
         done = [trial for trial in self.trials if trial.completed or over]
         if len(done) >= self._shown + max(1, self._shown // 50) or (over and len(done) > 0):
@@ -271,10 +271,10 @@ class Watching:
         self._feed.emit("report", name=key, report=report)
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
-        """Do nothing: the narrator reports it."""
+        """Do nothing: the publisher reports it."""
 
     def progress(self, now: float, run: str, notice: Feedback) -> None:
-        """Do nothing: the narrator reports it."""
+        """Do nothing: the publisher reports it."""
 
     def settled(self, now: float, state: State) -> None:
-        """Do nothing: the narrator reports it."""
+        """Do nothing: the publisher reports it."""

@@ -52,7 +52,7 @@ _GOING = ACTIVE | {Phase.STOPPING, Phase.STUCK}
 _LEVEL = {Severity.NOTE: "info", Severity.WARNING: "warning", Severity.ERROR: "error"}
 
 
-class Narrator:
+class ChangePublisher:
     """Publishes changes on a feed. `where` gives the node of each action. Implements
     `coordinator.run.interfaces.Observer`.
 
@@ -192,7 +192,7 @@ class Narrator:
             )
         self._seen = state
 
-    def adopt(self, now: float, state: State) -> None:
+    def recover(self, now: float, state: State) -> None:
         """Take over and publish the whole state that another process left."""
         time = now - self.origin
         self._marking(time, (-1,) * len(state.marking), state.marking)

@@ -22,14 +22,8 @@ from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.learning.learner import usual_contexts
 from petrobot.coordinator.learning.selectors import CREDITS, DEFAULT, RULES
 from petrobot.coordinator.learning.session import LearningSetting
-from petrobot.coordinator.operator.session import (
-    LOCKSTEP,
-    MODES,
-    REALTIME,
-    SEED,
-    RecordedPoint,
-    RunRequest,
-)
+from petrobot.coordinator.operator.prepare import SEED, RecordedPoint, RunRequest
+from petrobot.coordinator.operator.session import LOCKSTEP, MODES, REALTIME
 from petrobot.coordinator.operator.start_from import AGAIN
 from petrobot.coordinator.page.task_store import StoreError, TaskStore
 from petrobot.coordinator.task import Task
@@ -68,7 +62,7 @@ def read_start(task: Task, data: Mapping[str, Any], estimates: Path) -> RunReque
     )
 
 
-def read_depart(task: Task, data: Mapping[str, Any]) -> RunRequest:
+def read_start_from(task: Task, data: Mapping[str, Any]) -> RunRequest:
     """Read a start with `from`: {run, record, going}; the default seed is that of the recorded run.
     Raises ValueError."""
     _refuse_unknown(data)

@@ -18,20 +18,15 @@ from typing import Any
 from petrobot.coordinator.background import BackgroundProcess
 from petrobot.coordinator.learning.estimates_file import EstimatesError
 from petrobot.coordinator.operator.controls import Answer, Controls, refusal
-from petrobot.coordinator.operator.door_file import Door
 from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
 from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.operator.observation import shown_selectors
-from petrobot.coordinator.operator.run_state import Narrator
-from petrobot.coordinator.operator.session import (
-    LOCKSTEP,
-    RunRequest,
-    RunSession,
-    prepare,
-    prepare_from,
-)
-from petrobot.coordinator.operator.start_form import read_depart, read_start
+from petrobot.coordinator.operator.prepare import RunRequest, prepare, prepare_from
+from petrobot.coordinator.operator.run_address import RunAddress
+from petrobot.coordinator.operator.run_state import ChangePublisher
+from petrobot.coordinator.operator.session import LOCKSTEP, RunSession
+from petrobot.coordinator.operator.start_form import read_start, read_start_from
 from petrobot.coordinator.operator.start_from import read_recorded
 from petrobot.coordinator.page.task_store import StoreError, TaskStore, TaskText
 from petrobot.coordinator.run.folder import JOURNAL
@@ -61,8 +56,8 @@ OVER = frozenset({"success", "failure", "error", "aborted", "stopped"})
 
 
 class Station:
-    """The coordinator of one cell; `runs` is the folder of journals, `door` gives the address that
-    each run writes to its folder."""
+    """The coordinator of one cell; `runs` is the folder of journals, `address` gives the address
+    that each run writes to its folder."""
 
     def __init__(
         self,
@@ -75,7 +70,7 @@ class Station:
         self.directory = directory
         self.feed = Feed()
         self.controls = Controls(self.feed)
-        self.door: Callable[[str], Door] | None = None
+        self.address: Callable[[str], RunAddress] | None = None
         self._tasks = tasks
         self._runs, self._mock, self._estimates = runs, mock, estimates
         self._loaded = self._revision = ""
@@ -191,7 +186,7 @@ class Station:
         if text.name != self._loaded:
             self._forget(text.name)
         self._revision = text.revision
-        self._narrator(task).begin("", "realtime", **self._kept(task))
+        self._publisher(task).begin("", "realtime", **self._kept(task))
         self._tell_file()
 
     def _tell_file(self) -> None:
@@ -223,7 +218,7 @@ class Station:
 
     async def _started(self, who: str, data: Mapping[str, Any]) -> Answer:
         if data.get("from") is not None:
-            return await self._departed(data)
+            return await self._started_from(data)
         name = str(data.get("task") or self._loaded)
         if not name:
             return refusal("task", "choose a task first")
@@ -257,7 +252,7 @@ class Station:
             return {**refusal("unreachable", str(fault)), "nodes": list(fault.nodes)}
         return self._follow(run)
 
-    async def _departed(self, data: Mapping[str, Any]) -> Answer:
+    async def _started_from(self, data: Mapping[str, Any]) -> Answer:
         """Start a simulated run from a point of a recorded one."""
         run = await asyncio.to_thread(self._prepared_from, data)
         task = run.mission.executor.task.name
@@ -273,7 +268,7 @@ class Station:
         if name not in {path.parent.name for path in self._runs.glob(f"*/{JOURNAL}")}:
             raise ValueError(f"from.run: there is no run {name!r}")
         found = read_recorded(self._runs / name / JOURNAL)
-        return prepare_from(self._own(read_depart(found.task, data), mock=False), found)
+        return prepare_from(self._own(read_start_from(found.task, data), mock=False), found)
 
     def _own(self, request: RunRequest, *, mock: bool = True) -> RunRequest:
         """Return a request with the settings of all runs of this station."""
@@ -294,7 +289,7 @@ class Station:
     def _follow(self, run: RunSession) -> Answer:
         """Let operators see and control a run, and lead it to its end."""
         run.operate(self.feed, self.controls, starts=True, stops=self._stops, choices=self._choices)
-        run.door = self.door(run.identity) if self.door is not None else None
+        run.address = self.address(run.identity) if self.address is not None else None
         self._tell_file()
         self._run = run
         self._going = asyncio.get_running_loop().create_task(self._to_its_end(run))
@@ -320,8 +315,8 @@ class Station:
         notice = {"level": "error", "text": text, "at": self.feed.state["time"]}
         self.feed.emit("notice", notice=notice)
 
-    def _narrator(self, task: Task) -> Narrator:
-        return Narrator(
+    def _publisher(self, task: Task) -> ChangePublisher:
+        return ChangePublisher(
             self.feed, task, {a: entry.node for a, entry in self.directory.actions.items()}
         )
 

@@ -14,7 +14,7 @@ from aiohttp import web
 from petrobot.coordinator.background import BackgroundProcess
 from petrobot.coordinator.operator.port import HistoryPort, MissionPort, OffersPort, StartsPort
 from petrobot.coordinator.page.access import AccessRules
-from petrobot.coordinator.page.connection_limits import Gate
+from petrobot.coordinator.page.connection_limits import ConnectionLimit
 from petrobot.coordinator.page.sessions import Session, carry_out, encode
 from petrobot.coordinator.page.task_store import TaskStore
 
@@ -35,7 +35,7 @@ class PageState:
     offers: OffersPort | None = None
     history: HistoryPort | None = None
     starts: StartsPort | None = None
-    gate: Gate | None = None
+    limit: ConnectionLimit | None = None
     sessions: set[Session] = field(default_factory=set)
     commands: set[asyncio.Task[None]] = field(default_factory=set)
     apart: BackgroundProcess = field(default_factory=BackgroundProcess)

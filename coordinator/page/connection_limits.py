@@ -11,14 +11,14 @@ SILENT_S = 10.0
 """A connection without a complete request header in this time (s) is closed (slow-loris)."""
 
 
-class _Turned(asyncio.Protocol):
+class _Refused(asyncio.Protocol):
     """Closes a connection above the limit at once."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         transport.close()
 
 
-class Gate:
+class ConnectionLimit:
     """A protocol factory around aiohttp's that counts and times connections."""
 
     def __init__(
@@ -35,7 +35,7 @@ class Gate:
         """Return the protocol of a new connection."""
         if self.open_connections >= self._limit:
             self.turned_away += 1
-            return _Turned()
+            return _Refused()
         handler = self._server()
         self._waiting.add(handler)
         self._coming += 1  # aiohttp counts it one iteration of the event loop later.

@@ -169,7 +169,8 @@ def _has_header(path: tuple[str, ...]) -> bool:
 
 
 def _is_element(path: tuple[str, ...]) -> bool:
-    """Return whether a path leads to one place, transition, event or the like."""
+    """Return whether a path leads to one element: a place, transition, event, variable or primitive
+    task."""
     return len(path) == 2 or (path[0] == "subnets" and len(path) == 4)
 
 

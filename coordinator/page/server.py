@@ -25,7 +25,7 @@ from petrobot.coordinator.page import documents
 from petrobot.coordinator.page import server as feeds
 from petrobot.coordinator.page.access import AccessRules, Handler, middleware, names_for
 from petrobot.coordinator.page.app_state import PAGE_STATE, PageState
-from petrobot.coordinator.page.connection_limits import Gate
+from petrobot.coordinator.page.connection_limits import ConnectionLimit
 from petrobot.coordinator.page.requests import LARGEST_BODY, json_answer, read_object, refused
 from petrobot.coordinator.page.sessions import LARGEST_MESSAGE, Session, carry_out, who_is
 from petrobot.coordinator.page.task_store import TaskStore
@@ -55,10 +55,10 @@ class Page:
         return frozenset(self._page_state.sessions)
 
     @property
-    def gate(self) -> Gate:
+    def limit(self) -> ConnectionLimit:
         """The factory of connections."""
-        assert self._page_state.gate is not None
-        return self._page_state.gate
+        assert self._page_state.limit is not None
+        return self._page_state.limit
 
     async def idle(self) -> None:
         """Wait until no command is being carried out."""
@@ -119,9 +119,9 @@ async def start_page(
     )
     await runner.setup()
     assert runner.server is not None
-    page_state.gate = Gate(runner.server)
+    page_state.limit = ConnectionLimit(runner.server)
     listening = await asyncio.get_running_loop().create_server(
-        page_state.gate, sock=listener, ssl=tls, backlog=128
+        page_state.limit, sock=listener, ssl=tls, backlog=128
     )
     shown = (
         "127.0.0.1"
@@ -156,8 +156,8 @@ def _listen(host: str, port: int) -> sockets.socket:
 def _application(page_state: PageState, page: bool) -> web.Application:
     @web.middleware
     async def count(request: web.Request, handler: Handler) -> web.StreamResponse:
-        if page_state.gate is not None:
-            page_state.gate.asked(request)
+        if page_state.limit is not None:
+            page_state.limit.asked(request)
         return await handler(request)
 
     app = web.Application(

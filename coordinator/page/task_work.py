@@ -100,7 +100,7 @@ class FormatError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class ConvertedTask:
     """A task in another format."""
 
     text: str
@@ -129,14 +129,14 @@ def load(text: str, filename: str) -> Task:
         raise FormatError(str(error)) from error
 
 
-def export(text: str, filename: str, form: str, cell: Fields = None) -> Made:
+def export(text: str, filename: str, form: str, cell: Fields = None) -> ConvertedTask:
     """Return the task in another format; `gspn.svg` draws its stochastic view. Raises
     FormatError."""
     task = load(text, filename)
     if form == "toml":
-        return Made(dumps(task), "application/toml")
+        return ConvertedTask(dumps(task), "application/toml")
     if form == "pnml":
-        return Made(write_pnml(net_file_of(task)), "application/xml")
+        return ConvertedTask(write_pnml(net_file_of(task)), "application/xml")
     if form == "gspn.svg":
         # Here, because few need it and their import takes a while.
         from petrobot.coordinator.analysis.time.stochastic import stochastic_view
@@ -148,7 +148,9 @@ def export(text: str, filename: str, form: str, cell: Fields = None) -> Made:
         except ValueError as fault:
             raise FormatError(f"no stochastic view: {fault}") from fault
         model = NetFile(view.gspn.net, task.name, view.gspn)
-        return Made(gspn_svg(model, view.sources, task.name, assumed(known)), "image/svg+xml")
+        return ConvertedTask(
+            gspn_svg(model, view.sources, task.name, assumed(known)), "image/svg+xml"
+        )
     raise FormatError(f"no format {form!r}: toml, pnml and gspn.svg are known")
 
 

@@ -111,7 +111,7 @@ class Fences:
                 self._fences[device] = Fence(fence.run, node, min(fence.until, now + STOP_MARGIN))
 
     def over(self, now: float) -> list[tuple[str, Fence]]:
-        """Remove the fences whose time is over."""
+        """Remove the fences whose time has passed, and return them with their devices."""
         found = [(device, fence) for device, fence in self._fences.items() if fence.until <= now]
         for device, _ in found:
             del self._fences[device]

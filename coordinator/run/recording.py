@@ -207,7 +207,7 @@ six balls: 4e-14 at the first record that differs, 5e-6 where a ball meets the r
 
 
 def alike(was: Any, now: Any) -> bool:
-    """Return whether plain data is equal but for the last digits of its floats."""
+    """Return whether plain data is equal except for the last digits of its floats."""
     if isinstance(was, float) and isinstance(now, float):
         return math.isclose(was, now, rel_tol=LAST_DIGITS, abs_tol=1e-9)
     if isinstance(was, dict) and isinstance(now, dict):

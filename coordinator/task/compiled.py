@@ -62,7 +62,8 @@ class CompiledNet:
         return cls(tuple(consume), bars, changes, tuple(priority))
 
     def has_concession(self, marking: Sequence[int], t: int) -> bool:
-        """Whether tokens, inhibitors and capacities allow transition t, priorities aside."""
+        """Whether tokens, inhibitors and capacities allow transition t; priorities are not
+        considered."""
         return all(marking[p] >= w for p, w in self.needs[t]) and all(
             marking[p] < k for p, k in self.bars[t]
         )

@@ -31,7 +31,7 @@ class Executed(StrEnum):
 
 
 class Kind(StrEnum):
-    """What a place stands for."""
+    """What a token in a place means."""
 
     ACTION = "action"
     """A primitive task: a token in it is a run of one of its actions."""
@@ -67,7 +67,8 @@ class Counts(StrEnum):
     FAILURE = "failure"
     ERROR = "error"
     NONE = "none"
-    """Censored: the run says nothing about reliability, only that it lasted at least so long."""
+    """Censored: the run does not count for reliability; it only shows that it lasted at least so
+    long."""
 
 
 class Scope(StrEnum):

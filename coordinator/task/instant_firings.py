@@ -1,4 +1,4 @@
-"""Firings that wait for nothing: whether a task can go on firing for ever without time passing."""
+"""Firings that wait for nothing: whether a task can fire for ever without time passing."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ def is_timeless(t: Transition) -> bool:
 
 
 def endless(task: Task) -> set[str]:
-    """Transitions of a flat task that might fire for ever without time passing; none: every such
-    sequence comes to an end.
+    """Return the transitions of a flat task that might fire for ever without time passing; if there
+    are none, every such sequence ends.
 
     Of the transitions that wait for nothing, those are dropped again and again that drain a place
-    which no other of them fills: they can fire only finitely often. Whatever is left may go on for
+    which no other of them fills: they can fire only finitely often. The others may fire for
     ever.
     """
     net = task.net

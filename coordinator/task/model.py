@@ -62,7 +62,7 @@ class Task:
     empty: none."""
     services: str = ""
     """Location file that the task is usually run with, relative to the task's own file; empty: the
-    one at hand."""
+    one that the command finds."""
     errors_to: str = ""
     """Place that receives the errors of action places without an `error` arc; empty: none."""
     expansion: Task | None = field(default=None, compare=False, repr=False)

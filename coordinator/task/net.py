@@ -100,7 +100,8 @@ class Net:
         )
 
     def has_concession(self, marking: Marking, t: int) -> bool:
-        """Whether tokens, inhibitors and capacities allow transition t, priorities aside."""
+        """Whether tokens, inhibitors and capacities allow transition t; priorities are not
+        considered."""
         return self.compiled.has_concession(marking, t)
 
     def is_enabled(self, marking: Marking, t: int) -> bool:

@@ -54,7 +54,7 @@ class FloorCamera(Driver):
             self._images.start(self.usual_rate)
 
     def end(self) -> None:
-        """Take no more images."""
+        """Stop taking images."""
         self._images.end()
 
     async def read(self, ctx: Context, timeout: float) -> Image | None:
@@ -86,7 +86,7 @@ class FloorCamera(Driver):
         }
 
     def stop(self, now: float) -> None:
-        """Take no more images."""
+        """Stop taking images."""
         self.end()
 
     def stopped(self) -> bool:

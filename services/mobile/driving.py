@@ -273,7 +273,7 @@ async def _follow(
         if patient <= (STUCK if why == "no_line" else SILENT):
             return None
         if why == "stale":
-            return error("stale_set_point", f"the stream of sights has ceased for {stuck:.1f} s")
+            return error("stale_set_point", f"no new sight has arrived for {stuck:.1f} s")
         if state["way"] - way > ROLLED and state["line_end"] is not None:
             return failure(
                 "unannounced_end", "the line ceased", at_t=False, line_end=list(state["line_end"])
@@ -324,7 +324,7 @@ def _recovered(state: Mapping[str, Any]) -> Result | None:
     if state["standing"] and (state["ahead"] < 0.08 or state["reason"] == "no_line"):
         return failure(
             "no_track",
-            "the way expected has been driven to its end and no track was seen",
+            "the expected path was driven to its end, and no track was seen",
             recovered=False,
         )
     return None
@@ -429,7 +429,7 @@ class _Drive:
         return await self.again()
 
     async def again(self) -> Result | None:
-        """Begin the stretch once more: what was seen of it was something else."""
+        """Begin the stretch again: what was seen was not a part of it."""
         why = await _command(self.ctx, self._stretch)
         return error("refused", why) if why else None
 
@@ -459,7 +459,7 @@ class _Drive:
                 lambda seen=seen: ctx.device.state["cycles"] != seen,  # type: ignore[misc]
                 RENEW,
             )
-        return error("timeout", f"nothing came of it in {timeout:.1f} s")
+        return error("timeout", f"not finished after {timeout:.1f} s")
 
 
 def _geometry(

@@ -3,7 +3,7 @@ expected.
 
 The camera sees the track only from 0.4 m ahead on. What it saw is kept until the axle has passed
 over it, so that the error at the axle itself is known. Where the track is interrupted, the points
-of a plan replace what cannot be seen; whatever follows the map need not know the difference.
+of a plan replace what cannot be seen; what follows the map does not distinguish the two.
 """
 
 from __future__ import annotations

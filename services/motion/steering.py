@@ -112,7 +112,7 @@ class Steering:
 
         On a detour that is the closer guard. An arm that was switched on where neither guard is
         satisfied leaves that pose creeping, and touches nothing; only where it touches already,
-        any way out is allowed.
+        every motion away is allowed.
         """
         trajectory = self.trajectory
         if self._via is None and not self._creeps and self._guard.stops_clear(trajectory):

@@ -180,7 +180,7 @@ class Child:
         except ValueError:
             received = []
             self._close_pipe()
-            self.kill("it wrote into its pipe what is no message, and was killed")
+            self.kill("it wrote data into its pipe that is not a message, and was killed")
         first = received[0] if received and not self._worker else None
         if isinstance(first, list) and first[0] == BORN:
             self._worker = first[1]

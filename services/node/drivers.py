@@ -39,12 +39,12 @@ def make_driver(directory: Directory, device: DeviceEntry, ports: Ports) -> Driv
     except (KeyError, TypeError, ValueError) as fault:
         told = f"is missing {fault}" if isinstance(fault, KeyError) else str(fault)
         raise DirectoryError(
-            (f"{here}: {device.driver} refuses it: {told}; mend its table or the driver",)
+            (f"{here}: {device.driver} refuses it: {told}; correct its table or the driver",)
         ) from fault
     except Exception as fault:  # not a bad key, which raises one of the above, but a bug
         _log.exception("device %s: its driver cannot be made", device.name)
         raise DirectoryError(
-            (f"{here}: {device.driver} failed: {describe(fault)}; mend the driver",)
+            (f"{here}: {device.driver} failed: {describe(fault)}; correct the driver",)
         ) from fault
     missing = [
         m

@@ -60,8 +60,8 @@ from petrobot.services.worker.runner import Hung, stop_reason
 _log = logging.getLogger(__name__)
 
 SLACK = 1e-6
-"""Rounding (s) by which a pulse may be early; without it a period that is no binary fraction would
-cost a whole tick."""
+"""Rounding (s) by which a pulse may be early; without it a period that is not a binary fraction
+would cost a whole tick."""
 
 
 class EventTimers:

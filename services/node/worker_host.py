@@ -96,7 +96,7 @@ class HostStage(Enum):
     CLOSED = "the node ends; nothing is started any more"
 
 
-class Happening(Enum):
+class HostEvent(Enum):
     """What moves a host from one stage to the next."""
 
     START_DRIVER = "a process for the device's driver was started"
@@ -108,20 +108,20 @@ class Happening(Enum):
     CLOSE = "the node ends"
 
 
-NEXT: Mapping[tuple[HostStage, Happening], HostStage] = {
-    (HostStage.DOWN, Happening.START_DRIVER): HostStage.DRIVER_STARTS,
-    (HostStage.DOWN, Happening.START_ACTIONS): HostStage.ACTIONS_START,
-    (HostStage.DRIVER_STARTS, Happening.DRIVER_READY): HostStage.ACTIONS_DOWN,
-    (HostStage.DRIVER_STARTS, Happening.READY): HostStage.READY,
-    (HostStage.DRIVER_STARTS, Happening.ALL_ENDED): HostStage.DOWN,
-    (HostStage.ACTIONS_DOWN, Happening.START_ACTIONS): HostStage.ACTIONS_START,
-    (HostStage.ACTIONS_DOWN, Happening.ALL_ENDED): HostStage.DOWN,
-    (HostStage.ACTIONS_START, Happening.READY): HostStage.READY,
-    (HostStage.ACTIONS_START, Happening.ACTIONS_ENDED): HostStage.ACTIONS_DOWN,
-    (HostStage.ACTIONS_START, Happening.ALL_ENDED): HostStage.DOWN,
-    (HostStage.READY, Happening.ACTIONS_ENDED): HostStage.ACTIONS_DOWN,
-    (HostStage.READY, Happening.ALL_ENDED): HostStage.DOWN,
-    **{(stage, Happening.CLOSE): HostStage.CLOSED for stage in HostStage},
+NEXT: Mapping[tuple[HostStage, HostEvent], HostStage] = {
+    (HostStage.DOWN, HostEvent.START_DRIVER): HostStage.DRIVER_STARTS,
+    (HostStage.DOWN, HostEvent.START_ACTIONS): HostStage.ACTIONS_START,
+    (HostStage.DRIVER_STARTS, HostEvent.DRIVER_READY): HostStage.ACTIONS_DOWN,
+    (HostStage.DRIVER_STARTS, HostEvent.READY): HostStage.READY,
+    (HostStage.DRIVER_STARTS, HostEvent.ALL_ENDED): HostStage.DOWN,
+    (HostStage.ACTIONS_DOWN, HostEvent.START_ACTIONS): HostStage.ACTIONS_START,
+    (HostStage.ACTIONS_DOWN, HostEvent.ALL_ENDED): HostStage.DOWN,
+    (HostStage.ACTIONS_START, HostEvent.READY): HostStage.READY,
+    (HostStage.ACTIONS_START, HostEvent.ACTIONS_ENDED): HostStage.ACTIONS_DOWN,
+    (HostStage.ACTIONS_START, HostEvent.ALL_ENDED): HostStage.DOWN,
+    (HostStage.READY, HostEvent.ACTIONS_ENDED): HostStage.ACTIONS_DOWN,
+    (HostStage.READY, HostEvent.ALL_ENDED): HostStage.DOWN,
+    **{(stage, HostEvent.CLOSE): HostStage.CLOSED for stage in HostStage},
 }
 """All transitions between stages. Anything else (a second READY) is ignored."""
 
@@ -217,7 +217,7 @@ class WorkerHost:
         self._retiring: Child | None = None
         """A process that was ordered to exit because it ran out of memory."""
         self._emergency = False
-        """Whether the device is in emergency stop; its next process is told so at its start."""
+        """Whether the device is in emergency stop; its next process is notified at its start."""
 
     # --- processes ----------------------------------------------------------------------------
 
@@ -288,10 +288,10 @@ class WorkerHost:
         try:
             if self._setup.device and self._stage is HostStage.DOWN:
                 self._owner = self._spawn(self._setup, self._heard, self._ended, None)
-                self._move(Happening.START_DRIVER)
+                self._move(HostEvent.START_DRIVER)
             else:
                 self._start_worker()
-                self._move(Happening.START_ACTIONS)
+                self._move(HostEvent.START_ACTIONS)
         except OSError as fault:
             self.failed = f"its process could not be started: {fault}"
             self._plan_restart()
@@ -303,7 +303,7 @@ class WorkerHost:
             self._owner.pass_link(far, LINKED)
         self._worker = self._spawn(self._setup, self._heard, self._ended, link)
 
-    def _move(self, happening: Happening) -> bool:
+    def _move(self, happening: HostEvent) -> bool:
         """Go to the next stage. Return False if there is no such transition."""
         stage = NEXT.get((self._stage, happening))
         if stage is None:
@@ -325,7 +325,7 @@ class WorkerHost:
                         self._take_message(item)
                 except (ValueError, TypeError, IndexError, KeyError, AttributeError):
                     # The user's code has written into the pipe, or a copy of the process has.
-                    child.kill("it wrote into its pipe what is no message, and was killed")
+                    child.kill("it wrote data into its pipe that is not a message, and was killed")
         self._changed(plain_ends)
 
     def _name(self) -> str:
@@ -366,9 +366,9 @@ class WorkerHost:
             if self._frozen:
                 child.post(HOLD)
         if driver and data["period"]:
-            if self._move(Happening.DRIVER_READY):
+            if self._move(HostEvent.DRIVER_READY):
                 self._start_due()
-        elif self._move(Happening.READY):
+        elif self._move(HostEvent.READY):
             self._worker, self._given, self.failed, self._died = child, 0, "", ""
             self._withdrawn.clear()
             _log.info("process %d of %s is ready", child.pid, self._name())
@@ -399,7 +399,7 @@ class WorkerHost:
         self._worker = None
         self._died = f"the process of its actions died: {child.describe()}"
         self._lose_runs(*_cause_of(child), child)
-        if self._move(Happening.ACTIONS_ENDED):
+        if self._move(HostEvent.ACTIONS_ENDED):
             self._halts += 1
             self._halt_due = self._clock() + STOP_LIMIT + MARGIN
             self._owner.post(Command(f"{HALT}{self._halts}", HALT))
@@ -429,7 +429,7 @@ class WorkerHost:
             self._lose_runs(cause, text, child)
         self._answer_commands()
         self._tell_lost(f"driver: {why}" if driver else "")
-        if self._move(Happening.ALL_ENDED):
+        if self._move(HostEvent.ALL_ENDED):
             self._plan_restart(child)
 
     def _plan_restart(self, child: Child | None = None) -> None:
@@ -770,7 +770,7 @@ class WorkerHost:
 
     def close(self, now: float) -> None:
         """Let the processes end by themselves."""
-        self._move(Happening.CLOSE)
+        self._move(HostEvent.CLOSE)
         self.withdraw()
         self._restart_at = None
         for child in self.children():

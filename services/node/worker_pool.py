@@ -44,7 +44,7 @@ IDLE_LIMIT = 30.0
 
 
 @dataclass
-class _Gathered:
+class _GatheredCommand:
     """A command that several workers carry out."""
 
     verb: str
@@ -75,7 +75,7 @@ class WorkerPool:
         self._soonest = math.inf
         self._streams: dict[str, set[int]] = {}
         """By stream: workers that need its receiver's address."""
-        self._commands: dict[str, _Gathered] = {}
+        self._commands: dict[str, _GatheredCommand] = {}
         self._waiting: dict[str, tuple[float, Call]] = {}
         """Calls that wait for a worker, and until when (s)."""
         self._held = False
@@ -352,7 +352,7 @@ class WorkerPool:
             word, why = self.condition if verb == "status" else (DONE.get(verb, "stopped"), "")
             self._tell(command.id, word, why)
             return
-        self._commands[command.id] = _Gathered(verb, asked)
+        self._commands[command.id] = _GatheredCommand(verb, asked)
         self._touched |= asked
         for number in sorted(asked):
             self._workers[number].command(now, command)

@@ -58,7 +58,7 @@ class TableCamera(Driver):
         return {"source": self._images.condition, "images": self._count}
 
     def stop(self, now: float) -> None:
-        """Take no more images."""
+        """Stop taking images."""
         self._images.end()
 
     def stopped(self) -> bool:

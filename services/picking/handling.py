@@ -132,7 +132,7 @@ async def make_ready(
     SUCCESS when it is there; ERROR `arm_fault` or `arm_timeout`.
     """
     try:
-        hand, known = Hand(ctx, arm, timeout), cell_named(cell)
+        hand, known = PickingArm(ctx, arm, timeout), cell_named(cell)
         await hand.enable()
         if hand.state.held:
             (x0, x1), (y0, y1) = known.area
@@ -183,7 +183,7 @@ async def _grasp(
     timeout: float,
 ) -> Result:
     try:
-        hand = Hand(ctx, arm, timeout)
+        hand = PickingArm(ctx, arm, timeout)
         grasp = planned(_kind(cell_named(cell), part), part, hand.arm)
         place = partial(hand.arm.over, grasp.x, grasp.y)
         above = place(ABOVE, grasp.turn, hand.state.q)
@@ -220,7 +220,7 @@ async def verify_width(
     """
     try:
         kind = _kind(cell_named(cell), part)
-        state = Hand(ctx, arm, 1.0).state
+        state = PickingArm(ctx, arm, 1.0).state
     except (ArmError, NumbersError) as fault:
         return _error(fault)
     narrow, grip = min(kind.size), state.grip
@@ -260,7 +260,7 @@ async def place_in_tray(
     it was not. Raises the event `tray_full` with the last slot.
     """
     try:
-        hand, known = Hand(ctx, arm, timeout), cell_named(cell)
+        hand, known = PickingArm(ctx, arm, timeout), cell_named(cell)
         kind = _kind(known, part)
         tray, used = known.trays[kind.tray], dict(slots or {})
         place = partial(
@@ -308,7 +308,7 @@ def _error(fault: Exception) -> Result:
     return error(cause, str(fault))
 
 
-class Hand:
+class PickingArm:
     """An arm with its numbers, as the actions use it."""
 
     def __init__(self, ctx: Context, arm: str, timeout: float) -> None:

@@ -44,7 +44,7 @@ class PartKind:
 
 
 @dataclass(frozen=True, slots=True)
-class Eye:
+class OverheadCamera:
     """The camera: straight above the table, its image's u along -y and v along -x."""
 
     width: int
@@ -83,7 +83,7 @@ class Tray:
 class PickingCell:
     """The cell, as far as its services know it."""
 
-    eye: Eye
+    eye: OverheadCamera
     area: tuple[tuple[float, float], tuple[float, float]]
     """Search area for parts: x from, to; y from, to (m)."""
     kinds: Mapping[str, PartKind]
@@ -232,7 +232,7 @@ def read_cell(text: str, source: str) -> PickingCell:
             for name, t in table["trays"].items()
         }
         x, y, z = map(float, camera["position"])
-        eye = Eye(
+        eye = OverheadCamera(
             int(camera["width"]),
             int(camera["height"]),
             float(camera["focal_px"]),

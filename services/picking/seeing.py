@@ -53,7 +53,9 @@ async def _locate(ctx: Context[TableCamera], find: Finder, images: int, timeout:
         return error("no_image", f"{len(taken)} of {images} images came")
     parts = confirmed([find(image, cell) for image in taken])
     if not parts:
-        return error("no_part", f"no part of {', '.join(cell.kinds)} is seen where parts lie")
+        return error(
+            "no_part", f"no part of {', '.join(cell.kinds)} is seen in the area of the parts"
+        )
     part = easiest(parts)
     return provisional(success(part=part.plain(), found=ctx.run, seen=len(parts)))
 
@@ -110,7 +112,7 @@ async def await_tray(
 
 
 def is_empty(image: NDArray[np.uint8], cell: PickingCell, tray: str) -> bool:
-    """Return whether nothing lies in a tray, and nothing is over it."""
+    """Return whether a tray is empty and nothing is above it."""
     there = cell.trays[tray]
     (x, y), (along, across) = there.position, (0.8 * size for size in there.size)
     u0, v0 = cell.eye.pixel(x + along / 2, y + across / 2, 0.0)

@@ -97,7 +97,7 @@ class Camera(Driver):
         return True
 
     def end(self) -> None:
-        """Take no more images."""
+        """Stop taking images."""
         self._images.end()
 
     async def read(self, ctx: Context, timeout: float) -> Image | None:
@@ -192,7 +192,7 @@ class Camera(Driver):
         return shapes
 
     def stop(self, now: float) -> None:
-        """Take no more images."""
+        """Stop taking images."""
         self.end()
 
     def stopped(self) -> bool:

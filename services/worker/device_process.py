@@ -87,7 +87,7 @@ class DeviceLoop:
 
     def run(self) -> None:
         """Step until the node has ended and the device stands still, or the time of the stop
-        routine is over. Raises DeviceError."""
+        routine has passed. Raises DeviceError."""
         gc.collect()
         gc.freeze()
         try:
@@ -106,7 +106,7 @@ class DeviceLoop:
 
     def _stop_broken(self) -> None:
         """Stop a device whose driver failed: step it, while that works, until the device stands
-        still or time is over."""
+        still or the time has passed."""
         end = time.monotonic() + STOP_LIMIT
         try:
             stop_at_once(self._driver, time.monotonic())

@@ -1,13 +1,13 @@
-"""The process between a node and one of its workers: whatever user code leaves running ends with
-the worker.
+"""The process between a node and one of its workers: it ends everything that user code
+left running when the worker ends.
 
 An action or a driver may fork, start daemons or leave programs running. A worker that dies cannot
 clean up after itself, and its node is not the parent of what it started. So each worker has a
-keeper: the subreaper (prctl(2)) to which every orphan of the worker falls, whatever sessions and
-process groups it has made for itself. The keeper runs no user code and imports next to nothing. It
-kills its worker when the node orders it or dies, kills what is left once the worker has ended, and
-then ends as the worker did. So the end of this process says that nothing of the worker runs any
-more.
+keeper: the subreaper (prctl(2)) that becomes the parent of every orphan of the worker, even of one
+with a session or process group of its own. The keeper runs no user code and imports next to
+nothing. It kills its worker when the node orders it or dies, kills what is left once the worker has
+ended, and then ends as the worker did. So the end of this process says that nothing of the worker
+runs any more.
 
 What escapes: a process that user code starts as another user (set-user-ID programs cannot be
 signalled), one that hangs in the kernel, and all of them if user code kills the keeper itself.

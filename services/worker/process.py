@@ -217,7 +217,8 @@ class Worker:
             self._place.bar(now, cause)
 
     def _pause(self) -> float | None:
-        """Return for how long nothing is due (s), None until something arrives."""
+        """Return the time until the next action of this process (s); None: it only waits for
+        messages."""
         if self._node.unsent:
             return POLL
         due = self._place.due()

@@ -329,8 +329,8 @@ class Runner:
         self._reports.append(report)
 
     def due(self) -> float | None:
-        """When `advance` has something to do at the latest (s), None if only something that comes
-        in can matter."""
+        """When `advance` has something to do at the latest (s); None: not before a message
+        arrives."""
         if not self._runs:  # nor is a stream open
             return None
         held = self._held_since is not None
@@ -550,8 +550,8 @@ class Runner:
         elif run.phase not in _AFTER:
             text = self._with_refusal(run, text) if cause == "deadline" else text
             run.cause, run.text, run.result, run.limit = cause, text, None, now + GRACE
-            # A held device stands without having been stopped: released, it would go on without its
-            # run.
+            # A held device stands without having been stopped: when released, it would continue its
+            # motion without its run.
             run.abandoned = self.held
             self._outlets.close(run.call.id)
             run.phase = SETTLING if run.over else STOPPING

@@ -238,7 +238,7 @@ class FeetechBus:
         adapter returns what it sends, as the simplest ones do."""
         self.servos = {servo.id: servo for servo in servos}
         self.noise: Callable[[bytes], bytes] = lambda answer: answer
-        """What becomes of an answer on its way to the master: a test spoils it here."""
+        """Changes each answer on its way to the master: a test can spoil answers with it."""
         self._chained, self._echo = chained, echo
         self._buffer = bytearray()
 

@@ -41,7 +41,7 @@ class PtyLine:
         """Answer what has come; wait up to `timeout` seconds for something."""
         if not select.select([self._near], [], [], timeout)[0]:
             return
-        with contextlib.suppress(BlockingIOError):  # nobody reads: lost, as on a real line
+        with contextlib.suppress(BlockingIOError):  # no reader: lost, as on a real line
             answer = self._take(os.read(self._near, 65536))
             if answer:
                 os.write(self._near, answer)
@@ -123,7 +123,7 @@ class TcpServer:
             self._drop(near)
 
     def close(self) -> None:
-        """Cut all connections, and listen no more."""
+        """Cut all connections, and stop listening."""
         self.cut()
         for listener in self._listeners:
             if listener.family == socket.AF_UNIX:

@@ -13,7 +13,7 @@ where both ends of a step are free: at 5 m/s by 0.2 mm.
   step that keep the ball out of all surfaces at the step's end, found by relaxing one contact after
   the other (projected Gauss-Seidel, as in time-stepping contact solvers).
 
-The cup moves as it is told; no ball moves it.
+The motion of the cup is given; the ball has no effect on it.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@ regime's disturbances.
 
 Only the laboratory reads this. A regime name is a regime and any number of disturbances of
 `sim/catching/laboratory.toml`, joined by `+` (or a comma): `A`, `B+latency200`, `A+dim+arm50`. With
-`@n` behind it, it takes place in another installation: `C@3`, `A+dim@1`.
+`@n` behind it, it is another installation: `C@3`, `A+dim@1`.
 """
 
 from __future__ import annotations
@@ -267,7 +267,7 @@ def _calibrated(
     camera: CameraTruth, left: Mapping[str, Any], rng: np.random.Generator
 ) -> CameraTruth:
     """Return the camera of another installation, as its own calibration would find it: the shipped
-    one but for what calibrations leave."""
+    one with the errors that a calibration leaves."""
     turn = rotation_from_vector(rng.normal(0.0, left["camera_rotation"], 3))
     dx, dy = rng.normal(0.0, left["camera_principal_px"], 2)
     k1, k2, p1, p2 = np.asarray(camera.distortion) * (
@@ -288,8 +288,8 @@ def _elsewhere(
     ranges: Mapping[str, Any],
     rng: np.random.Generator,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return settings and cup of another installation: its table is as smooth, its thrower throws
-    with as little spin and its cup is as large and springy as drawn."""
+    """Return settings and cup of another installation: friction of the
+    table, least spin of the throws, size and restitution of the cup are drawn."""
     friction, spin, radius, restitution = (
         float(rng.uniform(*ranges[key]))
         for key in ("friction", "least_spin", "cup_radius", "cup_restitution")

@@ -21,7 +21,7 @@ from petrobot.sim.picking.camera import Picture, SceneCamera
 from petrobot.sim.picking.controllers import controller
 from petrobot.sim.picking.referee import Referee
 from petrobot.sim.picking.truth import PickingSite, picking_site_of
-from petrobot.sim.picking.world import World
+from petrobot.sim.picking.world import PickingWorld
 
 PICKING_FAULTS: Final = FaultKinds(
     keys={
@@ -67,7 +67,7 @@ class PickingLaboratory(LaboratoryParty):
         pose."""
         self.truth = self._site.truth(regime)
         drawn = self._site.parts(self.truth, np.random.default_rng((seed, _PARTS)), parts)
-        self.world = World(
+        self.world = PickingWorld(
             self._site.table, self._site.fingers, drawn, np.random.default_rng((seed, _WORLD))
         )
         self._image_draws = np.random.default_rng((seed, _IMAGE))

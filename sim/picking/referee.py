@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from petrobot.sim.picking.arm import ToolPose
 from petrobot.sim.picking.parts import Part
-from petrobot.sim.picking.world import World
+from petrobot.sim.picking.world import PickingWorld
 
 EXCHANGE: Final = 3.0
 """Time that a person needs to change a full tray (s)."""
@@ -36,7 +36,7 @@ class Referee:
 
     def __init__(
         self,
-        world: World,
+        world: PickingWorld,
         trays: Mapping[str, Any],
         belongs: Mapping[str, str],
         began: float,

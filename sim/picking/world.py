@@ -1,8 +1,8 @@
 """The table with its parts, and a gripper over it, which pushes, holds, carries and drops them.
 
-The arm's motion is an input (`World.move`); the world computes how far the fingers close and how
-hard they press. It knows neither actions nor a clock; all randomness comes from the generator
-passed to it.
+The arm's motion is an input (`PickingWorld.move`); the world computes how far the fingers close
+and how hard they press. It knows neither actions nor a clock; all randomness comes from the
+generator passed to it.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class TableTop:
         return self.x[0] <= part.x <= self.x[1] and self.y[0] <= part.y <= self.y[1]
 
 
-class World:
+class PickingWorld:
     """Parts and fingers, and how they act on each other."""
 
     def __init__(

@@ -200,7 +200,7 @@ def parser() -> argparse.ArgumentParser:
         type=float,
         default=0.0,
         metavar="S",
-        help="let the plan's rover drive, S seconds a run",
+        help="animate the plan: the rover drives the whole run in S seconds",
     )
     commands.add_argument(
         "--film", type=Path, metavar="FILE", help="write the film (.webm, .mp4, .avi, .gif, .webp)"

@@ -58,7 +58,7 @@ class Light(NamedTuple):
     veil: float
 
 
-class Hall:
+class TrackLight:
     """The hall's light from `began` (s) on, for moments in ascending order. Flashes come at random
     (Poisson), drawn by `rng`."""
 
@@ -129,7 +129,7 @@ class TrackLaboratory(LaboratoryParty):
         self.truth, self.track = truth, track
         self._floor.paint(track)
         self._camera = self._camera_of(truth)
-        self._hall = Hall(truth.light, np.random.default_rng((seed, _LIGHT)), self.now)
+        self._hall = TrackLight(truth.light, np.random.default_rng((seed, _LIGHT)), self.now)
         self._image_draws = np.random.default_rng((seed, _IMAGE))
         self._echo_draws = np.random.default_rng((seed, _ECHO))
         hangs = (

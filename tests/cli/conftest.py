@@ -16,7 +16,7 @@ import pytest_asyncio
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.launch import Setting, realtime_mission
 from petrobot.coordinator.operator.commands import Operation
-from petrobot.coordinator.operator.door_file import Door, door_open
+from petrobot.coordinator.operator.run_address import RunAddress, published
 from petrobot.coordinator.page.server import Page, start_page
 from petrobot.coordinator.run.folder import JOURNAL
 from petrobot.coordinator.run.interfaces import FirstAlternative
@@ -117,8 +117,8 @@ async def cell_of(folder: Path, read: Callable[[], Any]) -> AsyncIterator[Termin
     operation = Operation(shell, selector)
     page = await start_page(operation, tasks_folder=folder, page=False)
     running = asyncio.create_task(shell.run())
-    door = Door(RUN, page.base, page.token, os.getpid(), str(directory.source))
-    with door_open(journal.parent, door):
+    address = RunAddress(RUN, page.base, page.token, os.getpid(), str(directory.source))
+    with published(journal.parent, address):
         yield Terminal(operation, shell, page, robot, folder, read)
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)

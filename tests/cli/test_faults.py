@@ -192,7 +192,7 @@ def test_check_does_not_promise_that_analyse_searches_longer(petrobot: Petrobot)
     Path("work.toml").write_text(endless, encoding="utf-8")
     code, out, _ = petrobot("check", "work.toml")
     assert code == 2 and "bounded NO" in out
-    assert "cut short (the net is unbounded)" in out and "goes on longer" not in out
+    assert "cut short (the net is unbounded)" in out and "continues longer" not in out
 
 
 @pytest.mark.processes

@@ -13,8 +13,13 @@ import pytest
 
 from petrobot.coordinator.cli import COMMANDS, main
 from petrobot.coordinator.engine import Mode
-from petrobot.coordinator.operator.door_file import DOOR, Door, door_open, find_door
-from petrobot.coordinator.page import app_state as house
+from petrobot.coordinator.operator.run_address import (
+    ADDRESS_FILE,
+    RunAddress,
+    find_address,
+    published,
+)
+from petrobot.coordinator.page import app_state
 from petrobot.coordinator.run.folder import JOURNAL, NoRunError
 from petrobot.coordinator.run.journal import read_journal
 from petrobot.coordinator.run.recording import remarks
@@ -197,9 +202,9 @@ async def test_one_operator_holds_the_controls(petrobot: Terminal) -> None:
 
 async def test_controls_are_requested_and_handed_over(petrobot: Terminal) -> None:
     """`--take` waits until the holder hands them over."""
-    from petrobot.coordinator.cli.operate.hand import connect
+    from petrobot.coordinator.cli.operate.command import connect
 
-    async with connect(find_door(folder=petrobot.runs), "ana") as ana:
+    async with connect(find_address(folder=petrobot.runs), "ana") as ana:
         assert (await ana.command("take_controls"))["ok"]
         asking = asyncio.create_task(petrobot("pause", "--as", "bob", "--take", "60"))
         assert await ana.until(lambda state: bool(state["controls"]["asking"]), 60)
@@ -216,8 +221,8 @@ async def test_controls_of_a_silent_script_are_released(
     """A script takes the controls over plain HTTP and sends nothing more."""
     import aiohttp
 
-    monkeypatch.setattr(house, "ABSENT_S", 0.1)
-    monkeypatch.setattr(house, "CLOCK_S", 0.01)
+    monkeypatch.setattr(app_state, "ABSENT_S", 0.1)
+    monkeypatch.setattr(app_state, "CLOCK_S", 0.01)
     headers = {"Authorization": f"Bearer {petrobot.page.token}"}
     async with aiohttp.ClientSession(headers=headers) as http:
         body = {"verb": "take_controls", "name": "script"}
@@ -300,23 +305,23 @@ def test_only_the_owner_can_read_the_runs_address_which_is_removed_at_its_end(
 
     (tmp_path / "r").mkdir()
     (tmp_path / "r" / JOURNAL).touch()
-    door = Door("r", "http://127.0.0.1:1", "secret", os.getpid())
-    with door_open(tmp_path / "r", door) as path:
+    address = RunAddress("r", "http://127.0.0.1:1", "secret", os.getpid())
+    with published(tmp_path / "r", address) as path:
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
-        assert find_door(folder=tmp_path) == find_door("r", tmp_path) == door
+        assert find_address(folder=tmp_path) == find_address("r", tmp_path) == address
     assert not path.exists()
     with pytest.raises(NoRunError, match="is not active"):
-        find_door("r", tmp_path)
+        find_address("r", tmp_path)
 
 
 def test_the_address_of_a_killed_coordinator_is_ignored(tmp_path: Path) -> None:
-    """The door of a process that has ended does not count. The next coordinator of this run
+    """The address of a process that has ended does not count. The next coordinator of this run
     replaces it."""
     (tmp_path / "r").mkdir()
     dead = {"run": "r", "url": "http://127.0.0.1:1", "token": "t", "process": 2**22 + 1}
-    (tmp_path / "r" / DOOR).write_text(json.dumps(dead))
+    (tmp_path / "r" / ADDRESS_FILE).write_text(json.dumps(dead))
     with pytest.raises(NoRunError):
-        find_door(folder=tmp_path)
+        find_address(folder=tmp_path)
 
 
 async def test_the_result_says_that_the_host_was_too_busy(petrobot: Terminal) -> None:

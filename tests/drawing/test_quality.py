@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from petrobot.coordinator.drawing.layout import COLUMN, WIDEST, Point
-from petrobot.coordinator.drawing.routing import ArcPath, Box, Words, place_words, route
+from petrobot.coordinator.drawing.routing import ArcPath, Box, LabelBox, place_words, route
 from petrobot.coordinator.drawing.scene import (
     DrawnNode,
     Scene,
@@ -86,13 +86,13 @@ def through_nodes(scene: Scene, ways: list[ArcPath]) -> Iterator[tuple[ArcPath, 
                 yield way, node.name
 
 
-def through_words(words: list[Words], ways: list[ArcPath]) -> int:
+def through_words(words: list[LabelBox], ways: list[ArcPath]) -> int:
     """Count the labels with an arc through their middle, where it disturbs reading."""
     cores = [(w.box[0], w.box[1] + 4, w.box[2], w.box[3] - 4) for w in words]
     return sum(any(inside(p, core) for p in way.points) for core in cores for way in ways)
 
 
-def drawn(scene: Scene) -> tuple[list[ArcPath], list[Words]]:
+def drawn(scene: Scene) -> tuple[list[ArcPath], list[LabelBox]]:
     """Return the paths and labels of a scene."""
     ways = route(scene)
     return ways, place_words(scene.nodes, ways)

@@ -12,7 +12,7 @@ import pytest
 
 from petrobot.coordinator.drawing import draw
 from petrobot.coordinator.drawing.layout import lay_out
-from petrobot.coordinator.drawing.routing import Words, place_words, route
+from petrobot.coordinator.drawing.routing import LabelBox, place_words, route
 from petrobot.coordinator.drawing.scene import scene_of_task
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import load
@@ -69,7 +69,7 @@ def test_words_cover_neither_nodes_nor_each_other(path: Path, errors: bool, plac
             )
 
 
-def overlap(a: Words, b: Words) -> bool:
+def overlap(a: LabelBox, b: LabelBox) -> bool:
     """Return whether two text blocks overlap."""
     return (
         a.box[0] < b.box[2] and b.box[0] < a.box[2] and a.box[1] < b.box[3] and b.box[1] < a.box[3]

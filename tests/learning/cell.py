@@ -15,7 +15,7 @@ from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import load
 from petrobot.services.action import Status
 from petrobot.services.comm.location_file import Directory, parse
-from petrobot.services.scripted import Line, Scripted
+from petrobot.services.scripted import Scripted, ScriptedRun
 
 TASK_FILE = Path(__file__).parent / "sorting.toml"
 HEAD = """
@@ -35,14 +35,16 @@ node = "node"
 WEIGHT = {"weight": 1.5}
 LINES = {
     "pick_fast": [
-        Line(Status.ERROR, (0.1, 0.1), cause="slipped"),
-        Line(seconds=(0.1, 0.1), values=WEIGHT),
-        Line(Status.FAILURE, (0.1, 0.1), WEIGHT, "crooked"),
+        ScriptedRun(Status.ERROR, (0.1, 0.1), cause="slipped"),
+        ScriptedRun(seconds=(0.1, 0.1), values=WEIGHT),
+        ScriptedRun(Status.FAILURE, (0.1, 0.1), WEIGHT, "crooked"),
     ],
-    "pick_slow": [Line(seconds=(0.3, 0.4), values=WEIGHT)],
-    "pick_blind": [Line(Status.ERROR, (0.2, 0.2), cause="missed")],
-    "place_soft": [Line(seconds=(0.2, 0.5), values={"tries": 2, "note": "soft", "sure": True})],
-    "place_hard": [Line(seconds=(0.2, 0.3), values={"tries": 1})],
+    "pick_slow": [ScriptedRun(seconds=(0.3, 0.4), values=WEIGHT)],
+    "pick_blind": [ScriptedRun(Status.ERROR, (0.2, 0.2), cause="missed")],
+    "place_soft": [
+        ScriptedRun(seconds=(0.2, 0.5), values={"tries": 2, "note": "soft", "sure": True})
+    ],
+    "place_hard": [ScriptedRun(seconds=(0.2, 0.3), values={"tries": 1})],
 }
 
 

@@ -256,10 +256,10 @@ def test_the_subcommands_of_learned(cell: Path, capsys: pytest.CaptureFixture[st
         (["show", "one.db", "--target", "7"], "7 is not a number of more than 0 and at most 1"),
         (["show", "one.db", "--rho", "-3"], "-3 is not a number of at least 0"),
         (["show", "one.db", "--budget", "nan"], "nan is not a number of more than 0"),
-        (["show", "one.db", "--context", "nowhere"], "knows the contexts 'regime=A'"),
+        (["show", "one.db", "--context", "nowhere"], "has the contexts 'regime=A'"),
         (
             ["task", "one.db", str(TASK_FILE), "--context", "nowhere"],
-            "knows the contexts 'regime=A'",
+            "has the contexts 'regime=A'",
         ),
     ):
         assert main(["learned", *arguments]) == 2
@@ -554,7 +554,7 @@ def learned_in(path: Path, plant: str, **actions: tuple[int, int]) -> None:
 def test_mock_runs_do_not_move_what_was_learned_in_a_simulation(
     cell: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Both are shown, with their source; the simulated runs judge."""
+    """Both are shown, with their plant; the simulated runs judge."""
     path = cell / "learned.db"
     learned_in(path, "simulated", pick_fast=(25, 0), pick_slow=(5, 20))
     assert petrobot("--learn", "learned.db")[0] == 0
@@ -575,7 +575,7 @@ def test_mock_runs_do_not_move_what_was_learned_in_a_simulation(
     assert main(["forecast", str(TASK_FILE), *more]) == 2
     assert "several plants, which are never pooled: mock, simulated" in capsys.readouterr().err
     assert main(["analyse", str(TASK_FILE), "--estimates", "learned.db", "--json", "-"]) in (0, 1)
-    assert "its simulated runs, not pooled with: mock" in capsys.readouterr().err
+    assert "those of plant simulated, not pooled with: mock" in capsys.readouterr().err
 
 
 def test_a_file_that_does_not_say_its_plant_is_shown_so(
@@ -583,10 +583,10 @@ def test_a_file_that_does_not_say_its_plant_is_shown_so(
 ) -> None:
     path = cell / "learned.db"
     learned_in(path, "", pick_fast=(5, 0))
-    assert "source" not in told(path, capsys)[1]
+    assert "plant" not in told(path, capsys)[1]
     learned_in(path, "mock", pick_fast=(0, 5))
     shown, text = told(path, capsys)
-    assert shown["pick"]["source"] == "" and "judged by the not said runs alone" in text
+    assert shown["pick"]["source"] == "" and "judged by the runs of plant unknown alone" in text
 
 
 @pytest.mark.parametrize(("trials", "runs", "good"), [(10.0, 14.0, 8.0), (200.0, 54.0, 40.0)])
@@ -608,7 +608,7 @@ def test_a_simulated_estimate_is_a_discounted_prior_of_a_real_one(
         session.save()
     shown, text = told(path, capsys)
     assert shown["pick"]["prior"] == {"source": "simulated", "trials": trials}
-    assert f"count the simulated runs of each action, as {trials:g} trials" in text
+    assert f"count the runs of plant simulated, as {trials:g} trials of each action" in text
     rows = {(row["action"], row["source"]): row["runs"] for row in shown["pick"]["actions"]}
     assert rows["pick_fast", "real"] == 4 and rows["pick_fast", "simulated"] == 50
 

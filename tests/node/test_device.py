@@ -87,7 +87,7 @@ def test_a_wrong_key_is_refused_by_name(config: dict[str, Any], words: str) -> N
     with pytest.raises(ValueError) as fault:
         read_keys(Scanner, config)
     assert words in str(fault.value)
-    with pytest.raises(DirectoryError, match=r"services\.toml: devices\.it: .*mend the keys"):
+    with pytest.raises(DirectoryError, match=r"services\.toml: devices\.it: .*correct the keys"):
         made("Scanner", **config)
 
 

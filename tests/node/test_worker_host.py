@@ -31,7 +31,7 @@ from petrobot.services.node.worker_host import (
     PAUSES,
     SILENT,
     START_LIMIT,
-    Happening,
+    HostEvent,
     Hosting,
     HostStage,
     WorkerHost,
@@ -533,14 +533,14 @@ def test_every_stage_can_be_entered_and_left_by_the_table() -> None:
     reached = {HostStage.DOWN, *NEXT.values()}
     assert reached == set(HostStage)
     for stage in set(HostStage) - {HostStage.CLOSED}:
-        assert {happening for at, happening in NEXT if at is stage} > {Happening.CLOSE}, stage
+        assert {happening for at, happening in NEXT if at is stage} > {HostEvent.CLOSE}, stage
     waiting = {
         HostStage.DRIVER_STARTS,
         HostStage.ACTIONS_START,
         HostStage.ACTIONS_DOWN,
         HostStage.READY,
     }
-    assert all(NEXT[stage, Happening.ALL_ENDED] is HostStage.DOWN for stage in waiting)
+    assert all(NEXT[stage, HostEvent.ALL_ENDED] is HostStage.DOWN for stage in waiting)
 
 
 @pytest.mark.parametrize("stopped", [False, True])

@@ -7,7 +7,7 @@ from pathlib import Path
 from petrobot.coordinator.engine import Begin, Engine, RunEnded, StartRun
 from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.history import opened
-from petrobot.coordinator.operator.run_state import Narrator
+from petrobot.coordinator.operator.run_state import ChangePublisher
 from petrobot.coordinator.run.journal import JournalWriter
 from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task import Status
@@ -39,7 +39,7 @@ both = { in = ["looking:normal", "moving:normal"], out = ["done"] }
 def test_history_and_live_page_name_the_action_that_did_not_succeed(tmp_path: Path) -> None:
     """A join takes two runs; its reason is that of the worse one, and so is the action."""
     task, path, feed = loads(JOIN, "join.toml"), tmp_path / "run.journal", Feed()
-    engine, narrator = Engine(task), Narrator(feed, task)
+    engine, narrator = Engine(task), ChangePublisher(feed, task)
     narrator.begin("m", "lockstep")
     writer = JournalWriter(path, {"task": JOIN, "mode": "lockstep"})
     store, state, started = JournalStore(writer, 0.0), engine.initial(), dict[str, str]()

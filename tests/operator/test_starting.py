@@ -19,8 +19,8 @@ from petrobot.coordinator.operator import station
 from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP
 from petrobot.coordinator.operator.history import opened
 from petrobot.coordinator.operator.observation import TASK_REPORT
-from petrobot.coordinator.operator.session import RunRequest
-from petrobot.coordinator.operator.start_form import read_depart, read_start, start_form
+from petrobot.coordinator.operator.prepare import RunRequest
+from petrobot.coordinator.operator.start_form import read_start, read_start_from, start_form
 from petrobot.coordinator.operator.station import Station
 from petrobot.coordinator.page.task_store import TaskStore
 from petrobot.coordinator.run.folder import JOURNAL, RESULT
@@ -213,7 +213,7 @@ def test_any_input_becomes_an_order_or_a_refusal(data: dict[str, Any], tmp_path:
         assert order.learning is None or order.learning.path.parent == tmp_path
     if "from" in data:
         try:
-            depart = read_depart(MOVING, data)
+            depart = read_start_from(MOVING, data)
         except ValueError:
             return
         assert depart.start is not None

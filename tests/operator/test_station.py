@@ -9,8 +9,8 @@ import os
 
 import pytest
 
-from petrobot.coordinator.operator.door_file import Door, find_door
 from petrobot.coordinator.operator.history import opened
+from petrobot.coordinator.operator.run_address import RunAddress, find_address
 from petrobot.coordinator.run.folder import JOURNAL, RESULT, NoRunError
 from petrobot.coordinator.run.journal import read_journal
 from tests.operator.conftest import TASK, Cell
@@ -40,10 +40,10 @@ async def test_a_task_runs_again_and_again_over_real_nodes(cell: Cell) -> None:
 
 async def test_the_run_can_be_controlled_while_it_is_active(cell: Cell) -> None:
     """Pause, step and tokens work; the command line finds the run until it has ended."""
-    cell.station.door = lambda run: Door(run, "http://127.0.0.1:1", "secret", os.getpid())
+    cell.station.address = lambda run: RunAddress(run, "http://127.0.0.1:1", "secret", os.getpid())
     started = await cell.say("start", task="moving")
     await cell.until(lambda: cell.state["mission"]["state"] == "running")
-    assert find_door(None, cell.runs).run == started["run"]
+    assert find_address(None, cell.runs).run == started["run"]
     assert (await cell.say("pause"))["ok"]
     fired = cell.state["mission"]["firings"]
     assert (await cell.say("step"))["ok"]
@@ -56,7 +56,7 @@ async def test_the_run_can_be_controlled_while_it_is_active(cell: Cell) -> None:
     assert sum(f["transition"] == "begin" for f in cell.state["firings"]) == 3
     assert result["status"] == "success"
     with pytest.raises(NoRunError):
-        find_door(None, cell.runs)
+        find_address(None, cell.runs)
 
 
 async def test_a_start_that_is_impossible_is_refused_with_the_reason(cell: Cell) -> None:

@@ -1,5 +1,5 @@
-"""A mission for tests and measurements: the real engine and narrator, with scripted actions instead
-of nodes."""
+"""A mission for tests and measurements: the real engine and the state for viewers, with scripted
+actions instead of nodes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from petrobot.coordinator.engine import (
 )
 from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.port import FREE
-from petrobot.coordinator.operator.run_state import Narrator
+from petrobot.coordinator.operator.run_state import ChangePublisher
 from petrobot.coordinator.run.folder import JOURNAL, header
 from petrobot.coordinator.run.journal import JournalWriter
 from petrobot.coordinator.run.recording import JournalStore
@@ -108,7 +108,7 @@ class Stage:
         self.feed = Feed()
         self.controls = Controls()
         self.commands: list[tuple[str, str, Mapping[str, Any]]] = []
-        self.narrator: Narrator | None = None
+        self.publisher: ChangePublisher | None = None
         self.clock = 0.0
         self._playing: dict[str, _Playing] = {}
         self._timers: dict[str, float] = {}
@@ -205,7 +205,7 @@ class Stage:
         if not self._over:
             return {"ok": False, "code": "running", "text": "a mission run is going on"}
         try:
-            name = data.get("task") or (self.narrator.task.name if self.narrator else "")
+            name = data.get("task") or (self.publisher.task.name if self.publisher else "")
             text = (self.tasks / f"{name}.toml").read_text()
             self.load(loads(text, f"{name}.toml"), text)
         except (OSError, TaskFileError) as fault:
@@ -279,7 +279,7 @@ class Stage:
         self._playing, self._timers = {}, {}
         self.engine = Engine(task)
         self.state = self.engine.initial()
-        self.narrator = Narrator(self.feed, task, self.where)
+        self.publisher = ChangePublisher(self.feed, task, self.where)
         selectors = {
             name: {
                 "alternatives": [
@@ -294,7 +294,7 @@ class Stage:
             "selectors": selectors,
         }
         mission = f"{task.name}-{self._missions}"
-        self.narrator.begin(mission, "realtime", **kept)
+        self.publisher.begin(mission, "realtime", **kept)
         if self.runs_folder is not None and text:
             path = self.runs_folder / mission / JOURNAL
             self._writer = JournalWriter(path, header(mission, text, "", "realtime", {"seed": 1}))
@@ -305,7 +305,7 @@ class Stage:
         self._stimulate(EventOccurred(event, "stage", number))
 
     def _order(self, stimulus: Stimulus) -> dict[str, Any]:
-        if self.narrator is None or (self._over and not isinstance(stimulus, SetBreakpoints)):
+        if self.publisher is None or (self._over and not isinstance(stimulus, SetBreakpoints)):
             return {"ok": False, "code": "idle", "text": "no mission run is going on"}
         self._notes = []
         self._stimulate(stimulus)
@@ -313,18 +313,18 @@ class Stage:
         return {"ok": False, "code": "refused", "text": refused[0]} if refused else {"ok": True}
 
     def _stimulate(self, *stimuli: Stimulus) -> None:
-        assert self.narrator is not None
+        assert self.publisher is not None
         queue = deque(stimuli)
         while queue:
             stimulus = queue.popleft()
-            self.narrator.stimulus(self.clock, stimulus)
+            self.publisher.stimulus(self.clock, stimulus)
             self.state, instructions = self.engine.handle(self.state, stimulus)
             if self._store is not None:
                 self._store.append(self.clock, stimulus, instructions, self.state)
             for instruction in instructions:
-                self.narrator.instruction(self.clock, instruction)
+                self.publisher.instruction(self.clock, instruction)
                 queue.extend(self._carry_out(instruction))
-            self.narrator.settled(self.clock, self.state)
+            self.publisher.settled(self.clock, self.state)
         if self._store is not None:
             self._store.sync()
 
@@ -388,7 +388,7 @@ class Stage:
 
     def advance(self, seconds: float) -> None:
         """Advance runs and timers by this time."""
-        assert self.narrator is not None
+        assert self.publisher is not None
         for run, playing in list(self._playing.items()):
             if playing.held:
                 continue
@@ -397,7 +397,7 @@ class Stage:
             if playing.start.action in self.kept:
                 fraction = min(fraction, 0.9)
             if fraction < 1.0:
-                self.narrator.progress(self.clock, run, Feedback(run, fraction, {}))
+                self.publisher.progress(self.clock, run, Feedback(run, fraction, {}))
                 continue
             del self._playing[run]
             part = playing.part

@@ -16,7 +16,7 @@ import pytest
 from petrobot.coordinator.operator.port import PROTOCOL
 from petrobot.coordinator.page import requests
 from petrobot.coordinator.page.access import HEADERS, is_loopback, names_for
-from petrobot.coordinator.page.connection_limits import CONNECTIONS, Gate
+from petrobot.coordinator.page.connection_limits import CONNECTIONS, ConnectionLimit
 from petrobot.coordinator.page.server import CLIENTS, Page, start_page
 from petrobot.coordinator.page.sessions import LARGEST_MESSAGE
 from tests.page.stage import Stage
@@ -239,8 +239,8 @@ async def test_a_thousand_sockets_do_not_block_the_operator(page: Page) -> None:
                 base(page) + "/api/command", json={"verb": "estop", "name": "ana"}
             ) as answer:
                 assert answer.status == 200
-            assert page.gate.turned_away >= 1_000 - CONNECTIONS
-            assert page.gate.open_connections <= CONNECTIONS
+            assert page.limit.turned_away >= 1_000 - CONNECTIONS
+            assert page.limit.open_connections <= CONNECTIONS
         finally:
             for one in crowd:
                 one.close()
@@ -250,13 +250,13 @@ async def test_a_thousand_sockets_do_not_block_the_operator(page: Page) -> None:
 async def test_silent_connections_are_closed(page: Page) -> None:
     """A request header sent slowly and in part does not keep its connection for ever
     (slow-loris)."""
-    page.gate.silent = 0.2
+    page.limit.silent = 0.2
     reader, writer = await asyncio.open_connection("127.0.0.1", port_of(page))
     writer.write(b"GET / HTTP/1.1\r\nHost: 127")
     with contextlib.suppress(ConnectionResetError):  # bytes that came too late for the page
         assert await asyncio.wait_for(reader.read(), 60) == b""
     writer.close()
-    assert isinstance(page.gate, Gate)
+    assert isinstance(page.limit, ConnectionLimit)
 
 
 async def test_scripts_use_the_token(page: Page, stage: Stage) -> None:

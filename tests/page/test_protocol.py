@@ -13,8 +13,7 @@ import aiohttp
 import pytest
 
 from petrobot.coordinator.operator.changes import apply
-from petrobot.coordinator.page import app_state as house
-from petrobot.coordinator.page import sessions
+from petrobot.coordinator.page import app_state, sessions
 from petrobot.coordinator.page.server import Page
 from tests.page.stage import Stage
 from tests.waiting import beat
@@ -160,7 +159,7 @@ async def test_controls_become_free_when_their_holder_is_gone(
 ) -> None:
     """A holder whose last window was closed does not block others for ever; one that only reloads
     the page keeps them."""
-    monkeypatch.setattr(house, "ABSENT_S", 0.3)
+    monkeypatch.setattr(app_state, "ABSENT_S", 0.3)
     async with joined(page, "ben", "2") as ben:
         async with joined(page) as ana:
             await ana.command("take_controls")

@@ -9,7 +9,7 @@ from typing import Any
 
 from petrobot.coordinator.task import Task
 from petrobot.services.comm.location_file import Directory, parse
-from petrobot.services.scripted import Line, Scripted
+from petrobot.services.scripted import Scripted, ScriptedRun
 
 HEAD = """
 schema = 1
@@ -39,10 +39,10 @@ def services_text(task: Task, every: bool = False) -> str:
     )
 
 
-def scripts(task: Task, lines: Mapping[str, list[Line]]) -> dict[str, Callable[..., Any]]:
+def scripts(task: Task, lines: Mapping[str, list[ScriptedRun]]) -> dict[str, Callable[..., Any]]:
     """Return a scripted action for every alternative of each primitive task; by default, success
     after half a second."""
-    usual = [Line(seconds=(0.5, 0.5))]
+    usual = [ScriptedRun(seconds=(0.5, 0.5))]
     return {
         a: Scripted(lines.get(p.name, usual))
         for p in task.primitive_tasks.values()

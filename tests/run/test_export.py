@@ -15,7 +15,7 @@ from petrobot.coordinator.cli import main
 from petrobot.coordinator.cli.recorded_runs import recorded
 from petrobot.coordinator.engine import Fired, RunRecorded
 from petrobot.coordinator.run.export import messages
-from tests.run.test_runfolder import SCRIPT, SERVICES
+from tests.run.test_folder import SCRIPT, SERVICES
 
 SHUTTLE = Path(__file__).parents[1] / "chaos" / "shuttle.toml"
 JOURNAL = Path(__file__).parent / "golden" / "catch_ball-missed-and-recovered.journal"

@@ -21,12 +21,12 @@ from petrobot.services.action import Status as ActionStatus
 from petrobot.services.comm.calls.caller import Caller
 from petrobot.services.comm.location_file import parse
 from petrobot.services.comm.protocol import messages as m
-from petrobot.services.scripted import Line
+from petrobot.services.scripted import ScriptedRun
 from tests.run.scripted_cell import directory_for, scripts
 from tests.run.toy_arm import SERVICES, TASK
 
 
-def run(task: Task, lines: dict[str, list[Line]], **given: Any) -> tuple[Mission, Timeline]:
+def run(task: Task, lines: dict[str, list[ScriptedRun]], **given: Any) -> tuple[Mission, Timeline]:
     """Run the task to its end, at most an hour of simulated time."""
     timeline = Timeline()
     cell, party = lockstep_cell(directory_for(task), Setting(task, **given), scripts(task, lines))
@@ -35,12 +35,12 @@ def run(task: Task, lines: dict[str, list[Line]], **given: Any) -> tuple[Mission
     return party.mission, timeline
 
 
-def failing(cause: str, status: ActionStatus = ActionStatus.ERROR) -> Line:
+def failing(cause: str, status: ActionStatus = ActionStatus.ERROR) -> ScriptedRun:
     """Return a script whose run ends in ERROR after 0.1 s with this cause."""
-    return Line(status, (0.1, 0.1), cause=cause)
+    return ScriptedRun(status, (0.1, 0.1), cause=cause)
 
 
-GOOD = Line(seconds=(0.2, 0.2))
+GOOD = ScriptedRun(seconds=(0.2, 0.2))
 
 
 def test_an_error_of_the_net_is_logged_when_it_occurs(caplog: pytest.LogCaptureFixture) -> None:
@@ -166,7 +166,9 @@ def test_failure_continues_on_the_normal_branch(catch_ball: Task) -> None:
 
 def test_a_raised_deadline_is_an_error_with_a_reason(catch_ball: Task) -> None:
     """The node ends a run at its deadline."""
-    mission, _ = run(catch_ball, {"locate_ball": [Line(seconds=(1e6, 1e6)), GOOD, GOOD, GOOD]})
+    mission, _ = run(
+        catch_ball, {"locate_ball": [ScriptedRun(seconds=(1e6, 1e6)), GOOD, GOOD, GOOD]}
+    )
     first = mission.tally.runs[0]
     assert (first.status, first.cause) == (Status.ERROR, "deadline")
     assert 8.0 <= first.seconds < 8.2
@@ -174,7 +176,7 @@ def test_a_raised_deadline_is_an_error_with_a_reason(catch_ball: Task) -> None:
 
 def test_the_same_seed_gives_the_same_run(catch_ball: Task) -> None:
     """Scripts draw durations by seed and run."""
-    lines = {"track_ball": [Line(seconds=(0.1, 2.0))]}
+    lines = {"track_ball": [ScriptedRun(seconds=(0.1, 2.0))]}
     one, again, other = (run(catch_ball, lines, seed=seed)[1] for seed in (5, 5, 6))
     assert one.firings == again.firings
     assert one.firings != other.firings

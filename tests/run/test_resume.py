@@ -27,20 +27,20 @@ from petrobot.coordinator.run.recording import JournalStore, ReplayError, replay
 from petrobot.coordinator.task import Status, Task
 from petrobot.services.action import Status as ActionStatus
 from petrobot.services.comm.lockstep.cell import LockStepCell
-from petrobot.services.scripted import Line
+from petrobot.services.scripted import ScriptedRun
 from tests.run.scripted_cell import directory_for, scripts
 
 LINES = {
-    "locate_ball": [Line(seconds=(0.2, 0.2), values={"ball": [1.0, 0.1]})],
+    "locate_ball": [ScriptedRun(seconds=(0.2, 0.2), values={"ball": [1.0, 0.1]})],
     "move_to_point": [
-        Line(seconds=(0.3, 0.3)),
-        Line(ActionStatus.ERROR, (0.1, 0.1), cause="unreachable", text="y = 0.9 m"),
-        Line(seconds=(0.3, 0.3)),
-        Line(seconds=(0.3, 0.3)),
+        ScriptedRun(seconds=(0.3, 0.3)),
+        ScriptedRun(ActionStatus.ERROR, (0.1, 0.1), cause="unreachable", text="y = 0.9 m"),
+        ScriptedRun(seconds=(0.3, 0.3)),
+        ScriptedRun(seconds=(0.3, 0.3)),
     ],
     "catch_ball": [
-        Line(ActionStatus.FAILURE, (0.2, 0.2), cause="missed"),
-        Line(seconds=(0.2, 0.2)),
+        ScriptedRun(ActionStatus.FAILURE, (0.2, 0.2), cause="missed"),
+        ScriptedRun(seconds=(0.2, 0.2)),
     ],
 }
 

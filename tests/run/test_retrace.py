@@ -19,7 +19,7 @@ from petrobot.coordinator.run.recording import ReplayError, RetracingStore, rema
 from petrobot.coordinator.task import Task, model
 from petrobot.coordinator.task.expansion import expand
 from petrobot.coordinator.task.file import load, loads
-from tests.run.test_runfolder import SCRIPT, SERVICES
+from tests.run.test_folder import SCRIPT, SERVICES
 
 TASK = Path(__file__).parents[1] / "chaos" / "shuttle.toml"
 

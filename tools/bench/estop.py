@@ -40,7 +40,7 @@ from petrobot.services.comm.canopen.cia402 import DriveState
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import Hello
 from petrobot.services.comm.tls.credentials import Credentials
-from tests.doors.arm_cell import ROOT, Ear, cell_in, ear_on
+from tests.security.arm_cell import ROOT, Ear, cell_in, ear_on
 
 FLOOR_MS = 20.0
 """Limit of the 99th percentile of a warm stop on an idle machine (ms)."""

@@ -13,7 +13,7 @@ The first two show the cost of the code. In the third, the scheduler may keep bo
 contender on one core and those of another on two, where each message has to wake the other end.
 Only ratios matter: microseconds depend on the machine.
 
-The other checkout of `--against` has its own `.venv`; its `wire.py` may lie in `tests/bench`.
+The other checkout of `--against` has its own `.venv`; its `wire.py` may be in `tests/bench`.
 """
 
 from __future__ import annotations

@@ -39,13 +39,13 @@ class Pyro(Contender):
     def serve(self) -> None:
         api = importlib.import_module("Pyro5.api")
 
-        class Echo:
+        class PyroEcho:
             @api.expose  # type: ignore[untyped-decorator]
             def echo(self, value: Any) -> Any:
                 return value
 
         daemon = api.Daemon(host=HOST, port=0)
-        daemon.register(Echo(), "echo")
+        daemon.register(PyroEcho(), "echo")
         print(daemon.locationStr.rpartition(":")[2], flush=True)
         daemon.requestLoop()
 
@@ -98,11 +98,11 @@ class Rpyc(Contender):
         rpyc = importlib.import_module("rpyc")
         server_module = importlib.import_module("rpyc.utils.server")
 
-        class Echo(rpyc.Service):  # type: ignore[misc,name-defined]
+        class RpycEcho(rpyc.Service):  # type: ignore[misc,name-defined]
             def exposed_echo(self, value: Any) -> Any:
                 return value
 
-        server = server_module.ThreadedServer(Echo(), hostname=HOST, port=0)
+        server = server_module.ThreadedServer(RpycEcho(), hostname=HOST, port=0)
         print(server.port, flush=True)
         server.start()
 

@@ -117,7 +117,7 @@ def _near(t: CompiledTransition, ended: set[str], marking: Sequence[int]) -> boo
 
 
 def _at_rest(draft: Draft, t: CompiledTransition) -> bool:
-    """Whether all that is there for the transition are resources that nobody holds."""
+    """Whether all tokens that the transition could take now are free resources."""
     net, places = draft.compiled.net, tuple(draft.compiled.task.places.values())
     there = [p for p, _ in t.needs if draft.marking[p]]
     return all(

@@ -70,8 +70,8 @@ class Names:
     """The names that conditions of a task read, and so the parts of a state that matter."""
 
     def __init__(self, engine: Engine, contests: Iterable[tuple[str, ...]] | None = None) -> None:
-        """Collect them. `contests`: the transitions of each conflict that first come, first served
-        may have to settle; None: not known. Raises TooManyValues."""
+        """Collect them. `contests`: the transitions of each conflict that may be decided by the
+        order of arrival; None: not known. Raises TooManyValues."""
         self.engine = engine
         # any transition may win a conflict, so the order of waiting does not matter
         if engine.policy.ask_undecided:
@@ -326,7 +326,7 @@ class Names:
         return list({self.region(name, value): value for value in self._values[name]}.values())
 
     def undecided(self, instruction: object) -> tuple[str, ...]:
-        """Return the transitions of a conflict that neither priority nor weight settles, if the
+        """Return the transitions of a conflict that neither priority nor weight decides, if the
         instruction asks for one."""
         if isinstance(instruction, Choose) and instruction.subject is Subject.CONFLICT:
             return instruction.alternatives if not any(instruction.weights) else ()

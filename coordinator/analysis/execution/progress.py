@@ -271,8 +271,8 @@ class Progress:
             return self._unknown(f"not fired so far: {', '.join(t.name for t in idle)}")
         numbers = {t.index for t in idle}
         roots = [t for t in idle if not self._fed_by(t, numbers, t.needs)]
-        # A ring of transitions that wait for each other is told by a token that it should begin
-        # with, not by a run.
+        # In a ring of transitions that wait for each other, name the one that lacks a token, not
+        # one that lacks a run: the ring should begin with that token.
         roots = roots or [t for t in idle if self._fed_by(t, numbers, t.plain)] or idle
         told = [f"{t.name} can never fire: {self._never(t, numbers)}" for t in roots]
         if others := [t.name for t in idle if t not in roots]:

@@ -29,7 +29,7 @@ class OrdinaryView:
         return self._holds(self.task.flat.final, marking)
 
     def is_final_error(self, marking: Marking) -> bool:
-        """Whether the task has given up honestly."""
+        """Whether the task has given up as designed (further entries are ignored)."""
         return self._holds(self.task.flat.final_error, marking)
 
     def is_end(self, marking: Marking) -> bool:
@@ -49,7 +49,7 @@ class OrdinaryView:
 
     @cached_property
     def error_exits(self) -> frozenset[str]:
-        """Transitions that take a run which ended with ERROR, or that are said to begin an error
+        """Transitions that take a run which ended with ERROR, or that the task declares as an error
         branch."""
         transitions = self.task.flat.transitions.values()
         return frozenset(t.name for t in transitions if any(a.end is End.ERROR for a in t.inputs))

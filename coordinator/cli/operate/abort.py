@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from petrobot.coordinator.cli.operate import hand
+from petrobot.coordinator.cli.operate import command
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.client import OperatorClient
@@ -15,13 +15,13 @@ EXAMPLE = "petrobot abort"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    hand.add_arguments(parser)
+    command.add_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Give the command, and print the answer."""
-    return hand.give(options, "abort", told=_told)
+    return command.give(options, "abort", told=_told)
 
 
-async def _told(client: OperatorClient, answer: hand.Answer) -> str:
+async def _told(client: OperatorClient, answer: command.Answer) -> str:
     return "aborted: its actions are being stopped"

@@ -8,7 +8,7 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.operate import hand
+from petrobot.coordinator.cli.operate import command
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.client import OperatorClient
@@ -20,14 +20,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.add_argument("element", nargs="?", help="a transition or place of the task")
     parser.add_argument("--off", action="store_true", help="remove this breakpoint")
-    hand.add_arguments(parser)
+    command.add_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Set, remove or list breakpoints."""
     if options.element is None:
         return asyncio.run(_list(options))
-    return hand.give(options, "breakpoint", lambda client: _data(client, options), _told)
+    return command.give(options, "breakpoint", lambda client: _data(client, options), _told)
 
 
 def _data(client: OperatorClient, options: argparse.Namespace) -> dict[str, Any]:
@@ -35,12 +35,12 @@ def _data(client: OperatorClient, options: argparse.Namespace) -> dict[str, Any]
     kinds = {one["name"]: kind for kind in ("places", "transitions") for one in task[kind]}
     name = options.element.rpartition(".")[2]
     return {
-        "element": f"{kinds[hand.named(kinds, name, 'place or transition')]}.{name}",
+        "element": f"{kinds[command.named(kinds, name, 'place or transition')]}.{name}",
         "on": not options.off,
     }
 
 
-async def _told(client: OperatorClient, answer: hand.Answer) -> str:
+async def _told(client: OperatorClient, answer: command.Answer) -> str:
     answer["breakpoints"] = client.state["breakpoints"]
     return _words(client.state["breakpoints"])
 
@@ -52,13 +52,13 @@ def _words(breakpoints: list[str]) -> str:
 async def _list(options: argparse.Namespace) -> int:
     from petrobot.coordinator.operator.client import OperatorError
 
-    door = hand.find(options)
+    address = command.find(options)
     try:
-        async with hand.connect(door, options.name) as client:
+        async with command.connect(address, options.name) as client:
             breakpoints = client.state["breakpoints"]
     except OperatorError as fault:
-        raise CommandError(3, f"{door.run}: {fault}") from fault
-    hand.show(
-        options, {"run": door.run, "ok": True, "breakpoints": breakpoints}, _words(breakpoints)
+        raise CommandError(3, f"{address.run}: {fault}") from fault
+    command.show(
+        options, {"run": address.run, "ok": True, "breakpoints": breakpoints}, _words(breakpoints)
     )
     return 0

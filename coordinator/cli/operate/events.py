@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from petrobot.coordinator.cli.operate import hand
+from petrobot.coordinator.cli.operate import command
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.client import OperatorClient
@@ -16,7 +16,7 @@ EXAMPLE = "petrobot raise image_tick"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.add_argument("event", help="an external event of the task")
-    hand.add_arguments(parser)
+    command.add_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -26,9 +26,9 @@ def run(options: argparse.Namespace) -> int:
         external = {
             name: one for name, one in client.state["events"].items() if one["scope"] == "external"
         }
-        return {"event": hand.named(external, options.event, "external event")}
+        return {"event": command.named(external, options.event, "external event")}
 
-    async def told(client: OperatorClient, answer: hand.Answer) -> str:
+    async def told(client: OperatorClient, answer: command.Answer) -> str:
         return f"raised {options.event}"
 
-    return hand.give(options, "raise_event", data, told)
+    return command.give(options, "raise_event", data, told)

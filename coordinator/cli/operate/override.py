@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.operate import hand
+from petrobot.coordinator.cli.operate import command
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.client import OperatorClient
@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", help="a primitive task")
     parser.add_argument("action", nargs="?", help="the action to use from now on")
     parser.add_argument("--free", action="store_true", help="let the run choose again")
-    hand.add_arguments(parser)
+    command.add_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -29,16 +29,16 @@ def run(options: argparse.Namespace) -> int:
 
     def data(client: OperatorClient) -> dict[str, Any]:
         selectors = client.state["selectors"]
-        task = hand.named(selectors, options.task, "primitive task")
+        task = command.named(selectors, options.task, "primitive task")
         if options.action is not None:
-            hand.named(
+            command.named(
                 {one["action"]: one for one in selectors[task]["alternatives"]},
                 options.action,
                 "alternative",
             )
         return {"primitive_task": task, "action": options.action}
 
-    async def told(client: OperatorClient, answer: hand.Answer) -> str:
+    async def told(client: OperatorClient, answer: command.Answer) -> str:
         return f"{options.task}: {options.action or 'chosen freely again'}"
 
-    return hand.give(options, "override_selector", data, told)
+    return command.give(options, "override_selector", data, told)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from petrobot.coordinator.cli.operate import hand
+from petrobot.coordinator.cli.operate import command
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.client import OperatorClient
@@ -22,15 +22,15 @@ WORDS = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    hand.add_arguments(parser)
+    command.add_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Give the command, and print what each node reports."""
-    return hand.give(options, "pause", told=_told)
+    return command.give(options, "pause", told=_told)
 
 
-async def _told(client: OperatorClient, answer: hand.Answer) -> str:
+async def _told(client: OperatorClient, answer: command.Answer) -> str:
     nodes = answer.get("nodes", {})
     lines = [f"  {node:12} {WORDS.get(said, said)}" for node, said in nodes.items()]
     return "\n".join(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from petrobot.coordinator.cli.operate import hand
+from petrobot.coordinator.cli.operate import command
 
 EXAMPLE = 'petrobot remark "a visitor touched the table"'
 
@@ -12,9 +12,9 @@ EXAMPLE = 'petrobot remark "a visitor touched the table"'
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("text", help="one line of at most 1,000 characters")
-    hand.add_arguments(parser, controls=False)
+    command.add_arguments(parser, controls=False)
 
 
 def run(options: argparse.Namespace) -> int:
     """Remark."""
-    return hand.give(options, "remark", lambda client: {"text": options.text})
+    return command.give(options, "remark", lambda client: {"text": options.text})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from petrobot.coordinator.cli.operate import hand
+from petrobot.coordinator.cli.operate import command
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.client import OperatorClient
@@ -17,7 +17,7 @@ PATIENCE = 2.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    hand.add_arguments(parser)
+    command.add_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -29,7 +29,7 @@ def run(options: argparse.Namespace) -> int:
         seen = int(client.state["mission"].get("firings", 0))
         return {}
 
-    async def told(client: OperatorClient, answer: hand.Answer) -> str:
+    async def told(client: OperatorClient, answer: command.Answer) -> str:
         if not await client.until(
             lambda state: state["mission"].get("firings", 0) > seen, PATIENCE
         ):
@@ -38,4 +38,4 @@ def run(options: argparse.Namespace) -> int:
         answer["firing"] = firing
         return f"fired {firing['transition']} ({firing['cause']})"
 
-    return hand.give(options, "step", look, told)
+    return command.give(options, "step", look, told)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from petrobot.coordinator.cli.operate import hand
+from petrobot.coordinator.cli.operate import command
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.client import OperatorClient
@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.add_argument("place", help="a control place of the task")
     parser.add_argument("tokens", type=_change, help="how many to add (+2) or to remove (-1)")
-    hand.add_arguments(parser)
+    command.add_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -25,14 +25,14 @@ def run(options: argparse.Namespace) -> int:
     verb = "add_tokens" if options.tokens > 0 else "remove_tokens"
 
     def data(client: OperatorClient) -> dict[str, Any]:
-        place = hand.named(client.state["marking"], options.place, "place")
+        place = command.named(client.state["marking"], options.place, "place")
         return {"place": place, "count": abs(options.tokens)}
 
-    async def told(client: OperatorClient, answer: hand.Answer) -> str:
+    async def told(client: OperatorClient, answer: command.Answer) -> str:
         answer["tokens"] = client.state["marking"].get(options.place)
         return f"{options.place} holds {answer['tokens']} tokens"
 
-    return hand.give(options, verb, data, told)
+    return command.give(options, verb, data, told)
 
 
 def _change(text: str) -> int:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.operate import hand
+from petrobot.coordinator.cli.operate import command
 from petrobot.services.host.json_text import json_text
 from petrobot.services.host.whole_file import write_whole
 
@@ -25,7 +25,7 @@ ENDED = {"success": 0, "failure": 1, "error": 1, "aborted": 1, "stopped": 1}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    hand.add_run_arguments(parser)
+    command.add_run_arguments(parser)
     parser.add_argument(
         "--as",
         dest="name",
@@ -58,12 +58,12 @@ def run(options: argparse.Namespace) -> int:
 async def _watch(options: argparse.Namespace, out: TextIO) -> int:
     from petrobot.coordinator.operator.client import OperatorError
 
-    door = hand.find(options)
+    address = command.find(options)
     try:
-        async with hand.connect(door, options.name) as client:
+        async with command.connect(address, options.name) as client:
             return await _follow(client, out, plain=not options.json)
     except OperatorError as fault:
-        raise CommandError(3, f"{door.run}: {fault}") from fault
+        raise CommandError(3, f"{address.run}: {fault}") from fault
 
 
 async def _follow(client: OperatorClient, out: TextIO, plain: bool) -> int:
@@ -88,7 +88,7 @@ def _snapshot(client: OperatorClient) -> str:
     tokens = ", ".join(f"{place} {n}" for place, n in client.state["marking"].items() if n)
     return (
         f"{mission['id']}: {mission['state']}; controls: "
-        f"{controls['holder'] or 'nobody'}; tokens: {tokens}"
+        f"{controls['holder'] or 'no operator'}; tokens: {tokens}"
     )
 
 

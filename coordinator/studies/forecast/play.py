@@ -25,8 +25,7 @@ from petrobot.coordinator.task.net import Marking
 
 IDLE, GOING, DONE = 0, 1, 2
 LONGEST = 10_000
-"""Firings without time going on, and steps of a trial, after which it counts as one that never
-ends."""
+"""After so many firings at one time, or so many steps, a trial counts as one that never ends."""
 Choices = Mapping[str, Mapping[str, float]]
 """By primitive task: the probability of each action."""
 
@@ -59,7 +58,7 @@ class Played:
 
 
 class Play:
-    """Trials under way; `replicate` (columns,) says whose bootstrap weights each one draws with."""
+    """Active trials; `replicate` (columns,) says whose bootstrap weights each one draws with."""
 
     def __init__(
         self,
@@ -250,8 +249,8 @@ class Play:
                 turn[q, columns] = never
 
     def _cut(self, q: int, m: Move, counts: Counts, columns: Codes) -> None:
-        """Runs that are taken while they go on: they count as the arc says, whatever they would
-        have come to. One that still waits for its device never began, so it does not count."""
+        """End runs that are taken while they are active: they count as the arc says. One that still
+        waits for its device never began, so it does not count."""
         columns = columns[self._turn[q, columns] == 0]
         status = CENSORED if counts is Counts.NONE else STATUSES.index(Status(counts.value))
         lasted = self._now[columns] - self._came[q, columns]
@@ -379,7 +378,8 @@ class Play:
     # --- ends ---------------------------------------------------------------------------------
 
     def _over(self) -> Codes:
-        """1: as designed, -1: given up, 0: goes on."""
+        """Return by column whether the trial ended as designed (1), was given up (-1) or is still
+        active (0)."""
         _, first, inverse = np.unique(self._keys(), return_index=True, return_inverse=True)
         verdicts = np.array(
             [self._judge(tuple(self._tokens[:, i].tolist())) for i in first], np.int64
@@ -404,7 +404,7 @@ class Play:
         return self._ends[marking]
 
     def _finish(self, verdict: Codes) -> None:
-        """Note the columns that are over and play on with the others."""
+        """Record the columns that have ended, and continue with the others."""
         over = verdict != 0
         if not over.any():
             return

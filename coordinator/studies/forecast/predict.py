@@ -124,7 +124,7 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
 
 
 def _refuse_unmeasured(training: Training, choices: Choices, asked: list[str]) -> None:
-    """Raise ValueError for choices of which the training tells nothing."""
+    """Raise ValueError for choices without runs in the training."""
     names, runs = training.vocabulary, training.runs
     known = set(zip(runs.place.tolist(), runs.action.tolist(), strict=True))
     entered = {place for place, _ in known}

@@ -139,7 +139,7 @@ def ways_table(before: Mapping[str, int], after: Mapping[str, int]) -> np.ndarra
 
 ORDER_LEVEL = 3e-4
 """Significance level, after Holm, at which trials depend on their order: a forecast that is refused
-for nothing counts as a miss, so this shall not happen once in 3,000 forecasts."""
+without a reason counts as a miss, so this must not happen once in 3,000 forecasts."""
 ORDER = 0.1
 """Rank correlation from which such a dependence matters."""
 

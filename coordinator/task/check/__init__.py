@@ -41,10 +41,10 @@ def check(
     translates: Mapping[str, str] | None = None,
     source: str = "services.toml",
 ) -> CheckReport:
-    """Everything that can be said of the task without exploring it.
+    """Check what can be found without exploring the states of the task.
 
-    `offers`: the node of each action that is offered; `translates`: the primitive task that each of
-    them is said to translate; `source`: the location file that says so.
+    `offers`: the node of each action that is offered; `translates`: the primitive task of each
+    according to its location file; `source`: the name of that file.
     """
     broken = faults(task)
     if broken:

@@ -1,8 +1,8 @@
 """Whether a task fits the code of its actions: arguments, results, causes of errors, events, and
 what an action does that would fail only when it runs.
 
-What the code says comes from elsewhere (`services.comm.location_file.code`), as plain data by
-action; actions of other hosts are not known here and are left out.
+The code itself is read by `services.comm.location_file.code`, which gives plain data by action.
+Actions of other hosts are not known here and are left out.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ def _uncovered(
         yield Finding(Severity.WARNING, "coverage-unknown", key, text, remedy)
 
 
-# Events that can never be heard, and waits that only the outside world can end.
+# Events that no transition can receive, and waits that only the outside world can end.
 
 
 def event_faults(task: Task) -> Iterator[Finding]:

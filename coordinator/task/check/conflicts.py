@@ -1,5 +1,5 @@
 """Conflicts found on the structure: which pairs of transitions can compete for a token, and what
-settles them.
+decides between them.
 
 Two transitions compete when one stimulus, or what had come before it, can make both fireable for
 the same token. So what can come *last* before each can fire is compared: a pulse can only come
@@ -99,8 +99,8 @@ Trigger = tuple[str, str]
 
 def conflicts(task: Task) -> Iterator[Finding]:
     """Find conflicts that the arcs suggest: those that the task does not decide (warnings), and
-    those that the order of arrival decides (notes). Whether any comes to pass is for the execution
-    graph."""
+    those that the order of arrival decides (notes). The execution graph shows whether any of them
+    can occur."""
     domains, flows, net = condition_domains(task), semiflows(task), task.net
     for t, u in combinations(task.transitions.values(), 2):
         shared = sorted(_shared(task, t, u))

@@ -52,8 +52,8 @@ class ConditionError(ValueError):
 
 
 class ConditionFault(Exception):  # noqa: N818 - not a bug: the values at hand give the condition no truth value
-    """A condition has no truth value for the values at hand (a name was never written, or holds
-    another kind)."""
+    """A condition has no truth value for the present values (a name was never written, or holds a
+    value of another type)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ It is used both in real time (`server.py` drives it) and in lock step. The node 
   ids was full (`FinishedIds.complete` is False), an unknown call that may have been sent before
   (`Call.again`) does not run, because its id may be a forgotten one.
 - Every run produces one outcome, kept until its caller acknowledges it or until the time
-  `Retention.results` is over.
+  `Retention.results` has passed.
 - A run is active no longer than its deadline, and no longer than its offer's `orphan_time` without
   its caller.
 - A device accepts orders from one caller at a time: the holder of its lease.
@@ -81,7 +81,7 @@ class ActiveRun:
     device: str
     orphan_time: float | None
     limit: float = NEVER
-    """When its deadline is over (s)."""
+    """When its deadline ends (s)."""
     held: float | None = None
     """Since when an operator holds it (s)."""
     stopping: bool = False
@@ -164,7 +164,7 @@ class Retention:
 
 
 _weigh = msgpack.Packer(default=lambda value: None, unicode_errors="surrogatepass").pack
-"""Packs data to learn its length on the wire; what cannot be sent counts as nothing."""
+"""Packs data to learn its length on the wire; what cannot be sent counts 0 bytes."""
 
 
 _DIGITS = "0123456789"

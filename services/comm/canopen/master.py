@@ -42,7 +42,7 @@ HEARTBEAT_MS: Final = 50
 RETRY: Final = 1.0
 """Pause before a failed configuration is tried again (s)."""
 BY_THEMSELVES: Final = 1.2
-"""Time in which enabled drives that have lost their master stand still: they notice it by its
+"""Time after which enabled drives that have lost their master stand still: they notice it by its
 heartbeat (0.25 s at most here) and stop quickly (0.8 s at most), then their brakes hold (s)."""
 SETTLE: Final = 0.05
 """Time that nodes get after a reset of their communication (s)."""

@@ -160,7 +160,7 @@ class Directory:
 
     @property
     def text(self) -> str:
-        """The text of the file, as its other programs shall read it. Raises DirectoryError,
+        """The text of the file for the other programs of the cell. Raises DirectoryError,
         OSError."""
         text = read_text(self.source)
         return dry(text) if self.dry_run and not parse(text, self.source).dry_run else text

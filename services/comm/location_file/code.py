@@ -96,7 +96,8 @@ def _ask_process(question: str, seconds: float) -> tuple[list[Facts], str]:
         text, _ = process.communicate()
         why = f"importing it took longer than {seconds:g} s"
     lines = [line for line in text.splitlines() if line.endswith("}")]
-    return [json.loads(line) for line in lines], f"{why}; a module only defines, it does nothing"
+    remedy = "a module may define functions and classes, but must do nothing when it is imported"
+    return [json.loads(line) for line in lines], f"{why}; {remedy}"
 
 
 _ask_once = functools.lru_cache(maxsize=8)(_ask_process)
@@ -108,7 +109,7 @@ def code_faults(directory: Directory, code: Mapping[str, Facts], text: str) -> t
     faults, told = Faults(text, str(directory.source)), set[tuple[str, str]]()
 
     def unread(key: str, path: str) -> None:
-        """Say why a path cannot be imported; what is wrong in its module is said once."""
+        """Report why a path cannot be imported; a fault of its module is reported once."""
         why = code.get(path, {}).get("import", "")
         module = (path.partition(":")[0], why)
         if why and module not in told:

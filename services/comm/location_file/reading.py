@@ -117,7 +117,7 @@ SHAPES: Mapping[str, Mapping[str, KeySpec]] = {
     "devices": {"node": _name_key("a node", required=True), "driver": _path_key("Class")},
     "actions": {
         "run": _path_key("function", required=True),
-        "task": _name_key("the primitive task that the action translates"),
+        "task": _name_key("the primitive task that the action does"),
         "device": _name_key("a device"),
         "node": KeySpec("the name of one node", _text),
         "args": KeySpec("a table of arguments", lambda v: isinstance(v, dict)),

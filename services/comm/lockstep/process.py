@@ -19,7 +19,7 @@ from petrobot.services.comm.tls.credentials import shared_keys
 def cell_key(directory: Directory) -> Keys | None:
     """Return the key that seals the ticks of a lock-step cell: the shared key, if there is one.
 
-    Ticks are not sent through TLS (docs/decisions/lock-step-doors.md): with certificates all
+    Ticks are not sent through TLS (docs/decisions/lock-step-keys.md): with certificates all
     members must be on loopback. Raises KeyNeededError if they are not, KeyFileError for a key file
     that cannot be used.
     """

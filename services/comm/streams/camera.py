@@ -125,7 +125,7 @@ class StreamImages:
         self._control(rate)
 
     def stop(self) -> None:
-        """Request no more images."""
+        """Stop requesting images."""
         self._control(0.0)
 
     def close(self) -> None:
@@ -329,7 +329,7 @@ class MemoryImages:
         self._control(rate)
 
     def stop(self) -> None:
-        """Request no more images."""
+        """Stop requesting images."""
         self._on, self._newest = False, None
         self._control(0.0)
 

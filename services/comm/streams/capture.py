@@ -32,7 +32,7 @@ OPEN_LIMIT = 10.0
 
 @dataclass(frozen=True, slots=True)
 class CaptureSettings:
-    """What a camera is asked for. Zero, empty or None: what it does by itself."""
+    """Settings of a camera. Zero, empty or None: the camera keeps its own setting."""
 
     fps: float = 0.0
     """Images/s that it takes; 0: the rate of the first `start`."""
@@ -41,7 +41,8 @@ class CaptureSettings:
     fourcc: str = ""
     """Pixel format, four characters such as "MJPG"."""
     exposure: float | None = None
-    """Exposure in the unit of its driver (V4L2: 100 us); given, it is no longer automatic."""
+    """Exposure in the unit of its driver (V4L2: 100 us); if given, the camera does not set it
+    automatically."""
     colour: bool = False
     """Images of shape (height, width, 3), blue green red, instead of grey levels."""
     latency: float = 0.0
@@ -94,7 +95,7 @@ class CaptureImages:
             raise ConnectionError(self._fault)
 
     def stop(self) -> None:
-        """Deliver no more images. The camera stays open for the next start."""
+        """Stop delivering images. The camera stays open for the next start."""
         with self._lock:
             self._newest, self._rate = None, 0.0
 
@@ -186,7 +187,7 @@ class RecordedImages:
         self._begin, self._rate, self._sequence = self._clock(), rate, 0
 
     def stop(self) -> None:
-        """Deliver no more images."""
+        """Stop delivering images."""
         self._rate = 0.0
 
     def close(self) -> None:

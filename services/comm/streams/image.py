@@ -37,7 +37,7 @@ class ImageSource(Protocol):
         """Begin to deliver images at about this rate (1/s)."""
 
     def stop(self) -> None:
-        """Deliver no more images."""
+        """Stop delivering images."""
 
     def newest(self) -> Image | None:
         """Return the newest image that was not returned yet, None if there is none; older ones are
@@ -69,7 +69,7 @@ class RequestedImages:
         self.rate = rate
 
     def end(self) -> None:
-        """Take no more images."""
+        """Stop taking images."""
         if self.rate:
             self._source.stop()
         self.rate, self._newest = 0.0, None
@@ -87,6 +87,6 @@ class RequestedImages:
         return image
 
     def close(self) -> None:
-        """Take no more images, and release the source."""
+        """Stop taking images, and release the source."""
         self.end()
         self._source.close()

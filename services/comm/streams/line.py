@@ -186,7 +186,7 @@ class Link:
         self, now: float, open_line: Callable[[], ByteLine], patience: float = math.inf
     ) -> None:
         """Open the line, as `lambda: ports.tcp(host, port)` does. Raises what that raises. A line
-        over which nothing comes for `patience` s is given up."""
+        over which nothing arrives for `patience` s is closed."""
         self._open, self._patience, self._heard = open_line, patience, now
         self._line: ByteLine | None = open_line()
         self._since, self._next, self._pause = now, 0.0, PAUSES[0]
@@ -196,7 +196,8 @@ class Link:
         """Why there is no line."""
 
     def receive(self, now: float) -> bytes:
-        """Return what has come; without a line nothing, and open another one when that is due."""
+        """Return the bytes that have arrived. Without a line return nothing, and open another line
+        when that is due."""
         try:
             if self._line is None:
                 if now < self._next:

@@ -19,21 +19,21 @@ from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task.file import dumps
 from petrobot.services.action import Status
 from petrobot.services.comm.location_file import parse
-from petrobot.services.scripted import Line
+from petrobot.services.scripted import ScriptedRun
 from tests.run.scripted_cell import scripts, services_text
 
 FOLDER = Path(__file__).parent
-GOOD = Line(seconds=(0.2, 0.2))
-FAULT = Line(Status.ERROR, (0.1, 0.1), cause="drive_fault", text="drive 3: following error")
-MISSED = Line(Status.FAILURE, (0.3, 0.3), cause="missed")
+GOOD = ScriptedRun(seconds=(0.2, 0.2))
+FAULT = ScriptedRun(Status.ERROR, (0.1, 0.1), cause="drive_fault", text="drive 3: following error")
+MISSED = ScriptedRun(Status.FAILURE, (0.3, 0.3), cause="missed")
 END = [4.0, 2.0, 0.0]
-GOES_ON = Line(seconds=(3.0, 3.0), values={"at_t": False, "line_end": END})
-ENDS_AT_T = Line(seconds=(3.0, 3.0), values={"at_t": True, "line_end": END})
-FOUND = Line(seconds=(2.0, 2.0), values={"recovered": True})
-NOT_FOUND = Line(Status.FAILURE, (2.5, 2.5), {"recovered": False}, "no_track")
-LOST = Line(Status.ERROR, (1.0, 1.0), cause="no_line", text="no line to follow for 0.5 s")
-UNSEEN = Line(Status.ERROR, (4.0, 4.0), cause="no_line", text="the line was lost for 0.8 s")
-STORIES: Mapping[str, tuple[str, int, Mapping[str, list[Line]]]] = {
+GOES_ON = ScriptedRun(seconds=(3.0, 3.0), values={"at_t": False, "line_end": END})
+ENDS_AT_T = ScriptedRun(seconds=(3.0, 3.0), values={"at_t": True, "line_end": END})
+FOUND = ScriptedRun(seconds=(2.0, 2.0), values={"recovered": True})
+NOT_FOUND = ScriptedRun(Status.FAILURE, (2.5, 2.5), {"recovered": False}, "no_track")
+LOST = ScriptedRun(Status.ERROR, (1.0, 1.0), cause="no_line", text="no line to follow for 0.5 s")
+UNSEEN = ScriptedRun(Status.ERROR, (4.0, 4.0), cause="no_line", text="the line was lost for 0.8 s")
+STORIES: Mapping[str, tuple[str, int, Mapping[str, list[ScriptedRun]]]] = {
     "catch_ball-undisturbed": ("catch_ball", 4, {}),
     "catch_ball-missed-and-recovered": (
         "catch_ball",

@@ -13,7 +13,7 @@ from petrobot.sim.picking.camera import Picture, SceneCamera
 from petrobot.sim.picking.gripper import Fingers
 from petrobot.sim.picking.parts import Part
 from petrobot.sim.picking.truth import LABORATORY_FILE, PickingSite
-from petrobot.sim.picking.world import TableTop, World
+from petrobot.sim.picking.world import PickingWorld, TableTop
 
 FILES = Path(__file__).parents[3] / "services" / "picking"
 FINGERS = Fingers(0.065, 0.008, 0.014)
@@ -64,7 +64,7 @@ class Crane:
     """Fingers over a table, moved by the test: the world without an arm."""
 
     def __init__(self, *parts: Part) -> None:
-        self.world = World(
+        self.world = PickingWorld(
             TableTop((-0.2, 0.2), (-0.2, 0.2)), FINGERS, parts, np.random.default_rng(1)
         )
         self.pose = [0.0, 0.0, ABOVE, 0.0]

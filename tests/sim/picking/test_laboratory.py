@@ -13,7 +13,7 @@ from petrobot.sim.picking.arm import ToolPose
 from petrobot.sim.picking.laboratory import PickingLaboratory
 from petrobot.sim.picking.parts import contact
 from petrobot.sim.picking.referee import EXCHANGE, Referee
-from petrobot.sim.picking.world import World
+from petrobot.sim.picking.world import PickingWorld
 from tests.sim.picking.bench import FINGERS, camera, cube, puck, scene, site
 
 AWAY = ToolPose(0.1, 0.0, 0.2, 0.0, 0.0)
@@ -78,15 +78,15 @@ def test_a_laboratory_is_at_rest_until_it_is_moved_and_is_repeatable(arm: str) -
     assert scores[0] == scores[1]
 
 
-def world_with(*places: tuple[float, float]) -> World:
+def world_with(*places: tuple[float, float]) -> PickingWorld:
     """Cubes at these places on the shipped table."""
     parts = [cube(x, y) for x, y in places]
     for number, part in enumerate(parts):
         part.number = number
-    return World(site().table, FINGERS, parts, np.random.default_rng(0))
+    return PickingWorld(site().table, FINGERS, parts, np.random.default_rng(0))
 
 
-def watched(world: World, seconds: float, pose: ToolPose = AWAY) -> Referee:
+def watched(world: PickingWorld, seconds: float, pose: ToolPose = AWAY) -> Referee:
     """A referee that has watched for so long."""
     referee = Referee(world, site().trays, site().belongs, 0.0)
     for k in range(round(seconds / 0.02)):
@@ -140,7 +140,7 @@ def test_a_round_part_rolls_farther_than_a_box() -> None:
     ways = []
     for part in (cube(0.1, 0.0), puck(0.1, 0.0)):
         part.z = 0.05
-        world = World(site().table, FINGERS, [part], np.random.default_rng(4))
+        world = PickingWorld(site().table, FINGERS, [part], np.random.default_rng(4))
         world._fall(part, None)
         ways.append(math.hypot(part.x - 0.1, part.y))
     assert 0.0 < ways[0] < ways[1]

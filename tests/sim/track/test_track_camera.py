@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from petrobot.sim.track.camera import Motion, Mount, RoverCamera
 from petrobot.sim.track.course import Track
 from petrobot.sim.track.floor import Floor
-from petrobot.sim.track.laboratory import Hall
+from petrobot.sim.track.laboratory import TrackLight
 from petrobot.sim.track.truth import LightTruth, TrackSite
 
 NOMINAL = Mount(0.10, 0.60, 0.663, 0.0, 0.0, 140.0, (79.5, 59.5), 160, 120)
@@ -188,9 +188,9 @@ def test_the_same_draws_give_the_same_image(floor: Floor) -> None:
 # Light
 
 
-def hall(seed: int = 1, **changes: Any) -> Hall:
+def hall(seed: int = 1, **changes: Any) -> TrackLight:
     nominal = LightTruth(1.0, 0.0, 10.0, 0.0, (0.05, 0.15), 2.0, 50.0, 1.0)
-    return Hall(replace(nominal, **changes), np.random.default_rng(seed), 3.0)
+    return TrackLight(replace(nominal, **changes), np.random.default_rng(seed), 3.0)
 
 
 def test_light_drifts_slowly_around_its_level() -> None:

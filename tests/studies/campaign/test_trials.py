@@ -22,14 +22,14 @@ from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial, TrialL
 from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.file import load
 from petrobot.services.action import Status as ActionStatus
-from petrobot.services.scripted import Line
+from petrobot.services.scripted import ScriptedRun
 from tests.run.scripted_cell import directory_for, scripts
 from tests.studies.campaign.conftest import TASK
 
 TOY = load(TASK)
 
 
-def logged(lines: dict[str, list[Line]], runs: int = 3) -> tuple[TrialLog, Mission]:
+def logged(lines: dict[str, list[ScriptedRun]], runs: int = 3) -> tuple[TrialLog, Mission]:
     """Return trials of catch_ball with scripted actions."""
     task = load_task("catch_ball")
     cell, party = lockstep_cell(directory_for(task), Setting(task, runs=runs), scripts(task, lines))
@@ -43,7 +43,7 @@ def test_a_trial_lists_its_runs_and_the_transitions_that_took_them() -> None:
     """Durations count from the arrival of the token; parallel runs are both listed; the trial ends
     when all tokens are back."""
     log, _ = logged(
-        {"locate_ball": [Line(seconds=(0.4, 0.4), values={"ball": [0.0], "images": 20})]}
+        {"locate_ball": [ScriptedRun(seconds=(0.4, 0.4), values={"ball": [0.0], "images": 20})]}
     )
     assert len(log.trials) == 3
     trial = log.trials[0]
@@ -74,8 +74,10 @@ def test_a_trial_lists_its_runs_and_the_transitions_that_took_them() -> None:
 
 def test_an_error_branch_belongs_to_its_trial() -> None:
     """Recovery is part of the trial that needed it, not of the next one."""
-    bad = Line(ActionStatus.ERROR, (0.1, 0.1), cause="unreachable", text="too far")
-    log, _ = logged({"move_to_point": [bad, Line(seconds=(0.2, 0.2)), Line(seconds=(0.2, 0.2))]})
+    bad = ScriptedRun(ActionStatus.ERROR, (0.1, 0.1), cause="unreachable", text="too far")
+    log, _ = logged(
+        {"move_to_point": [bad, ScriptedRun(seconds=(0.2, 0.2)), ScriptedRun(seconds=(0.2, 0.2))]}
+    )
     first, second, _ = log.trials
     assert (first.status, first.cause) == ("error", "unreachable")
     assert first.fired["recovered"] == first.fired["arm_back"] == 1
@@ -85,7 +87,7 @@ def test_an_error_branch_belongs_to_its_trial() -> None:
 
 def test_giving_up_leaves_later_trials_unstarted() -> None:
     """The last trial was started but not completed; later ones were not started."""
-    dead = [Line(ActionStatus.ERROR, (0.1, 0.1), cause="drive_fault")]
+    dead = [ScriptedRun(ActionStatus.ERROR, (0.1, 0.1), cause="drive_fault")]
     log, mission = logged({"move_to_point": dead, "recover_arm": dead}, runs=4)
     assert len(log.trials) == 1 < mission.runs
     assert not log.trials[0].completed and log.trials[0].time is None

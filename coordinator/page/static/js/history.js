@@ -5,7 +5,7 @@ import { attribute, fill, h, Press, seconds, text, words } from "./dom.js";
 import { listRuns, openRun } from "./files.js";
 import { icon } from "./icons.js";
 import { reasonText } from "./live.js";
-import { departDialog } from "./start.js";
+import { simulateDialog } from "./start.js";
 import { alarms, drawnOn, sheetOf, tokensOf, trailOf } from "./sheet.js";
 
 const SESSION = "(this run)";
@@ -324,7 +324,7 @@ export class History {
     const { run, records } = this.reel;
     const record = this.index ? records[this.index - 1] : null;
     const labelOf = (place) => words(run.task.places.find((p) => p.name === place)?.label || place);
-    departDialog(run, record?.number ?? 0, record?.going ?? [], labelOf, async (data) => {
+    simulateDialog(run, record?.number ?? 0, record?.going ?? [], labelOf, async (data) => {
       const answer = await this.operator.give("start", data, false, true);
       if (answer.ok) location.hash = "#Live";
       return answer;

@@ -125,7 +125,7 @@ class LearningPart {
 }
 
 /** A simulated run from a record: how the actions that were active then continue. */
-export function departDialog(run, record, going, labelOf, send) {
+export function simulateDialog(run, record, going, labelOf, send) {
   const chosen = going.map((place) => [place, select(`Run in ${labelOf(place)}`, GOING, "again")]);
   const seed = whole("Seed", run.seed, 0);
   const pace = select("Pace", PACE, "1");

@@ -17,7 +17,7 @@ from petrobot.coordinator.cli.loading import write_json
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.client import OperatorClient
-    from petrobot.coordinator.operator.door_file import Door
+    from petrobot.coordinator.operator.run_address import RunAddress
 
 Answer = dict[str, Any]
 BAD_INPUT = frozenset({"bad_data", "unknown", "unknown_command"})
@@ -73,8 +73,8 @@ def give(
 ) -> int:
     """Give one command and print its answer. Return 0, or 1 if it was refused.
 
-    `data(hand)` makes the command's data once the snapshot has arrived; `told(hand, answer)` makes
-    the text that is printed when the command was accepted.
+    `data(client)` makes the command's data once the snapshot has arrived; `told(client, answer)`
+    makes the text that is printed when the command was accepted.
     """
     return asyncio.run(_give(options, verb, data, told))
 
@@ -88,21 +88,22 @@ async def _give(
     from petrobot.coordinator.operator.client import OperatorError
     from petrobot.coordinator.operator.port import FREE
 
-    door = find(options)
+    address = find(options)
     try:
-        async with connect(door, options.name) as hand:
-            given = data(hand) if data is not None else {}
+        async with connect(address, options.name) as client:
+            given = data(client) if data is not None else {}
             if verb not in FREE:
-                await take_controls(hand, options.take)
-            answer = await hand.command(verb, given)
+                await take_controls(client, options.take)
+            answer = await client.command(verb, given)
             if not answer.get("ok"):
                 raise CommandError(
-                    2 if answer.get("code") in BAD_INPUT else 1, f"{door.run}: {answer.get('text')}"
+                    2 if answer.get("code") in BAD_INPUT else 1,
+                    f"{address.run}: {answer.get('text')}",
                 )
-            text = await told(hand, answer) if told is not None else "done"
+            text = await told(client, answer) if told is not None else "done"
     except OperatorError as fault:
-        raise CommandError(3, f"{door.run}: {fault}") from fault
-    show(options, {"run": door.run, "verb": verb, **answer}, text)
+        raise CommandError(3, f"{address.run}: {fault}") from fault
+    show(options, {"run": address.run, "verb": verb, **answer}, text)
     return 0
 
 
@@ -114,25 +115,25 @@ def show(options: argparse.Namespace, answer: Mapping[str, Any], text: str) -> N
         print(f"{answer['run']}: {text}")
 
 
-def find(options: argparse.Namespace) -> Door:
-    """Return the door of the run that the options name."""
-    from petrobot.coordinator.operator.door_file import find_door
+def find(options: argparse.Namespace) -> RunAddress:
+    """Return the address of the run that the options name."""
+    from petrobot.coordinator.operator.run_address import find_address
     from petrobot.coordinator.run.folder import NoRunError
 
     try:
-        return find_door(options.run, options.journal)
+        return find_address(options.run, options.journal)
     except NoRunError as fault:
         raise CommandError(2, str(fault)) from fault
 
 
-def connect(door: Door, name: str | None) -> OperatorClient:
+def connect(address: RunAddress, name: str | None) -> OperatorClient:
     """Return a client of the run. Commands under the same name are of the same operator, who keeps
     the controls for 10 s after each."""
     from petrobot.coordinator.operator.client import OperatorClient
 
     name = name or user_name()
-    secret = hmac.digest(door.token.encode(), f"operator {name}".encode(), hashlib.sha256).hex()
-    return OperatorClient(door.url, door.token, name, secret)
+    secret = hmac.digest(address.token.encode(), f"operator {name}".encode(), hashlib.sha256).hex()
+    return OperatorClient(address.url, address.token, name, secret)
 
 
 def user_name() -> str:
@@ -143,17 +144,17 @@ def user_name() -> str:
         return "operator"
 
 
-async def take_controls(hand: OperatorClient, wait: float | None) -> None:
+async def take_controls(client: OperatorClient, wait: float | None) -> None:
     """Take the controls, or ask for them and wait `wait` seconds. Raises CommandError (1) if
     another operator keeps them."""
-    answer = await hand.command("take_controls")
+    answer = await client.command("take_controls")
     if answer.get("ok"):
         return
-    holder = hand.state["controls"]["holder"]
+    holder = client.state["controls"]["holder"]
     if wait is None:
         raise CommandError(1, f"{holder} holds the controls; ask for them with --take")
-    await hand.command("ask_controls")
-    if not await hand.until(lambda state: bool(state["controls"]["holder"] == hand.who), wait):
+    await client.command("ask_controls")
+    if not await client.until(lambda state: bool(state["controls"]["holder"] == client.who), wait):
         raise CommandError(1, f"{holder} did not hand over the controls within {wait:g} s")
 
 

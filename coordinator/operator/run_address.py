@@ -15,11 +15,11 @@ from petrobot.coordinator.run.folder import DEFAULT, NoRunError, journal_of
 from petrobot.services.host.json_text import json_text
 from petrobot.services.host.whole_file import make_folder, write_whole
 
-DOOR = "operator.json"
+ADDRESS_FILE = "operator.json"
 
 
 @dataclass(frozen=True, slots=True)
-class Door:
+class RunAddress:
     """Address of the coordinator of a mission run."""
 
     run: str
@@ -33,48 +33,49 @@ class Door:
 
 
 @contextmanager
-def door_open(folder: Path, door: Door) -> Iterator[Path]:
+def published(folder: Path, address: RunAddress) -> Iterator[Path]:
     """Keep the address in a run folder as long as the run can be controlled; only its owner may
     read it (mode 600)."""
-    path = folder / DOOR
+    path = folder / ADDRESS_FILE
     make_folder(folder)
-    write_whole(path, json_text(asdict(door)), mode=0o600)
+    write_whole(path, json_text(asdict(address)), mode=0o600)
     try:
         yield path
     finally:
         path.unlink(missing_ok=True)
 
 
-def find_door(name: str | None = None, folder: Path = DEFAULT) -> Door:
-    """Return the door of the named mission run (None: the newest active one). Raises NoRunError."""
+def find_address(name: str | None = None, folder: Path = DEFAULT) -> RunAddress:
+    """Return the address of a mission run (None: of the newest active one). Raises
+    NoRunError."""
     if name is not None:
         run = journal_of(name, folder).parent
-        door = _read(run / DOOR)
-        if door is None:
+        address = _read(run / ADDRESS_FILE)
+        if address is None:
             raise NoRunError(f"{run.name} is not active: only an active run can be controlled")
-        return door
-    doors = [door for path in _newest_first(folder) if (door := _read(path)) is not None]
-    if not doors:
+        return address
+    addresses = [address for path in _newest_first(folder) if (address := _read(path)) is not None]
+    if not addresses:
         raise NoRunError(
             f"no run in {folder} is active; start one with `petrobot run`, or name its folder "
             "with --journal"
         )
-    return doors[0]
+    return addresses[0]
 
 
 def _newest_first(folder: Path) -> list[Path]:
     found: list[tuple[float, Path]] = []
-    for path in folder.glob(f"*/{DOOR}"):
+    for path in folder.glob(f"*/{ADDRESS_FILE}"):
         with contextlib.suppress(OSError):
             found.append((path.stat().st_mtime, path))
     return [path for _, path in sorted(found, reverse=True)]
 
 
-def _read(path: Path) -> Door | None:
-    """Return the door in a file; None if there is none, or if its coordinator has ended."""
+def _read(path: Path) -> RunAddress | None:
+    """Return the address in a file; None if there is none, or if its coordinator has ended."""
     try:
-        door = Door(**json.loads(path.read_text(encoding="utf-8")))
-        os.kill(door.process, 0)
+        address = RunAddress(**json.loads(path.read_text(encoding="utf-8")))
+        os.kill(address.process, 0)
     except (OSError, ValueError, TypeError):
         return None
-    return door
+    return address

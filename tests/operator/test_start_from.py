@@ -15,12 +15,8 @@ from hypothesis import strategies as st
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.engine import Engine, Phase
-from petrobot.coordinator.operator.session import (
-    RecordedPoint,
-    RunRequest,
-    RunSession,
-    prepare_from,
-)
+from petrobot.coordinator.operator.prepare import RecordedPoint, RunRequest, prepare_from
+from petrobot.coordinator.operator.session import RunSession
 from petrobot.coordinator.operator.start_from import ENDS, DepartureError, read_recorded
 from petrobot.coordinator.run.folder import JOURNAL
 from petrobot.coordinator.run.journal import Journal, read_journal
@@ -28,7 +24,7 @@ from petrobot.coordinator.run.recording import replay
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import load
 from petrobot.services.comm.location_file import Directory, parse
-from tests.run.test_runfolder import SCRIPT, SERVICES
+from tests.run.test_folder import SCRIPT, SERVICES
 
 TASK = Path(__file__).parents[1] / "chaos" / "shuttle.toml"
 

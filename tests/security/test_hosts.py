@@ -19,13 +19,13 @@ import pytest
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.launch import local_programs
-from petrobot.coordinator.operator.door_file import DOOR
+from petrobot.coordinator.operator.run_address import ADDRESS_FILE
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.services.comm.location_file import parse
 from petrobot.services.comm.protocol.security import new_key, write_key
 from petrobot.services.comm.tls.certificates import make_certificates
-from tests.doors.arm_cell import ROOT, cell_in
-from tests.doors.conftest import KEY, Victim
+from tests.security.arm_cell import ROOT, cell_in
+from tests.security.conftest import KEY, Victim
 from tests.waiting import Limit, beat
 
 pytestmark = pytest.mark.processes
@@ -225,7 +225,7 @@ class Guarded:
         own = {
             path
             for path in self.folder.rglob("*")
-            if path.suffix == ".key" or path.name.startswith(DOOR)
+            if path.suffix == ".key" or path.name.startswith(ADDRESS_FILE)
         }
         outputs |= {
             str(path): path.read_bytes()
@@ -269,7 +269,7 @@ async def test_a_guarded_cell_works_and_keeps_its_secrets(tmp_path: Path, how: s
     async def look_for_token(done: asyncio.Future[Any]) -> None:
         limit = Limit("the page's token")
         while not done.done() and not token and limit.left():
-            for path in tmp_path.glob(f"runs/*/{DOOR}"):
+            for path in tmp_path.glob(f"runs/*/{ADDRESS_FILE}"):
                 token["page token"] = json.loads(path.read_text())["token"]
             await beat(0.01)
 

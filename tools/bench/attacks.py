@@ -1,8 +1,8 @@
 """Measure what attacks cost a node: its memory, and how long the calls of an honest client take
 meanwhile.
 
-    python tools/bench/doors.py
-    python tools/bench/doors.py --json out.json
+    python tools/bench/attacks.py
+    python tools/bench/attacks.py --json out.json
 
 The server is a process of its own; the attackers are other processes (for connections) or this one.
 *Grown*: the increase of the server's largest resident set (VmHWM) since its start. The honest
@@ -32,8 +32,8 @@ from tools.bench.processes import quantile
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.tls.certificates import make_certificates
-from tests.doors.conftest import KEY, MIB, Stranger, Victim, frame
-from tests.doors.test_attacks import STRANGE, _bombard, _flood, crowd_at
+from tests.security.conftest import KEY, MIB, Stranger, Victim, frame
+from tests.security.test_attacks import STRANGE, _bombard, _flood, crowd_at
 
 CROWD = 10_000
 LEAST = 200

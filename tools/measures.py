@@ -1,8 +1,8 @@
-"""Measure the house: sizes, names, comments and the files on the main path, as a Markdown table.
+"""Measure the source: sizes, names, comments and the files on the main path, as a Markdown table.
 
-    python -m tools.house                 of this checkout
-    python -m tools.house REVISION ...    of revisions beside it (read from git's history)
-    python -m tools.house --walk          which files one run of an action really passes
+    python -m tools.measures                 of this checkout
+    python -m tools.measures REVISION ...    of revisions beside it (read from git's history)
+    python -m tools.measures --walk          which files one run of an action really passes
 
 Code lines are lines that are neither blank, comment nor docstring. A file serves one other file if
 exactly one module imports it; commands of the command line, `__main__` and package files, which are
@@ -14,6 +14,7 @@ process between two firings.
 
 from __future__ import annotations
 
+import argparse
 import ast
 import io
 import itertools
@@ -47,7 +48,7 @@ class Measures:
     comments: int = 0
     long: int = 0
     lines: int = 0
-    rooms: set[str] = field(default_factory=set)
+    folders: set[str] = field(default_factory=set)
     classes: Counter[str] = field(default_factory=Counter)
     serving_one: int = 0
     tests: int = 0
@@ -57,7 +58,7 @@ class Measures:
         repeated = sum(1 for count in self.classes.values() if count > 1)
         return [
             ("code lines / files", f"{sum(self.code) / 1000:.1f}k / {self.files}"),
-            ("rooms (folders with modules)", str(len(self.rooms))),
+            ("folders with modules", str(len(self.folders))),
             ("file, median / most (code lines)", _median_most(self.code)),
             ("function, median / most (code lines)", _median_most(self.functions)),
             ("comment lines per 100 code lines", f"{100 * self.comments / sum(self.code):.1f}"),
@@ -104,7 +105,7 @@ def measure(root: Path) -> Measures:
         found.comments += sum(1 for line in text.splitlines() if line.lstrip().startswith("#"))
         found.lines += text.count("\n")
         found.long += sum(1 for line in text.splitlines() if len(line) > COLUMNS)
-        found.rooms.add(str(path.parent))
+        found.folders.add(str(path.parent))
         for node in ast.walk(tree):
             if isinstance(node, ast.ClassDef):
                 found.classes[node.name] += 1
@@ -218,9 +219,15 @@ def at_revision(revision: str) -> Measures:
 
 def main() -> int:
     """Print the table, or the walk."""
-    if sys.argv[1:] == ["--walk"]:
+    parser = argparse.ArgumentParser(description="Measure the source.")
+    parser.add_argument("revisions", nargs="*", metavar="REVISION", help="compare with these")
+    parser.add_argument(
+        "--walk", action="store_true", help="list the files that one run of an action passes"
+    )
+    options = parser.parse_args()
+    if options.walk:
         return walk()
-    columns = {revision: at_revision(revision).rows() for revision in sys.argv[1:]}
+    columns = {revision: at_revision(revision).rows() for revision in options.revisions}
     columns["now"] = measure(ROOT).rows()
     print("| | " + " | ".join(columns) + " |")
     print("|---|" + "---|" * len(columns))

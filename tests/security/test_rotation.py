@@ -14,9 +14,9 @@ import pytest
 from petrobot.services.comm.location_file import DirectoryError, parse
 from petrobot.services.comm.protocol.security import new_key, write_key
 from petrobot.services.comm.tls.certificates import make_certificates
-from tests.doors.test_streams import GuardedOperator
 from tests.node.test_processes import CELL, PATIENCE, start_node
 from tests.ports import free_ports
+from tests.security.test_streams import GuardedOperator
 
 pytestmark = pytest.mark.processes
 PASSES = {

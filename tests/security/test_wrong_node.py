@@ -17,9 +17,9 @@ from pathlib import Path
 import pytest
 
 from petrobot.services.comm.protocol.security import new_key, write_key
-from tests.doors.test_estop import finished, petrobot
 from tests.node.test_processes import Nodes
 from tests.ports import free_ports
+from tests.security.test_estop import finished, petrobot
 
 pytestmark = pytest.mark.processes
 HOST = "127.0.0.1"

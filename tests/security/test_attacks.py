@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.wire import Connection, ProtocolError, Side
 from tests.comm.ends import head
-from tests.doors.conftest import HELLO, KEY, MIB, GoodClient, Stranger, Victim, frame
+from tests.security.conftest import HELLO, KEY, MIB, GoodClient, Stranger, Victim, frame
 from tests.waiting import Limit, beat
 
 pytestmark = pytest.mark.processes
@@ -321,9 +321,9 @@ async def crowd_at(server: Victim, count: int) -> Any:
         crowd.communicate()
 
 
-@pytest.mark.parametrize("door", ["plain", "sealed", "TLS"])
+@pytest.mark.parametrize("link", ["plain", "sealed", "TLS"])
 async def test_ten_thousand_connections(
-    victim: Start, door: str, certificates: Path, many_files: None
+    victim: Start, link: str, certificates: Path, many_files: None
 ) -> None:
     """Connections, descriptors and memory stay bounded; connected clients are served all the time,
     and a new one can connect."""
@@ -331,7 +331,7 @@ async def test_ten_thousand_connections(
         "plain": {},
         "sealed": {"key": KEY.hex()},
         "TLS": {"folder": str(certificates)},
-    }[door]
+    }[link]
     server = victim(**how)
     async with server.good_client() as good, crowd_at(server, 10_000) as crowd:
         assert crowd.stdout is not None
@@ -345,7 +345,7 @@ async def test_ten_thousand_connections(
         async with _second(server) as second:
             await second.still_served()
         await good.still_served()
-    assert server.grown() < (TOLERATED if door != "TLS" else 64 * MIB)
+    assert server.grown() < (TOLERATED if link != "TLS" else 64 * MIB)
 
 
 async def test_an_address_that_fails_too_often_is_cut_off(victim: Start) -> None:
@@ -545,7 +545,7 @@ import sys, pathlib
 sys.path.insert(0, {root!r})
 import atheris
 with atheris.instrument_imports(include=["petrobot.services.comm"]):
-    from tests.doors.test_attacks import beginnings, feed
+    from tests.security.test_attacks import beginnings, feed
 for number, data in enumerate(beginnings()):
     pathlib.Path({corpus!r}, str(number)).write_bytes(data)
 limits = ["-max_total_time={seconds}", "-max_len=4096", "-rss_limit_mb=1024"]

@@ -14,9 +14,9 @@ import pytest
 from petrobot.coordinator.launch import local_programs
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.services.comm.canopen.cia402 import DriveFault, DriveState, state_of
-from tests.doors.arm_cell import DRIVES, cell_in, ear_on
-from tests.doors.test_estop import LIMIT, Cell
 from tests.processes import below, kill
+from tests.security.arm_cell import DRIVES, cell_in, ear_on
+from tests.security.test_estop import LIMIT, Cell
 
 pytestmark = pytest.mark.processes
 DRIVE_EDS = str(files("petrobot.services.comm.canopen.eds").joinpath("joint_drive.eds"))

@@ -21,7 +21,7 @@ from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.security import KeyFileError
 from petrobot.services.comm.tls.certificates import CertificateError, make_certificates
 from petrobot.services.comm.tls.credentials import Credentials, may_speak_as
-from tests.doors.conftest import HELLO, Victim
+from tests.security.conftest import HELLO, Victim
 from tests.waiting import beat
 
 pytestmark = pytest.mark.processes

@@ -18,14 +18,14 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.launch import local_programs
-from petrobot.coordinator.operator.door_file import find_door
 from petrobot.coordinator.operator.emergency_stop import still_stopped
+from petrobot.coordinator.operator.run_address import find_address
 from petrobot.coordinator.run.folder import NoRunError
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.services.comm.canopen.cia301 import NmtState
 from petrobot.services.comm.canopen.cia402 import DriveState
 from petrobot.services.comm.location_file import Directory
-from tests.doors.arm_cell import DRIVES, ROOT, Ear, cell_in, ear_on
+from tests.security.arm_cell import DRIVES, ROOT, Ear, cell_in, ear_on
 from tests.waiting import Limit, beat
 
 pytestmark = pytest.mark.processes
@@ -225,7 +225,7 @@ async def test_estop_without_nodes_says_so(tmp_path: Path) -> None:
     code, out, _ = await finished(petrobot("estop", *services))
     assert code == 3 and "NO ANSWER" in out and "no CAN hub" in out
     with pytest.raises(NoRunError):
-        find_door(folder=tmp_path)
+        find_address(folder=tmp_path)
 
 
 async def test_a_stop_is_cleared_while_its_node_does_not_run(tmp_path: Path) -> None:
