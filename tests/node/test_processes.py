@@ -548,7 +548,7 @@ BAD = [
     ),
     (
         "period = 0.02\nspeed",
-        "pace = 1",
+        "pace = 1\nspeed",
         "devices.slide: toy_cell.drivers:Slide refuses it: is missing 'period'",
     ),
     ('host = "127.0.0.1"\nport = {left}', 'host = "0.0.0.0"\nport = {left}', "petrobot keys"),
