@@ -38,9 +38,8 @@ def make_driver(directory: Directory, device: DeviceEntry, ports: Ports) -> Driv
         ) from fault
     except (KeyError, TypeError, ValueError) as fault:
         told = f"is missing {fault}" if isinstance(fault, KeyError) else str(fault)
-        raise DirectoryError(
-            (f"{here}: {device.driver} refuses it: {told}; correct its table or the driver",)
-        ) from fault
+        remedy = "correct the keys of this table, or the driver"
+        raise DirectoryError((f"{here}: {device.driver} refuses it: {told}; {remedy}",)) from fault
     except Exception as fault:  # not a bad key, which raises one of the above, but a bug
         _log.exception("device %s: its driver cannot be made", device.name)
         raise DirectoryError(
