@@ -282,7 +282,8 @@ async def test_events_progress_and_pulses(operator: Operator) -> None:
 async def test_a_cyclic_device_moves_and_is_paced(operator: Operator) -> None:
     end = await operator.call("go", to=0.8)
     assert end.status == "success" and end.values["position"] == pytest.approx(0.8)
-    assert end.seconds >= 0.19, "4 m/s is the slide's limit"
+    # ten periods at 4 m/s; the first has begun already, and a late one is followed by a short one
+    assert end.seconds >= 0.15, "4 m/s is the slide's limit"
     began, first = time.monotonic(), await cycles(operator)
 
     async def went_on() -> bool:
