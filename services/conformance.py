@@ -63,6 +63,7 @@ def check_driver(
     seconds: float = 5.0,
     within: float = 1.0,
     cable: Callable[[bool], None] | None = None,
+    positions: Sequence[str] = (),
     simulated: bool = False,
 ) -> DriverCheck:
     """Check a driver. `make()` makes a new one each time; `make(speed=0.25)` adds this key to the
@@ -71,13 +72,14 @@ def check_driver(
     `commands` are two or more that move to different positions, each in at most `seconds`,
     preferably in more than `within`; `first` are those that a new driver needs before them, to
     switch its drives on. The device must stand still `within` s after `stop`. `cable(False)` pulls
-    the device's cable, `cable(True)` puts it back. `simulated`: time passes only between two steps,
-    for a driver whose device is simulated by its steps; the check then takes milliseconds. A driver
-    that was made with ports None gets ports with a clock, `random`, `raise_event` and silent
-    streams.
+    the device's cable, `cable(True)` puts it back. `positions` are the keys of the state that tell
+    where the device is; without them, all numbers that the commands change. `simulated`: time
+    passes only between two steps, for a driver whose device is simulated by its steps; the check
+    then takes milliseconds. A driver that was made with ports None gets ports with a clock,
+    `random`, `raise_event` and silent streams.
     """
     clock: Any = _Clock() if simulated else time
-    check = _Check(_with_ports(make, clock.monotonic), clock, within, first)
+    check = _Check(_with_ports(make, clock.monotonic), clock, within, first, positions)
     try:
         check.rules(commands, seconds, cable)
     except Exception as fault:
@@ -109,6 +111,7 @@ def check_device(
     first: Sequence[Command] = (),
     seconds: float = 5.0,
     within: float = 1.0,
+    positions: Sequence[str] = (),
 ) -> DriverCheck:
     """Check the driver of a device of a location file, in this process and in real time. Raises
     ValueError when there is none, or when it cannot be made."""
@@ -127,7 +130,9 @@ def check_device(
         ports.draws.reseed(0)
         return driver
 
-    return check_driver(make, commands, first=first, seconds=seconds, within=within)
+    return check_driver(
+        make, commands, first=first, seconds=seconds, within=within, positions=positions
+    )
 
 
 class _Clock:
@@ -152,8 +157,9 @@ class _Check:
         clock: Any,
         within: float,
         first: Sequence[Command],
+        positions: Sequence[str],
     ) -> None:
-        self.make, self.within, self.first = make, within, first
+        self.make, self.within, self.first, self.positions = make, within, first, positions
         self.now: Callable[[], float] = clock.monotonic
         self.sleep: Callable[[float], None] = clock.sleep
         self.found = DriverCheck()
@@ -176,12 +182,16 @@ class _Check:
         self.found.notes.append(f"not checked: {text}")
 
     def numbers(self) -> dict[str, float]:
-        """Return the numbers of the state, by path."""
+        """Return the numbers of the state that may tell where the device is, by path."""
         try:
             state = plain(self.driver.state(), "state")
         except Exception as fault:
             self.fault(f"state: expected plain data, got {type(fault).__name__}: {fault}")
             return {}
+        if missing := [key for key in self.positions if key not in state]:
+            self.fault(f"state: no {', '.join(missing)}, which should tell where it is")
+        elif self.positions:
+            state = {key: state[key] for key in self.positions}
         return dict(_leaves(state, ""))
 
     def step(self) -> dict[str, float]:

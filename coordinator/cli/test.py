@@ -41,6 +41,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a command that a new driver needs before those, to switch its drives on",
     )
     parser.add_argument(
+        "--position",
+        dest="positions",
+        action="append",
+        default=[],
+        metavar="KEY",
+        help="a key of the state that tells where the device is (default: all numbers that the "
+        "commands change)",
+    )
+    parser.add_argument(
         "--seconds",
         type=number(least=0.1),
         default=5.0,
@@ -80,6 +89,7 @@ def run(options: argparse.Namespace) -> int:
             first=options.first,
             seconds=options.seconds,
             within=options.within,
+            positions=options.positions,
         )
     except DirectoryError as fault:  # it names the device itself
         raise CommandError(2, str(fault)) from fault

@@ -80,6 +80,20 @@ def test_a_driver_without_ports_may_draw_read_a_stream_and_raise_events() -> Non
     assert checked(Notices).faults == []
 
 
+class Ages(Axis):
+    """Its state has a number that grows with time, also while it stands, once it has moved."""
+
+    def state(self) -> Mapping[str, Any]:
+        return {**super().state(), "age": 0.001 * self.cycles if self.at else 0.0}
+
+
+def test_the_positions_may_be_named() -> None:
+    """Else a number that changes after a command counts as one."""
+    assert checked(Ages).faults
+    assert checked(Ages, positions=["axis"]).faults == []
+    assert "state: no pose" in "; ".join(checked(Ages, positions=["pose"]).faults)
+
+
 class NeverStops(Axis):
     def stop(self, now: float) -> None:
         pass
