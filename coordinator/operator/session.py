@@ -19,7 +19,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -127,8 +127,9 @@ class RunSession(ABC):
         self._led = True
         _log.info("run %s: started (%s, task %s)", self.identity, self.mode, self._task.name)
         try:
-            address = self.folder is not None and self.address is not None
-            with published(self.folder, self.address) if address else nullcontext():  # type: ignore[arg-type]
+            with ExitStack() as until_ended:
+                if self.folder is not None and self.address is not None:
+                    until_ended.enter_context(published(self.folder, self.address))
                 await self._lead(watch)
         except BaseException as fault:
             _log.info("run %s: stopped by %s: %s", self.identity, type(fault).__name__, fault)

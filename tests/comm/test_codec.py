@@ -382,7 +382,7 @@ def test_a_value_that_takes_long_to_read_is_neither_sent_nor_accepted(value: Any
 
 
 def test_a_result_may_have_more_values_than_a_call() -> None:
-    """Only its caller decodes it."""
+    """The score of a long mission run is one."""
     long = m.Outcome("c", "success", {"v": [1] * 500_000}, "", "", Executed.YES, 0.0, 0.0)
     assert decode(encode(long)) == long
     with pytest.raises(ProtocolError, match=r"too_large: a Outcome: more than 524288 values"):

@@ -169,9 +169,11 @@ def simulate(
     if goal is None and not horizon < np.inf:
         raise ValueError("a simulation needs a horizon (s) or a goal")
     if engine == "numba":
-        return _compiled(
-            gspn, random, replicas, horizon, warmup, goal, firings, confidence, progress
-        )
+        if goal is not None or lost is not None or not horizon < np.inf:
+            raise ValueError(
+                "the engine 'numba' plays to a horizon; take the engine 'numpy' for a goal"
+            )
+        return _compiled(gspn, random, replicas, horizon, warmup, firings, confidence, progress)
     play = _Play(gspn, random, replicas, horizon, warmup, goal, lost)
     try:
         while len(play.alive) and play.fired < firings:
@@ -189,7 +191,6 @@ def _compiled(
     replicas: int,
     horizon: float,
     warmup: float,
-    goal: Stop | None,
     firings: int,
     confidence: float,
     progress: Callable[[int, float], None] | None,
@@ -201,10 +202,6 @@ def _compiled(
     if plain(play) is play:
         raise ImportError(
             "the engine 'numba' needs numba: install petrobot[fast], or take the engine 'numpy'"
-        )
-    if goal is not None or not horizon < np.inf:
-        raise ValueError(
-            "the engine 'numba' plays to a horizon; take the engine 'numpy' for a goal"
         )
     tables, initial = Tables.of(gspn), np.array(gspn.net.initial, dtype=np.int64)
     fires = np.zeros((replicas, len(gspn.net.transitions)))

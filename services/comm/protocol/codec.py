@@ -259,7 +259,8 @@ Together with the limit of bytes it bounds how long other callers wait while one
 about 30 ms at worst.
 """
 MAX_VALUES_OF_OUTCOME = 1 << 19
-"""The same for a result: only its caller decodes it, and the score of a long mission run is one."""
+"""The same for a result, since the score of a long mission run is one. The worst that was tried
+takes a node 40 ms from its worker to the caller, and the caller 25 ms (2-core PC)."""
 ENTRY = 6
 """How many values one entry of a map counts as: its key must be checked, hashed and inserted."""
 MAX_CONTAINERS_OF_TICK = 100_000
