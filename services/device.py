@@ -84,9 +84,9 @@ class Ports(Protocol):
     def random(self, purpose: str) -> np.random.Generator:
         """Return the random generator of (seed of the mission run, device, purpose).
 
-        The seed comes with the first action of the mission run, so ask for the generator where you
-        draw and do not keep it; before any mission run the seed is 0. Raises ValueError while the
-        driver is being made.
+        The seed comes with the device's first action of the mission run, or, if no action uses the
+        device, when the mission run begins. So ask for the generator where you draw and do not keep
+        it; before any mission run the seed is 0. Raises ValueError while the driver is being made.
         """
 
     def file(self, path: str) -> bytes:

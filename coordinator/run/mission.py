@@ -28,7 +28,14 @@ from petrobot.coordinator.task.net import Marking
 from petrobot.services.comm.calls.caller import Caller, Notice, PeerLost
 from petrobot.services.comm.calls.events import RunVerdict
 from petrobot.services.comm.location_file import Directory, DirectoryError
-from petrobot.services.comm.protocol.messages import Call, Feedback, Outcome, Welcome
+from petrobot.services.comm.protocol.messages import (
+    SEED,
+    Call,
+    Command,
+    Feedback,
+    Outcome,
+    Welcome,
+)
 
 _log = logging.getLogger(__package__)
 MOST_TOLD = 20_000
@@ -282,7 +289,7 @@ class Mission:
     def take(self, now: float, node: str, notices: Sequence[Notice]) -> None:
         """Handle what a node's caller noticed. Notices wait until every node is connected: a
         mission never starts with a part of its nodes."""
-        self._note_links(node, notices)
+        self._note_links(now, node, notices)
         if self.stage is Stage.CONNECTING:
             self._early.extend(
                 (node, notice) for notice in notices if not isinstance(notice, Welcome | PeerLost)
@@ -420,13 +427,21 @@ class Mission:
             store.sync()
             self.score, self.stage = score, Stage.OVER
 
-    def _note_links(self, node: str, notices: Sequence[Notice]) -> None:
+    def _note_links(self, now: float, node: str, notices: Sequence[Notice]) -> None:
         for notice in notices:
             if isinstance(notice, PeerLost):
                 self.lost[node] = notice.reason
             elif isinstance(notice, Welcome):
                 self.lost.pop(node, None)
                 self.executor.store.record(NODE, {"node": node, "boot": notice.boot})
+                self._send_seed(now, node)
+
+    def _send_seed(self, now: float, node: str) -> None:
+        """Tell the seed to the devices that no call reaches."""
+        if self.executor.directory.without_actions(node):
+            seed = {SEED: self.executor.seed}
+            command = Command(f"{self.executor.mission}/{SEED}", SEED, data=seed)
+            self.callers[node].command(now, command)
 
 
 def _verdicts(said: Any) -> list[RunVerdict]:

@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from petrobot.services.action import Status
 from petrobot.services.comm.location_file import ActionEntry
 from petrobot.services.comm.protocol.messages import (
+    SEED,
     Answer,
     Call,
     Cancel,
@@ -115,7 +117,10 @@ class InlineHost:
         if self._cyclic is not None:
             self._remote.expect(self._cyclic.state)
         self._commands: list[DeviceCommand] = []
-        self._next_step: float | None = None
+        # In lock step a device without actions waits for the mission's seed before its first step,
+        # so that what it draws there differs between missions, too.
+        unseeded = virtual and reseed is not None and not actions
+        self._next_step: float | None = math.inf if unseeded else None
         self._told: list[Report] = []
         self._runner = Runner(
             actions,
@@ -159,7 +164,7 @@ class InlineHost:
         """Carry out an operator's command at once."""
         if not self.failed:
             try:
-                word, data = self._carry_out(now, command.verb)
+                word, data = self._carry_out(now, command.verb, command.data)
                 self._told.append(answer_of(command.id, word, data))
                 return
             except Exception as fault:
@@ -186,8 +191,15 @@ class InlineHost:
             with contextlib.suppress(Exception):
                 stop_at_once(driver, now)
 
-    def _carry_out(self, now: float, verb: str) -> tuple[str, Mapping[str, Any]]:
+    def _carry_out(
+        self, now: float, verb: str, data: Mapping[str, Any] | None = None
+    ) -> tuple[str, Mapping[str, Any]]:
         driver = self._driver
+        if verb == SEED:
+            if self._reseed is not None and data:
+                self._reseed(data[SEED])
+                self._next_step = None if self._next_step == math.inf else self._next_step
+            return "seeded", {}
         if verb == "hold":
             answer = driver.hold(now) if driver else "held"
             if answer != "cannot hold":
@@ -209,11 +221,11 @@ class InlineHost:
             return "cleared", {}
         if verb == PICTURE:
             return PICTURE, picture_of(driver)
-        data = {"runs": list(self._runner.runs), "fenced": self._runner.fenced}
-        data["state"] = plain(driver.state(), "state") if driver else {}
+        found = {"runs": list(self._runner.runs), "fenced": self._runner.fenced}
+        found["state"] = plain(driver.state(), "state") if driver else {}
         if self._cyclic:
-            data["refused"] = self._cyclic.refused
-        return "up", data
+            found["refused"] = self._cyclic.refused
+        return "up", found
 
     def _stop_driver(self, now: float, verb: str) -> None:
         if self._cyclic is not None and verb == EMERGENCY_STOP:

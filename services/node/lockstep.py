@@ -262,8 +262,9 @@ class LockstepNode:
                 directory, entry, self._clock, self._out.append
             )
             driver = make_driver(directory, entry, ports)
-            ports.draws.reseed(0)
             reseed = ports.draws.reseed
+            if device not in directory.without_actions(self.name):
+                reseed(0)
         return InlineHost(
             {
                 a.name: a

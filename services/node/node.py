@@ -31,6 +31,7 @@ from petrobot.services.comm.location_file import (
 )
 from petrobot.services.comm.protocol.messages import (
     COORDINATOR,
+    SEED,
     Answer,
     Call,
     Cancel,
@@ -154,7 +155,9 @@ Less would cost quick actions more timers; people do not notice so little. In lo
 at once."""
 ANSWER_WITHIN = 1.0
 """Time in which the devices must answer an operator's command (s)."""
-VERBS = frozenset({"hold", "release", "stop", "status", PICTURE, EMERGENCY_STOP, CLEAR_EMERGENCY})
+VERBS = frozenset(
+    {"hold", "release", "stop", "status", PICTURE, EMERGENCY_STOP, CLEAR_EMERGENCY, SEED}
+)
 """Verbs of a COMMAND."""
 _OWN_CAUSES = ("deadline", "orphan", EMERGENCY_STOP)
 _WELL_HELD = ("held", "stopped")
@@ -394,6 +397,8 @@ class Node:
 
     def _command(self, now: float, command: Command) -> None:
         keys = [k for k in self.places if k != LOOP and command.target in ("", k or self.name)]
+        if command.verb == SEED:
+            keys = [k for k in keys if k in self.directory.without_actions(self.name)]
         level = logging.DEBUG if command.verb in ("status", PICTURE) else logging.INFO
         peer = self.callee.commander(command.id)
         _log.log(level, "%s orders %s of %s", peer, command.verb, command.target or "all")
@@ -404,6 +409,9 @@ class Node:
                 False,
                 {"cause": "unknown_verb", "text": f"no verb {command.verb!r}"},
             )
+        elif command.verb == SEED and type(command.data.get(SEED)) is not int:
+            text = "data: expected {seed: an integer}"
+            self.callee.answer(now, command.id, False, {"cause": "bad_arguments", "text": text})
         elif not keys and command.target:
             text = f"{self.name} has no device {command.target!r}"
             self.callee.answer(now, command.id, False, {"cause": "unknown_device", "text": text})

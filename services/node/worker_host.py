@@ -19,6 +19,7 @@ from typing import Any
 
 from petrobot.services.action import Status
 from petrobot.services.comm.protocol.messages import (
+    SEED,
     Answer,
     Call,
     Cancel,
@@ -218,6 +219,8 @@ class WorkerHost:
         """A process that was ordered to exit because it ran out of memory."""
         self._emergency = False
         """Whether the device is in emergency stop; its next process is notified at its start."""
+        self._seed: Command | None = None
+        """The newest seed of a device without actions, for its next process."""
 
     # --- processes ----------------------------------------------------------------------------
 
@@ -365,6 +368,8 @@ class WorkerHost:
                 child.post(Command("", EMERGENCY_STOP))
             if self._frozen:
                 child.post(HOLD)
+            if self._seed is not None:
+                child.post(self._seed)
         if driver and data["period"]:
             if self._move(HostEvent.DRIVER_READY):
                 self._start_due()
@@ -686,6 +691,8 @@ class WorkerHost:
         verb = command.verb
         if verb in (EMERGENCY_STOP, CLEAR_EMERGENCY):
             self._emergency = verb == EMERGENCY_STOP
+        elif verb == SEED:
+            self._seed = command
         target = self._commanded()
         if target is None:
             self._refuse(command.id, verb)

@@ -15,7 +15,7 @@ import os
 import socket
 import time
 
-from petrobot.services.comm.protocol.messages import Answer, Command, Event
+from petrobot.services.comm.protocol.messages import SEED, Answer, Command, Event
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import PICTURE, Driver, picture_of, stop_at_once
 from petrobot.services.node.emergency_stops import BEAT, Guard
@@ -27,7 +27,6 @@ from petrobot.services.worker.remote import (
     CLEAR_EMERGENCY,
     EMERGENCY_STOP,
     NODE_SILENT,
-    SEED,
     CyclicDriver,
     DeviceCommand,
 )
@@ -163,7 +162,7 @@ class DeviceLoop:
                 if word == LINKED:
                     self._attach()
                 elif isinstance(item, Command):
-                    self._obey(now, item.id, item.verb)
+                    self._obey(now, item)
             if self._guard is not None and now >= self._guard.due:
                 self._watch(now, self._guard)
         self._take_commands(now)
@@ -219,8 +218,9 @@ class DeviceLoop:
             self._worker.socket.close()
             self._worker = None
 
-    def _obey(self, now: float, id_: str, verb: str) -> None:
+    def _obey(self, now: float, command: Command) -> None:
         """Carry out a command of the node, and answer it."""
+        id_, verb = command.id, command.verb
         if verb == HALT:
             self._driver.stop(now)
             self._stopping[id_] = now + STOP_LIMIT
@@ -238,6 +238,9 @@ class DeviceLoop:
         elif verb == "release":
             self._driver.release(now)
             self._tell(id_, "released")
+        elif verb == SEED:
+            self._ports.draws.reseed(command.data[SEED])
+            self._tell(id_, "seeded")
         elif verb == PICTURE:
             data = {"answer": PICTURE, **picture_of(self._driver)}
             self._node.report(Answer(id_, True, data))

@@ -9,13 +9,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
+from petrobot.services.comm.protocol.messages import SEED
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import Driver, stop_at_once
 from petrobot.services.worker.callables import describe, words_of
 
 _log = logging.getLogger(__name__)
 
-COMMAND, STOP, SEED = "command", "stop", "seed"
+COMMAND, STOP = "command", "stop"
 EMERGENCY_STOP, CLEAR_EMERGENCY = "emergency_stop", "clear_emergency"
 """Verbs of the operator: stop at once and refuse all commands; accept commands again (which moves
 nothing by itself)."""

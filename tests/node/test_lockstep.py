@@ -404,7 +404,12 @@ def test_hold_stops_the_arm_and_its_run_but_not_the_eye() -> None:
 
 
 @pytest.mark.parametrize(
-    ("verb", "target", "cause"), [("dance", "", "unknown_verb"), ("hold", "foot", "unknown_device")]
+    ("verb", "target", "cause"),
+    [
+        ("dance", "", "unknown_verb"),
+        ("hold", "foot", "unknown_device"),
+        ("seed", "", "bad_arguments"),
+    ],
 )
 def test_meaningless_commands(verb: str, target: str, cause: str) -> None:
     bench = Bench(directory())

@@ -200,6 +200,11 @@ class Directory:
         file."""
         return tuple(a.name for a in self.actions.values() if a.task == task)
 
+    def without_actions(self, node: str) -> frozenset[str]:
+        """Return the devices of a node that no action uses: a button, a light barrier."""
+        used = {action.device for action in self.actions.values()}
+        return frozenset(d.name for d in self.devices.values() if d.node == node) - used
+
     def address(self, node: str) -> tuple[str, int]:
         """Return host and port of a node or of the coordinator."""
         entry = self.coordinator if node == COORDINATOR else self.nodes[node]

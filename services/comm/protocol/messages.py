@@ -17,6 +17,8 @@ from typing import Any, ClassVar, Final
 
 COORDINATOR: Final = "coordinator"
 """Name of the coordinator: its role in HELLO, its table in services.toml, its certificate."""
+SEED: Final = "seed"
+"""Verb and key of the COMMAND that tells the mission's seed to devices that no action uses."""
 
 
 class Executed(StrEnum):
