@@ -325,8 +325,12 @@ def _short_forms(
         if here is None and resource in names.places:
             continue  # judged when it is bound
         if here is None or here.kind is not Kind.RESOURCE:
-            known = [q.name for q in (*task.places.values(), *places.values())]
-            remedy = f'name a place with kind = "resource"{nearest(resource, known)}'
+            resources = {
+                q.name for q in (*task.places.values(), *places.values()) if q.kind is Kind.RESOURCE
+            }
+            remedy = f'name a place with kind = "resource"{nearest(resource, resources)}'
+            if here is not None and here.kind is Kind.PLAIN:
+                remedy = f'write kind = "resource" in places.{here.name}, or name such a place'
             yield Fault(f"{key}.holds", f"{resource!r} is not a resource", remedy)
 
 

@@ -399,7 +399,8 @@ class Node:
         keys = [k for k in self.places if k != LOOP and command.target in ("", k or self.name)]
         if command.verb == SEED:
             keys = [k for k in keys if k in self.directory.without_actions(self.name)]
-        level = logging.DEBUG if command.verb in ("status", PICTURE) else logging.INFO
+        quiet = command.verb in ("status", PICTURE, SEED)
+        level = logging.DEBUG if quiet else logging.INFO
         peer = self.callee.commander(command.id)
         _log.log(level, "%s orders %s of %s", peer, command.verb, command.target or "all")
         if command.verb not in VERBS:

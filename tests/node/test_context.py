@@ -11,11 +11,12 @@ import pytest
 
 from petrobot import CommandRefused, Context, Driver, Remote, Result, rehearse, success
 from petrobot.services.comm.location_file import DirectoryError, parse
+from petrobot.services.comm.protocol.messages import SEED
 from petrobot.services.node.drivers import make_driver
 from petrobot.services.node.lockstep import LockstepPorts
 from petrobot.services.node.ports import ProcessPorts
 from petrobot.services.worker.context import Draws
-from petrobot.services.worker.remote import COMMAND, SEED, DeviceCommand, RemoteDriver
+from petrobot.services.worker.remote import COMMAND, DeviceCommand, RemoteDriver
 
 
 class Door(Driver):

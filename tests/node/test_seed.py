@@ -54,10 +54,12 @@ scope = "external"
 mean_wait = 1.0
 [places]
 waiting = { tokens = 1 }
+ready = {}
 nod = { kind = "action", task = "nod" }
 over = {}
 [transitions]
-rings = { in = ["waiting"], out = ["nod"], event = "bell" }
+rings = { in = ["waiting"], out = ["ready"], event = "bell" }
+rings_again = { in = ["ready"], out = ["nod"], event = "bell" }
 done = { in = ["nod:normal"], out = ["over"] }
 failed = { in = ["nod:error"], out = ["over"] }
 """

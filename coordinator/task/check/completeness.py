@@ -3,7 +3,7 @@ conditions cover all cases."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 from petrobot.coordinator.task import (
@@ -33,11 +33,11 @@ def uncovered_exits(task: Task) -> Iterator[Finding]:
         if place.kind is not Kind.ACTION:
             continue
         for end in (End.NORMAL, End.ERROR):
-            if not exits(task, place, end):
+            if not _written(place, exits(task, place, end)):
                 yield _missing(place, end)
         for status in Status:
             ways = exits(task, place, _EXIT_OF[status])
-            if ways and not any(w.when is None or w.events for w in ways):
+            if _written(place, ways) and not any(w.when is None or w.events for w in ways):
                 yield from _uncovered(place, status, ways, domains)
 
 
@@ -50,10 +50,17 @@ def exits(task: Task, place: Place, end: End) -> list[Transition]:
     ]
 
 
+def _written(place: Place, ways: Iterable[Transition]) -> bool:
+    """Return whether there is a way out besides the retry of `tries`."""
+    return any(way.name != f"{place.name}.retry" for way in ways)
+
+
 def _missing(place: Place, end: End) -> Finding:
     what = "success or failure" if end is End.NORMAL else "error"
     text = f"no outgoing arc `{end}`: the token of a run that ends with {what} would stay for ever"
     remedy = f'add a transition with in = ["{place.name}:{end}"]'
+    if end is End.ERROR:
+        remedy += ", or name a place for all errors: [errors] to = ..."
     return Finding(Severity.ERROR, f"no-{end}-exit", f"places.{place.name}", text, remedy)
 
 

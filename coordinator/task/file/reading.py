@@ -108,6 +108,10 @@ class Table:
     def word(self, name: str, words: type[E], default: E | None = None) -> E:
         """One of the words of an enumeration; required without a default."""
         first = next(iter(words))
+        if default is None and name not in self.data:
+            self.asked.add(name)
+            self.fault(name, "missing", f"give one of {', '.join(words)}")
+            return first
         text = self._value(name, str, default, first)
         try:
             return words(text)
