@@ -14,8 +14,9 @@ anyone can repeat it. It resumes where it stopped, and measures again what has c
 
 `floor` is the least that is promised, `holds` says whether the measurement reaches it. `sources`
 identifies the measured code (without comments and layout); `(older)` means that the code has
-changed since. Each row of a disturbed regime is 200 runs with the first alternative of each task.
-Fewer throws: the ball was not seen, or the task gave up; more: balls went by unseen.
+changed since, and `a = b` that it was measured at a, and that at b ten balls gave the same numbers
+to the last digit. Each row of a disturbed regime is 200 runs with the first alternative of each
+task. Fewer throws: the ball was not seen, or the task gave up; more: balls went by unseen.
 
 How faults that were injected on purpose ended: [figures-faults.md](figures-faults.md).
 """
@@ -44,9 +45,13 @@ def _table(proofs: Sequence[FigureProof], measured: Mapping[str, Mapping[str, An
             lines.append(_row(proof.name, *[""] * len(columns), proof.floor, "not measured", ""))
             continue
         holds = "yes" if data["holds"] else "**no**"
-        stale = "" if data["sources"] == proof.fingerprint() else " (older)"
+        sources = data["sources"][:8]
+        if not proof.holds_for(data):
+            sources += " (older)"
+        elif data["sources"] != proof.fingerprint():
+            sources += f" = {data['same_at'][:8]}"
         values = [_said(data["result"].get(key)) for key in columns]
-        lines.append(_row(proof.name, *values, proof.floor, holds, data["sources"][:8] + stale))
+        lines.append(_row(proof.name, *values, proof.floor, holds, sources))
     return lines
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from tools.proof.catching import wilson_lower
-from tools.proof.proof import KEPT, LOCK_STEP, ROOT, FigureProof, Result, run_task
+from tools.proof.catching import SAMPLE, wilson_lower
+from tools.proof.proof import KEPT, LOCK_STEP, ROOT, FigureProof, Result, digest, run_task
 
 from petrobot.sim.catching.physics import BACK_ENDS, BULLET, PORTABLE, arm_dynamics
 from petrobot.sim.catching.site import CupMount, read_site
@@ -59,7 +60,9 @@ def same_balls(regime: str) -> Callable[[], Result]:
     """Run the same throws of a regime with both back ends."""
 
     def measure() -> Result:
-        fates = {name: _caught(name, regime) for name in BACK_ENDS}
+        fates = {
+            name: [throw["caught"] for throw in _thrown(name, regime, THROWS)] for name in BACK_ENDS
+        }
         pairs = list(zip(fates[BULLET], fates[PORTABLE], strict=True))
         lost = sum(one and not other for one, other in pairs)
         won = sum(other and not one for one, other in pairs)
@@ -76,16 +79,22 @@ def same_balls(regime: str) -> Callable[[], Result]:
     return measure
 
 
-def _caught(physics: str, regime: str) -> list[bool]:
+def sample(regime: str) -> Callable[[], str]:
+    """Run a few balls with both back ends; return a digest of all that is known of them."""
+    return lambda: digest([_thrown(name, regime, SAMPLE) for name in BACK_ENDS])
+
+
+def _thrown(physics: str, regime: str, throws: int) -> list[dict[str, Any]]:
     services = KEPT / f"{physics}.services.toml"
     text = (ROOT / "services.toml").read_text(encoding="utf-8")
     services.write_text(
         text.replace("[nodes.laboratory]\n", f'[nodes.laboratory]\nphysics = "{physics}"\n'),
         encoding="utf-8",
     )
-    given = ("catch_ball", "--services", str(services), "--mode", "lockstep", "--regime", regime)
-    found = run_task(f"{physics}_{regime}", *given, "--runs", str(THROWS), "--seed", str(SEED))
-    return [throw["caught"] for throw in found["throws"]]
+    cell = ("catch_ball", "--services", str(services), "--mode", "lockstep", "--regime", regime)
+    balls = ("--runs", str(throws), "--seed", str(SEED))
+    found: list[dict[str, Any]] = run_task(f"{physics}_{regime}_{throws}", *cell, *balls)["throws"]
+    return found
 
 
 def paired_interval(lost: int, won: int, pairs: int) -> tuple[float, float]:
@@ -132,6 +141,7 @@ def proofs() -> list[FigureProof]:
             f"lower bound of each >= {floor}, same shares within "
             f"{SPRINGY if 'springy' in regime else MARGIN}",
             LOCK_STEP,
+            sample=sample(regime),
         )
         for regime, floor in FLOORS.items()
     ]

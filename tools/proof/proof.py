@@ -39,6 +39,8 @@ class FigureProof:
 
     `chapter` is its table in docs/figures.md. `sources` are the folders and files whose change
     makes it stale. `alone` is true where other work on the machine would falsify it (speeds).
+    `sample` is a short run of the same kind, as a digest of all its numbers: where that is still
+    the same after a change of the sources, the figure is not measured again.
     """
 
     name: str
@@ -48,6 +50,7 @@ class FigureProof:
     floor: str
     sources: Sequence[str]
     alone: bool = False
+    sample: Callable[[], str] | None = None
 
     def fingerprint(self) -> str:
         """Return the hash of all sources that the figure depends on, without their comments,
@@ -57,6 +60,15 @@ class FigureProof:
             place = path.relative_to(ROOT).as_posix()
             digest.update(place.encode() + _meaning(path))
         return digest.hexdigest()[:16]
+
+    def holds_for(self, data: Mapping[str, Any]) -> bool:
+        """Return whether a stored result is one of the present sources."""
+        return self.fingerprint() in (data.get("sources"), data.get("same_at"))
+
+
+def digest(result: object) -> str:
+    """Return the hash of a result that JSON can write, with all its digits."""
+    return hashlib.sha256(json.dumps(result, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _files(base: Path) -> list[Path]:
