@@ -49,6 +49,8 @@ class _Seen:
 
     faults: list[tuple[str, int, str]] = field(default_factory=list)
     """Faults, each with file, line and text."""
+    ignored: list[tuple[str, int, str]] = field(default_factory=list)
+    """Answers that nobody looks at, in the same form."""
     causes: set[str] = field(default_factory=set)
     """Causes: first arguments of `error`."""
     values: set[str] = field(default_factory=set)
@@ -145,6 +147,8 @@ def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
     for node in ast.walk(code.tree):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             seen.words.add(node.value)
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Await):
+            _ignored(code, node.value.value, seen)
         if not isinstance(node, ast.Call):
             continue
         made = code.value(node.func)
@@ -157,6 +161,14 @@ def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
             seen.faults.append((code.file, node.lineno, text))
         if isinstance(node.func, ast.Attribute):
             _method(code, node, node.func, seen, node in awaited)
+
+
+def _ignored(code: _Code, awaited: ast.expr, seen: _Seen) -> None:
+    """Record a call of a service whose result is dropped: one that failed would go unnoticed."""
+    called = awaited.func if isinstance(awaited, ast.Call) else awaited
+    if ast.unparse(called) in ("ctx.call", "context.call"):
+        text = "nobody looks at the result of `ctx.call`: that it failed would go unnoticed"
+        seen.ignored.append((code.file, awaited.lineno, text))
 
 
 def _method(
@@ -315,6 +327,7 @@ def _sets_period(thing: type) -> bool:
 def _plain(seen: _Seen) -> dict[str, Any]:
     return {
         "faults": sorted(set(seen.faults)),
+        "ignored": sorted(set(seen.ignored)),
         "causes": sorted(seen.causes),
         "values": sorted(seen.values),
         "complete": seen.complete,

@@ -439,9 +439,9 @@ class Mission:
     def _send_seed(self, now: float, node: str) -> None:
         """Tell the seed to the devices that no call reaches."""
         if self.executor.directory.without_actions(node):
-            seed = {SEED: self.executor.seed}
-            command = Command(f"{self.executor.mission}/{SEED}", SEED, data=seed)
-            self.callers[node].command(now, command)
+            caller, seed = self.callers[node], {SEED: self.executor.seed}
+            identity = f"{self.executor.mission}/{caller.hello.epoch}/{SEED}"
+            caller.command(now, Command(identity, SEED, data=seed))
 
 
 def _verdicts(said: Any) -> list[RunVerdict]:

@@ -85,12 +85,18 @@ def log_fault(log: logging.Logger, fault: BaseException, text: str, *arguments: 
 
 
 def _traceback(fault: BaseException) -> str:
-    """Return the traceback of an exception after those of the exceptions that led to it, as Python
-    prints them, but with each message cut by `words_of`."""
+    """Return the traceback of an exception after those of the exceptions that led to it.
+
+    As Python prints them, but each from its first line of user code on, and its message as
+    `words_of` has it.
+    """
     parts: list[str] = []
     found: BaseException | None = fault
     while found is not None and len(parts) < CHAIN:
-        lines = traceback.format_tb(found.__traceback__, -FRAMES)
+        place = found.__traceback__
+        while place is not None and place.tb_frame.f_code.co_filename.startswith(_OURS):
+            place = place.tb_next
+        lines = traceback.format_tb(place or found.__traceback__, -FRAMES)
         parts.append(f"{''.join(lines)}{type(found).__name__}: {words_of(found)}")
         hidden = found.__suppress_context__
         found = found.__cause__ if found.__cause__ is not None or hidden else found.__context__

@@ -248,6 +248,12 @@ IN_THE_CODE: list[Mistake] = [
     (
         CODE,
         "await ctx.sleep(0.3)",
+        "await ctx.call('lamp', 1.0)",
+        r"arm_bot.py:\d+: nobody looks at the result of `ctx.call`[^|]*`ctx.put`",
+    ),
+    (
+        CODE,
+        "await ctx.sleep(0.3)",
         "import time; time.sleep(0.3)",
         r"arm_bot.py:\d+: time.sleep stops everyth",
     ),
@@ -382,6 +388,7 @@ WARNINGS = (
     "no action of move returns",
     "also return jammed",
     "raises the event",
+    "nobody looks",
 )
 
 

@@ -47,6 +47,19 @@ def test_a_latched_event_raised_before_any_subscription_is_kept() -> None:
     assert _heard(callee, "coord") == []
 
 
+def test_no_event_of_the_time_before_a_caller_came_is_for_it() -> None:
+    callee = _node("coord")
+    callee.receive(0.0, "coord", m.Subscribe(("pressed",)))
+    callee.raise_event(0.0, "pressed", source="button", latched=True)
+    callee.link_up(0.1, "next", m.Hello(2, 2, "coordinator", "next", "n"))
+    callee.raise_event(0.2, "pressed", source="button", latched=True)
+    callee.receive(0.3, "next", m.Subscribe(("pressed",)))
+    sent = [
+        (to, message.number) for to, message in callee.messages() if isinstance(message, m.Event)
+    ]
+    assert sent == [("coord", 1), ("coord", 2), ("next", 2)]
+
+
 def test_an_acknowledgement_covers_only_the_subscriptions_of_its_sender() -> None:
     callee = _node("coord")
     callee.receive(0.0, "coord", m.Subscribe(("a",)))

@@ -44,6 +44,7 @@ def test_an_exception_of_an_action_is_logged_with_its_cause(
     first, second = said.split("-- then --")
     assert "KeyError: 'gripper'" in first and 'raise KeyError("gripper")' in first
     assert "ValueError: cannot grasp" in second and "in grasp" in second
+    assert "runner.py" not in said, "it begins with the user's own code"
 
 
 def test_an_exception_while_a_cancelled_action_cleans_up_is_logged(

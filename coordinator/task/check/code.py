@@ -60,9 +60,13 @@ def code_findings(
     for action in used:
         yield from _events(task, action, code[action])
     yield from _misspelt(task, [code[action].get("device", {}) for action in code])
-    faults = {tuple(fault) for action in used for fault in code[action].get("faults", ())}
-    for file, line, text in sorted(faults):
-        yield Finding(Severity.ERROR, "code", f"{file}:{line}", text)
+    for kind, severity, remedy in (
+        ("faults", Severity.ERROR, ""),
+        ("ignored", Severity.WARNING, "test its `status`; for the memory write `ctx.put`"),
+    ):
+        found = {tuple(fault) for action in used for fault in code[action].get(kind, ())}
+        for file, line, text in sorted(found):
+            yield Finding(severity, "code", f"{file}:{line}", text, remedy)
 
 
 def _arguments(

@@ -386,6 +386,8 @@ class Callee:
             self._answers = OrderedDict(
                 (key, kept) for key, kept in self._answers.items() if key[0] != peer
             )
+        if known is None:
+            self.events.newcomer(peer)
         forgotten = self._peers.come(peer, hello, local)
         self.events.peer_down(forgotten, leaves=True)
         self._messages.extend((peer, event) for event in self.events.waiting(peer))
