@@ -315,9 +315,13 @@ class WorkerHost:
         return True
 
     def _heard(self, child: Child, received: list[Item]) -> None:
-        """Handle what a process sent. Items of a former process are ignored."""
+        """Handle what a process sent. Items of a former process are ignored, and of the progress of
+        a run only the newest counts: an action may report it in a loop that never waits."""
         plain_ends = True
+        newest = {item.id: item for item in received if type(item) is Feedback}
         for item in received:
+            if type(item) is Feedback and newest[item.id] is not item:
+                continue
             if type(item) is not Outcome or item.cause == OUT_OF_MEMORY:
                 plain_ends = False
             if child is self._owner or child is self._worker:

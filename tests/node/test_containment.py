@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from petrobot.services.comm.calls.caller import PeerLost
 from petrobot.services.comm.protocol.messages import Call, Outcome
 from petrobot.services.node.child import Child
 from petrobot.services.worker.pipe import Item
@@ -43,6 +44,7 @@ leave_behind_eye = {{ run = "toy_cell.actions:leave_behind", task = "see", devic
 leave_behind_slide = {{ run = "toy_cell.actions:leave_behind", task = "move", device = "slide" }}
 keep_memory = {{ run = "toy_cell.actions:keep_memory", task = "sum", node = "left" }}
 block = {{ run = "toy_cell.actions:block", task = "sum", node = "left" }}
+chatter = {{ run = "toy_cell.actions:chatter", task = "sum", node = "left" }}
 write_down = {{ run = "toy_cell.actions:write_down", task = "sum", node = "left" }}
 """
 )
@@ -265,6 +267,20 @@ async def test_messages_sent_before_a_process_ended_are_read(
         await over.wait()
     assert results == ["1", "2"]
     assert child.code == -signal.SIGSEGV
+
+
+@pytest.mark.parametrize("what", ["progress", "events"])
+async def test_a_run_that_reports_without_end_disturbs_no_other(
+    operator: Operator, what: str
+) -> None:
+    chatting = asyncio.create_task(operator.call("chatter", 4.0, what=what))
+    others = []
+    limit = Limit("the run to end at its deadline")
+    while not chatting.done() and limit.left():
+        others.append(await operator.call("nap", 20.0, seconds=0.05))
+    assert (await chatting).cause == "deadline"
+    assert others and {run.status for run in others} == {"success"}
+    assert not [notice for notice in operator.notices if isinstance(notice, PeerLost)]
 
 
 async def test_a_run_beyond_the_limit_is_refused_with_the_reason(operator: Operator) -> None:

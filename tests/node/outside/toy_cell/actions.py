@@ -27,6 +27,17 @@ def write_down(ctx: Context, *, file: str, line: str) -> Result:
     return success()
 
 
+async def chatter(ctx: Context, *, what: str) -> Result:
+    """Report progress or raise events, as fast as it can, without end."""
+    while True:
+        for number in range(20_000):
+            if what == "progress":
+                ctx.progress(0.5, number=number)
+            else:
+                ctx.raise_event("chatter", number=number)
+        await ctx.sleep(1e-9)
+
+
 async def nap(ctx: Context, *, seconds: float) -> Result:
     """Wait."""
     await ctx.sleep(seconds)
@@ -188,6 +199,23 @@ def double(ctx: Context, *, numbers: tuple[float, ...]) -> Result:
     """Return a tuple, and send one in an event."""
     ctx.raise_event("doubled", count=len(numbers))
     return success(numbers=tuple(2.0 * n for n in numbers))
+
+
+class Leaving(Exception):  # noqa: N818 - not a name of ours
+    """An exception, and a value, that raise SystemExit when they are read."""
+
+    def __str__(self) -> str:
+        raise SystemExit(3)
+
+    def __bool__(self) -> bool:
+        raise SystemExit(3)
+
+
+def leaving(ctx: Context, *, by: str) -> Result:
+    """Raise or return what cannot be read."""
+    if by == "exception":
+        raise Leaving
+    return Result(Status.SUCCESS, {}, deferred=Leaving())  # type: ignore[arg-type]
 
 
 def broken(ctx: Context) -> Result:
