@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from petrobot.coordinator.operator.run_address import RunAddress
 
 EXAMPLE = "petrobot estop"
+HARDWARE = "press the hardware's emergency stop"
 COORDINATOR_PATIENCE = 1.0
 """How long to wait for the coordinator's answer (s). The coordinator is notified after the devices
 were stopped."""
@@ -54,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Stop, or clear. Return 0 if every node with devices has answered, 3 otherwise."""
+    """Stop, or clear. Return 0 if every device has carried it out, 3 otherwise."""
     from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
     from petrobot.services.comm.protocol.messages import COORDINATOR
     from petrobot.services.comm.tls.credentials import credentials
@@ -76,7 +77,7 @@ def run(options: argparse.Namespace) -> int:
         else ""
     )
     _show(options, answers, coordinator, took)
-    return 0 if answers and all(answer.answered or answer.cleared for answer in answers) else 3
+    return 0 if answers and all(answer.done for answer in answers) else 3
 
 
 def _address(options: argparse.Namespace) -> RunAddress | None:
@@ -138,6 +139,9 @@ def _show(
             print(f"{answer.node:12} {device:12} {said}")
         if not answer.answered and not answer.cleared:
             print(f"{answer.node:12} {'':12} NO ANSWER: {answer.why}")
+        if answer.open and not options.clear:
+            names = ", ".join(answer.open)
+            print(f"{answer.node:12} {'':12} NOT KNOWN TO STAND STILL: {names}; {HARDWARE}")
         for said in filter(None, (answer.note, answer.latch)):
             print(f"{answer.node:12} {'':12} {said}")
         if answer.bus:

@@ -303,10 +303,10 @@ class Operation:
         stopped over its bus, and the stop is latched."""
         directory = self.executor.directory
         for told in await order_all(directory, credentials_of(directory)):
-            if not told.answered:
-                text = "; ".join(
-                    filter(None, (f"{told.node}: {told.why or 'no answer'}", told.bus, told.latch))
-                )
+            if not told.done:
+                why = told.why or ", ".join(f"{d} {told.devices[d]}" for d in told.open)
+                why = f"{told.node}: {why or 'no answer'}"
+                text = "; ".join(filter(None, (why, told.bus, told.latch)))
                 self.feed.emit(
                     "notice", notice={"level": "error", "text": text, "at": self.feed.state["time"]}
                 )

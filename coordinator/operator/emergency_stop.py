@@ -4,8 +4,8 @@ not answer.
 It needs no coordinator, and no coordinator can delay it: each node receives it over a separate
 connection, stops its devices at once (a drive's quick stop is sent with the next bus cycle) and
 lets no action use them until `CLEAR`. If a node that owns a CAN bus of this host does not answer in
-time, all CANopen devices of that bus are stopped by NMT (CiA 301: a drive that leaves OPERATIONAL
-while it moves stops, object 6007h)."""
+time, or the driver of one of its devices does not, all CANopen devices of that bus are stopped by
+NMT (CiA 301: a drive that leaves OPERATIONAL while it moves stops, object 6007h)."""
 
 from __future__ import annotations
 
@@ -27,6 +27,10 @@ from petrobot.services.host.emergency_latch import ALL, LatchError, latch_of
 
 STOP = "emergency_stop"
 CLEAR = "clear_emergency"
+_DONE = {STOP: ("stopped",), CLEAR: ("cleared", "not ready")}
+"""By order: the answers of a device that has carried it out. One that is not ready is not known to
+stand still; once cleared, it starts without a stop."""
+_SILENT = "no answer"
 NODE_LATE = 0.15
 """Wait for a node's answer before its bus is stopped instead (s)."""
 STANDSTILL = 1.5
@@ -44,6 +48,9 @@ class Stopped:
     node: str
     devices: dict[str, str] = field(default_factory=dict)
     """Each device's answer: stopped, stopping, cleared, not ready, no answer."""
+    open: list[str] = field(default_factory=list)
+    """Devices that are not known to have carried out the order: their drivers are frozen, are being
+    started again, or still move them."""
     seconds: float | None = None
     """Time from the order to the first answer (s); None without an answer."""
     why: str = ""
@@ -61,6 +68,11 @@ class Stopped:
     def answered(self) -> bool:
         """Whether the node itself has answered."""
         return self.seconds is not None
+
+    @property
+    def done(self) -> bool:
+        """Whether every device of the node is known to have carried out the order."""
+        return self.cleared or (self.answered and not self.open)
 
 
 def nodes_with_devices(directory: Directory) -> list[str]:
@@ -196,6 +208,8 @@ async def _order(
             if bus or not stopped.answered:
                 stopped.bus = await _stop_buses(directory, node)
         await asking
+        if verb == STOP and not stopped.bus and _SILENT in stopped.devices.values():
+            stopped.bus = await _stop_buses(directory, node)
         if verb == STOP and not stopped.answered:
             stopped.latch = stopped.latch or await _latch(directory, node)
         elif stopped.answered:
@@ -228,6 +242,7 @@ async def _ask(line: EmergencyLine, stopped: Stopped, verb: str) -> None:
             if stopped.seconds is None:
                 stopped.seconds = loop.time() - begun
             stopped.devices, stopped.note = line.devices_of(answers), line.note or stopped.note
+            stopped.open = [d for d, said in stopped.devices.items() if said not in _DONE[verb]]
             if "stopping" not in stopped.devices.values() or loop.time() - begun > STANDSTILL:
                 return
             await asyncio.sleep(ASK_AGAIN)

@@ -381,7 +381,7 @@ class Station:
             f"{one.node}: {one.bus or one.why or 'no answer'}" for one in told if not one.answered
         ]
         said = [f"{device} {answer}" for one in told for device, answer in one.devices.items()]
-        if missing:
+        if not all(one.done for one in told):
             return refusal("unreachable", "; ".join([*missing, *said]))
         return {"ok": True, "text": ", ".join(said)}
 

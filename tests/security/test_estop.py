@@ -25,6 +25,8 @@ from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.services.comm.canopen.cia301 import NmtState
 from petrobot.services.comm.canopen.cia402 import DriveState
 from petrobot.services.comm.location_file import Directory
+from tests.node.conftest import OUTSIDE
+from tests.node.test_processes import Nodes, operator_of, pids
 from tests.security.arm_cell import DRIVES, ROOT, Ear, cell_in, ear_on
 from tests.waiting import Limit, beat
 
@@ -216,6 +218,21 @@ async def test_a_stop_remains_after_its_node_is_killed(tmp_path: Path, answers: 
         assert without_power(cell.ear) and cell.ear.energised == 0, "not even for a moment"
         assert (await cell.estop("--clear"))[0] == 0
         await cell.sweep()
+
+
+async def test_estop_names_a_device_whose_driver_hangs(tmp_path: Path) -> None:
+    """Its node answers, but nothing has stopped the device: exit code 3."""
+    nodes = Nodes(tmp_path, "left", "right")
+    command = ["estop", "--services", str(nodes.file), "--journal", str(tmp_path)]
+    try:
+        assert (await finished(petrobot(*command, PYTHONPATH=f"{ROOT}:{OUTSIDE}")))[0] == 0
+        async with operator_of(nodes.directory, "left") as operator:
+            os.kill((await pids(operator, "left", "slide"))["driver"], signal.SIGSTOP)
+        code, out, _ = await finished(petrobot(*command, PYTHONPATH=f"{ROOT}:{OUTSIDE}"))
+        assert code == 3 and "NOT KNOWN TO STAND STILL: slide; press the hardware's" in out, out
+        assert "eye" in out and "eye;" not in out
+    finally:
+        nodes.stop()
 
 
 async def test_estop_without_nodes_says_so(tmp_path: Path) -> None:
