@@ -18,13 +18,15 @@ exit codes:
        operator's command
     2  bad input (check: the task may not run)
     3  a node cannot be reached
-  130  interrupted"""
+  130  interrupted
+  141  the program that reads its output has closed it"""
 SHORT_EXIT_CODES = """\
 exit codes:
     0  done
     2  bad input
     3  a node cannot be reached
-  130  interrupted"""
+  130  interrupted
+  141  the program that reads its output has closed it"""
 
 
 FILE_FAULTS = {
@@ -49,6 +51,10 @@ class CommandError(Exception):
     def __init__(self, code: int, text: str) -> None:
         super().__init__(text)
         self.code = code
+
+
+PIPE_CLOSED = 128 + 13
+"""Exit code of a program that SIGPIPE has ended: 1 would say that the answer is no."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +183,7 @@ def _dispatch(command: Subcommand, arguments: Sequence[str]) -> int:
     except BrokenPipeError:
         # The program that reads our output has closed it; Python would report that again at exit.
         sys.stderr.close()
-        return 1
+        return PIPE_CLOSED
 
 
 def _run(run: Callable[[argparse.Namespace], int], options: argparse.Namespace) -> int:

@@ -3,7 +3,10 @@ exception's name."""
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -221,6 +224,17 @@ def test_help_explains_exit_codes(petrobot: Petrobot) -> None:
         word in told
         for word in ("analyse refutes", "forecast or replay", "operator's command", "3  a node")
     )
+
+
+@pytest.mark.processes
+def test_a_reader_that_leaves_is_no_answer() -> None:
+    """`petrobot check TASK | head -1` must not end as if the task might not run."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "petrobot.coordinator", "check", "catch_ball"]
+    ended = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (ended.returncode, ended.stderr) == (141, "")
 
 
 def no_laboratory(directory: Directory, name: str) -> Party:
