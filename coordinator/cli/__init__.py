@@ -119,7 +119,18 @@ PLAIN = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _main(list(sys.argv[1:] if argv is None else argv))
+    except KeyboardInterrupt:  # also while modules are imported: that takes longest
+        print("interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The program that reads our output has closed it; Python would report that again at exit.
+        sys.stderr.close()
+        return PIPE_CLOSED
+
+
+def _main(arguments: list[str]) -> int:
     if arguments[:1] == ["--version"]:
         from importlib.metadata import version  # slower to import than all the rest here
 
@@ -177,13 +188,6 @@ def _dispatch(command: Subcommand, arguments: Sequence[str]) -> int:
     except CommandError as fault:
         print(f"petrobot {command.name}: {fault}", file=sys.stderr)
         return fault.code
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        # The program that reads our output has closed it; Python would report that again at exit.
-        sys.stderr.close()
-        return PIPE_CLOSED
 
 
 def _run(run: Callable[[argparse.Namespace], int], options: argparse.Namespace) -> int:

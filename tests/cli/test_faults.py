@@ -226,6 +226,17 @@ def test_help_explains_exit_codes(petrobot: Petrobot) -> None:
     )
 
 
+def test_an_interrupt_during_the_imports_is_an_interrupt(
+    petrobot: Petrobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(name: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("importlib.import_module", interrupted)
+    code, _, said = petrobot("check", "work.toml")
+    assert (code, said) == (130, "interrupted\n")
+
+
 @pytest.mark.processes
 def test_a_reader_that_leaves_is_no_answer() -> None:
     """`petrobot check TASK | head -1` must not end as if the task might not run."""
