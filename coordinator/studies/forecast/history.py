@@ -120,7 +120,14 @@ class Seen:
             self.visits[:, which],
         )
 
-    def note(self, q: int, columns: Codes, outcome: Codes, action: Codes, took: Values) -> None:
+    def note(
+        self,
+        q: int,
+        columns: Codes | int,
+        outcome: Codes | int,
+        action: Codes | int,
+        took: Values | float,
+    ) -> None:
         """Record that runs ended in a place."""
         self.outcome[q, columns], self.action[q, columns], self.took[q, columns] = (
             outcome,
@@ -277,14 +284,9 @@ def _runs(vocabulary: RunVocabulary, trials: tuple[Trial, ...], waiting: Mapping
         while end < n and flat[end][0] == flat[begin][0]:
             end += 1
         for j in range(begin, end):
-            for i in _ended_before(flat, j, begin, end):
+            for i in _ended_before(flat, j, begin):
                 run = flat[i][1]
-                one = (
-                    np.array([codes[i]]),
-                    np.array([actions.get(run.action, 0)]),
-                    np.array([took[i]]),
-                )
-                seen.note(places[run.place], np.array([j]), *one)
+                seen.note(places[run.place], j, codes[i], actions.get(run.action, 0), took[i])
         begin = end
     return Runs(
         np.array([places[run.place] for _, run in flat], np.int64),
@@ -299,15 +301,13 @@ def _runs(vocabulary: RunVocabulary, trials: tuple[Trial, ...], waiting: Mapping
     )
 
 
-def _ended_before(flat: list[tuple[int, RunEntry]], j: int, begin: int, end: int) -> list[int]:
-    """Return the runs of the same trial that ended before run j began, in the order of their
-    ends."""
-    came = flat[j][1].begun
+def _ended_before(flat: list[tuple[int, RunEntry]], j: int, begin: int) -> list[int]:
+    """Return the runs of the same trial, from `begin` on, that ended before run j began, in the
+    order of their ends."""
     # 1e-9 s: times are rounded to microseconds, but their sums are not
-    over = [
-        i for i in range(begin, end) if i != j and flat[i][1].begun + flat[i][1].took <= came + 1e-9
-    ]
-    return sorted((i for i in over if i < j), key=lambda i: flat[i][1].begun + flat[i][1].took)
+    came = flat[j][1].begun + 1e-9
+    ends = [(run.begun + run.took, i) for i, (_, run) in enumerate(flat[begin:j], begin)]
+    return [i for end, i in sorted(ends) if end <= came]
 
 
 def _outcome(vocabulary: RunVocabulary, run: RunEntry) -> int:

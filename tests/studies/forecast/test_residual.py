@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from petrobot.coordinator.studies.forecast import residual
 from petrobot.coordinator.studies.forecast.history import Training
 from petrobot.coordinator.studies.forecast.play import Played
 from petrobot.coordinator.studies.forecast.residual import (
@@ -105,3 +106,17 @@ def test_independent_trials_are_seldom_doubtful() -> None:
         for _ in range(200)
     )
     assert found <= 2
+
+
+def test_stopping_early_decides_as_all_permutations_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tried with correlations whose p-values lie around the level: those below it are the same."""
+    random, level = np.random.default_rng(3), residual.ORDER_LEVEL
+    one = random.normal(size=(30, 40))
+    other = 0.65 * one + random.normal(size=one.shape)
+    early = [residual._rank_test(a, b) for a, b in zip(one, other, strict=True)]
+    monkeypatch.setattr(residual, "ORDER_LEVEL", 2.0)  # no p-value reaches it
+    full = [residual._rank_test(a, b) for a, b in zip(one, other, strict=True)]
+    assert [(r, p if p < level else 1.0) for r, p in early] == [
+        (r, p if p < level else 1.0) for r, p in full
+    ]
+    assert sum(level / 3 < p < level for _, p in full) >= 2 and early != full
