@@ -8,9 +8,12 @@ raised here is printed as it is: `argument --runs: abc is not a whole number of 
 from __future__ import annotations
 
 import logging
-from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Callable
 from math import isfinite
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, ArgumentTypeError
 
 LOG_LEVELS = {
     "debug": logging.DEBUG,
@@ -47,6 +50,12 @@ LARGEST_SEED = 2**63 - 1
 """As a signed 64-bit number carries it."""
 
 
+def _refusal(text: str) -> ArgumentTypeError:
+    from argparse import ArgumentTypeError  # here, because workers need only `log_to_stderr`
+
+    return ArgumentTypeError(text)
+
+
 def whole(least: int = 1, most: int | None = None) -> Callable[[str], int]:
     """Return the type of an option that takes a whole number of at least `least`, at most
     `most`."""
@@ -57,9 +66,9 @@ def whole(least: int = 1, most: int | None = None) -> Callable[[str], int]:
         except ValueError:
             value = least - 1
         if value < least:
-            raise ArgumentTypeError(f"{text} is not a whole number of at least {least}")
+            raise _refusal(f"{text} is not a whole number of at least {least}")
         if most is not None and value > most:
-            raise ArgumentTypeError(f"{text} is more than the largest number, {most}")
+            raise _refusal(f"{text} is more than the largest number, {most}")
         return value
 
     return read
@@ -80,7 +89,7 @@ def number(
             value = float("nan")
         low = (above is None or value > above) and (least is None or value >= least)
         if not (isfinite(value) and low and (most is None or value <= most)):
-            raise ArgumentTypeError(
+            raise _refusal(
                 f"{text} is not a number of {asked}" if asked else f"{text} is not a finite number"
             )
         return value

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import ipaddress
 import json
@@ -27,6 +26,8 @@ class KeySpec(NamedTuple):
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return a hint with the nearest known name, or with all names when there are few."""
+    import difflib  # here, because each process of a node reads the file, and few find a fault
+
     names = list(dict.fromkeys(known))
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     if close:

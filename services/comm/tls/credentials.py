@@ -13,16 +13,18 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import ssl
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import COORDINATOR
 from petrobot.services.comm.protocol.security import KeyFileError, Keys, read_key, read_secret
 from petrobot.services.comm.tls.expiry import watch
+
+if TYPE_CHECKING:
+    import ssl
 
 CA_FILE: Final = "ca.pem"
 MADE_BY: Final = "`petrobot keys --tls`"
@@ -57,12 +59,12 @@ class Credentials:
     def server(self) -> ssl.SSLContext | None:
         """Return the TLS context of a listening end; None without certificates. Raises
         KeyFileError."""
-        return self._context(ssl.PROTOCOL_TLS_SERVER)
+        return self._context(listens=True)
 
     def client(self) -> ssl.SSLContext | None:
         """Return the TLS context of a connecting end; None without certificates. Raises
         KeyFileError."""
-        return self._context(ssl.PROTOCOL_TLS_CLIENT)
+        return self._context(listens=False)
 
     def stream_key(self, ticket: str) -> Keys | None:
         """Return the key that seals a set-point stream: the shared key; with certificates a key
@@ -89,9 +91,12 @@ class Credentials:
         )
         watch(self.folder / CA_FILE, now, RENEW_CA)
 
-    def _context(self, side: ssl._SSLMethod) -> ssl.SSLContext | None:
+    def _context(self, listens: bool) -> ssl.SSLContext | None:
         if self.folder is None:
             return None
+        # Here, because each worker imports this module, and few cells have certificates.
+        import ssl
+
         certificate, key, ca = (
             self.folder / name for name in (f"{self.party}.pem", f"{self.party}.key", CA_FILE)
         )
@@ -102,7 +107,7 @@ class Credentials:
                 f"{key}: {fault.strerror}; make it with {MADE_BY} and copy it here from "
                 "where that was run"
             ) from None
-        context = ssl.SSLContext(side)
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if listens else ssl.PROTOCOL_TLS_CLIENT)
         context.minimum_version = ssl.TLSVersion.TLSv1_3
         context.verify_mode = ssl.CERT_REQUIRED
         try:

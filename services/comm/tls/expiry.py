@@ -7,7 +7,6 @@ X.690): each element is a tag byte, a length, and the contents.
 
 from __future__ import annotations
 
-import ssl
 import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -26,6 +25,8 @@ _BEFORE_VALIDITY = 3
 def ends_of(pem: str) -> datetime:
     """Return when the first certificate of a PEM text expires. Raises ValueError if it cannot be
     read."""
+    import ssl  # here, because each worker imports this module, and few cells have certificates
+
     first = pem[pem.find("-----BEGIN CERTIFICATE-----") :].partition("-----END CERTIFICATE-----")
     try:
         der = ssl.PEM_cert_to_DER_cert("".join(first[:2]))
