@@ -11,19 +11,19 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tomlkit
 
-from petrobot.coordinator.analysis.commands import net_file_of
-from petrobot.coordinator.analysis.formats.netfile import NetFile, NetFileError
-from petrobot.coordinator.analysis.formats.pnml import parse_pnml, write_pnml
 from petrobot.coordinator.analysis.may_run import Cell, assumed, devices_of, may_run
 from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.page.edits import EditError, Rename, parse, plain
 from petrobot.coordinator.page.task_store import Conflict, StoreError, TaskStore, TaskText
 from petrobot.coordinator.task import Kind, Task
 from petrobot.coordinator.task.file import TaskFileError, dumps, loads
+
+if TYPE_CHECKING:  # few conversions need formats and numpy, and the designer waits for their import
+    from petrobot.coordinator.analysis.formats.netfile import NetFile
 
 # Nets of other tools as the text of a task file that can be edited: names, marking, weights,
 # inhibitors and positions (pure functions).
@@ -136,9 +136,12 @@ def export(text: str, filename: str, form: str, cell: Fields = None) -> Converte
     if form == "toml":
         return ConvertedTask(dumps(task), "application/toml")
     if form == "pnml":
+        from petrobot.coordinator.analysis.commands import net_file_of
+        from petrobot.coordinator.analysis.formats.pnml import write_pnml
+
         return ConvertedTask(write_pnml(net_file_of(task)), "application/xml")
     if form == "gspn.svg":
-        # Here, because few need it and their import takes a while.
+        from petrobot.coordinator.analysis.formats.netfile import NetFile
         from petrobot.coordinator.analysis.time.stochastic import stochastic_view
         from petrobot.coordinator.studies.report.gspn_picture import gspn_svg
 
@@ -160,6 +163,9 @@ def imported(form: str, text: str) -> str:
         return text
     if form != "pnml":
         raise FormatError(f"no format {form!r}: toml and pnml are known")
+    from petrobot.coordinator.analysis.formats.netfile import NetFileError
+    from petrobot.coordinator.analysis.formats.pnml import parse_pnml
+
     try:
         return as_task_file(parse_pnml(text))
     except NetFileError as error:

@@ -13,6 +13,7 @@ import aiohttp
 import pytest
 import pytest_asyncio
 
+from petrobot.coordinator.analysis.formats import pnml
 from petrobot.coordinator.analysis.formats.pnml import parse_pnml
 from petrobot.coordinator.cli.loading import own_tasks
 from petrobot.coordinator.operator import history as journals
@@ -39,7 +40,7 @@ FORBIDDEN = (
     (verdicts, "parse"),
     (verdicts, "loads"),
     (verdicts, "may_run"),
-    (verdicts, "parse_pnml"),
+    (pnml, "parse_pnml"),
     (journals, "read_journal"),
     (journals, "replay"),
     (journals, "loads"),
@@ -337,11 +338,11 @@ async def test_long_computations_never_run_in_the_coordinators_process(
     status, saved = await save(http, TASK, base=task["revision"], document=document)
     assert status == 200 and saved["document"]["task"]["text"] == "altered"
     async with http.get(f"/api/tasks/{TASK}/export/pnml") as answer:
-        pnml = await answer.text()
+        exported = await answer.text()
     for path, body in {
         "/api/check": drawn,
         "/api/analyse": drawn,
-        "/api/import": {"form": "pnml", "text": pnml},
+        "/api/import": {"form": "pnml", "text": exported},
     }.items():
         async with http.post(path, json=body) as answer:
             assert answer.status == 200, (path, await answer.text())
