@@ -53,8 +53,9 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give each long test the limit of the long ones, unless it has a limit of its own; a browser
-    is a process, too."""
+    """Begin with the long tests: begun last, one of them keeps the other cores idle. Give each
+    proof the limit of proofs, unless it has a limit of its own; a browser is a process, too."""
+    items.sort(key=lambda item: item.get_closest_marker("long") is None)
     for item in items:
         if isinstance(item, pytest.Function) and "browser" in item.fixturenames:
             item.add_marker("processes")

@@ -24,7 +24,7 @@ from tests.cli.test_new import on_free_port
 from tests.integration.cell_files import services_file
 from tests.waiting import Limit
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.long]
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 COMMANDS = [

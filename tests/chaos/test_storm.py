@@ -15,7 +15,7 @@ import pytest
 from tests.chaos.shuttle_cell import ROOT
 from tests.chaos.storm import LEAST_EVENTS, LEAST_MISSIONS, LONGEST
 
-pytestmark = [pytest.mark.processes, pytest.mark.timeout(1500)]
+pytestmark = [pytest.mark.processes, pytest.mark.long, pytest.mark.timeout(1500)]
 SHORT, LONG = 20.0, 600.0
 NAMESPACE = ("unshare", "--user", "--map-root-user", "--net")
 

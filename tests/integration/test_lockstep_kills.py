@@ -19,7 +19,7 @@ import pytest
 
 from tests.integration.cell_files import ROOT, services_file
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.long]
 SEED, RUNS = 3, 4
 
 
