@@ -485,14 +485,13 @@ def proven(n: EndsNet, space: Space, view: OrdinaryView) -> dict[str, PropertyVe
     single = [p for p in flat.places.values() if p.kind is Kind.ACTION and p.servers is None]
     if all(np.max(held[index[p.name]]) <= 1 for p in single):
         holds("one_run_each", "no action place is entered while its run is active")
-    markings = np.array(held).T.tolist() if held else [[]] * len(space)
-    final = np.array([view.is_final(tuple(m)) for m in markings], dtype=np.bool_)
+    final = view.where(flat.final, held, len(space))
     resources = [p for p in flat.places.values() if p.kind is Kind.RESOURCE]
     if all((held[index[p.name]][final] == p.tokens).all() for p in resources):
         holds("returned", "every resource has its initial number of tokens at the end")
     if not n.left_out and not endless(flat):
         fires = np.array([name in n.origin for name in n.net.transitions] or [False])
-        alive = np.array([view.is_end(tuple(m)) for m in markings], dtype=np.bool_)
+        alive = final | view.where(flat.final_error, held, len(space))
         alive[space.source[fires[space.label]]] = True
         if (
             Graph(len(space), space.source, space.target, space.row, rooted=True)

@@ -5,8 +5,12 @@ Its ordinary net is `Task.net` (docs/semantics.md, section 8).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
 
 from petrobot.coordinator.task import End, Kind, Task
 from petrobot.coordinator.task.conditions import Expression
@@ -35,6 +39,23 @@ class OrdinaryView:
     def is_end(self, marking: Marking) -> bool:
         """Whether a dead marking is a designed end of either kind."""
         return self.is_final(marking) or self.is_final_error(marking)
+
+    def where(
+        self, predicate: Expression | None, held: Sequence[NDArray[np.int64]], markings: int
+    ) -> NDArray[np.bool_]:
+        """Return in which of `markings` markings a predicate holds; `held`: the tokens of each
+        place in each of them.
+
+        It is evaluated once for each combination of tokens of the places that it reads: a task has
+        few of these and up to 100,000 markings.
+        """
+        if predicate is None or not predicate.names:
+            return np.full(markings, self._holds(predicate, ()))
+        names = sorted(predicate.names)
+        read = np.array([held[self.task.net.place_index[name]] for name in names])
+        found, which = np.unique(read, axis=1, return_inverse=True)
+        values = (dict(zip(names, column, strict=True)) for column in found.T.tolist())
+        return np.array([predicate.holds(some) for some in values])[which.reshape(-1)]
 
     @cached_property
     def error_places(self) -> tuple[int, ...]:
