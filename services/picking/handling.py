@@ -25,7 +25,7 @@ from petrobot.services.action import (
 )
 from petrobot.services.picking.commands import ARMS, ArmState
 from petrobot.services.picking.model import (
-    JointChain,
+    ArmNumbers,
     NumbersError,
     OutOfReachError,
     PartKind,
@@ -81,7 +81,7 @@ class ArmError(Exception):
 # Where to grasp
 
 
-def across(kind: PartKind, part: Mapping[str, Any], arm: JointChain) -> Grasp:
+def across(kind: PartKind, part: Mapping[str, Any], arm: ArmNumbers) -> Grasp:
     """Return a grasp across a part's narrow side. A round part has none: the fingers close across
     the direction from which the arm comes."""
     narrow, turn = min(kind.size), float(part["turn"]) + math.pi / 2
@@ -97,7 +97,7 @@ def across(kind: PartKind, part: Mapping[str, Any], arm: JointChain) -> Grasp:
     )
 
 
-def at_centre(kind: PartKind, part: Mapping[str, Any], arm: JointChain) -> Grasp:
+def at_centre(kind: PartKind, part: Mapping[str, Any], arm: ArmNumbers) -> Grasp:
     """Return a grasp at a part's middle, with the fingers wide open and closing across the
     direction from which the arm comes; closing turns the part."""
     return Grasp(
@@ -114,9 +114,9 @@ def _depth(kind: PartKind) -> float:
     return max(FLOOR, kind.height - SEAT)
 
 
-def _arriving(part: Mapping[str, Any], arm: JointChain) -> float:
+def _arriving(part: Mapping[str, Any], arm: ArmNumbers) -> float:
     """Return the direction across the line from the arm's base to the part (rad)."""
-    foot = arm.points[0]
+    foot = arm.foot
     return math.atan2(float(part["y"]) - foot[1], float(part["x"]) - foot[0]) + math.pi / 2
 
 
@@ -176,7 +176,7 @@ async def grasp_centre(
 
 async def _grasp(
     ctx: Context,
-    planned: Callable[[PartKind, Mapping[str, Any], JointChain], Grasp],
+    planned: Callable[[PartKind, Mapping[str, Any], ArmNumbers], Grasp],
     part: Mapping[str, Any],
     arm: str,
     cell: str,

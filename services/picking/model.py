@@ -1,8 +1,7 @@
 """The numbers of a pick-and-place cell and of its arm, read from TOML files and checked.
 
-An arm is described by its joint axes at joint angles of zero, so any arm of five or six joints can
-be used. `JointChain.tool` is its forward kinematics, `JointChain.over` gives the joint angles for
-fingers that point straight down.
+An arm is described by the axes of its joints (`petrobot.JointChain`), so any arm of five or six
+joints can be used. `ArmNumbers.over` gives the joint angles for fingers that point straight down.
 """
 
 from __future__ import annotations
@@ -10,17 +9,15 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Vector = NDArray[np.float64]
-_NEAR: Final = 2e-4
-"""Tolerance of a pose in `JointChain.over` (m and rad)."""
+from petrobot.services.joint_chain import JointChain, rotation_matrix, rotation_vector
 
 
 class NumbersError(ValueError):
@@ -101,110 +98,45 @@ class Gripper:
 
 
 @dataclass(frozen=True, slots=True)
-class JointChain:
-    """An arm on the table, all in the table's frame at joint angles of zero."""
+class ArmNumbers:
+    """An arm on the table."""
 
     name: str
-    points: Vector
-    """A point on each axis (m), shape (n, 3)."""
-    axes: Vector
-    """Unit vectors of the axes, shape (n, 3)."""
-    tip: Vector
-    """The middle between the finger tips (m), shape (3,)."""
-    approach: Vector
-    """Unit vector along the fingers, shape (3,)."""
-    closing: Vector
-    """Unit vector along which the fingers close, shape (3,)."""
-    limits: Vector
-    """Lowest and highest angle of each joint (rad), shape (n, 2)."""
+    chain: JointChain
+    """Its joints in the table's frame. The tool is the middle between the finger tips; its z points
+    along the fingers, its x is the direction in which they close."""
+    foot: tuple[float, float]
+    """Where it stands (m)."""
     gripper: Gripper
     controller: str
     """Commands of its driver: a key of `petrobot.services.picking.commands.ARMS`."""
     poses: Mapping[str, tuple[float, ...]]
 
-    def tool(self, joints: Sequence[float]) -> tuple[Vector, Vector, Vector, Vector]:
-        """Return tip, approach and closing direction (3,) and the Jacobian (6, n) of tip velocity
-        and turning rate."""
-        rotation, moved = np.eye(3), np.zeros(3)
-        axes, points = [], []
-        for angle, point, axis in zip(joints, self.points, self.axes, strict=True):
-            axes.append(rotation @ axis)
-            points.append(rotation @ point + moved)
-            turned = _rotation(axis, float(angle))
-            moved = moved + rotation @ (point - turned @ point)
-            rotation = rotation @ turned
-        tip = rotation @ self.tip + moved
-        jacobian = np.vstack((np.cross(axes, tip - np.array(points)).T, np.array(axes).T))
-        return tip, rotation @ self.approach, rotation @ self.closing, jacobian
-
     def over(
         self, x: float, y: float, z: float, turn: float, near: Sequence[float] | None = None
     ) -> tuple[float, ...]:
         """Return joint angles with the tips at (x, y, z) m, the fingers straight down and closing
-        along `turn` (rad, modulo half a turn), nearest to the angles `near`.
-
-        Damped least squares. Raises OutOfReachError.
-        """
-        starts = [self.poses["reach"]] if near is None else [tuple(near), self.poses["reach"]]
-        aim = math.atan2(y - self.points[0][1], x - self.points[0][0])
-        tip = self.tool(self.poses["reach"])[0] - self.points[0]
-        begun = list(self.poses["reach"])
-        begun[0] += _wrapped(aim - math.atan2(tip[1], tip[0]))
-        starts.append(tuple(begun))
-        found: list[tuple[float, tuple[float, ...]]] = []
-        for start in starts:
-            for half in (0.0, math.pi):
-                joints = self._solve((x, y, z), turn + half, start)
-                if joints is not None:
-                    away = joints - np.asarray(near if near is not None else start)
-                    found.append((float(np.abs(away).max()), tuple(joints.tolist())))
+        along `turn` (rad, modulo half a turn), nearest to the angles `near`. Raises
+        OutOfReachError."""
+        reach = self.poses["reach"]
+        tip = self.chain.point(reach)
+        aim = math.atan2(y - self.foot[1], x - self.foot[0])
+        ahead = aim - math.atan2(tip[1] - self.foot[1], tip[0] - self.foot[0])
+        aimed = (reach[0] + math.remainder(ahead, 2.0 * math.pi), *reach[1:])
+        for start in (near or reach, reach, aimed):
+            found: list[tuple[float, tuple[float, ...]]] = []
+            for half in (turn / 2, turn / 2 + math.pi / 2):
+                # straight down: half a turn about the line between x and the closing direction
+                pose = (x, y, z, math.pi * math.cos(half), math.pi * math.sin(half), 0.0)
+                with suppress(ValueError):
+                    joints = self.chain.joints(pose, start)
+                    pairs = zip(joints, near or start, strict=True)
+                    found.append((max(abs(a - b) for a, b in pairs), tuple(joints)))
             if found:
-                break
-        if not found:
-            raise OutOfReachError(
-                f"{self.name} cannot reach x {x:.3f}, y {y:.3f}, z {z:.3f} m with its fingers down"
-            )
-        return min(found)[1]
-
-    def _solve(
-        self, place: tuple[float, float, float], turn: float, start: Sequence[float]
-    ) -> Vector | None:
-        joints: Vector = np.array(start, float)
-        wanted = np.array((math.cos(turn), math.sin(turn), 0.0))
-        down = np.array((0.0, 0.0, -1.0))
-        for _ in range(60):
-            tip, approach, closing, jacobian = self.tool(joints.tolist())
-            away = np.array(place) - tip
-            aside = 0.5 * (np.cross(approach, down) + np.cross(closing, wanted))
-            if approach @ down < 0.0 or closing @ wanted < 0.0:
-                aside += 0.5 * approach if abs(closing @ wanted) < 0.99 else 0.2 * approach
-            error = np.concatenate((away, aside))
-            if np.abs(error).max() < _NEAR and closing @ wanted > 0.0 and approach @ down > 0.0:
-                return joints
-            damping = 1e-4 * np.eye(6)
-            step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping, error)
-            joints = np.clip(
-                joints + np.clip(step, -0.4, 0.4), self.limits[:, 0], self.limits[:, 1]
-            )
-        return None
-
-
-def _wrapped(angle: float) -> float:
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
-
-
-def _rotation(axis: Vector, angle: float) -> Vector:
-    """Return the rotation about a unit vector (Rodrigues)."""
-    x, y, z = axis
-    c, s = math.cos(angle), math.sin(angle)
-    k = 1.0 - c
-    return np.array(
-        (
-            (c + x * x * k, x * y * k - z * s, x * z * k + y * s),
-            (y * x * k + z * s, c + y * y * k, y * z * k - x * s),
-            (z * x * k - y * s, z * y * k + x * s, c + z * z * k),
+                return min(found)[1]
+        raise OutOfReachError(
+            f"{self.name} cannot reach x {x:.3f}, y {y:.3f}, z {z:.3f} m with its fingers down"
         )
-    )
 
 
 # Reading the files
@@ -247,22 +179,24 @@ def read_cell(text: str, source: str) -> PickingCell:
     return cell
 
 
-def read_arm(text: str, source: str) -> JointChain:
+def read_arm(text: str, source: str) -> ArmNumbers:
     """Read an arm's numbers. Raises NumbersError."""
     table = _table(text, source)
     try:
         base, tool, gripper = table["base"], table["tool"], table["gripper"]
-        turn = _rotation(np.array((0.0, 0.0, 1.0)), float(base["yaw"]))
+        turn = rotation_matrix((0.0, 0.0, float(base["yaw"])))
         foot = np.asarray(base["position"], float)
-        joints = table["joints"]
-        arm = JointChain(
+        joints = [
+            {**j, "axis": (turn @ j["axis"]).tolist(), "point": (turn @ j["point"] + foot).tolist()}
+            for j in table["joints"]
+        ]
+        closing, approach = np.array(tool["closing"], float), np.array(tool["approach"], float)
+        axes = np.column_stack((closing, np.cross(approach, closing), approach))
+        tip = turn @ tool["tip"] + foot
+        arm = ArmNumbers(
             str(table["name"]),
-            np.array([turn @ np.asarray(j["point"], float) + foot for j in joints]),
-            np.array([turn @ np.asarray(j["axis"], float) for j in joints]),
-            turn @ np.asarray(tool["tip"], float) + foot,
-            turn @ np.asarray(tool["approach"], float),
-            turn @ np.asarray(tool["closing"], float),
-            np.array([_pair(j["limits"]) for j in joints]),
+            JointChain(joints, [*tip.tolist(), *rotation_vector(turn @ axes).tolist()]),
+            (float(foot[0]), float(foot[1])),
             Gripper(
                 float(gripper["opening"]),
                 float(gripper["thickness"]),
@@ -284,7 +218,7 @@ def read_arm(text: str, source: str) -> JointChain:
 
 
 @cache
-def arm_named(name: str) -> JointChain:
+def arm_named(name: str) -> ArmNumbers:
     """Return the arm of a shipped file (`"so101"`, `"ur5e"`), or of the file at a path. Raises
     NumbersError."""
     own = Path(__file__).with_name(f"{name}.toml")

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from petrobot.services.comm.streams.line import ByteLine, Link
     from petrobot.services.conformance import DriverCheck, check_driver
     from petrobot.services.device import Driver, Ports, Remote, Setpoint, key, numbers
+    from petrobot.services.joint_chain import JointChain
     from petrobot.services.joint_motion import JointMotion
     from petrobot.services.perform import perform
     from petrobot.services.rehearsal import Rehearsal, rehearse
@@ -44,6 +45,7 @@ __all__ = [
     "Context",
     "Driver",
     "DriverCheck",
+    "JointChain",
     "JointMotion",
     "Link",
     "Ports",
@@ -69,6 +71,7 @@ _HOMES = {
     **dict.fromkeys(
         ("Driver", "Ports", "Remote", "Setpoint", "key", "numbers"), "petrobot.services.device"
     ),
+    "JointChain": "petrobot.services.joint_chain",
     "JointMotion": "petrobot.services.joint_motion",
     **dict.fromkeys(("DriverCheck", "check_driver"), "petrobot.services.conformance"),
     "perform": "petrobot.services.perform",

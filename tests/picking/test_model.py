@@ -10,7 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.adapters.so101.kinematics import forward
+from petrobot import JointChain
+from petrobot.services.adapters.so101.kinematics import CHAIN
+from petrobot.services.adapters.ur.kinematics import chain
+from petrobot.services.joint_chain import rotation_matrix
 from petrobot.services.picking.model import (
     NumbersError,
     OutOfReachError,
@@ -34,11 +37,13 @@ def test_over_and_tool_are_inverse_wherever_parts_lie(
 ) -> None:
     numbers = arm_named(arm)
     joints = numbers.over(x, y, z, turn)
-    tip, approach, closing, _ = numbers.tool(joints)
-    assert math.dist(tip, (x, y, z)) < 1e-3
-    assert approach[2] < -0.9999
-    assert abs(math.remainder(math.atan2(closing[1], closing[0]) - turn, math.pi)) < 2e-3
-    assert all(low <= q <= high for q, (low, high) in zip(joints, numbers.limits, strict=True))
+    pose = numbers.chain.tool(joints)
+    closing, _, approach = rotation_matrix(pose[3:]).T
+    assert math.dist(pose[:3], (x, y, z)) < 1e-6
+    assert approach[2] < -0.999999
+    assert abs(math.remainder(math.atan2(closing[1], closing[0]) - turn, math.pi)) < 1e-5
+    limits = numbers.chain.limits.values()
+    assert all(low <= q <= high for q, (low, high) in zip(joints, limits, strict=True))
 
 
 @pytest.mark.parametrize("arm", ARMS)
@@ -47,13 +52,23 @@ def test_every_slot_can_be_reached(arm: str) -> None:
     for tray in cell_named().trays.values():
         for slot in tray.slots:
             for z in (0.004, 0.065):
-                tip = numbers.tool(numbers.over(*slot, z, 0.0))[0]
-                assert math.dist(tip, (*slot, z)) < 1e-3
+                tip = numbers.chain.point(numbers.over(*slot, z, 0.0))
+                assert math.dist(tip, (*slot, z)) < 1e-6
 
 
-@given(st.lists(ANGLE, min_size=5, max_size=5))
-def test_the_so101_is_the_one_of_its_adapter(joints: list[float]) -> None:
-    assert math.dist(arm_named("so101").tool(joints)[0], forward(joints)[:3]) < 2e-4
+@pytest.mark.parametrize(
+    ("arm", "own", "off"), [("so101", CHAIN, 2e-4), ("ur5e", chain("ur5e", (0.0, 0.0, 0.15)), 1e-6)]
+)
+@given(joints=st.lists(ANGLE, min_size=6, max_size=6))
+def test_each_arm_is_the_one_of_its_adapter(
+    arm: str, own: JointChain, off: float, joints: list[float]
+) -> None:
+    numbers = arm_named(arm)
+    joints = joints[: len(own.limits)]
+    x, y, z = own.point(joints)
+    base = math.pi if arm == "ur5e" else 0.0  # as it is turned on its table
+    seen = x * math.cos(base) + numbers.foot[0], y * math.cos(base) + numbers.foot[1], z
+    assert math.dist(numbers.chain.point(joints), seen) < off
 
 
 @settings(max_examples=20, deadline=None)
@@ -61,11 +76,11 @@ def test_the_so101_is_the_one_of_its_adapter(joints: list[float]) -> None:
 @given(joints=st.lists(ANGLE, min_size=6, max_size=6))
 def test_the_laboratory_has_the_same_arm_but_for_its_errors(arm: str, joints: list[float]) -> None:
     numbers = arm_named(arm)
-    joints = joints[: len(numbers.points)]
+    joints = joints[: len(numbers.chain.limits)]
     errors = dict.fromkeys(("base", "base_z", "base_yaw", "joint_zero"), 0.0)
     exact = true_arm(site(arm).numbers, errors, np.random.default_rng(0))
-    assert math.dist(numbers.tool(joints)[0], exact.tool(joints)[:3]) < 1e-9
-    away = math.dist(numbers.tool(joints)[0], site(arm).arm().tool(joints)[:3])
+    assert math.dist(numbers.chain.point(joints), exact.tool(joints)[:3]) < 1e-9
+    away = math.dist(numbers.chain.point(joints), site(arm).arm().tool(joints)[:3])
     assert 1e-4 < away < 0.02
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from petrobot import Context, Remote, Result, error, failure, perform, success
-from petrobot.services.adapters.so101.kinematics import forward, inverse
+from petrobot.services.adapters.so101.kinematics import CHAIN, inverse
 
 State = Mapping[str, Any]
 STARTING = 1.0
@@ -46,8 +46,8 @@ async def move_to(
     except ValueError as fault:
         return error("unreachable", str(fault))
     result = await move_joints(ctx, joints=joints, speed=speed, timeout=timeout)
-    tip = forward(ctx.device.state["q"])
-    return result if result.cause else success(off=math.dist(tip[:3], (x, y, z)))
+    tip = CHAIN.point(ctx.device.state["q"])
+    return result if result.cause else success(off=math.dist(tip, (x, y, z)))
 
 
 async def grasp(

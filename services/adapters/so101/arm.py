@@ -22,7 +22,7 @@ from typing import Any, Final
 
 from petrobot import Driver, JointMotion, Link, Ports, key, numbers
 from petrobot.services.adapters.so101 import bus
-from petrobot.services.adapters.so101.kinematics import JOINTS, forward
+from petrobot.services.adapters.so101.kinematics import CHAIN, JOINTS
 
 BAUD: Final = 1_000_000
 """bit/s, as the servos are delivered."""
@@ -153,7 +153,7 @@ class Arm(Driver):
         self._calibrated = self._read_calibration()
         self._on = self.enable
         speeds = self.top_speed, self.acceleration
-        self.motion = JointMotion(self, _limits(self.arm), *speeds, lambda q: forward(q)[:3])
+        self.motion = JointMotion(self, _limits(self.arm), *speeds, CHAIN.point)
         self.jaw = JointMotion(self, _limits([self.gripper]), *speeds)
         self._hand = ""
         """"open", "close", or "keep" (it was stopped while it held something)."""

@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import partial
-from operator import sub
 from typing import Any
 
 from petrobot import Driver, JointMotion, Link, Ports, key, numbers
@@ -50,10 +49,6 @@ ASK_AGAIN = 1.0
 """Time between two requests while the drives are being enabled (s)."""
 BY_ITSELF = 1.0
 """Seconds in which the program has stopped the arm after the set points ceased."""
-PART = 0.02, 0.004
-"""rad and m between two places of a straight way."""
-TURN = 2 * math.pi
-JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 PROGRAM = """\
 def petrobot():
   patience = 0.1
@@ -102,7 +97,7 @@ class Arm(Driver):
             raise ValueError(f"model: expected one of {known}, found {self.model!r}")
         if self.top_speed > 3.14 or self.acceleration > 20.0:
             raise ValueError("expected top_speed up to 3.14 rad/s, acceleration up to 20 rad/s^2")
-        self._arm = kinematics.Geometry(self.model, numbers(self.tool, 3, "tool"))
+        self._arm = kinematics.chain(self.model, numbers(self.tool, 3, "tool"))
         addresses = self.rtde_port, self.dashboard_port, self.program_port
         self._link, self._dashboard, self._program = (
             Link(ports.now, partial(ports.tcp, self.host, port), patience)
@@ -110,11 +105,7 @@ class Arm(Driver):
         )
         self._rtde, self._connection = Rtde(OUTPUTS, (SETPOINT, DIGITAL), 125.0), 1
         self._motion = JointMotion(
-            self,
-            dict.fromkeys(JOINTS, (-TURN, TURN)),
-            self.top_speed,
-            self.acceleration,
-            point=lambda q: self._arm.tool(q)[:3],
+            self, self._arm.limits, self.top_speed, self.acceleration, self._arm.point
         )
         self._seen = self._echoed = -math.inf
         self._count, self._echo, self._beat, self._ask_at = 0, -1, 0, 0.0
@@ -134,7 +125,8 @@ class Arm(Driver):
         elif what == "move":
             self._go([numbers(body.get("joints"), 6, "joints")], body)
         elif what == "linear":
-            self._go(self._straight(numbers(body.get("pose"), 6, "pose")), body)
+            pose = numbers(body.get("pose"), 6, "pose")
+            self._go(self._arm.line(pose, self._motion.q), body)
         elif what == "output":
             self._output(body.get("bit"), body.get("value"))
         elif what == "rest":
@@ -152,22 +144,6 @@ class Arm(Driver):
         self._pretended = self._pretended & ~(1 << bit) | value << bit
         if not self.dry_run:
             self._rtde.send(1, dict(zip(DIGITAL, (1 << bit, value << bit), strict=True)))
-
-    def _straight(self, pose: list[float]) -> list[list[float]]:
-        """Joint poses along the straight way of the tool from where the arm rests."""
-        begin, way = self._arm.tool(self._motion.q), [self._motion.q]
-        turn, length = math.dist(begin[3:], pose[3:]), math.dist(begin[:3], pose[:3])
-        parts = max(2, math.ceil(turn / PART[0]), math.ceil(length / PART[1]))
-        for part in range(1, parts + 1):
-            place = kinematics.between(begin, pose, part / parts)
-            found = self._arm.joints(place, way[-1])
-            if found is None or max(map(abs, map(sub, found, way[-1]))) > 0.2:
-                x, y, z = place[:3]
-                raise ValueError(
-                    f"linear: the arm cannot pass x = {x:.3f}, y = {y:.3f}, z = {z:.3f} m"
-                )
-            way.append(found)
-        return way
 
     def _go(self, way: list[list[float]], body: Mapping[str, Any]) -> None:
         if not self._enabled:

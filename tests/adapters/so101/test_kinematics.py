@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.services.adapters.so101.kinematics import JOINTS, forward, inverse
+from petrobot.services.adapters.so101.kinematics import CHAIN, JOINTS, inverse
+from petrobot.services.joint_chain import rotation_matrix
 
 HALF = math.pi / 2
 URDF = [
@@ -45,25 +46,40 @@ def test_the_tip_is_where_the_urdf_has_it(q: Any) -> None:
     x, y, z = (pose @ matrix(*TIP))[:3, 3]
     pan = URDF[0][0]
     expected = -(y - pan[1]), x - pan[0], z  # forward is the URDF's -y
-    assert forward(q)[:3] == pytest.approx(expected, abs=2e-6)
-    assert math.sin(forward(q)[3]) == pytest.approx(roll_axis[2], abs=2e-5)
+    tip = CHAIN.tool(q)
+    assert tip[:3] == pytest.approx(expected, abs=2e-6)
+    assert rotation_matrix(tip[3:])[2, 0] == pytest.approx(roll_axis[2], abs=2e-5)
 
 
 @given(angles)
 def test_inverse_gives_angles_that_bring_the_tip_there(q: Any) -> None:
-    tip = forward(q)
-    found = inverse(*tip, q[4])
-    again = forward(found)
-    assert again[:3] == pytest.approx(tip[:3], abs=1e-6) and found[4] == q[4]
-    assert math.remainder(again[3] - tip[3], 2 * math.pi) == pytest.approx(0.0, abs=1e-6)
+    tip, pitch = CHAIN.point(q), -sum(q[1:4])
+    x, y, z = tip
+    found = inverse(x, y, z, pitch, q[4])
+    assert CHAIN.point(found) == pytest.approx(tip, abs=1e-6) and found[4] == q[4]
+    assert math.remainder(-sum(found[1:4]) - pitch, 2 * math.pi) == pytest.approx(0.0, abs=1e-6)
     for (low, high), angle in zip(JOINTS.values(), found, strict=False):
-        assert low - 1e-9 <= angle <= high + 1e-9
+        assert low <= angle <= high
+
+
+def test_a_point_in_front_is_reached_with_the_elbow_up() -> None:
+    pan, lift, elbow, *_ = inverse(0.2, -0.1, 0.05, -HALF, 0.3)
+    assert pan == pytest.approx(math.atan2(0.1, 0.2), abs=0.02)
+    # stretched out: the forearm lies 1.288 rad above its direction at zero
+    assert -HALF < lift < HALF and elbow > -1.288
 
 
 @pytest.mark.parametrize(
-    ("x", "z", "words"),
-    [(0.6, 0.1, "too far away"), (0.0, 0.1, "too near the pan axis"), (-0.25, 0.05, "outside")],
+    ("x", "z", "roll", "words"),
+    [
+        (0.6, 0.1, 0.0, "no joint positions.* mm and"),
+        (0.0, 0.1, 0.0, "no joint positions"),
+        (-0.25, 0.05, 0.0, "no joint positions"),
+        (0.2, 0.05, 3.0, "roll: expected -2.793 to 2.793 rad"),
+    ],
 )
-def test_what_cannot_be_reached_is_refused_in_words(x: float, z: float, words: str) -> None:
+def test_what_cannot_be_reached_is_refused_in_words(
+    x: float, z: float, roll: float, words: str
+) -> None:
     with pytest.raises(ValueError, match=words):
-        inverse(x, 0.0, z, -HALF, 0.0)
+        inverse(x, 0.0, z, -HALF, roll)

@@ -156,7 +156,7 @@ def test_a_linear_motion_is_straight() -> None:
         ({"do": "move", "joints": [float("nan")] * 6}, "joints: expected 6 finite numbers"),
         ({"do": "move", "joints": [7.0, *HOME[1:]]}, "base: expected -6.283 to 6.283, found 7.000"),
         ({"do": "move", "joints": HOME, "speed": 0.0}, "speed: expected"),
-        ({"do": "linear", "pose": [3.0, 0, 0, 0, 0, 0]}, "the arm cannot pass"),
+        ({"do": "linear", "pose": [3.0, 0, 0, 0, 0, 0]}, "the tool cannot pass"),
         ({"do": "output", "bit": 9, "value": True}, "output: expected bit 0 to 7"),
         ({"do": "output", "bit": 1, "value": 1}, "output: expected bit 0 to 7"),
         ({"do": "move", "joints": THERE}, "lies outside the workspace x = ["),
