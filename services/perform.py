@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from petrobot.services.action import Context, Result, error, success
+from petrobot.services.action import CommandRefused, Context, Result, error, success
 from petrobot.services.device import Remote
 
 
@@ -19,10 +19,16 @@ async def perform(
 
     The driver's state has `faults`: what is wrong, by code; empty if nothing is. Return SUCCESS, or
     ERROR with the code and text of a fault, or ERROR `late` after `timeout` s; the driver is then
-    told to stop by the command `{"do": "rest"}`. A refusal ends the run in ERROR `command_refused`.
+    told to stop by the command `{"do": "rest"}`. A refusal without a fault ends the run in ERROR
+    `command_refused`.
     """
-    await ctx.command(command)
     device = ctx.device
+    try:
+        await ctx.command(command)
+    except CommandRefused:
+        for cause, text in device.state["faults"].items():
+            return error(cause, text)
+        raise
     await ctx.wait(lambda: bool(device.state["faults"]) or done(device.state), timeout)
     for cause, text in device.state["faults"].items():
         return error(cause, text)

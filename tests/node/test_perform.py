@@ -22,6 +22,8 @@ class Lift(Driver):
     def command(self, now: float, body: Mapping[str, Any]) -> None:
         if body["do"] not in ("rise", "rest"):
             raise ValueError(f"unknown command {body['do']!r}")
+        if self.height >= self.jams:
+            raise ValueError("it is jammed")
         self.moving = body["do"] == "rise"
         self.commands.append(body)
 
@@ -44,6 +46,7 @@ async def rise(ctx: Context[Remote], *, do: str = "rise", timeout: float = 2.0) 
     [
         (9.0, {}, ("success", ""), "", ["rise"]),
         (0.5, {}, ("error", "jammed"), "something is in the way", ["rise"]),
+        (0.0, {}, ("error", "jammed"), "something is in the way", []),
         (9.0, {"timeout": 0.5}, ("error", "late"), "0.5 s it rises slowly", ["rise", "rest"]),
         (9.0, {"do": "fly"}, ("error", "command_refused"), "unknown command 'fly'", []),
     ],

@@ -1,8 +1,8 @@
 """Primitive actions of the SO-101: move_joints, move_to, grasp, release, enable, calibrate.
 
 Error causes: `unreachable`, `late`, `command_refused`, and the faults of the driver: `missing`,
-`heat`, `overload`, `voltage`, `current`, `sensor`, `power`, `workspace`, `uncalibrated`. `grasp`
-fails with `empty`.
+`mode`, `heat`, `overload`, `voltage`, `current`, `sensor`, `power`, `workspace`, `uncalibrated`.
+`grasp` fails with `empty`.
 """
 
 from __future__ import annotations

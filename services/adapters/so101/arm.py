@@ -46,7 +46,7 @@ GRASP_TIME: Final = 0.1
 """Time for which the gripper must squeeze at a standstill (s)."""
 
 
-UNREAD: Final = bus.Reading(False, 2048, 2048, 0, 0.0, 0.0, 0)
+UNREAD: Final = bus.Reading(0, False, 2048, 2048, 0, 0.0, 0.0, 0)
 
 
 @dataclass
@@ -299,6 +299,9 @@ class Arm(Driver):
             for bit, word in bus.ERRORS.items():
                 if answer.error & bit:
                     self._fault(word, f"the servo of {joint.name} reports {word}")
+            if read.mode:
+                text = f"the servo of {joint.name} is in mode {read.mode}: it must be 0 (position)"
+                self._fault("mode", text)
             if read.temperature > self.hottest:
                 self._fault("heat", f"{joint.name} has {read.temperature} deg C")
             if joint.ready and self._on and not read.torque:
@@ -306,7 +309,7 @@ class Arm(Driver):
                 joint.started = False
             if not (joint.ready and read.torque):
                 joint.settle()
-            joint.ready = read.torque and self._on and joint.started
+            joint.ready = read.torque and self._on and joint.started and not read.mode
         if not self.motion.moving and not all(joint.ready for joint in self.arm):
             self.motion.halt([joint.aim for joint in self.arm])
         if not self.gripper.ready:
@@ -380,7 +383,7 @@ class Arm(Driver):
                 continue
             if joint.ready:
                 goals[joint.servo] = bus.word(joint.steps(joint.aim + joint.trim))
-            elif self._on:
+            elif self._on and not joint.read.mode:
                 limit = self.squeeze if joint is self.gripper else 1.0
                 speed = min(round(1.5 * self.top_speed / bus.RAD), 32767)
                 start[joint.servo] = bus.setup(joint.steps(joint.aim), speed, round(1000 * limit))

@@ -14,8 +14,9 @@ from typing import Final, NamedTuple
 
 SYNC_READ, SYNC_WRITE = 0x82, 0x83
 BROADCAST: Final = 0xFE
-TORQUE, GOAL = 40, 42
-"""Registers: torque enable (the first that `setup` writes), and goal position."""
+MODE, TORQUE, GOAL = 33, 40, 42
+"""Registers: operating mode (0: position), torque enable (the first that `setup` writes), and goal
+position."""
 STEPS: Final = 4096
 RAD: Final = 2 * math.pi / STEPS
 """One step of a servo (rad)."""
@@ -23,8 +24,8 @@ LONGEST: Final = 64
 """Largest length byte of an answer: a longer one is noise."""
 ERRORS: Final = {1: "voltage", 2: "sensor", 4: "heat", 8: "current", 32: "overload"}
 """Error bits of an answer."""
-_STATE: Final = struct.Struct("<Bx H 4x H 6x HHH BBx BB")
-"""Registers 40 to 66: torque enable, goal, torque limit, position, speed, load, voltage,
+_STATE: Final = struct.Struct("<B6x Bx H 4x H 6x HHH BBx BB")
+"""Registers 33 to 66: mode, torque enable, goal, torque limit, position, speed, load, voltage,
 temperature, status, moving."""
 
 
@@ -77,6 +78,8 @@ class ServoAnswer(NamedTuple):
 class Reading(NamedTuple):
     """The report of a servo, in its own units."""
 
+    mode: int
+    """0: it goes to positions; in the others the same registers mean something else."""
     torque: bool
     goal: int
     """steps"""
@@ -94,7 +97,7 @@ class Reading(NamedTuple):
 
 def read_state(servos: Iterable[int]) -> bytes:
     """Return the request for the registers that `reading` reads."""
-    return sync_read(TORQUE, _STATE.size, servos)
+    return sync_read(MODE, _STATE.size, servos)
 
 
 def reading(data: bytes) -> Reading | None:
@@ -102,8 +105,9 @@ def reading(data: bytes) -> Reading | None:
     may return what it sends)."""
     if len(data) != _STATE.size:
         return None
-    torque, goal, _, position, speed, load, voltage, temperature, _, _ = _STATE.unpack(data)
+    mode, torque, goal, _, position, speed, load, voltage, temperature, _, _ = _STATE.unpack(data)
     return Reading(
+        mode,
         torque == 1,
         number(goal),
         number(position),

@@ -215,12 +215,17 @@ class Arm(Driver):
         else:
             self._dashboard.send(now, b"power on\n" if mode == POWER_OFF else b"brake release\n")
 
-    def _lose(self, fault: str) -> None:
+    def _lose(self, fault: str, said: str = "") -> None:
         """Note a fault: nothing moves until the arm is enabled again."""
         if self._enabled and fault in ("link_lost", "program_lost"):
             self._unseen_until = self._now + BY_ITSELF
         self._enabled = self._wanted = False
-        self._fault = self._reason = fault
+        self._fault = fault
+        self._reason = said or {
+            "link_lost": f"no data for {STALE:g} s {self._link.why}".rstrip(),
+            "program_lost": f"no echo of the controller's program for {STALE:g} s",
+            "power_off": "the drives have lost their power",
+        }.get(fault, f"the controller reports {fault}")
         self._motion.halt(self._motion.q)
 
     def _send(self, now: float) -> None:
@@ -263,7 +268,7 @@ class Arm(Driver):
     def quick_stop(self, now: float) -> None:
         """Let the controller stop the joints as hard as its program does."""
         self._quick = True
-        self._lose("emergency_stop")
+        self._lose("emergency_stop", "an emergency stop of petrobot")
 
     def stopped(self) -> bool:
         """Return whether the arm is known to stand still: by its measured speeds, or because its

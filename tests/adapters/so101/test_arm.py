@@ -363,7 +363,7 @@ def test_a_period_takes_a_small_part_of_its_time() -> None:
 
 def test_a_joint_reads_and_writes_steps() -> None:
     joint = Joint("elbow_flex", 3, -1.0, 1.0, sign=-1, zero=2000)
-    joint.take(0.0, bus.Reading(True, 0, 2100, 0, -0.25, 7.4, 25))
+    joint.take(0.0, bus.Reading(0, True, 0, 2100, 0, -0.25, 7.4, 25))
     assert joint.q == pytest.approx(-100 * bus.RAD) and joint.load == 0.25
     assert joint.steps(joint.q) == 2100 and joint.steps(99.0) == 0
 

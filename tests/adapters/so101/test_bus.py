@@ -104,4 +104,4 @@ def test_a_damaged_answer_does_not_hide_others(spoilt: bytes) -> None:
 
 
 def test_an_answer_to_another_request_is_not_a_state() -> None:
-    assert bus.reading(b"\0" * 26) is None and bus.reading(b"\0" * 27) is not None
+    assert bus.reading(b"\0" * 33) is None and bus.reading(b"\0" * 34) is not None
