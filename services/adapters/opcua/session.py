@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ipaddress
+import time
 from collections.abc import Mapping
 from typing import Any, Final
 from urllib.parse import urlsplit
@@ -17,6 +18,12 @@ from petrobot import Driver, Ports, SessionThread, key
 
 LOOK: Final = 0.3
 """Time between two checks of the connection (s)."""
+HEARTBEAT: Final = "i=2258"
+"""The server's clock, a node that each server has. It changes all the time, so its notifications
+show that the server still serves the subscription."""
+BEAT: Final = 500.0
+"""Time between two of these (ms)."""
+CHANGED: Final = "nodes of the server have changed"
 UNKNOWN: Final = "the session was lost: it is unknown whether it was written"
 
 
@@ -99,16 +106,22 @@ class OpcUaSession(Driver):
     def step(self, now: float) -> None:
         """Take over what the session's thread has received; raise events for changed values."""
         for kind, item in self._session.news():
-            if kind == "up":
-                self.faults = item
+            if kind == "up":  # values and faults of nodes may have come before it
+                self.faults = {**self.faults, **item}
+                self.faults.pop("session", None)
             elif kind == "down":
                 self.faults, self.values = {"session": f"{item}; trying again"}, {}
                 if self._done < self._asked:
                     self._done, self._write_fault = self._asked, UNKNOWN
             elif kind == "done":
                 self._done, self._write_fault = self._done + 1, item
+            elif kind == "bad":
+                name, text = item
+                self.faults[name] = f"{self.nodes[name]}: {text}"
+                self.values.pop(name, None)
             else:
                 name, value = item
+                self.faults.pop(name, None)
                 known, before = name in self.values, self.values.get(name)
                 self.values[name] = value
                 # The first value of a session is not a change: the value before it is unknown.
@@ -164,6 +177,8 @@ class OpcUaSession(Driver):
             faults: dict[str, str] = {}
             heard = _Notifications(session)
             subscription = await client.create_subscription(1000 * self.interval, heard)
+            heartbeat = client.get_node(HEARTBEAT)
+            await subscription.subscribe_data_change(heartbeat, sampling_interval=BEAT)
             for name, text in self.nodes.items():
                 try:
                     node = client.get_node(text)
@@ -179,10 +194,17 @@ class OpcUaSession(Driver):
                     values = await session.get(LOOK)
                 except TimeoutError:
                     await client.check_connection()
+                    if heard.silent() > self.patience + BEAT / 1000:
+                        raise ConnectionError(
+                            "the server no longer serves the subscription"
+                        ) from None
                     continue
                 if values is None:
                     return
-                session.tell("done", await _written(values, nodes, faults))
+                wrong = await _written(values, nodes, faults)
+                session.tell("done", wrong)
+                if wrong.endswith(CHANGED):
+                    raise ConnectionError(CHANGED)  # so that types are read and values sent again
 
 
 class _Notifications:
@@ -190,11 +212,25 @@ class _Notifications:
 
     def __init__(self, session: SessionThread) -> None:
         self.names: dict[Any, str] = {}
-        self._session = session
+        self._session, self._beat = session, time.monotonic()
+
+    def silent(self) -> float:
+        """Return for how long nothing has come (s)."""
+        return time.monotonic() - self._beat
 
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
         """Take a new value."""
-        self._session.tell("value", (self.names[node.nodeid], _plain(value)))
+        self._beat = time.monotonic()
+        status = data.monitored_item.Value.StatusCode
+        if node.nodeid not in self.names:
+            return  # the heartbeat
+        name = self.names[node.nodeid]
+        if status is not None and status.is_bad():
+            self._session.tell("bad", (name, status.name))
+        elif value is None:
+            self._session.tell("bad", (name, "it has no value"))
+        else:
+            self._session.tell("value", (name, _plain(value)))
 
 
 async def _written(
@@ -215,13 +251,25 @@ async def _written(
         try:
             variant_to_binary(wanted[name][1])  # one that cannot be encoded would end the session
         except Exception:
-            return f"{name}: expected {kind.name}, found {value!r:.40}"
+            text = f"{name}: expected {kind.name}, found {value!r:.40}"
+            return text + await _changed(node, kind)
     for name, (node, variant) in wanted.items():
         try:
             await node.write_value(variant)
         except ua.UaStatusCodeError as fault:
-            return f"{name}: {fault}"
+            return f"{name}: {fault}" + await _changed(node, wanted[name][1].VariantType)
     return ""
+
+
+async def _changed(node: Any, kind: Any) -> str:
+    """Return in words that a node is not of the type that it had when the session began."""
+    from asyncua import ua
+
+    try:
+        same = await node.read_data_type_as_variant_type() == kind
+    except ua.UaStatusCodeError:  # it is gone
+        same = False
+    return "" if same else f"; {CHANGED}"
 
 
 def _plain(value: Any) -> Any:

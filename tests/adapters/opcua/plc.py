@@ -1,7 +1,9 @@
 """A simulated PLC for tests, in a separate process: `plc.py PORT [CERTIFICATE KEY CLIENT]`.
 
 The node `manner` decides how `request` is acknowledged: "good", "silent", "stuck" (never
-withdrawn).
+withdrawn). Other values let something happen once: "retyped" (`count` becomes a text node),
+"forgotten" (all subscriptions are deleted), "bad" (`speed` has a bad status), "gone" (`count` is
+deleted).
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import sys
 from pathlib import Path
+from typing import Any
 
 from asyncua import Server, ua
 from asyncua.crypto.permission_rules import SimpleRoleRuleset
@@ -38,6 +41,24 @@ async def secure(server: Server, certificate: str, key: str, clients: str) -> No
     server.set_certificate_validator(CertificateValidator(options, trusted))
 
 
+async def trouble(server: Server, nodes: dict[str, Any], manner: str) -> None:
+    """Do once what a manner says."""
+    if manner == "forgotten":
+        service = server.iserver.subscription_service
+        await service.delete_subscriptions(list(service.subscriptions))
+    elif manner == "bad":
+        status = ua.StatusCode(ua.StatusCodes.BadSensorFailure)
+        data = ua.DataValue(ua.Variant(1.5, ua.VariantType.Float), StatusCode=status)
+        await nodes["speed"].write_attribute(ua.AttributeIds.Value, data)
+    else:
+        identifier = nodes["count"].nodeid
+        await server.delete_nodes([nodes["count"]])
+        if manner == "retyped":
+            kind = ua.VariantType.String
+            node = await server.nodes.objects.add_variable(identifier, "count", "none", kind)
+            await node.set_writable()
+
+
 async def serve(port: str, *security: str) -> None:
     """Run until the process is killed."""
     server = Server()
@@ -62,6 +83,9 @@ async def serve(port: str, *security: str) -> None:
             manner, request = await nodes["manner"].get_value(), await nodes["request"].get_value()
             if manner == "good" or (manner == "stuck" and request):
                 await nodes["done"].write_value(bool(request))
+            if manner in ("retyped", "gone", "forgotten", "bad"):
+                await nodes["manner"].write_value("good")
+                await trouble(server, nodes, manner)
             await asyncio.sleep(0.02)
 
 

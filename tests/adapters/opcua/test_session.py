@@ -195,10 +195,15 @@ def test_values_of_any_type_are_plain(cell: Cell) -> None:
     heard = _Notifications(driver._session)
     heard.names["node"] = "count"
     dates = [datetime.datetime(2026, 11, 23), [datetime.datetime(2026, 11, 24)], 3]
-    heard.datachange_notification(SimpleNamespace(nodeid="node"), dates, None)
+    item = SimpleNamespace(Value=SimpleNamespace(StatusCode=None))
+    data = SimpleNamespace(monitored_item=item)
+    heard.datachange_notification(SimpleNamespace(nodeid="node"), dates, data)
     driver.step(0.0)
     told = plain(driver.state())["values"]["count"]
     assert told == ["2026-11-23 00:00:00", ["2026-11-24 00:00:00"], 3]
+    heard.datachange_notification(SimpleNamespace(nodeid="node"), None, data)
+    driver.step(0.0)
+    assert "no value" in driver.state()["faults"]["count"] and not driver.state()["values"]
 
 
 @pytest.mark.processes
@@ -300,3 +305,54 @@ def test_a_secured_server_accepts_only_its_certificate(cell: Cell) -> None:
     for refused in (driver("stranger"), driver("me", "stranger.der"), cell.driver()):
         state = await_(refused, lambda state: "trying again" in str(state["faults"]), "the refusal")
         assert not state["up"]
+
+
+@pytest.mark.processes
+def test_nodes_of_another_type_and_nodes_that_are_gone(cell: Cell) -> None:
+    cell.power(True)
+    driver = cell.driver()
+    await_(driver, complete, "all values")
+    assert done(driver, {"manner": "retyped"}) == ""
+    limit, fault = Limit("the new node"), ""
+    while "changed" not in fault and limit.left():
+        fault = done(driver, {"count": 7})
+    assert fault.startswith("count: ") and "nodes of the server have changed" in fault
+    await_(driver, lambda state: not state["up"], "the end of the session")
+    await_(driver, complete, "all values")
+    assert driver.state()["values"]["count"] == "none"
+    assert "count: expected String" in done(driver, {"count": 7})
+    assert done(driver, {"count": "seven", "manner": "gone"}) == ""
+    limit, fault = Limit("the loss"), ""
+    while "changed" not in fault and limit.left():
+        fault = done(driver, {"count": "eight"})
+    await_(driver, lambda state: not state["up"], "the end of the session")
+    state = await_(driver, lambda state: state["up"], "its successor")
+    assert "Bad" in state["faults"].get("count", ""), (fault, state)
+    assert done(driver, {"sensor": True}) == ""
+
+
+@pytest.mark.processes
+def test_what_comes_after_a_lost_subscription_is_new(cell: Cell) -> None:
+    cell.power(True)
+    driver = cell.driver(patience=2.0)
+    await_(driver, complete, "all values")
+    driver.command(0.0, {"write": {"manner": "forgotten"}})
+    state = await_(driver, lambda state: not state["up"], "the loss")
+    assert "no longer serves the subscription" in state["faults"]["session"]
+    assert state["values"] == {}
+    await_(driver, complete, "all values")
+    assert done(driver, {"count": 9}) == ""
+    await_(driver, lambda state: state["values"]["count"] == 9, "the new value")
+
+
+@pytest.mark.processes
+def test_a_node_without_a_good_value_is_a_fault_of_its_name(cell: Cell) -> None:
+    cell.power(True)
+    driver = cell.driver()
+    await_(driver, complete, "all values")
+    driver.command(0.0, {"write": {"manner": "bad"}})
+    state = await_(driver, lambda state: "speed" in state["faults"], "the fault")
+    assert "BadSensorFailure" in state["faults"]["speed"] and "speed" not in state["values"]
+    assert state["up"] and done(driver, {"speed": 2.5}) == ""
+    state = await_(driver, lambda state: "speed" in state["values"], "a good value again")
+    assert state["faults"] == {}
