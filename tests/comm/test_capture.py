@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from petrobot.services.comm.streams import capture
 from petrobot.services.comm.streams.camera import StreamImages, open_images
@@ -27,6 +28,7 @@ from tests.ports import free_ports
 from tests.waiting import Limit
 
 SIZE = (48, 64)
+GREY = np.full((*SIZE, 3), 90, np.uint8)
 
 
 def until(awaited: str, holds: Callable[[], Any]) -> Any:
@@ -210,12 +212,14 @@ def test_bad_settings_are_refused_with_a_remedy(table: dict[str, Any], text: str
 
 
 class Stream(BaseHTTPRequestHandler):
-    """A camera that sends JPEGs over HTTP, one after the other, until it is cut."""
+    """A camera that sends JPEGs over HTTP, one after the other, until it is cut in the middle of
+    one."""
 
     cut: threading.Event
+    pixels: NDArray[np.uint8]
 
     def do_GET(self) -> None:
-        _, jpeg = cv2.imencode(".jpg", np.full((*SIZE, 3), 90, np.uint8))
+        _, jpeg = cv2.imencode(".jpg", self.pixels)
         self.send_response(200)
         self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=image")
         self.end_headers()
@@ -224,6 +228,7 @@ class Stream(BaseHTTPRequestHandler):
             limit = Limit("the end of the test")
             while not self.cut.wait(0.02) and limit.left():
                 self.wfile.write(head.encode() + jpeg.tobytes() + b"\r\n")
+            self.wfile.write(head.encode() + jpeg.tobytes()[: jpeg.size * 2 // 3])
         except OSError:
             pass
 
@@ -238,10 +243,10 @@ class Network:
         [self.port] = free_ports(1)
         self.plug()
 
-    def plug(self) -> None:
-        """Let it come (back)."""
+    def plug(self, pixels: NDArray[np.uint8] = GREY) -> None:
+        """Let it come (back), with this image."""
         self._cut = threading.Event()
-        handler = type("Own", (Stream,), {"cut": self._cut})
+        handler = type("Own", (Stream,), {"cut": self._cut, "pixels": pixels})
         self._server = ThreadingHTTPServer(("127.0.0.1", self.port), handler)
         self._serving = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._serving.start()
@@ -276,6 +281,37 @@ def test_a_network_camera_is_cut_off_and_comes_back(network: Network) -> None:
     images.start(25.0)
     assert until("an image again", images.newest).pixels.shape == SIZE
     images.close()
+
+
+def test_no_part_of_a_cut_image_is_delivered_and_another_size_may_come_back() -> None:
+    """The lower third of the last image is missing: a decoder would fill it with grey."""
+    noise = np.random.default_rng(1).integers(0, 40, (240, 320, 1), np.uint8)
+    bright = np.repeat(noise + 200, 3, axis=2).astype(np.uint8)
+    camera = Network()
+    camera.unplug()
+    camera.plug(bright)
+    images = CaptureImages(f"http://127.0.0.1:{camera.port}/", time.monotonic)
+    taken = list[NDArray[np.uint8]]()
+
+    def more(shape: tuple[int, int]) -> bool:
+        if (newest := images.newest()) is not None:
+            taken.append(newest.pixels)
+        return bool(taken) and taken[-1].shape == shape
+
+    try:
+        images.start(0.0)
+        images.start(25.0)
+        until("the first image", lambda: more((240, 320)))
+        camera.unplug()
+        until("the loss", lambda: more((0, 0)) or "was lost" in images.condition)
+        camera.plug(bright[:120])
+        until("smaller images", lambda: more((120, 320)))
+        assert images.condition == ""
+        assert {each.shape for each in taken} == {(240, 320), (120, 320)}
+        assert all(each[-20:].mean() > 195 for each in taken)
+    finally:
+        images.close()
+        camera.unplug()
 
 
 def test_a_network_camera_that_is_not_there_is_reported(network: Network) -> None:

@@ -7,7 +7,13 @@ from typing import Any
 
 from petrobot import Ports, key
 from petrobot.services.adapters.ros2.link import RosbridgeLink, SimulatedLink, connect
-from petrobot.services.adapters.ros2.protocol import MOVING, ExchangePhase, Exchanges, Message
+from petrobot.services.adapters.ros2.protocol import (
+    MOVING,
+    ExchangePhase,
+    Exchanges,
+    Fragments,
+    Message,
+)
 from petrobot.services.adapters.ros2.topics import TopicDriver
 
 
@@ -23,6 +29,7 @@ class Bridge(TopicDriver):
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         super().__init__(config, ports)
         self.exchanges = Exchanges(self.patience)
+        self.fragments = Fragments()
         self.advertised: dict[str, str] = {}
         self.now = 0.0
         """Time of the present step (s)."""
@@ -74,15 +81,28 @@ class Bridge(TopicDriver):
             elif kind == "down":
                 self.advertised.clear()
                 self.topics.clear()  # values from before the link was lost
+                self.fragments = Fragments()
                 self.exchanges.link(now, False)
             elif kind == "refused":
                 self.refuse(item)
-            elif item["op"] == "publish":
-                self.arrive(now, item.get("topic"), item.get("msg"))
-            elif fault := self.exchanges.receive(now, item):
-                self.refuse(fault)
+            elif item["op"] != "fragment":
+                self._receive(now, item)
+            else:
+                try:
+                    whole = self.fragments.add(item)
+                except ValueError as fault:
+                    self.refuse(str(fault))
+                    continue
+                if whole is not None:
+                    self._receive(now, whole)
         self._send(self.exchanges.advance(now))
         super().step(now)
+
+    def _receive(self, now: float, message: Message) -> None:
+        if message["op"] == "publish":
+            self.arrive(now, message.get("topic"), message.get("msg"))
+        elif fault := self.exchanges.receive(now, message):
+            self.refuse(fault)
 
     def _subscriptions(self) -> list[Message]:
         return [

@@ -12,12 +12,10 @@ from typing import Any, Protocol
 import aiohttp
 
 from petrobot import SessionThread
-from petrobot.services.adapters.ros2.protocol import Message, parse
+from petrobot.services.adapters.ros2.protocol import LARGEST, Message, parse
 
 CONNECTING = 5.0
 """Limit of an attempt to connect (s)."""
-LARGEST = 4 << 20
-"""Bytes of the largest message that is received."""
 
 
 class RosbridgeLink(Protocol):

@@ -12,6 +12,10 @@ from enum import StrEnum
 from typing import Any
 
 Message = dict[str, Any]
+LARGEST = 4 << 20
+"""Bytes of the largest message that is received."""
+WAITING = 8
+"""Messages of which fragments may be missing at the same time."""
 DEPTH, ITEMS, TABLES = 16, 20_000, 1_000
 """Limits of a message: deepest nesting, most items, and most lists and tables. A driver's state can
 contain several such messages."""
@@ -34,6 +38,34 @@ def parse(text: str) -> Message:
     if not isinstance(message, dict) or not isinstance(message.get("op"), str):
         raise ValueError(f"expected an object with a text `op`, found {text[:60]!r}")
     return message
+
+
+class Fragments:
+    """Puts messages together that a server sends in parts (operation `fragment`)."""
+
+    def __init__(self) -> None:
+        self._parts: dict[str, dict[int, str]] = {}
+
+    def add(self, part: Message) -> Message | None:
+        """Return the message that a part completes, None if parts are missing. Raises
+        ValueError."""
+        number, total, data = part.get("num"), part.get("total"), part.get("data")
+        if not (
+            isinstance(number, int)
+            and isinstance(total, int)
+            and isinstance(data, str)
+            and 0 <= number < total
+        ):
+            raise ValueError(f"not a fragment: {str(part)[:60]}")
+        name = str(part.get("id"))
+        parts = self._parts.setdefault(name, {})
+        parts[number] = data
+        if len(parts) == total:
+            return parse("".join(text for _, text in sorted(self._parts.pop(name).items())))
+        if sum(map(len, parts.values())) > LARGEST or len(self._parts) > WAITING:
+            self._parts.pop(next(iter(self._parts)) if len(self._parts) > WAITING else name)
+            raise ValueError(f"fragments of {name:.40}: too many or too long")
+        return None
 
 
 def _finite(text: str) -> float | None:

@@ -132,9 +132,9 @@ class Controller:
             self.inputs.update(zip(names, struct.unpack(form, payload[1:]), strict=True))
 
     def _value(self, name: str) -> bytes:
-        known = {"actual_q": self.q, "actual_qd": self.qd, "robot_mode": [self.mode],
-                 "safety_mode": [self.safety]}  # fmt: skip
-        values = known.get(name, [int(self.inputs[name])])
+        known: dict[str, list[float]] = {"actual_q": self.q, "actual_qd": self.qd}
+        known |= {"robot_mode": [self.mode], "safety_mode": [self.safety]}
+        values = known.get(name) or [int(self.inputs[name])]
         return struct.pack(">" + FORMS[TYPES[name]], *values)
 
     def _send(self, kind: str, payload: bytes) -> None:
