@@ -78,15 +78,20 @@ class Controller:
                 self._dashboard(data)
             else:
                 self.program = self.mode == 7 and self.safety in (1, 2)
-        while len(self.buffer) >= 3 and len(self.buffer) >= int.from_bytes(self.buffer[:2], "big"):
-            size = int.from_bytes(self.buffer[:2], "big")
-            kind, payload = chr(self.buffer[2]), self.buffer[3:size]
-            self.buffer = self.buffer[size:]
-            self._rtde(kind, payload)
+        while (package := self._package()) is not None:
+            self._rtde(chr(package[2]), package[3:])
         self._move(dt)
         if self.running and now - self.sent >= self.period - 1e-9:
             self.sent = now
             self._send("U", b"\x01" + b"".join(map(self._value, self.outputs)))
+
+    def _package(self) -> bytes | None:
+        """Remove the next whole package: its size (uint16), its type, its payload."""
+        size = int.from_bytes(self.buffer[:2], "big")
+        if len(self.buffer) < max(3, size):
+            return None
+        package, self.buffer = self.buffer[:size], self.buffer[size:]
+        return package
 
     def _drop(self, number: int, line: socket.socket) -> None:
         line.close()
