@@ -39,7 +39,7 @@ from petrobot.coordinator.engine import (
     TimerFired,
 )
 from petrobot.coordinator.engine.stimuli import Stimulus
-from petrobot.coordinator.task import Scope, Status, Task
+from petrobot.coordinator.task import Estimate, Executed, Scope, Status, Task
 from petrobot.coordinator.task.file import loads
 from tests.analysis.test_execution_graph import COMMON
 from tests.analysis.test_views import timed
@@ -80,6 +80,7 @@ class Text:
     rest: str = ""
     final_error: str = ""
     done: str = ""
+    tries: int = 1
 
     def task(self) -> Task:
         """Return the task: parts are worked on one after the other, and branches may listen."""
@@ -92,7 +93,8 @@ class Text:
             '[events.ready]\nscope = "internal"\nby = "work"\nmean_wait = 1.7\n'
             f'[places]\nparts = {{ kind = "control", tokens = {self.parts} }}\n'
             'arm = { kind = "resource", tokens = 1 }\n'
-            f'work = {{ kind = "action", task = "work" }}\n{"".join(self.places)}'
+            f'work = {{ kind = "action", task = "work", tries = {self.tries} }}\n'
+            f"{''.join(self.places)}"
             f"[transitions]\n{arcs('start', 'parts,arm', 'work')}"
             f"{arcs('did', 'work:normal', 'arm', self.done)}{''.join(self.moves)}{self.rest}"
         )
@@ -186,15 +188,16 @@ def never_begun() -> Task:
     return text.task()
 
 
-def figures_agree(task: Task) -> None:
+def figures_agree(task: Task, measured: Measured | None = None) -> None:
     """Compare the view with the execution graph as a Markov chain, where no conflict is left to
     the order of waiting or of the file."""
     x = execute(task, limit=STEPS)
     assume(x.complete and not x.livelocks)
     assume(not execute(task, limit=STEPS, free_choice=True).contests)
     try:
-        chain = chain_of(x, size=2_000)
-        view = stochastic_view(task, stages=chain.stages, timer_stages=chain.stages)
+        chain = chain_of(x, measured, size=2_000)
+        few = chain.stages
+        view = stochastic_view(task, measured, stages=few, timer_stages=few)
         found = forecast(view, limits=SearchLimits(states=20_000))
     except TooLarge:
         assume(False)
@@ -266,16 +269,19 @@ class Clock:
     def after(self, mean: float, stimulus: Stimulus) -> None:
         self.due.append((self.now + self.random.exponential(mean), stimulus))
 
+    def start(self, order: StartRun) -> None:
+        """Draw how a run ends, and when."""
+        i = int(self.random.choice(3, p=SHARES[order.primitive_task]))
+        self.after(SECONDS[order.primitive_task][i], RunEnded(order.run, list(Status)[i]))
+
     def hear(self, said: tuple[Instruction, ...]) -> None:
         """Do what the engine orders, and note what it records."""
         for one in said:
             if isinstance(one, Choose):
                 self.due.append((self.now, Chosen(one.key, one.alternatives[0])))
             elif isinstance(one, StartRun):
-                name = one.primitive_task
-                i = int(self.random.choice(3, p=SHARES[name]))
-                self.after(SECONDS[name][i], RunEnded(one.run, list(Status)[i]))
-                if name == "work":
+                self.start(one)
+                if one.primitive_task == "work":
                     self.after(
                         self.task.events["ready"].mean_wait or 0, RunRaised(one.run, "ready")
                     )
@@ -386,3 +392,127 @@ def test_a_measured_wait_that_contains_the_run_is_doubtful() -> None:
     found = analyse(text.task(), view="gspn", measured=Measured(waits={"ready": 2.0}))
     assert any("ready" in text for text in found.doubts)
     assert not analyse(text.task(), view="gspn").doubts
+
+
+ENDINGS = tuple((c, str(e)) for c in ("jam", "slip", "emergency_stop") for e in Executed)
+"""Causes of the runs in `short_forms`, executed or not."""
+
+
+@st.composite
+def short_forms(draw: st.DrawFn) -> tuple[Task, Measured]:
+    """Tries, held resources, a default error branch, conditions on causes, and a variable that
+    transitions set; with two measured actions that end by different causes."""
+    text = (
+        'schema = 1\n[task]\nname = "t"\nfinal = "parts == 0 and arm == 1"\n'
+        'final_error = "broken > 0"\n[errors]\nto = "fault"\n'
+        '[primitive_tasks]\npick = { goal = "g", alternatives = ["a", "b"], deadline = 99.0 }\n'
+        'put = { goal = "g", alternatives = ["c"], deadline = 99.0 }\n'
+        '[variables.mode]\ntype = "str"\ninitial = "fresh"\n[places]\n'
+        f'parts = {{ kind = "control", tokens = {draw(st.integers(1, 2))} }}\n'
+        'arm = { kind = "resource", tokens = 1 }\nfault = {}\nbroken = {}\n'
+    )
+    for name in ("pick", "put"):
+        more = draw(st.sampled_from(("", ", retry_unknown = true")))
+        tries = draw(st.integers(1, 3))
+        text += f'{name} = {{ kind = "action", task = "{name}", holds = "arm", tries = {tries}'
+        text += f"{more if tries > 1 else ''} }}\n"
+    text += f"[transitions]\n{arcs('start', 'parts', 'pick')}{arcs('done', 'put:normal', '')}"
+    if draw(st.booleans()):
+        text += arcs("jam", "pick:error", "", ", when = \"pick.reason == 'jam'\"")
+        text += arcs("other", "pick:error", "fault", ", when = \"pick.reason != 'jam'\"")
+    told = draw(st.sampled_from(("", "pick.status == 'failure'", "pick.reason == 'slip'")))
+    if told:
+        text += arcs("poor", "pick:normal", "", f', when = "{told}"')
+        text += arcs("went", "pick:normal", "put", f', when = "not {told}"')
+    else:
+        text += arcs("went", "pick:normal", "put")
+    text += arcs("mended", "fault", "", ", when = \"mode == 'fresh'\", set = { mode = \"'worn'\" }")
+    text += arcs("gave_up", "fault", "broken", ", when = \"mode == 'worn'\"")
+    task = loads(text, "t.toml")
+
+    def shares(least: int = 0) -> dict[tuple[str, str], float]:
+        n = draw(st.lists(st.integers(least, 5), min_size=len(ENDINGS), max_size=len(ENDINGS)))
+        return dict(zip(ENDINGS, map(float, n), strict=True)) | {("jam", "yes"): 1.0}
+
+    runs, causes = {}, {}
+    for key in (("pick", "a"), ("pick", "b"), ("put", "c")):
+        runs[key] = {
+            s: Estimate(share, draw(st.sampled_from((0.5, 1.0, 1.5))), 1.0)
+            for s, share in zip(Status, (0.5, 0.2, 0.3), strict=True)
+        }
+        whole = {e: n for e, n in shares().items() if e[1] == "yes"}
+        causes[key] = {Status.SUCCESS: {("", "yes"): 1.0}, Status.FAILURE: whole}
+        causes[key][Status.ERROR] = shares()
+    choice = {"pick": {"a": 0.25, "b": 0.75}}
+    known = draw(st.sampled_from((causes, causes, {})))
+    return task, Measured(runs, choice, causes=known)
+
+
+@settings(COMMON, max_examples=40)
+@given(short_forms())
+def test_the_causes_of_ends_decide_conditions_in_both_views(case: tuple[Task, Measured]) -> None:
+    figures_agree(*case)
+
+
+@pytest.mark.proof
+@settings(COMMON, max_examples=2000)
+@given(short_forms())
+def test_the_causes_of_ends_decide_conditions_at_length(case: tuple[Task, Measured]) -> None:
+    figures_agree(*case)
+
+
+class WithCauses(Clock):
+    """A world in which runs also have causes, as they were measured."""
+
+    def __init__(self, engine: Engine, random: np.random.Generator, measured: Measured) -> None:
+        super().__init__(engine, random)
+        self.measured = measured
+
+    def start(self, order: StartRun) -> None:
+        key = order.primitive_task, order.action
+        ends = list(self.measured.runs[key].items())
+        status, estimate = ends[self.random.choice(len(ends), p=[e.share for _, e in ends])]
+        causes = self.measured.causes[key][status]
+        n = np.array(list(causes.values()))
+        cause, executed = list(causes)[self.random.choice(len(n), p=n / n.sum())]
+        end = RunEnded(order.run, status, cause, "", Executed(executed))
+        self.after(estimate.mean, end)
+
+
+def test_missions_with_tries_have_the_figures_of_the_measured_causes() -> None:
+    """The condition of a retry is no draw: what the runs ended by and the tries left decide it."""
+    text = Text(2, done=", when = \"work.status == 'success'\"")
+    text.moves += [
+        arcs("poor", "work:normal", "arm", ", when = \"work.status == 'failure'\""),
+        arcs("jam", "work:error", "arm", ", when = \"work.reason == 'jam'\""),
+        arcs("bad", "work:error", "broken", ", when = \"work.reason != 'jam'\""),
+    ]
+    text.places.append("broken = { }\n")
+    text.final_error, text.tries = 'final_error = "broken == 1"', 3
+    task = text.task()
+    runs = {
+        ("work", "work_a"): {
+            s: Estimate(share, mean)
+            for s, share, mean in zip(Status, SHARES["work"], SECONDS["work"], strict=True)
+        }
+    }
+    errors = {("jam", "yes"): 3.0, ("slip", "yes"): 2.0, ("lost", "unknown"): 2.0}
+    good = {("", "yes"): 1.0}
+    causes = {Status.SUCCESS: good, Status.FAILURE: good, Status.ERROR: errors}
+    measured = Measured(runs, causes={("work", "work_a"): causes})
+    view = stochastic_view(task, measured)
+    assert not [text for text in view.assumptions if "condition" in text or "why" in text]
+    found, engine, n = forecast(view).figures, Engine(task), 600
+    random, times, good_ends, completed = np.random.default_rng(5), list[float](), 0, 0
+    for _ in range(n):
+        world = WithCauses(engine, random, measured)
+        world.play()
+        completed += world.ended is Status.SUCCESS
+        good_ends += world.good and world.ended is Status.SUCCESS
+        times += [world.now] if world.ended is Status.SUCCESS else []
+    for seen, name in ((completed, "P_complete"), (good_ends, "R_conj")):
+        p = found[name]
+        assert 0.05 < p < 0.99
+        assert abs(seen / n - p) < 5 * sqrt(p * (1 - p) / n), name
+    error = float(np.std(times)) / sqrt(len(times))
+    assert abs(float(np.mean(times)) - found["mean time (s)"]) < 5 * error

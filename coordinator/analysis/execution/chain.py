@@ -3,14 +3,15 @@
 A state of the chain is a state of the execution graph with a clock for each active run and each
 armed timer. A run draws its action and its status when it starts, and then takes the phase-type
 duration of that status; a timer takes an Erlang duration; an awaited event and an internal event
-come after an exponential wait. Choices, draws and stops take no time. The numbers are those of the
-stochastic view (`time.stochastic`). What a run writes is not measured: values that lead to
-different firings are equally likely, unless the frequency of a condition was measured.
+come after an exponential wait. Choices, draws and stops take no time. The numbers, those of the
+causes by which runs end among them, are those of the stochastic view (`time.stochastic`). What a
+run writes is not measured: values that lead to different firings are equally likely, unless the
+frequency of a condition was measured.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -25,7 +26,14 @@ from petrobot.coordinator.analysis.net.graph import Graph, Mask, sum_by
 from petrobot.coordinator.analysis.time.gspn import Values
 from petrobot.coordinator.analysis.time.linear import SolveOrder, solve, stationary
 from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit
-from petrobot.coordinator.analysis.time.stochastic import Measured, NoEstimate, Numbers, is_cause
+from petrobot.coordinator.analysis.time.stochastic import (
+    FIELDS,
+    Ending,
+    Measured,
+    NoEstimate,
+    Numbers,
+    is_cause,
+)
 from petrobot.coordinator.engine import (
     CancelRun,
     Chosen,
@@ -41,7 +49,7 @@ from petrobot.coordinator.engine import (
     VariableChanged,
 )
 from petrobot.coordinator.engine.state import ACTIVE
-from petrobot.coordinator.task import Counts, Kind, Status
+from petrobot.coordinator.task import Counts, Kind, Place, Status
 
 SIZE = 20_000
 """The most states of a chain; they take about a second."""
@@ -52,8 +60,9 @@ FIXED = 1e-9
 """Seconds for a timer of 0 s."""
 
 Clock = tuple[str, int, float]
-"""What ends (a status, `by.` and a preempting transition, or a timer), the phases that are left,
-and the rate (1/s) of each."""
+"""What ends (a status, followed by the action where actions of a place end by different causes;
+`by.` and a preempting transition; or a timer), the phases that are left, and the rate (1/s) of
+each."""
 Draw = list[tuple[float, Clock]]
 """Clocks with their probabilities."""
 NEVER: Clock = ("never", 1, 0.0)
@@ -309,7 +318,7 @@ class _Builder:
                 phases.append((rate, self.index(state, later)))
             elif rate and (outcomes := plan.ends.get((k, what))):
                 # where no condition reads the status, a FAILURE takes the edge of a SUCCESS
-                bad = what in BAD
+                bad = what.partition(" ")[0] in BAD
                 ends.append((rate, [replace(o, spoils=o.spoils or bad) for o in outcomes]))
         total = sum(rate for rate, _ in phases) + sum(rate for rate, _ in ends)
         if not total:
@@ -383,7 +392,8 @@ class _Builder:
         for action, chosen in self.numbers.alternatives(place).items():
             if devices.get(action, "") != run.device:
                 continue
-            ends = {str(s): e for s, e in self.numbers.estimates(place, action).items()}
+            own = self.numbers.estimates(place, action).items()
+            ends = {self.what(place, s, action): e for s, e in own}
             if self._covered(place.name):
                 caused = self.measured.preempted[place.name, action]
                 ends |= {f"by.{name}": e for name, e in caused.items()}
@@ -394,6 +404,12 @@ class _Builder:
                     duration = fit(e.mean, (e.cv * e.mean) ** 2, stages=self.stages)
                     found.append((chosen * e.share, what, duration))
         return found
+
+    def what(self, place: Place, status: Status, action: str) -> str:
+        """Return what a clock of a run says: its status, and its action if that tells why."""
+        actions = self._actions(place.name)
+        causes = [self.numbers.causes(place, a).get(status, {}) for a in actions]
+        return str(status) if all(c == causes[0] for c in causes) else f"{status} {action}"
 
     def _actions(self, place: str) -> list[str]:
         return list(self.numbers.alternatives(self.task.places[place]))
@@ -443,11 +459,11 @@ class _Builder:
             return _Plan(slots, first, {}, [])
         ends: dict[tuple[int, str], list[_Outcome]] = {}
         events: list[tuple[float, _Outcome]] = []
+        own: dict[tuple[str, Status], list[tuple[RunEnded, _Outcome]]] = {}
         for cause, outcome in made:
             stimulus = cause.stimulus
             if isinstance(stimulus, RunEnded):
-                k = number["run", stimulus.run]
-                ends.setdefault((k, str(stimulus.status)), []).append(outcome)
+                own.setdefault((stimulus.run, stimulus.status), []).append((stimulus, outcome))
             elif isinstance(stimulus, TimerFired):
                 name = stimulus.key.rpartition("#")[0]
                 for k in self.slots_of_cause(state, name, number):
@@ -472,12 +488,19 @@ class _Builder:
                     events.append((self.rate(stimulus.event), outcome))
             elif isinstance(stimulus, VariableChanged):
                 raise NoEstimate(f"no rate at which the variable `{stimulus.name}` changes")
-        shared = {key: self.shares(slots[key[0]][1], given) for key, given in ends.items()}
-        # where no condition reads the status, the graph merges failure with success
-        for k, what in list(shared):
-            if what == Status.SUCCESS:
-                shared.setdefault((k, str(Status.FAILURE)), shared[k, what])
-        return _Plan(slots, (), shared, events)
+        for (name, status), given in list(own.items()):
+            if status is Status.SUCCESS:
+                # where no condition reads the status, the graph merges failure with success
+                own.setdefault((name, Status.FAILURE), given)
+        for (name, status), given in own.items():
+            run = state.run(name)
+            assert run is not None
+            place = self.task.places[run.place]
+            for action in self._actions(place.name):
+                key = number["run", name], self.what(place, status, action)
+                if key not in ends and self.occurs(place, action, status):
+                    ends[key] = self.shares(place, action, status, given)
+        return _Plan(slots, (), ends, events)
 
     def event(
         self,
@@ -545,10 +568,46 @@ class _Builder:
         mine = devices.get(action, "")
         return sum(p for other, p in shares.items() if devices.get(other, "") == mine)
 
-    def shares(self, run: str, outcomes: list[_Outcome]) -> list[_Outcome]:
-        """Return the outcomes of a run that ends with one status, with their shares: by the
-        measured frequencies of the conditions, else equal shares."""
-        different = {(o.state, o.edge < 0 or self.fired(o)): o for o in outcomes}
+    def occurs(self, place: Place, action: str, status: Status) -> bool:
+        """Return whether runs of an action end with a status."""
+        estimate = self.numbers.estimates(place, action).get(status)
+        return estimate is not None and estimate.share > 0
+
+    def shares(
+        self, place: Place, action: str, status: Status, given: list[tuple[RunEnded, _Outcome]]
+    ) -> list[_Outcome]:
+        """Return the outcomes of a run that ends with one status, with their shares.
+
+        Each cause has its own; results that are left have shares by the measured frequencies of the
+        conditions, else equal ones.
+        """
+        if len({self.leads_to(o) for _, o in given}) == 1:
+            return [given[0][1]]
+        if self.numbers.by_switches(place):
+            return self.drawn_results(place, [o for _, o in given])
+
+        def kind(ending: Ending) -> tuple[Hashable, ...]:
+            names = (f"{place.name}.{field}" for field in FIELDS)
+            return tuple(map(self.x.names.region, names, ending))
+
+        by_kind: dict[tuple[Hashable, ...], list[_Outcome]] = {}
+        for end, outcome in given:
+            by_kind.setdefault(kind((end.cause, str(end.executed))), []).append(outcome)
+        examples = [(end.cause, str(end.executed)) for end, _ in given]
+        found: list[_Outcome] = []
+        for some, part in self.numbers.endings(place, action, status, examples, kind).items():
+            drawn = self.drawn_results(place, by_kind[some])
+            found += [replace(o, share=o.share * part) for o in drawn]
+        return found
+
+    def leads_to(self, outcome: _Outcome) -> Hashable:
+        """Return what distinguishes an outcome from others of the same run."""
+        return outcome.state, outcome.edge < 0 or self.fired(outcome)
+
+    def drawn_results(self, place: Place, outcomes: list[_Outcome]) -> list[_Outcome]:
+        """Return the outcomes with shares by the measured frequencies of the conditions, else
+        equal ones."""
+        different = {self.leads_to(o): o for o in outcomes}
         if len(different) == 1:
             return [outcomes[0]]
         weights = []
@@ -559,8 +618,8 @@ class _Builder:
             weights.append(weight)
         if not any(n in self.measured.switches for o in outcomes for n in self.fired(o)):
             self.numbers.assumptions.append(
-                f"{run.rpartition('#')[0]}: what its runs write, and why they end, was not "
-                "measured; results that lead to different firings are equally likely"
+                f"{place.name}: what its runs write was not measured; results that lead to "
+                "different firings are equally likely"
             )
         total = sum(weights)
         return [

@@ -19,10 +19,11 @@ chosen its action waits until it is free. Devices that never have to be waited f
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations, combinations_with_replacement, product
+from typing import TypeVar
 
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.structure import (
@@ -38,6 +39,7 @@ from petrobot.coordinator.task import (
     End,
     Estimate,
     Event,
+    Executed,
     Kind,
     Place,
     Scope,
@@ -51,7 +53,9 @@ from petrobot.coordinator.task.compiled_task import (
     CompiledTransition,
     compile_transitions,
 )
-from petrobot.coordinator.task.conditions.regions import can_hold
+from petrobot.coordinator.task.conditions import Compare, Expression, Literal, Name, Not, walk
+from petrobot.coordinator.task.conditions.language import Scalar, with_values
+from petrobot.coordinator.task.conditions.regions import can_hold, region_values
 from petrobot.coordinator.task.net import Marking, Net
 from petrobot.coordinator.task.validation import condition_domains, is_pulse
 
@@ -67,6 +71,13 @@ STAGES = 8
 markings, so it is small."""
 
 Weights = dict[str, int]
+K = TypeVar("K", bound=Hashable)
+Ending = tuple[str, str]
+"""Why a run ended: its cause, and whether it was executed (`yes`, `no`, `unknown`)."""
+FIELDS = ("reason", "executed")
+"""What conditions call the two: `PLACE.reason`, `PLACE.executed`."""
+EMERGENCY = "emergency_stop"
+"""Cause of a run that an emergency stop ended."""
 DECLARED, MEASURED = "declared in the task file", "measured"
 """Where the numbers of an action come from."""
 
@@ -80,6 +91,8 @@ class Measured:
     - `waits[event]`: mean time (s) that a transition waits for the event.
     - `switches[transition]`: how often its condition is true, relative to the transitions that
       compete with it.
+    - `causes[(place or primitive task, action)]`: by status, how often its own ends with that
+      status came by each cause, executed or not.
     - `preempted[(place, action)]`: share, mean (s) and cv of the runs that each transition
       preempted. If all actions of a place have it, the preempting event is one of the causes by
       which a run ends (the shares here and in `runs` sum to 1), not an independent race.
@@ -92,6 +105,12 @@ class Measured:
     preempted: Mapping[tuple[str, str], Mapping[str, Estimate]] = field(default_factory=dict)
     sources: Mapping[tuple[str, str], str] = field(default_factory=dict)
     """Where the numbers in `runs` and `preempted` come from, in words, by the same keys."""
+    causes: Mapping[tuple[str, str], Mapping[Status, Mapping[Ending, float]]] = field(
+        default_factory=dict
+    )
+    mixed: frozenset[tuple[str, str]] = frozenset()
+    """Keys of `causes` where each cause was given the same share of runs that are not known to have
+    been executed, because only their number over all causes was measured."""
 
 
 def is_cause(transition: Transition) -> bool:
@@ -132,6 +151,18 @@ def contended(task: Task, devices: Mapping[str, str]) -> frozenset[str]:
 KEPT, LOST = "preempted", "lost"
 """Places `p.preempted` and `p.lost`: a run of p was preempted and counts as nothing or as SUCCESS,
 or as FAILURE or ERROR."""
+
+
+EndKind = tuple[str, ...]
+"""What conditions ask of an ended run, beside its status: its cause, and whether it was executed,
+as far as they ask."""
+Told = dict[str, Scalar]
+"""Values of names that a condition reads."""
+_Shared = dict[
+    tuple[Status, PhaseType, str, tuple[tuple[EndKind, float], ...]], list[tuple[str, float]]
+]
+"""Where a run enters the phases of a duration, with probabilities: by status, duration, device, and
+how probable each kind of end is."""
 
 
 def _cut(counts: Counts | None) -> str:
@@ -227,6 +258,70 @@ class Numbers:
             f"{primitive.name}: estimates declared in the task file, not measured"
         )
         return primitive.estimates
+
+    def causes(self, place: Place, action: str) -> Mapping[Status, Mapping[Ending, float]]:
+        """Return how often its runs ended by each cause, by status; empty if not measured."""
+        return self.measured.causes.get(self._key(place, action), {})
+
+    def _key(self, place: Place, action: str) -> tuple[str, str]:
+        own = (place.name, action)
+        return own if own in self.measured.causes else (place.task, action)
+
+    def by_switches(self, place: Place) -> bool:
+        """Return whether conditions on the causes of a place have measured frequencies, and the
+        causes themselves were not measured."""
+        if any(self.causes(place, action) for action in self.alternatives(place)):
+            return False
+        names = {f"{place.name}.{field}" for field in FIELDS}
+        return any(
+            t.when is not None and t.name in self.measured.switches and names & t.when.names
+            for t in self.task.transitions.values()
+        )
+
+    def endings(
+        self,
+        place: Place,
+        action: str,
+        status: Status,
+        examples: Sequence[Ending],
+        region: Callable[[Ending], K],
+    ) -> dict[K, float]:
+        """Return how probable each kind of end is among the runs that end with a status.
+
+        `region` gives the kind: conditions do not tell ends of one kind apart. `examples` has one
+        end of each kind. Where no cause was measured, a run is taken to have been executed, and not
+        to have been ended by an emergency stop: declared estimates are those of the action itself.
+        """
+        kinds = list(dict.fromkeys(map(region, examples)))
+        if len(kinds) == 1:
+            return {kinds[0]: 1.0}
+        known = {e: n for e, n in self.causes(place, action).get(status, {}).items() if n > 0}
+        if known and {region(e) for e in known} <= set(kinds):
+            if self._key(place, action) in self.measured.mixed:
+                self._mixed(place.name, {e: region(e) for e in known})
+            total, found = sum(known.values()), dict[K, float]()
+            for ending, n in known.items():
+                found[region(ending)] = found.get(region(ending), 0.0) + n / total
+            return found
+        own = {region((c, str(Executed.YES))) for c, _ in examples if c != EMERGENCY}
+        equal = [kind for kind in kinds if kind in own] or kinds
+        text = f"{place.name}: why its runs end in {status.name} was not measured"
+        if len(equal) < len(kinds):
+            text += "; they were executed, and not ended by an emergency stop"
+        text += "; causes that lead to different firings are equally likely" * (len(equal) > 1)
+        self.assumptions.append(text)
+        return dict.fromkeys(equal, 1.0 / len(equal))
+
+    def _mixed(self, place: str, kinds: Mapping[Ending, Hashable]) -> None:
+        """Note it if the kinds of ends depend on the cause, and for one cause on whether the run
+        was executed: then they need both numbers of the same runs."""
+        by_cause, by_both = {c: k for (c, _), k in kinds.items()}, set(kinds.values())
+        split = any(k != by_cause[c] for (c, _), k in kinds.items())
+        if split and len(by_both) > len({x for _, x in kinds}):
+            self.assumptions.append(
+                f"{place}: it was not measured which causes of ERROR came with executed = unknown; "
+                "each did as often"
+            )
 
     def wait(self, event: str) -> float:
         """Return the mean time (s) until an event comes. Raises NoEstimate."""
@@ -373,6 +468,20 @@ class _Derivation:
         self.by: dict[tuple[str, str], str] = {}
         self.compiled = compile_transitions(task)
         self.domains = condition_domains(task)
+        self.conditions = {
+            t.name: with_values(t.when, dict(task.parameters))
+            for t in task.transitions.values()
+            if t.when is not None
+        }
+        """By transition: its condition, with the values of parameters."""
+        self.regions = region_values(self.conditions.values(), self.domains)
+        self.kinds: dict[tuple[str, Status], list[EndKind]] = {}
+        """By action place and status: the kinds of its ends."""
+        self.told: dict[str, Told] = {}
+        """By place of ended runs: what a condition reads of them."""
+        self.values: dict[str, dict[Scalar, str]] = {}
+        """By variable that only transitions set, to known values: the place of each value."""
+        self._variables()
         self.flags: set[str] = set()
         """Latched events with a place of their own, `event e`."""
         self.served: dict[str, int] = {}
@@ -464,8 +573,13 @@ class _Derivation:
         if name in self.queues:
             self.places[f"{name}.server"] = place.most_active
         self.possible[name], self.phases[name] = set(), []
-        shared: dict[tuple[Status, PhaseType, str], list[tuple[str, float]]] = {}
+        shared: _Shared = {}
         alternatives = self.numbers.alternatives(place)
+        endings = {
+            (action, status): ends
+            for status in Status
+            for action, ends in self._endings(place, alternatives, status).items()
+        }
         if alternatives and all(
             (name, action) in self.measured.preempted for action in alternatives
         ):
@@ -475,7 +589,8 @@ class _Derivation:
             self._choice(place, action, chosen)
             known = {s: e for s, e in self.numbers.estimates(place, action).items() if e.share > 0}
             for status, estimate in known.items():
-                self._status(place, action, status, estimate, shared)
+                ends = endings[action, status]
+                self._status(place, action, status, estimate, ends, shared)
             begun, device = f"{name}.{action}", self._device(action)
             if not known:  # no run ever ended by itself: it stays active until it is preempted
                 self.phases[name].append(begun)
@@ -514,7 +629,11 @@ class _Derivation:
                 "forecast, or measure with mission runs"
             )
         for status in Status:
-            self.places |= {self._ended(name, status, raised): 0 for raised in self._sets(name)}
+            for kind, raised in product(self.kinds[name, status], self._sets(name)):
+                label = self._ended(name, status, kind, raised)
+                asked = dict(zip(self._asked(place, status), kind, strict=True))
+                self.places[label] = 0
+                self.told[label] = {f"{name}.status": str(status), **asked}
         self.places |= {f"{name}.raised {e}": 0 for e in self.raised[name]}
 
     def _sets(self, name: str) -> list[tuple[str, ...]]:
@@ -522,9 +641,99 @@ class _Derivation:
         events = self.raised[name]
         return [s for n in range(len(events) + 1) for s in combinations(events, n)]
 
-    def _ended(self, name: str, status: Status, raised: Iterable[str]) -> str:
-        """Return the place of runs that have ended with a status after they raised some events."""
-        return " ".join([f"{name}.{status}", *raised])
+    def _ended(self, name: str, status: Status, kind: EndKind, raised: Iterable[str]) -> str:
+        """Return the place of runs that have ended with a status and a kind of cause after they
+        raised some events."""
+        several = len(self.kinds[name, status]) > 1
+        return " ".join([f"{name}.{status}", *(kind if several else ()), *raised])
+
+    # Why a run ended.
+
+    def _asked(self, place: Place, status: Status) -> list[str]:
+        """Return the names by which conditions ask why a run of a place ended with a status."""
+        if self.numbers.by_switches(place):
+            return []
+        fits = End.ERROR if status is Status.ERROR else End.NORMAL
+        read = {
+            name
+            for x in self.compiled
+            for a in x.actions
+            if x.name in self.conditions and a.name == place.name
+            if a.takes_done or a.end is fits
+            for name in self.conditions[x.name].names
+        }
+        return [f"{place.name}.{f}" for f in FIELDS if f"{place.name}.{f}" in read]
+
+    def _literals(self, name: str) -> set[Scalar] | None:
+        """Return what conditions compare a name with; None if other names are among it."""
+        found = set[Scalar]()
+        for node in (n for c in self.conditions.values() for n in walk(c.tree)):
+            if isinstance(node, Compare):
+                for side, other in ((node.left, node.right), (node.right, node.left)):
+                    if isinstance(side, Name) and side.name == name:
+                        if not isinstance(other, Literal):
+                            return None
+                        found.add(other.value)
+        return found
+
+    def _endings(
+        self, place: Place, actions: Iterable[str], status: Status
+    ) -> dict[str, dict[EndKind, float]]:
+        """Return how probable each kind of end with a status is, by action."""
+        asked, reason = self._asked(place, status), f"{place.name}.reason"
+        literals = self._literals(reason)
+        if literals is None:  # a cause may be any text, so no finite number of kinds is enough
+            asked = []
+        reasons = [str(r) for r in self.regions.get(reason, [""])]
+        other = next((r for r in reasons if r not in (literals or ())), "")
+        executed = list(map(str, Executed if status is Status.ERROR else [Executed.YES]))
+
+        def kind(ending: Ending) -> EndKind:
+            # of causes that no condition names, one stands for all
+            told = (ending[0] if ending[0] in (literals or ()) else other, ending[1])
+            both = zip(FIELDS, told, strict=True)
+            return tuple(value for field, value in both if f"{place.name}.{field}" in asked)
+
+        found: dict[str, dict[EndKind, float]] = {}
+        for action in actions:
+            estimate = self.numbers.estimates(place, action).get(status)
+            if asked and estimate is not None and estimate.share > 0:
+                examples = list(product(reasons, executed))
+                found[action] = self.numbers.endings(place, action, status, examples, kind)
+            else:
+                found[action] = {kind((other, str(Executed.YES))): 1.0}
+        self.kinds[place.name, status] = list(dict.fromkeys(k for e in found.values() for k in e))
+        return found
+
+    # Variables.
+
+    def _variables(self) -> None:
+        """Give each value of a variable a place, where only transitions write it and all that they
+        write is known: literals, parameters, and other such variables."""
+        flat, first = self.task, self.task.initial_variables()
+        read = {name for c in self.conditions.values() for name in c.names}
+        written: dict[str, list[Expression]] = {}
+        for t in flat.transitions.values():
+            for name, value in t.sets:
+                written.setdefault(name, []).append(with_values(value, dict(flat.parameters)))
+        known = set(written) - {v for p in flat.places.values() for v in p.out.values()}
+        while more := {n for n in known if any(e.names - known for e in written[n])}:
+            known -= more
+        values: dict[str, set[Scalar]] = {name: {first[name]} for name in known}
+        grown = True
+        while grown:
+            before = sum(map(len, values.values()))
+            for name in known:
+                for e in written[name]:
+                    values[name] |= values[min(e.names)] if e.names else {e.value({})}
+            grown = sum(map(len, values.values())) > before
+        # what a condition reads, directly or by way of another variable
+        needed = read & known
+        while more := {m for n in needed for e in written[n] for m in e.names} - needed:
+            needed |= more
+        for name in sorted(needed):
+            self.values[name] = {v: f"{name} = {v!r}" for v in sorted(values[name], key=repr)}
+            self.places |= {label: int(v == first[name]) for v, label in self.values[name].items()}
 
     def _raises(self, name: str) -> None:
         """Let an active run raise each event once, after an exponential wait; what a preempted run
@@ -620,7 +829,8 @@ class _Derivation:
         action: str,
         status: Status,
         estimate: Estimate,
-        shared: dict[tuple[Status, PhaseType, str], list[tuple[str, float]]],
+        ends: Mapping[EndKind, float],
+        shared: _Shared,
     ) -> None:
         """Add the choice of a status, and the phases of its delay.
 
@@ -632,9 +842,9 @@ class _Derivation:
             key, estimate.mean, (estimate.cv * estimate.mean) ** 2, self.stages
         )
         source, device = self._source(name, action), self._device(action)
-        same = (status, duration, device)
+        same = (status, duration, device, tuple(sorted(ends.items())))
         if same not in shared:
-            shared[same] = self._phases(place, status, duration, len(shared), source, device)
+            shared[same] = self._phases(place, status, duration, len(shared), source, device, ends)
         entries = shared[same]
         for i, (entry, share) in enumerate(entries):
             label = key if len(entries) == 1 else f"{key}.{i + 1}"
@@ -662,6 +872,7 @@ class _Derivation:
         number: int,
         source: str,
         device: str,
+        ends: Mapping[EndKind, float],
     ) -> list[tuple[str, float]]:
         """Add chains of phases; return the places where a run enters, with their probabilities.
 
@@ -680,11 +891,13 @@ class _Derivation:
                 self._timed(f"{stem}{i}", {f"{stem}{i}": 1}, {f"{stem}{i + 1}": 1}, rate, source)
             need = {f"{stem}{longest}": 1, f"{place.name}.going": 1}
             need |= {device: 1} if device else {}
-            for raised in self._sets(place.name):
-                label = " ".join([f"{stem}{longest}", *raised])
+            for (kind, part), raised in product(ends.items(), self._sets(place.name)):
+                words = kind if len(ends) > 1 else ()
+                label = " ".join([f"{stem}{longest}", *words, *raised])
                 flags = {e: f"{place.name}.raised {e}" for e in self.raised[place.name]}
-                give = {self._ended(place.name, status, raised): 1, **self._server(place.name)}
-                self._timed(label, need | {flags[e]: 1 for e in raised}, give, rate, source)
+                ended = self._ended(place.name, status, kind, raised)
+                give = {ended: 1, **self._server(place.name)}
+                self._timed(label, need | {flags[e]: 1 for e in raised}, give, rate * part, source)
                 if status is not Status.SUCCESS:
                     self.spoils.add(label)
                 if others := {flags[e]: 1 for e in flags if e not in raised}:
@@ -759,7 +972,7 @@ class _Derivation:
             self.served[x.name] = SERVE + 1 + ranks.index((x.rank, 0 if drawn else x.index))
             called = self.called[x.name] = f"{x.name}.called"
             self.places[called] = 0
-            for i, (need, _) in enumerate(self._cases(self.task.transitions[x.name])):
+            for i, (need, _, _) in enumerate(self._cases(self.task.transitions[x.name])):
                 name, test = f"{called} {i + 1}", {**need, flag: 1}
                 self._immediate(name, test, {**test, called: 1}, 1.0, CALL)
                 self.inhibit[name] = {**self._named(({}, dict(x.bars)))[1], called: 1}
@@ -796,16 +1009,17 @@ class _Derivation:
                 "came, and so contains its run; it is taken for the wait for the event"
             )
         cases = list(self._cases(t))
-        for i, (need, give) in enumerate(cases):
+        for i, (need, give, open_) in enumerate(cases):
             name = t.name if len(cases) == 1 else f"{t.name} {i + 1}"
             self.origin[name] = t.name
             inhibit = {i.place: i.threshold for i in t.inhibitors}
             if inhibit:
                 self.inhibit[name] = inhibit
-            self._fires(t, name, need, give)
+            self._fires(t, name, need, give, open_)
 
-    def _cases(self, t: Transition) -> list[tuple[Weights, Weights]]:
-        """Return what a firing takes and gives, for each combination of statuses of its runs."""
+    def _cases(self, t: Transition) -> list[tuple[Weights, Weights, bool]]:
+        """Return what a firing takes and gives, for each combination of kinds of its runs and of
+        values of variables, and whether its condition then still is open."""
         net, index = self.task.net, self.task.net.transition_index[t.name]
         base_need = {net.places[p]: w for p, w in net.consume[index]}
         base_give = {net.places[p]: w for p, w in net.produce[index]}
@@ -815,26 +1029,38 @@ class _Derivation:
                     base_give[f"{output.place}.{suffix}"] = output.weight
         out = []
         actions = self.compiled[index].actions
-        for combination in product(*(self._takings(t, arc) for arc in actions)):
-            taken = [(place, status) for place, status, _, _ in combination if status is not None]
-            if not self._may_hold(t, dict(taken)):
+        parameters = dict(self.task.parameters)
+        names = set(t.when.names) if t.when is not None else set()
+        names |= {n for name, value in t.sets if name in self.values for n in (name, *value.names)}
+        kept = sorted(names & set(self.values))
+        choices = [self.values[name].items() for name in kept]
+        takings = product(*(self._takings(t, arc) for arc in actions))
+        for combination, chosen in product(takings, product(*choices)):
+            told = dict(zip(kept, (value for value, _ in chosen), strict=True)) | parameters
+            for one, _, _ in combination:
+                told |= one
+            may_hold, open_ = self._judged(t, told)
+            if not may_hold:
                 continue
             need, give = dict(base_need), dict(base_give)
-            for _, _, takes, back in combination:
+            for _, takes, back in combination:
                 need |= takes
                 for place, n in back.items():
                     give[place] = give.get(place, 0) + n
-            out.append((need, give))
+            after = {n: e.value(told) for n, e in t.sets if n in self.values}
+            for name, (value, label) in zip(kept, chosen, strict=True):
+                need[label] = 1
+                give[self.values[name][after.get(name, value)]] = 1
+            out.append((need, give, open_))
         return out
 
-    def _takings(
-        self, t: Transition, arc: ActionArc
-    ) -> list[tuple[str, Status | None, Weights, Weights]]:
-        """Return how an arc may take its runs: (place, common status if any, taken, given back)."""
+    def _takings(self, t: Transition, arc: ActionArc) -> list[tuple[Told, Weights, Weights]]:
+        """Return how an arc may take its runs: (what all of them tell a condition, taken, given
+        back)."""
         p, w, going = arc.name, arc.weight, f"{arc.name}.going"
         if arc.end is End.GOING:
             flags = {f"{p}.raised {e}": w for e in arc.raised}
-            return [(p, None, {going: w, **flags}, {going: w})]
+            return [({}, {going: w, **flags}, {going: w})]
         if (p, t.name) in self.by:
             if arc.takes_done:
                 self.assumptions.append(
@@ -843,37 +1069,38 @@ class _Derivation:
                 )
             if _cut(arc.counts) == LOST:
                 self.spoils.add(t.name)
-            return [(p, None, {going: w, self.by[p, t.name]: w}, self._server(p))]
-        kinds: list[tuple[Status | None, str]] = [
-            (s, self._ended(p, s, raised))
+            return [({}, {going: w, self.by[p, t.name]: w}, self._server(p))]
+        kinds = [
+            self._ended(p, s, kind, raised)
             for s in Status
             if s in self.possible[p]
             and (arc.takes_done or arc.end is (End.ERROR if s is Status.ERROR else End.NORMAL))
+            for kind in self.kinds[p, s]
             for raised in self._sets(p)
             if set(arc.raised) <= set(raised)
         ]
-        kinds += [(None, going)] if arc.end is End.PREEMPT else []
-        out: list[tuple[str, Status | None, Weights, Weights]] = []
+        kinds += [going] if arc.end is End.PREEMPT else []
+        out: list[tuple[Told, Weights, Weights]] = []
         for chosen in combinations_with_replacement(kinds, w):
-            taken = Counter(label for _, label in chosen)
+            taken = Counter(chosen)
             given = {f"{p}.{_cut(arc.counts)}": taken[going]} if taken[going] else {}
             flags = {f"{p}.raised {e}": taken[going] for e in arc.raised if taken[going]}
-            statuses = {status for status, _ in chosen}
-            one = chosen[0][0] if len(statuses) == 1 else None
-            out.append((p, one, taken | flags, given))
+            own = [self.told.get(label, {}) for label in chosen]
+            told = dict(set(own[0].items()).intersection(*(o.items() for o in own)))
+            out.append((told, taken | flags, given))
         return out
 
-    def _may_hold(self, t: Transition, status: Mapping[str, Status]) -> bool:
-        """Return whether the condition can be true for these statuses.
-
-        What else it reads may have any value: then it becomes a random switch.
-        """
+    def _judged(self, t: Transition, told: Told) -> tuple[bool, bool]:
+        """Return whether the condition can be true for these values, and whether it is open: what
+        else it reads decides, and may have any value. Then it becomes a random switch."""
         if t.when is None:
-            return True
-        values = {f"{place}.status": str(s) for place, s in status.items()} | dict(
-            self.task.parameters
+            return True, False
+        free = t.when.names - set(told)
+        false = Expression(f"not ({t.when.text})", Not(t.when.tree))
+        return (
+            can_hold(t.when, told, free, self.domains),
+            bool(free) and can_hold(false, told, free, self.domains),
         )
-        return can_hold(t.when, values, t.when.names - set(values), self.domains)
 
     def _awaited_event(self, t: Transition) -> str:
         """Return the external event for which a transition waits once its arcs are satisfied;
@@ -881,10 +1108,10 @@ class _Derivation:
         events = (self.task.events[e] for e in t.events if e not in self.flags)
         return next((e.name for e in events if e.scope is Scope.EXTERNAL), "")
 
-    def _fires(self, t: Transition, name: str, need: Weights, give: Weights) -> None:
+    def _fires(self, t: Transition, name: str, need: Weights, give: Weights, open_: bool) -> None:
         """Add a case: it fires at once, after an exponential wait for its events, or after a
         timer."""
-        share = self._switch(t)
+        share = self._switch(t) if open_ else 1.0
         # Among equals a run's end comes before a preemption, unless weights are declared.
         preempts = t.weight is None and any(a.end is End.PREEMPT for a in t.inputs)
         priority = TASK + 2 * t.priority - preempts
@@ -902,25 +1129,30 @@ class _Derivation:
         else:
             weight = share * (t.weight if t.weight is not None else 1.0)
             source = "weight declared in the task file" if t.weight is not None else ""
-            if t.name in self.measured.switches:
+            if open_ and t.name in self.measured.switches:
                 source = "measured frequency of its condition"
             self._immediate(name, need, give, weight, priority, source)
 
     def _switch(self, t: Transition) -> float:
-        """Return how often a condition on variables is true, relative to its competitors."""
-        if t.when is None or all(n.endswith((".status", ".reason")) for n in t.when.names):
-            return 1.0
+        """Return how often an open condition is true, relative to its competitors."""
         known = self.measured.switches.get(t.name)
         if known is None:
-            self.assumptions.append(
-                f"{t.name}: its condition is assumed to be true as often as those it competes with"
-            )
+            often = "true as often as those it competes with"
+            if self._rivals(t) & set(self.measured.switches):
+                often = "true once in all that was measured, where it was never seen to be"
+            self.assumptions.append(f"{t.name}: its condition is assumed to be {often}")
         if known is None or not t.events:
             return 1.0 if known is None else known
         # The rate of an event is multiplied by it, so it must be 1 on average.
         rivals = [u.name for u in self.task.transitions.values() if set(u.events) & set(t.events)]
         shares = [self.measured.switches[u] for u in rivals if u in self.measured.switches]
         return known * len(shares) / sum(shares)
+
+    def _rivals(self, t: Transition) -> set[str]:
+        """Return the other transitions that take tokens from the same places."""
+        mine = {a.place for a in t.inputs}
+        others = (u for u in self.task.transitions.values() if u.name != t.name)
+        return {u.name for u in others if mine & {a.place for a in u.inputs}}
 
     def _wait_source(self, event: str) -> str:
         measured = event in self.measured.waits
