@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from math import inf
 from typing import TYPE_CHECKING
 
-from petrobot.coordinator.task import Task
+from petrobot.coordinator.task import Status, Task
 from petrobot.coordinator.task.check import CheckReport, Finding, Severity, check
 
 if TYPE_CHECKING:  # the search needs numpy, which a command that only reads the file does without
@@ -123,11 +124,13 @@ def may_run(task: Task, cell: Cell | None = None, budget: Budget | None = None) 
         if cell is None
         else check(task, cell.offers, translates=cell.translates, source=cell.source)
     )
-    broken = any(finding.code == "inconsistent" for finding in report.errors)
-    if broken or budget is None:
+    if any(finding.code == "inconsistent" for finding in report.errors):
+        return MayRun(task, report, None)
+    report = CheckReport((*report.findings, *_late(task)))
+    if budget is None:
         return MayRun(task, report, None)
     analysis = _search(task, budget, devices_of(cell))
-    report = _with_contests(report, analysis)
+    report = _with_graph(report, analysis)
     return MayRun(task, report, replace(analysis, refused=not report.ok))
 
 
@@ -137,13 +140,14 @@ def _search(task: Task, budget: Budget, devices: Mapping[str, str] | None) -> An
     return analyse(task, limits=budget.limits(), steps=budget.steps, devices=devices)
 
 
-def _with_contests(report: CheckReport, analysis: Analysis) -> CheckReport:
-    """Return the findings with the conflicts that the execution graph shows in place of those that
-    the arcs suggest. Where there is no complete graph, the latter stand."""
+def _with_graph(report: CheckReport, analysis: Analysis) -> CheckReport:
+    """Return the findings with what the execution graph shows: retries without a limit, and
+    conflicts in place of those that the arcs suggest. Without a complete graph, those stand."""
     if analysis.progress is None or not analysis.progress.x.complete:
         return report
     rest = [f for f in report.findings if f.code not in ("unsettled-conflict", "arrival-order")]
     found = [_contest(contest) for contest in analysis.progress.contests]
+    found += map(_retries, analysis.progress.x.retries)
     errors = [f for f in found if f.severity is Severity.ERROR]
     notes = [f for f in found if f.severity is Severity.NOTE]
     return CheckReport((*errors, *rest, *notes))
@@ -166,6 +170,36 @@ def _contest(contest: Contest) -> Finding:
     remedy = "give one a higher `priority`, each a `weight`, or exclusive conditions"
     text = f"{text} ({first}); if it went the other way: {told}"
     return Finding(Severity.ERROR, "unsettled-conflict", key, text, remedy)
+
+
+def _late(task: Task) -> list[Finding]:
+    """Return where runs are ended before they succeed, by what the task declares."""
+    found = []
+    for place in task.flat.places.values():
+        primitive = task.primitive_tasks.get(place.task)
+        good = primitive.estimates.get(Status.SUCCESS) if primitive else None
+        if primitive is None or good is None or not good.share:
+            continue
+        timeout = inf if place.timeout is None else place.timeout
+        if good.mean > (given := min(timeout, primitive.deadline)):
+            key = f"primitive_tasks.{primitive.name}.deadline"
+            key = f"places.{place.name}.timeout" if timeout == given else key
+            text = (
+                f"runs end in ERROR after {given:g} s (cause `deadline`), but a SUCCESS is "
+                f"declared to take {good.mean:g} s on average"
+            )
+            remedy = "give the runs more time, or correct the estimates"
+            found.append(Finding(Severity.WARNING, "deadline-too-short", key, text, remedy))
+    return found
+
+
+def _retries(names: tuple[str, ...]) -> Finding:
+    text = (
+        f"{' and '.join(f'`{name}`' for name in names)} can be repeated without limit while runs "
+        "end in ERROR: a fault that stays keeps the task busy for ever"
+    )
+    remedy = "use `tries`, or take a token of a place that has only a few"
+    return Finding(Severity.NOTE, "endless-retry", f"transitions.{names[0]}", text, remedy)
 
 
 def _line(finding: Finding) -> str:

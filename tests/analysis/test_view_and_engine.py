@@ -4,7 +4,7 @@ Markov chain, and in missions that the engine plays by a clock."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import sqrt
 
 import numpy as np
@@ -516,3 +516,45 @@ def test_missions_with_tries_have_the_figures_of_the_measured_causes() -> None:
         assert abs(seen / n - p) < 5 * sqrt(p * (1 - p) / n), name
     error = float(np.std(times)) / sqrt(len(times))
     assert abs(float(np.mean(times)) - found["mean time (s)"]) < 5 * error
+
+
+def test_a_retry_without_a_limit_is_named() -> None:
+    """A counter in the net, or `tries`, is a limit."""
+    text = Text(1)
+    text.moves.append(arcs("again", "work:error", "work"))
+    (found,) = (f for f in may_run(text.task(), None, BUDGET).report.findings if "retry" in f.code)
+    assert found.key == "transitions.again" and "without limit" in found.text
+    text.places.append('spare = { kind = "resource", tokens = 2 }\nlost = { }\n')
+    text.final_error = 'final_error = "lost == 1"'
+    text.moves = [
+        arcs("again", "work:error,spare", "work"),
+        arcs("gone", "work:error", "lost", ", priority = -1"),
+    ]
+    judged = may_run(text.task(), None, BUDGET)
+    assert judged.analysis is not None and judged.analysis.progress is not None
+    assert not [f for f in judged.report.findings if "retry" in f.code]
+
+
+def test_a_deadline_before_the_declared_success_is_named() -> None:
+    text = Text(1)
+    text.moves.append(arcs("bad", "work:error", "arm"))
+    assert not [f for f in may_run(text.task()).report.findings if "deadline" in f.code]
+    task = text.task()
+    work = replace(task.places["work"], timeout=1.5)
+    short = replace(task, places={**task.places, "work": work})
+    (found,) = (f for f in may_run(short).report.findings if "deadline" in f.code)
+    assert found.key == "places.work.timeout" and "1.5 s" in found.text and "2 s" in found.text
+
+
+def test_a_transition_can_fire_if_one_of_its_copies_can() -> None:
+    """With tries left, an ERROR by `jam` leads to another try: only the copy of `jam` for the last
+    try can ever fire."""
+    text = Text(1, tries=2)
+    text.moves += [
+        arcs("jam", "work:error", "arm", ", when = \"work.reason == 'jam'\""),
+        arcs("bad", "work:error", "arm", ", when = \"work.reason != 'jam'\""),
+    ]
+    judged = may_run(text.task(), None, BUDGET)
+    assert judged.analysis is not None
+    verdicts = judged.analysis.verdicts()
+    assert verdicts["quasi_live"].holds and verdicts["live"].holds

@@ -41,6 +41,8 @@ from petrobot.coordinator.task import Status, Task
 
 SHOWN = 20
 """The most firings of one stimulus that are written."""
+FAILED = " ends in error"
+"""Words in the text of a step by which a run ends in ERROR."""
 STEPS = 300_000
 """The most stimuli and firings for one graph; they take about twenty seconds."""
 
@@ -117,6 +119,21 @@ class ExecutionGraph:
         some = np.array([bool(wanted.intersection(s.firings)) for s in self.steps] or [False])
         mask: Mask = some[self.label]
         return mask
+
+    @cached_property
+    def retries(self) -> tuple[tuple[str, ...], ...]:
+        """Transitions that may be repeated for ever while every run ends in ERROR, by part of the
+        graph that only another end of a run, an event or the operator leaves."""
+        blind = np.array([_is_blind(step.text) for step in self.steps] or [False])
+        kept = np.flatnonzero(blind[self.label] & ~self.by_hand)
+        source, target = self.source[kept], self.target[kept]
+        part = Graph(len(self), source, target).components
+        found: dict[int, set[str]] = {}
+        for i in np.flatnonzero(part[source] == part[target]).tolist():
+            step = self.steps[self.label[kept[i]]]
+            if FAILED in step.text and step.firings:
+                found.setdefault(int(part[source[i]]), set()).update(step.firings)
+        return tuple(dict.fromkeys(tuple(sorted(names)) for names in found.values()))
 
     @cached_property
     def final(self) -> Mask:
@@ -367,3 +384,10 @@ def _endless(said: tuple[Instruction, ...]) -> bool:
 
 
 __all__ = ["STEPS", "ExecutionGraph", "Step", "TooManyValues", "execute"]
+
+
+def _is_blind(text: str) -> bool:
+    """Return whether a stimulus is neither a good end of a run nor something that comes from
+    outside."""
+    outside = (" ends in ", " comes", " becomes ", " raises ")
+    return FAILED in text or not any(words in text for words in outside)

@@ -33,7 +33,7 @@ from petrobot.coordinator.engine import (
     VariableChanged,
 )
 from petrobot.coordinator.engine.state import ACTIVE
-from petrobot.coordinator.task import End, Executed, Kind, Scope, Status
+from petrobot.coordinator.task import End, Executed, Kind, Scope, Status, Task
 from petrobot.coordinator.task.conditions import Compare, Literal, Name, walk
 from petrobot.coordinator.task.conditions.language import equal, is_number, with_values
 from petrobot.coordinator.task.conditions.regions import region_values
@@ -351,6 +351,16 @@ class Names:
 MISSING = type("Missing", (), {"__repr__": lambda _: "nothing"})()
 _SOME: Mapping[str, Any] = {"bool": False, "int": 0, "float": 0.0, "str": "", "any": None}
 """Values for variables that no condition reads."""
+
+
+def cases(task: Task) -> dict[str, frozenset[str]]:
+    """Return the transitions of a flat task, each with the copies of it that `tries` makes, one for
+    each number of used tries: it can fire if one of them can."""
+    found: dict[str, set[str]] = {}
+    for t in task.transitions.values():
+        own = t.expanded_from if t.expanded_from in task.transitions else t.name
+        found.setdefault(own, set()).add(t.name)
+    return {name: frozenset(names) for name, names in found.items()}
 
 
 def _armed(state: State, name: str) -> str:

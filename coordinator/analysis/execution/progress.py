@@ -33,7 +33,7 @@ from petrobot.coordinator.analysis.execution.graph import (
     execute,
     with_operator,
 )
-from petrobot.coordinator.analysis.execution.names import BY_HAND
+from petrobot.coordinator.analysis.execution.names import BY_HAND, cases
 from petrobot.coordinator.analysis.limits import OutOfTime
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
@@ -264,12 +264,14 @@ class Progress:
     def quasi_live(self) -> PropertyVerdict:
         """Every transition can fire."""
         fired = set(self.x.first).union(*(step.firings for step in self.x.steps))
-        idle = [t for t in self.x.engine.compiled.transitions if t.name not in fired]
+        compiled = self.x.engine.compiled
+        never = {n: c for n, c in cases(compiled.task).items() if not fired & c}
+        idle = [t for t in compiled.transitions if t.name in never]
         if not idle:
             return PropertyVerdict(True, "every transition can fire", assumption=self._fair)
         if not self.x.complete:
             return self._unknown(f"not fired so far: {', '.join(t.name for t in idle)}")
-        numbers = {t.index for t in idle}
+        numbers = {compiled.net.transition_index[n] for c in never.values() for n in c}
         roots = [t for t in idle if not self._fed_by(t, numbers, t.needs)]
         # In a ring of transitions that wait for each other, name the one that lacks a token, not
         # one that lacks a run: the ring should begin with that token.
@@ -375,8 +377,8 @@ class Progress:
         """Return a state in which a verdict fails and why, in words; None if it holds."""
         x = self.x
         if name == "live":
-            names = [t.name for t in x.engine.compiled.transitions]
-            return again.without({n: frozenset({n}) for n in names}, "fire", "transition fires")
+            copies = cases(x.engine.compiled.task)
+            return again.without(copies, "fire", "transition fires")
         if name == "controllable":
             return again.without(self.view.starts, "start", "action starts")
         if name == "proper":

@@ -32,7 +32,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.coordinator.analysis.execution.names import MISSING, RUN_FIELDS, Names, TooManyValues
+from petrobot.coordinator.analysis.execution.names import (
+    MISSING,
+    RUN_FIELDS,
+    Names,
+    TooManyValues,
+    cases,
+)
 from petrobot.coordinator.analysis.net.coverability import Coverability
 from petrobot.coordinator.analysis.net.graph import Graph
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
@@ -502,7 +508,7 @@ def proven(n: EndsNet, space: Space, view: OrdinaryView) -> dict[str, PropertyVe
     fired = {
         n.origin.get(t) for t, some in zip(n.net.transitions, space.fired, strict=True) if some
     }
-    idle = [t for t in flat.net.transitions if t not in fired]
+    idle = [name for name, copies in cases(flat).items() if not fired & copies]
     if idle:
         text = f"can never fire: {', '.join(idle)} (shown on the ends net)"
         found["quasi_live"] = PropertyVerdict(False, text)
