@@ -808,6 +808,8 @@ def _recovery_row(r: Recovery, odds: Odds) -> tuple[str, ...]:
 
 def _probability(p: float) -> str:
     """Return a probability with eight digits, or by how little it is short of 1."""
+    if 0 < 1 - p < 1e-13:
+        return "1"  # what is missing is rounding
     return f"1 - {1 - p:.1e}" if 0 < 1 - p < 5e-8 else f"{p:.8f}" if p % 1 else f"{p:.0f}"
 
 
