@@ -120,20 +120,13 @@ def inline_service(service: ServiceEntry, raised: Callable[[Event], None]) -> In
         except BaseException as fault:  # SystemExit of a service must not end the node
             if from_outside(fault):
                 raise
+            log_fault(_log, fault, "call %s of service %s raised", call.id, service.name)
             cause = "hung" if isinstance(fault, Hung) else "exception"
-            try:
-                log_fault(_log, fault, "call %s of service %s raised", call.id, service.name)
-                text = describe(fault)
-            except BaseException as worse:  # the words of an exception are code of a user, too
-                text = f"{type(fault).__name__}: (its message raises {type(worse).__name__})"
-            return Outcome(call.id, Status.ERROR, {}, cause, text)
+            return Outcome(call.id, Status.ERROR, {}, cause, describe(fault))
         try:
             outcome = checked_result(call.id, result, "values")
-        except BaseException as fault:  # and so are the values of a result
-            if from_outside(fault):
-                raise
-            why = str(fault) if isinstance(fault, ValueError) else type(fault).__name__
-            text = f"what it returned cannot be sent: {why}"
+        except ValueError as fault:
+            text = f"what it returned cannot be sent: {fault}"
             return Outcome(call.id, Status.ERROR, {}, "bad_result", text)
         outcome.cpu_seconds = time.process_time() - before
         return outcome

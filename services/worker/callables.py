@@ -57,7 +57,9 @@ def words_of(fault: BaseException) -> str:
     characters, with anything that is not Unicode escaped."""
     try:
         said = str(fault)
-    except Exception as worse:
+    except BaseException as worse:  # its words are code of a user, too
+        if from_outside(worse):
+            raise
         said = f"(its message cannot be had: {type(worse).__name__})"
     if len(said) > LONGEST:
         said = f"{said[:LONGEST]}... ({len(said):,} characters)"
@@ -79,7 +81,9 @@ def log_fault(log: logging.Logger, fault: BaseException, text: str, *arguments: 
     have used up the memory or made its exceptions unreadable."""
     try:
         trace = _traceback(fault)
-    except Exception as worse:
+    except BaseException as worse:
+        if from_outside(worse):
+            raise
         trace = f"(its traceback cannot be had: {type(worse).__name__})"
     log.error(f"{text}\n%s", *arguments, trace)
 

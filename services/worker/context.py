@@ -22,7 +22,7 @@ from petrobot.services.comm.protocol.messages import (
     Outcome,
 )
 from petrobot.services.comm.protocol.plain import plain
-from petrobot.services.worker.callables import describe, words_of
+from petrobot.services.worker.callables import describe, from_outside, words_of
 from petrobot.services.worker.outlets import Outlets, Sent
 
 Report = Outcome | Feedback | Event | Call | Cancel | Answer | Sent
@@ -87,7 +87,9 @@ def checked_result(identity: str, returned: Any, where: str = "result") -> Outco
         checked(result)
     except (TypeError, ValueError, MemoryError) as fault:
         raise ValueError(words_of(fault) or type(fault).__name__) from None
-    except Exception as fault:  # the value's own code: an object may raise whatever is asked of it
+    except BaseException as fault:  # the value's own code: an object may raise what it likes
+        if from_outside(fault):
+            raise
         raise ValueError(f"its values cannot be read: {describe(fault)}") from None
     return result
 

@@ -52,6 +52,8 @@ from petrobot.services.worker.outlets import Sent, StreamOutlets
 from petrobot.services.worker.pipe import Item, NewestLink, Permits, Pipe, keep_from_copies
 from petrobot.services.worker.remote import DeviceCommand, DeviceState, RemoteDriver
 
+LONGEST_PAUSE = 3600.0
+"""Longest wait for the next message (s): `poll` takes no infinite one."""
 POLL = 0.002
 """Time between checks of a condition for which a run waits (s)."""
 SETUP, BORN, READY, FAILED = "setup", "born", "ready", "failed"
@@ -158,7 +160,7 @@ class Worker:
         """Serve until the node has ended. Exits if the driver fails."""
         while not self._node.closed:
             pause = self._pause()
-            self._ends.poll(None if pause is None else 1e3 * pause)
+            self._ends.poll(None if pause is None else 1e3 * min(pause, LONGEST_PAUSE))
             if self._link is not None:
                 self._read_link(self._link)
             now = time.monotonic()

@@ -103,6 +103,16 @@ async def test_results_of_an_action(operator: Operator, kind: str) -> None:
 
 
 @pytest.mark.processes
+@pytest.mark.parametrize("seconds", [math.inf, 1e12])
+async def test_a_wait_without_an_end_ends_at_its_deadline(
+    operator: Operator, seconds: float
+) -> None:
+    end = await operator.call("nap", 0.3, seconds=seconds)
+    assert (end.status, end.cause) == ("error", "deadline"), end
+    assert (await operator.call("nap", None, seconds=0.01)).status == "success"
+
+
+@pytest.mark.processes
 @pytest.mark.parametrize("kind", table("RAISES", "SAYS", "ASKS"))
 async def test_exceptions_events_and_calls_of_an_action(operator: Operator, kind: str) -> None:
     await ends_alone(operator, "give", kind, "exception")

@@ -11,6 +11,8 @@ import numpy as np
 
 from petrobot.services.action import Context, Result, Status, error, failure, success
 
+from .actions import Leaving
+
 
 class OwnEnd(BaseException):
     """An exception that `except Exception` does not catch."""
@@ -115,6 +117,8 @@ RESULTS: Mapping[str, Callable[[], Any]] = {
     "no result": lambda: None,
     "a dict": lambda: {"x": 1},
     "a cause without words": lambda: error(Mute()),  # type: ignore[arg-type]
+    "a cause that leaves": lambda: error(Leaving()),  # type: ignore[arg-type]
+    "a value that leaves": lambda: Result(Status.SUCCESS, {}, deferred=Leaving()),  # type: ignore[arg-type]
 }
 """Values that an action returns; each must end its run as `bad_result`."""
 RAISES: Mapping[str, Callable[[], BaseException]] = {
@@ -125,6 +129,7 @@ RAISES: Mapping[str, Callable[[], BaseException]] = {
     "a cancellation": asyncio.CancelledError,
     "StopIteration": lambda: StopIteration(3),
     "one without words": Mute,
+    "one whose words leave": Leaving,
     "one with many words": lambda: ValueError("x" * 20_000_000),
     "one with half a letter": lambda: ValueError("\ud800"),
 }
