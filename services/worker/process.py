@@ -60,11 +60,12 @@ SETUP, BORN, READY, FAILED = "setup", "born", "ready", "failed"
 WANTED, STREAM_AT, DROPPED = "wanted", "stream_at", "dropped"
 OUT_OF_MEMORY = "out_of_memory"
 """Cause of a run that used up the memory of its process."""
-LINK_LOST, NO_MEMORY = 90, 91
+LINK_LOST, NO_MEMORY, CHANGED = 90, 91, 92
 """Exit codes: the driver's process has ended; not even the report of a run fits into the remaining
-memory."""
+memory; a run has changed its process for good."""
 
 
+_log = logging.getLogger(__name__)
 _IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -89,6 +90,50 @@ class Setup:
     def items(self) -> Mapping[str, Any]:
         """As plain data."""
         return asdict(self)
+
+
+class Surroundings:
+    """What the code of one run may change for the runs after it: working directory, file mode mask,
+    limits and timers of the process."""
+
+    LIMITS = tuple(
+        getattr(resource, f"RLIMIT_{name}")
+        for name in ("AS", "CPU", "DATA", "FSIZE", "NOFILE", "NPROC", "STACK")
+    )
+    TIMERS = (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF)
+
+    def __init__(self) -> None:
+        """Note how they are now."""
+        self._folder = self._here()
+        self._mask = os.umask(0)
+        os.umask(self._mask)
+        self._depth = sys.getrecursionlimit()
+        self._limits = [resource.getrlimit(limit) for limit in self.LIMITS]
+
+    def restored(self) -> str:
+        """Make them so again. Return why that is not possible, empty if it is."""
+        os.umask(self._mask)
+        if sys.getrecursionlimit() != self._depth:
+            sys.setrecursionlimit(self._depth)
+        try:
+            for timer in self.TIMERS:
+                if signal.getitimer(timer) != (0.0, 0.0):
+                    signal.setitimer(timer, 0.0)
+            for limit, wanted in zip(self.LIMITS, self._limits, strict=True):
+                if resource.getrlimit(limit) != wanted:
+                    resource.setrlimit(limit, wanted)
+            if self._here() != self._folder:
+                os.chdir(self._folder)
+        except (OSError, ValueError) as fault:
+            return str(fault)
+        return ""
+
+    @staticmethod
+    def _here() -> str:
+        try:
+            return os.getcwd()  # noqa: PTH109 - each run pays for it
+        except OSError:  # it was removed
+            return ""
 
 
 class Worker:
@@ -137,9 +182,12 @@ class Worker:
         """Whether runs take turns. Actions without a device do: one that blocks or crashes the
         process then ends no other run. The calls behind it have not begun, and the node gives them
         to another worker."""
+        self._surroundings = Surroundings()
         self._calls: deque[Call] = deque()
         self._spent = False
         """Whether a run used up the memory, so that the next one needs a new process."""
+        self._changed = False
+        """Whether a run has changed this process for good."""
         self._outlets = StreamOutlets(directory, f"{setup.node} {setup.device or 'actions'}")
         self._connecting = False
         # Faster than a selector. It also reports an end that user code has closed, which epoll
@@ -176,6 +224,8 @@ class Worker:
                 self._advance(time.monotonic())
             if self._calls:
                 self._give_back()
+            if self._changed and not self._node.unsent:
+                os._exit(CHANGED)
         self._place.close(time.monotonic())
         self._outlets.close()
 
@@ -194,7 +244,13 @@ class Worker:
         return not (self._spent or self._place.runs)
 
     def _begin(self, now: float, call: Call) -> None:
-        """Begin a call, unless the node has taken it back."""
+        """Begin a call, unless the node has taken it back, or this process cannot be made as it was
+        for its first run."""
+        if self._one_by_one and (why := self._surroundings.restored()):
+            _log.warning("a run has changed this process for good: %s", why)
+            self._calls.appendleft(call)
+            self._spent = self._changed = True
+            return
         if self._permits.take():
             self._place.take(now, call)
         else:

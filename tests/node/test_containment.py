@@ -46,6 +46,7 @@ keep_memory = {{ run = "toy_cell.actions:keep_memory", task = "sum", node = "lef
 block = {{ run = "toy_cell.actions:block", task = "sum", node = "left" }}
 chatter = {{ run = "toy_cell.actions:chatter", task = "sum", node = "left" }}
 write_down = {{ run = "toy_cell.actions:write_down", task = "sum", node = "left" }}
+change = {{ run = "toy_cell.actions:change", task = "sum", node = "left" }}
 """
 )
 WAYS = ("fork", "daemon", "program", "program with sockets")
@@ -338,3 +339,20 @@ async def test_hold_and_stop_reach_all_runs_without_a_device(operator: Operator)
     assert (await operator.command("left", "stop")).ok
     assert [(await run).cause for run in (held, blocked)] == ["stopped"] * 2
     assert (await operator.call("add", a=1)).values == {"sum": 2}
+
+
+@pytest.mark.parametrize("what", ["folder", "mask", "depth", "timer", "memory", "files"])
+async def test_what_a_run_changes_in_its_process_does_not_reach_the_next(
+    operator: Operator, what: str
+) -> None:
+    before = (await operator.call("change")).values["found"]
+    changed = await operator.call("change", what=what)
+    assert changed.status == "success" or what == "memory"
+    again = 0
+    for _ in range(12):
+        end = await operator.call("change")
+        assert end.status == "success", end
+        assert end.values["found"] == before
+        again += end.values["pid"] == changed.values.get("pid")
+        await asyncio.sleep(0.05)
+    assert again or what in ("memory", "files"), "after these a process may be of no more use"

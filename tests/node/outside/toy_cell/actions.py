@@ -6,8 +6,12 @@ from __future__ import annotations
 import ctypes
 import multiprocessing
 import os
+import resource
+import signal
 import subprocess
+import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +22,28 @@ from petrobot.services.action import Cancelled, Context, Result, Status, error, 
 def add(ctx: Context, *, a: int, b: int = 1) -> Result:
     """Return the sum."""
     return success(sum=a + b)
+
+
+CHANGES: dict[str, Callable[[], Any]] = {
+    "": lambda: None,
+    "folder": lambda: os.chdir("/"),
+    "mask": lambda: os.umask(0o777),
+    "depth": lambda: sys.setrecursionlimit(60),
+    "timer": lambda: signal.setitimer(signal.ITIMER_REAL, 0.2),
+    "memory": lambda: resource.setrlimit(resource.RLIMIT_AS, (1 << 20, resource.RLIM_INFINITY)),
+    "files": lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (5, 1024)),
+}
+"""What an action may leave behind in its process."""
+
+
+def change(ctx: Context, *, what: str = "") -> Result:
+    """Return how the process is, and change it."""
+    mask = os.umask(0o022)
+    os.umask(mask)
+    depth = sys.getrecursionlimit()
+    found = [str(Path.cwd()), mask, depth, list(resource.getrlimit(resource.RLIMIT_NOFILE))]
+    CHANGES[what]()
+    return success(found=found, pid=os.getpid())
 
 
 def write_down(ctx: Context, *, file: str, line: str) -> Result:
