@@ -97,13 +97,14 @@ class EventBoard:
     def acknowledge(self, peer: str, source: str, number: int) -> None:
         """`peer` has stored the events of this source up to this number; drop those that no other
         caller waits for."""
-        kept = self._kept.get(source)
-        if kept is None:
-            return
-        for one in kept:
-            if one.event.number <= number and self._wants(peer, one):
+        kept, awaited = self._kept.get(source, deque()), list[_Kept]()
+        while kept and kept[0].event.number <= number:
+            one = kept.popleft()
+            if self._wants(peer, one):
                 one.safe.add(peer)
-        self._kept[source] = deque(one for one in kept if self._awaited(one))
+            if self._awaited(one):
+                awaited.append(one)
+        kept.extendleft(reversed(awaited))
 
     def peer_down(self, peer: str, leaves: bool) -> None:
         """A peer's connection is closed; its subscription is dropped if it `leaves` or is not
