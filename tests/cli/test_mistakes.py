@@ -348,7 +348,7 @@ def _one_robot(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", list(sys.path))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """Return the files of a robot without a mistake, as `petrobot new robot` writes them."""
     folder = tmp_path_factory.mktemp("sound")
