@@ -94,13 +94,13 @@ class Executor:
 
     # --- in -----------------------------------------------------------------------------------
 
-    def subscribe(self, now: float) -> None:
+    def subscribe(self, now: float, *, fresh: bool) -> None:
         """Subscribe at every node to the events and variables of the task and to verdicts on its
-        runs."""
+        runs; `fresh`: the mission run begins now."""
         known = self._external | {MEMORY_EVENTS + name for name in self.task.flat.variables}
         names = sorted(known | {verdict_event(self.mission)})
         for caller in self.callers.values():
-            caller.subscribe(now, names)
+            caller.subscribe(now, names, fresh=fresh)
 
     def relive(self, now: float, step: RecordedStep) -> None:
         """Replay a step that an earlier process recorded at `now`: observers see it, but nothing is

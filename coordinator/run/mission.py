@@ -275,7 +275,7 @@ class Mission:
             self._finish(now, self.ended)
         elif self.executor.state.mode is not Mode.FRESH:
             self.stage = Stage.RUNNING
-            self.executor.subscribe(now)
+            self.executor.subscribe(now, fresh=False)
             self.executor.adopt(now)
             self.advance(now)
         elif PREPARED in stages:
@@ -346,7 +346,7 @@ class Mission:
 
     def _begin(self, now: float) -> None:
         self.stage, self.begun = Stage.RUNNING, now
-        self.executor.subscribe(now)
+        self.executor.subscribe(now, fresh=True)
         self.executor.stimulate(now, Begin(self.parameters, point=self.point))
 
     def _finish(self, now: float, ended: float) -> None:

@@ -47,17 +47,17 @@ def test_a_latched_event_raised_before_any_subscription_is_kept() -> None:
     assert _heard(callee, "coord") == []
 
 
-def test_no_event_of_the_time_before_a_caller_came_is_for_it() -> None:
-    callee = _node("coord")
+def test_a_fresh_subscription_gets_no_event_of_the_time_before() -> None:
+    callee = _node("coord", "next")
     callee.receive(0.0, "coord", m.Subscribe(("pressed",)))
     callee.raise_event(0.0, "pressed", source="button", latched=True)
-    callee.link_up(0.1, "next", m.Hello(2, 2, "coordinator", "next", "n"))
+    callee.receive(0.1, "next", m.Subscribe(("pressed",), fresh=True))
     callee.raise_event(0.2, "pressed", source="button", latched=True)
-    callee.receive(0.3, "next", m.Subscribe(("pressed",)))
+    callee.receive(0.3, "next", m.Subscribe(("pressed",)))  # as after a reconnection
     sent = [
         (to, message.number) for to, message in callee.messages() if isinstance(message, m.Event)
     ]
-    assert sent == [("coord", 1), ("coord", 2), ("next", 2)]
+    assert sent == [("coord", 1), ("coord", 2), ("next", 2), ("next", 2)]
 
 
 def test_an_acknowledgement_covers_only_the_subscriptions_of_its_sender() -> None:
@@ -163,9 +163,7 @@ def test_every_latched_event_arrives_once_and_in_order_of_its_source(
 
     for step in [*steps, "connect", "carry", "ack"]:
         if step.startswith("raise"):
-            event = callee.raise_event(0.0, step[-1], source="s", latched=True)
-            if caller.boot:  # else it came before the caller, and is not for it
-                raised.append(event)
+            raised.append(callee.raise_event(0.0, step[-1], source="s", latched=True))
         elif step == "ack":
             take()
             for event in arrived:

@@ -268,7 +268,7 @@ def working() -> Judges:
     """Begin work."""
     bench = Judges()
     bench.begin()
-    bench.executor.subscribe(0.0)
+    bench.executor.subscribe(0.0, fresh=True)
     bench.connect(0.1)
     return bench
 

@@ -386,8 +386,6 @@ class Callee:
             self._answers = OrderedDict(
                 (key, kept) for key, kept in self._answers.items() if key[0] != peer
             )
-        if known is None:
-            self.events.newcomer(peer)
         forgotten = self._peers.come(peer, hello, local)
         self.events.peer_down(forgotten, leaves=True)
         self._messages.extend((peer, event) for event in self.events.waiting(peer))
@@ -558,6 +556,8 @@ class Callee:
     def _take_subscribe(self, now: float, peer: str, subscribe: Subscribe) -> None:
         known = self._peers.get(peer)
         if known is not None:
+            if subscribe.fresh:
+                self.events.skip(peer)
             waiting = self.events.subscribe(peer, subscribe.names, known.role == COORDINATOR)
             self._messages.extend((peer, event) for event in waiting)
 

@@ -539,12 +539,12 @@ class Caller:
         self.soonest = min(self.soonest, now + self._patience.answer)
         self._messages.append(replace(command, data=plain(command.data, "data")))
 
-    def subscribe(self, now: float, names: Iterable[str]) -> None:
+    def subscribe(self, now: float, names: Iterable[str], *, fresh: bool = False) -> None:
         """Subscribe to these events, also after each reconnection; replaces an earlier
-        subscription."""
+        subscription. With `fresh`, events of the time before are not wanted."""
         self._names = tuple(names)
         if self.up:
-            self._messages.append(m.Subscribe(self._names))
+            self._messages.append(m.Subscribe(self._names, fresh))
 
     def acknowledge(self, now: float, id: str) -> None:  # noqa: A002
         """The owner has stored the result of this call, so the peer may forget it.

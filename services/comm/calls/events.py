@@ -51,11 +51,12 @@ class EventBoard:
         """Latched events that were dropped for newer ones before any caller had acknowledged
         them."""
 
-    def newcomer(self, peer: str) -> None:
-        """A caller comes for the first time: no event of the time before is for it. A button that
-        was pressed before a mission run does nothing in it."""
+    def skip(self, peer: str) -> None:
+        """No event of the time before is for this caller: a button that was pressed before a
+        mission run does nothing in it."""
         for kept in self._all():
-            kept.safe.add(peer)
+            if not kept.owner:
+                kept.safe.add(peer)
 
     def subscribe(self, peer: str, names: Iterable[str], durable: bool) -> list[Event]:
         """Send these events to `peer` from now on. Return the kept ones that it has not

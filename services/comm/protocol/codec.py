@@ -268,7 +268,7 @@ MAX_CONTAINERS_OF_TICK = 100_000
 UNCOUNTED = MAX_CONTAINERS
 """Bodies of up to this many bytes are decoded without counting: each array or map takes at least
 one byte, so a body this short cannot hold too many of them."""
-_SELDOM = frozenset((m.Call.KIND, m.Outcome.KIND))
+_SELDOM = frozenset((m.Call.KIND, m.Outcome.KIND, m.Subscribe.KIND))
 """Kinds whose last field is a bool that is left out when it is false, so a peer that does not know
 the field still reads the message."""
 _COUNTED = frozenset((m.Call.KIND, m.Outcome.KIND, m.Event.KIND, m.Answer.KIND))

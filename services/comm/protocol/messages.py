@@ -191,10 +191,12 @@ class EventAck:
 
 @dataclass(frozen=True, slots=True)
 class Subscribe:
-    """Send me events of these names from now on; replaces an earlier subscription."""
+    """Send me events of these names from now on; replaces an earlier subscription. With `fresh`,
+    latched events of the time before are not for me."""
 
     KIND: ClassVar[int] = 12
     names: tuple[str, ...]
+    fresh: bool = False
 
 
 @dataclass(frozen=True, slots=True)
