@@ -112,7 +112,10 @@ class Peer:
 
 
 @pytest.fixture
-def peer(tmp_path: Path) -> Iterator[Peer]:
+def peer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Peer]:
+    sdk = pytest.importorskip("scservo_sdk")
+    # It waits 34 ms for an answer; on a busy host the simulated bus may need longer to be woken.
+    monkeypatch.setattr(sdk.port_handler, "LATENCY_TIMER", 1000)
     peer = Peer(tmp_path / "so101")
     yield peer
     peer.close()
