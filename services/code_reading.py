@@ -50,7 +50,7 @@ class _Seen:
     faults: list[tuple[str, int, str]] = field(default_factory=list)
     """Faults, each with file, line and text."""
     ignored: list[tuple[str, int, str]] = field(default_factory=list)
-    """Answers that nobody looks at, in the same form."""
+    """Results of services that the code drops, in the same form."""
     causes: set[str] = field(default_factory=set)
     """Causes: first arguments of `error`."""
     values: set[str] = field(default_factory=set)
@@ -164,10 +164,9 @@ def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
 
 
 def _ignored(code: _Code, awaited: ast.expr, seen: _Seen) -> None:
-    """Record a call of a service whose result is dropped: one that failed would go unnoticed."""
-    called = awaited.func if isinstance(awaited, ast.Call) else awaited
-    if ast.unparse(called) in ("ctx.call", "context.call"):
-        text = "nobody looks at the result of `ctx.call`: that it failed would go unnoticed"
+    """Record a call of a service whose result is dropped."""
+    if isinstance(awaited, ast.Call) and ast.unparse(awaited.func) in ("ctx.call", "context.call"):
+        text = "the result of `ctx.call` is dropped: a failure would go unnoticed"
         seen.ignored.append((code.file, awaited.lineno, text))
 
 

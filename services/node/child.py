@@ -44,7 +44,7 @@ TURN = 1 << 14
 
 
 class _TurnSocket(socket.socket):
-    """The node's end of a pipe. A read of the pipe goes on while each part of it fills a `CHUNK`,
+    """The node's end of a pipe. A read of the pipe continues while each part of it fills a `CHUNK`,
     so a process that writes without end would keep the node from everything else: from its
     heartbeats, its devices and an emergency stop. This socket gives less than that at a time."""
 

@@ -249,7 +249,7 @@ IN_THE_CODE: list[Mistake] = [
         CODE,
         "await ctx.sleep(0.3)",
         "await ctx.call('lamp', 1.0)",
-        r"arm_bot.py:\d+: nobody looks at the result of `ctx.call`[^|]*`ctx.put`",
+        r"arm_bot.py:\d+: the result of `ctx.call` is dropped[^|]*`ctx.put`",
     ),
     (
         CODE,
@@ -388,7 +388,7 @@ WARNINGS = (
     "no action of move returns",
     "also return jammed",
     "raises the event",
-    "nobody looks",
+    "is dropped",
 )
 
 

@@ -118,7 +118,11 @@ RESULTS: Mapping[str, Callable[[], Any]] = {
     "a dict": lambda: {"x": 1},
     "a cause without words": lambda: error(Mute()),  # type: ignore[arg-type]
     "a cause that leaves": lambda: error(Leaving()),  # type: ignore[arg-type]
-    "a value that leaves": lambda: Result(Status.SUCCESS, {}, deferred=Leaving()),  # type: ignore[arg-type]
+    "a value that leaves": lambda: Result(
+        Status.SUCCESS,
+        {},
+        deferred=Leaving(),  # type: ignore[arg-type]
+    ),
 }
 """Values that an action returns; each must end its run as `bad_result`."""
 RAISES: Mapping[str, Callable[[], BaseException]] = {
