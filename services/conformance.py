@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -37,7 +38,7 @@ more than this multiple of its change at rest."""
 LATE_SHARE = 0.02
 """Share of steps that may take longer than the period: a busy computer delays some."""
 STARTING = 2
-"""Steps of a movement in which `stopped` may still be True."""
+"""Steps of a movement in which a position may change although `stopped` is still True."""
 UNKNOWN: Command = {"no driver knows this command": True}
 SLOW, SLOWED = 0.25, 0.5
 """Share of its speed at which a driver is tested, and the greatest share of its usual average speed
@@ -365,8 +366,8 @@ class _Check:
             self.fault(f"{dict(command)}: refused: {self.refusing}")
         judged, self.fresh = judged and not self.fresh, False
         begin = before = low = high = self.numbers()
-        fastest, resting, untrue = dict[str, float](), 0, 0
-        moved, lied = set[str](), set[str]()
+        fastest, resting = dict[str, float](), 0
+        moved, untrue = set[str](), Counter[str]()
         ways, away = dict[str, float](), set[str]()
         end = self.now() + seconds
         while self.now() < end and resting < REST:
@@ -385,15 +386,15 @@ class _Check:
             }
             before, moved = after, moved | changed
             resting = 0 if changed else resting + 1
-            if still and changed:
-                untrue, lied = untrue + 1, lied | changed
+            if still:
+                untrue.update(changed)
         found = {name: far for name, far in ways.items() if name in moved and name in away}
         # a position that hardly moves only settles
         least = SLOWEST * max(found.values(), default=0.0)
         found = {name: far for name, far in found.items() if far >= least}
-        if judged and untrue > STARTING and lied & found.keys():
-            names = _names(lied & found.keys())
-            self.fault(f"stopped: True during {dict(command)}, while {names} changed")
+        # each position by itself: one joint may settle while another only begins
+        if judged and (lied := {name for name in found if untrue[name] > STARTING}):
+            self.fault(f"stopped: True during {dict(command)}, while {_names(lied)} changed")
         return found
 
     def accepts(self, command: Command) -> bool:

@@ -94,6 +94,28 @@ def test_the_positions_may_be_named() -> None:
     assert "state: no pose" in "; ".join(checked(Ages, positions=["pose"]).faults)
 
 
+class Settles(Axis):
+    """It counts as standing until its first step, and what it bends settles after its last."""
+
+    speed = bent = 0.0
+
+    def step(self, now: float) -> None:
+        before = self.at
+        super().step(now)
+        self.speed = self.at - before
+        self.bent += 0.1 * (0.01 * self.at - self.bent)
+
+    def state(self) -> Mapping[str, Any]:
+        return {**super().state(), "bent": self.bent}
+
+    def stopped(self) -> bool:
+        return not self.speed
+
+
+def test_an_axis_may_settle_after_the_movement() -> None:
+    assert checked(Settles).faults == []
+
+
 class NeverStops(Axis):
     def stop(self, now: float) -> None:
         pass
