@@ -60,7 +60,6 @@ def _add_trials(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--regime",
-        default="",
         metavar="A,B",
         help="regimes that alternate, with the same seeds in each; C@1-5: regime C in the "
         "simulated installations 1 to 5",
@@ -288,17 +287,18 @@ async def _conduct(campaign: Campaign, options: argparse.Namespace) -> None:
 
 
 def _plan(options: argparse.Namespace, task: Task) -> CampaignPlan:
-    from petrobot.coordinator.cli.options import parameter_of
+    from petrobot.coordinator.cli.options import pairs, parameter_of, parameter_texts
     from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest, regimes_of
     from petrobot.coordinator.studies.campaign.policies import learns
 
-    given = dict(_pair("--set", text) for text in options.set)
-    regimes = regimes_of(options.regime) or (str(task.parameters.get("regime", "")),)
+    given = parameter_texts(options)
+    asked = given.pop("regime", "")
+    regimes = regimes_of(asked) or (str(task.parameters.get("regime", "")),)
     if regimes != ("",) and "regime" not in task.parameters:
-        raise CommandError(2, f"--regime {options.regime}: {task.name} has no parameter regime")
+        raise CommandError(2, f"--regime {asked}: {task.name} has no parameter regime")
     if len(set(regimes)) < len(regimes):
-        raise CommandError(2, f"--regime {options.regime}: name each regime once")
-    chosen = dict(_pair("--choose", text) for text in options.choose.split(",") if text)
+        raise CommandError(2, f"--regime {asked}: name each regime once")
+    chosen = pairs("--choose", filter(None, options.choose.split(",")), "TASK=ACTION")
     paths = {"task": str(task_path(options.task)), "services": str(options.services)}
     paths |= {"mock": str(options.mock)} if options.mock else {}
     return CampaignPlan(
@@ -353,13 +353,6 @@ def _selector_options(options: argparse.Namespace) -> dict[str, Any]:
             )
         found["by_regime"] = learned_choices(options.learned)
     return found
-
-
-def _pair(option: str, text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not equals:
-        raise CommandError(2, f"{option} {text}: write NAME=VALUE")
-    return name, value
 
 
 def _task_line(found: Mapping[str, Any], wide: int) -> list[str]:

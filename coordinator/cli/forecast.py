@@ -309,6 +309,7 @@ def _refuse_other_names(task: Task, path: Path, found: Mapping[str, Iterable[str
 def _request(
     task: Task, trainings: Mapping[str, Training], regime: str, options: argparse.Namespace
 ) -> Request:
+    from petrobot.coordinator.cli.options import pairs
     from petrobot.coordinator.studies.campaign.policies import learned_choices
     from petrobot.coordinator.studies.forecast.choices import choices_of
     from petrobot.coordinator.studies.forecast.predict import Request
@@ -328,10 +329,8 @@ def _request(
         for name, action in learned.get(regime, {}).items()
         if name in choices  # a place that training never entered stays at probability 0
     }
-    asked |= {
-        name: (action, "--choose")
-        for name, action in (_pair(t) for t in options.choose.split(",") if t)
-    }
+    chosen = pairs("--choose", filter(None, options.choose.split(",")), "TASK=ACTION")
+    asked |= {name: (action, "--choose") for name, action in chosen.items()}
     for name, (action, option) in asked.items():
         primitive = task.primitive_tasks.get(name)
         if primitive is None or action not in primitive.alternatives:
@@ -341,13 +340,6 @@ def _request(
             )
         choices[name] = {action: 1.0}
     return Request(options.runs, choices, options.seed, options.replicates)
-
-
-def _pair(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not equals:
-        raise CommandError(2, f"--choose {text}: write TASK=ACTION")
-    return name, value
 
 
 def _compare(registered: Path, folder: Path, options: argparse.Namespace) -> int:

@@ -6,14 +6,14 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from petrobot.coordinator.task import Task
 
@@ -37,13 +37,22 @@ def parameter_of(task: Task, name: str, text: str) -> Any:
         ) from fault
 
 
-def pairs(option: str, texts: list[str]) -> Iterator[tuple[str, str]]:
-    """Split each NAME=VALUE. Raises CommandError."""
+def pairs(option: str, texts: Iterable[str], form: str = "NAME=VALUE") -> dict[str, str]:
+    """Split texts of the form NAME=VALUE. Raises CommandError, also for a name with two values."""
+    found: dict[str, str] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals:
-            raise CommandError(2, f"{option} {text}: expected NAME=VALUE")
-        yield name, value
+            raise CommandError(2, f"{option} {text}: expected {form}")
+        if found.setdefault(name, value) != value:
+            raise CommandError(2, f"{option}: {name} is given as {found[name]} and as {value}")
+    return found
+
+
+def parameter_texts(options: argparse.Namespace) -> dict[str, str]:
+    """Return the texts of all parameters that `--set` and `--regime` give. Raises CommandError."""
+    regime = [] if options.regime is None else [f"regime={options.regime}"]
+    return pairs("--set", [*options.set, *regime])
 
 
 # The port of the operator's page: its option, and the message when it cannot be used.

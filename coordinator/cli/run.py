@@ -28,6 +28,7 @@ from petrobot.coordinator.cli.options import (
     named_port,
     pairs,
     parameter_of,
+    parameter_texts,
 )
 from petrobot.coordinator.cli.recorded_runs import (
     add_journal_arguments,
@@ -421,7 +422,7 @@ def _request(task: Task, directory: Directory, options: argparse.Namespace) -> R
         RunRequest,
     )
 
-    chosen = dict(pairs("--use", options.use))
+    chosen = pairs("--use", options.use, "TASK=ACTION")
     for primitive, action in chosen.items():
         known = task.primitive_tasks.get(primitive)
         if known is None or action not in known.alternatives:
@@ -450,9 +451,7 @@ def _request(task: Task, directory: Directory, options: argparse.Namespace) -> R
 
 
 def _parameters(task: Task, options: argparse.Namespace) -> Mapping[str, Any]:
-    given = dict(pairs("--set", options.set))
-    if options.regime is not None:
-        given["regime"] = options.regime
+    given = parameter_texts(options)
     return {name: parameter_of(task, name, text) for name, text in given.items()}
 
 

@@ -172,11 +172,11 @@ def test_train_forecast_run_and_compare(tmp_path: Path, capsys: pytest.CaptureFi
 def test_a_finished_campaign_is_not_run_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The same command returns the same result at once; another number of runs has its own
-    folder."""
+    """The same command returns the same result at once, and `--regime X` is `--set regime=X`;
+    another number of runs has its own folder."""
     monkeypatch.chdir(tmp_path)
-    told = ["campaign", *TOY, "--workers", "1", "--regime", "easy"]
-    assert main([*told, "--runs", "4"]) == 0
+    told = ["campaign", *TOY, "--workers", "1", "--set", "regime=rough"]
+    assert main(["campaign", *TOY, "--workers", "1", "--regime", "rough", "--runs", "4"]) == 0
     (folder,) = (tmp_path / "campaigns").iterdir()
     first = (folder / "sessions.csv").read_bytes()
     capsys.readouterr()
@@ -315,7 +315,11 @@ def _until(condition: Callable[[], bool]) -> None:
     [
         (["campaign", *TOY, "--selector", "oracle"], "choose one of fixed, round_robin"),
         (["campaign", *TOY, "--choose", "look=stare"], "choose one of look_quick"),
-        (["campaign", *TOY, "--choose", "look"], "write NAME=VALUE"),
+        (["campaign", *TOY, "--choose", "look"], "expected TASK=ACTION"),
+        (
+            ["campaign", *TOY, "--regime", "hard", "--set", "regime=easy"],
+            "--set: regime is given as easy and as hard",
+        ),
         (["campaign", *TOY, "--regime", "easy,easy"], "each regime once"),
         (["campaign", *TOY, "--seed", "-1"], "-1 is not a whole number of at least 0"),
         (["campaign", *TOY, "--rho", "-3"], "-3 is not a number of at least 0"),
