@@ -3,9 +3,9 @@
 Each result is stored in docs/figures.json with a hash of the sources that it depends on. A proof
 whose sources have not changed is not run again, so an interrupted `make proof` continues where it
 stopped, on another machine, too. Where they have changed, ten balls of each figure of the catching
-cell are run again; if all their numbers are as before, the figure stands. `--only NAME ...` runs
-some proofs, `--fresh` forgets the stored results, `--jobs K` runs K at the same time (speeds are
-always measured alone), `--page` only writes the page.
+cell, or a hundredth of a study, are run again; if all their numbers are as before, the figure
+stands. `--only NAME ...` runs some proofs, `--fresh` forgets the stored results, `--jobs K` runs K
+at the same time (speeds are always measured alone), `--page` only writes the page.
 """
 
 from __future__ import annotations

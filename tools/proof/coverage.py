@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tools.proof.proof import ROOT, FigureProof, Result
+from tools.proof.proof import ROOT, FigureProof, Result, digest
 
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast.choices import choices_of
@@ -670,6 +670,9 @@ def proofs() -> list[FigureProof]:
             "refused or doubtful": sum(f["missed"] for f in found),
         }
 
+    def sample() -> str:
+        return digest(experiment(parser().parse_args(["--repetitions", "2"])))
+
     return [
         FigureProof(
             "coverage of forecasts",
@@ -679,6 +682,7 @@ def proofs() -> list[FigureProof]:
             f"95 % intervals hold in {LOW} to {HIGH} of 200 on ten worlds, {POOLED[0]} to "
             f"{POOLED[1]} of 2,000 in all, <= {WIDEST} x as wide as an observer's",
             ("coordinator/studies/forecast", "tools/proof/coverage.py"),
+            sample=sample,
         )
     ]
 

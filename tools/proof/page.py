@@ -14,9 +14,10 @@ anyone can repeat it. It resumes where it stopped, and measures again what has c
 
 `floor` is the least that is promised, `holds` says whether the measurement reaches it. `sources`
 identifies the measured code (without comments and layout); `(older)` means that the code has
-changed since, and `a = b` that it was measured at a, and that at b ten balls gave the same numbers
-to the last digit. Each row of a disturbed regime is 200 runs with the first alternative of each
-task. Fewer throws: the ball was not seen, or the task gave up; more: balls went by unseen.
+changed since, and `a = b` that it was measured at a, and that at b a short measurement of the same
+kind gave the same numbers to the last digit: ten balls, or a hundredth of a study. Each row of a
+disturbed regime is 200 runs with the first alternative of each task. Fewer throws: the ball was not
+seen, or the task gave up; more: balls went by unseen.
 
 How faults that were injected on purpose ended: [figures-faults.md](figures-faults.md).
 """
