@@ -100,6 +100,24 @@ def test_an_event_of_a_run_goes_to_its_caller_and_is_gone_with_the_run() -> None
     assert _heard(callee, "coord") == []
 
 
+def test_a_run_that_raises_more_events_than_are_kept_is_stopped() -> None:
+    """It does not lose some of them silently, and what is acknowledged does not count."""
+    callee = _node("coord")
+    callee.receive(0.0, "coord", m.Call("1", "move"))
+    for _ in range(KEPT):
+        assert callee.raise_event(0.1, "noise", run="1", latched=True)
+    callee.receive(0.2, "coord", m.EventAck("motion", 1))
+    assert callee.raise_event(0.3, "noise", run="1", latched=True)
+    assert not any(isinstance(order, m.Cancel) for order in callee.orders())
+    assert callee.raise_event(0.4, "noise", run="1", latched=True) is None
+    assert [order.id for order in callee.orders() if isinstance(order, m.Cancel)] == ["1"]
+    callee.receive(0.5, "coord", m.EventAck("motion", KEPT))
+    assert callee.raise_event(0.6, "noise", run="1", latched=True) is None  # it has lost one
+    end = callee.finish(0.7, m.Outcome("1", "success", {"n": KEPT}))
+    assert (end.status, end.cause, end.values) == ("error", "too_many_events", {})
+    assert len(_heard(callee, "coord")) == KEPT + 1
+
+
 def test_a_caller_that_left_with_bye_receives_no_old_events_when_it_is_back() -> None:
     callee = _node("coord")
     callee.receive(0.0, "coord", m.Subscribe(("caught",)))

@@ -7,7 +7,8 @@ import time
 
 import pytest
 
-from petrobot.services.comm.calls.caller import PeerLost
+from petrobot.services.comm.calls.caller import Notice, Patience, PeerLost
+from petrobot.services.comm.calls.link import LinkTiming
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.messages import Answer, Executed, Outcome, Welcome
 from petrobot.services.comm.protocol.security import KeyNeededError
@@ -51,6 +52,34 @@ async def test_calls_of_several_clients_of_a_process_have_different_ids(open_nod
         assert (await call).status == "success"
         await told.client.close()
     await other.server.close()
+
+
+async def test_an_accept_behind_many_events_is_not_missed(
+    open_node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The coordinator needs longer for the events before it than it waits for ACCEPT."""
+    coordinator = open_node.client(timing=LinkTiming())
+    coordinator.caller._patience = Patience(accept=0.1)
+    longest = [0]
+
+    def slow(now: float, notices: list[Notice]) -> None:
+        time.sleep(0.0005 * len(notices))
+        longest[0] = max(longest[0], len(notices))
+        coordinator._take(now, notices)
+
+    monkeypatch.setattr(coordinator.client, "_on_notices", slow)
+    assert await coordinator.client.connected(60.0)
+    coordinator.caller.subscribe(coordinator.client.now(), ("noise",))
+    coordinator.client.flush()
+    await until(lambda: bool(open_node.server.callee.events._listeners))
+    for _ in range(2000):
+        open_node.server.callee.raise_event(0.0, "noise", {"text": 100 * "x"}, latched=True)
+    open_node.server.flush()
+    outcome = await asyncio.wait_for(coordinator.client.call("echo", {"n": 1}), 60.0)
+    assert outcome.values == {"n": 1}
+    assert len([n for n in coordinator.notices if isinstance(n, m.Event)]) == 2000
+    assert longest[0] < 200, "so many events are stored before anybody else is heard"
+    await coordinator.client.close()
 
 
 async def test_a_command_and_an_event(open_node: Node) -> None:

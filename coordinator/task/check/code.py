@@ -20,8 +20,8 @@ events, faults; `device`: the words of its driver."""
 RUNTIME = (
     *("bad_arguments", "bad_result", "busy", "cancelled", "command_not_taken", "command_refused"),
     *("deadline", "device_died", "emergency_stop", "exception", "fenced", "hung", "import_failed"),
-    *("node_lost", "node_silent", "not_ready", "out_of_memory", "stopped", "unknown_service"),
-    "worker_died",
+    *("node_lost", "node_silent", "not_ready", "out_of_memory", "stopped", "too_many_events"),
+    *("unknown_service", "worker_died"),
 )
 """Causes that the runtime gives to runs of any action."""
 _FITS: Mapping[str, tuple[type, ...]] = {

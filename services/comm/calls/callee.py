@@ -32,7 +32,7 @@ from typing import Any, Final
 
 import msgpack
 
-from petrobot.services.comm.calls.events import EventBoard
+from petrobot.services.comm.calls.events import KEPT, EventBoard
 from petrobot.services.comm.calls.peers import (
     Inline,
     Offer,
@@ -65,6 +65,8 @@ from petrobot.services.comm.protocol.wire import NEWEST_VERSION, negotiate
 
 NEVER: Final = float("inf")
 DEADLINE: Final = "deadline"
+TOO_MANY_EVENTS: Final = "too_many_events"
+TOO_MANY_TEXT: Final = f"raised events faster than they are stored: {KEPT:,} of its action wait"
 ORPHAN: Final = "orphan"
 
 
@@ -589,8 +591,9 @@ class Callee:
         """A run has finished: store its outcome, send it to the caller and return it.
 
         `plain_already`: its values came in a message or were checked, so they are plain data.
-        A run that was stopped by its deadline ends as ERROR `deadline` whatever it reports; one
-        that was stopped for another reason keeps its own status if it finished before. Raises
+        A run that was stopped by its deadline, or for too many events, ends as that ERROR whatever
+        it reports; one that was stopped for another reason keeps its own status if it finished
+        before. Raises
         ValueError if no such run is active.
         """
         run = self._running.pop(end.id, None)
@@ -602,6 +605,9 @@ class Callee:
                 f"{end.seconds:.3f} s)"
             )
             end = replace(end, status=ERROR, values={}, cause=DEADLINE, text=text, deferred=False)
+        elif run.reason == TOO_MANY_EVENTS:
+            cause, text = TOO_MANY_EVENTS, TOO_MANY_TEXT
+            end = replace(end, status=ERROR, values={}, cause=cause, text=text, deferred=False)
         elif run.stopping and end.cause == "cancelled":
             end = replace(end, cause=run.reason, text=end.text or run.call.service)
         outcome = _sendable(end, plain_already or not end.values)
@@ -631,18 +637,24 @@ class Callee:
         source: str = "",
         latched: bool = False,
         run: str = "",
-    ) -> Event:
+    ) -> Event | None:
         """Raise an event of the outside world for its subscribers, or of an active run for its
         caller.
 
         A latched event is numbered by its source (default: this node) and kept until it is
-        acknowledged.
+        acknowledged. A run whose action has too many such events is stopped instead; then None is
+        returned.
         """
         owner = ""
         if run:
             if run not in self._running:
                 raise ValueError(f"run {run}: no active run has this id")
-            owner = self._running[run].peer
+            active = self._running[run]
+            if latched and self.events.is_full(source or self.name):
+                self._stop(run, active, TOO_MANY_TEXT, TOO_MANY_EVENTS)
+            if active.reason == TOO_MANY_EVENTS:
+                return None
+            owner = active.peer
         event = Event(name, source or self.name, 0, plain(data or {}, "data"), run)
         event, peers = self.events.raise_event(event, latched, owner)
         for peer in peers:

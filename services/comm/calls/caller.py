@@ -708,10 +708,10 @@ class Caller:
         if self._commands.pop(answer.id, None) is not None:
             self._notices.append(answer)
 
-    def stood_still(self, now: float) -> None:
-        """Wait from now on at least as long as for ACCEPT: the peer, perhaps on the same host, may
-        have stood still, too."""
-        until = now + self._patience.accept
+    def stood_still(self, at: float) -> None:
+        """This process did not listen until `at`. Wait from then on at least as long as for ACCEPT:
+        the peer, perhaps on the same host, may have stood still, too."""
+        until = at + self._patience.accept
         self._pending.postpone(until)
         self._commands = {id_: max(due, until) for id_, due in self._commands.items()}
 

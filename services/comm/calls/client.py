@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import itertools
 import logging
+import math
 import os
 import random
 import socket
@@ -160,6 +161,7 @@ class Client:
         self._task: asyncio.Task[None] | None = None
         self._alarm = Alarm(self._advance)
         self._excused = False
+        self._behind = -math.inf
         self._flushing = False
         self._up = asyncio.Event()
         self._prefix = f"{caller.hello.name}/{caller.hello.boot}/"
@@ -273,6 +275,10 @@ class Client:
         self._excused = self._alarm.late > STOOD_STILL and not self._excused
         if self._excused:
             self.caller.stood_still(now)
+        elif self._link is not None and self._link.behind > self._behind:
+            # What we wait for may have come behind what we were reading then.
+            self._behind = self._link.behind
+            self.caller.stood_still(self._behind)
         self.caller.advance(now)
         self.flush(now)
 

@@ -15,7 +15,8 @@ from petrobot.services.comm.protocol.codec import NAME_LENGTH
 from petrobot.services.comm.protocol.messages import Event, EventAck
 
 KEPT = 1_000
-"""How many latched events of one source are kept; then the oldest is dropped."""
+"""How many latched events of one source are kept. Of an action, the run that raises more is
+stopped; of the outside world, the oldest is dropped."""
 
 
 @dataclass(slots=True)
@@ -71,6 +72,10 @@ class EventBoard:
             kept.event for kept in self._all() if peer not in kept.safe and self._wants(peer, kept)
         ]
 
+    def is_full(self, source: str) -> bool:
+        """Return whether as many events of this source wait as are kept."""
+        return len(self._kept.get(source, ())) >= KEPT
+
     def raise_event(self, event: Event, latched: bool, owner: str) -> tuple[Event, list[str]]:
         """Return the event as it is sent (numbered if latched), and its receivers. An event of a
         run goes to its `owner` only."""
@@ -87,7 +92,7 @@ class EventBoard:
         self._numbers[event.source] = number
         event = Event(event.name, event.source, number, event.data, event.run)
         kept = self._kept.setdefault(event.source, deque())
-        if len(kept) == KEPT:
+        if len(kept) >= KEPT:
             kept.popleft()
             self.lost += 1
         kept.append(_Kept(event, owner))

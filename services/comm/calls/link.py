@@ -35,6 +35,9 @@ _log = logging.getLogger(__name__)
 READ_BUFFER = 1 << 16
 """Most bytes read at once. They are decoded before another connection is read; in the worst case
 (only empty maps) that takes about 25 ms."""
+FIRST_READ = 1 << 13
+"""Most bytes read at once while messages are shorter: whoever owns the connection handles all that
+came together (a coordinator stores each event) before it hears anybody else."""
 HEARD = 4096
 """So many bytes of an incomplete frame count as a sign of life. Fewer do not: a frame that arrives
 byte by byte, or whose length was changed on its way, must not block the frames behind it for longer
@@ -191,6 +194,10 @@ class AsyncLink(asyncio.BufferedProtocol):
         """Frames that the connection has made and that are not written yet. They already have their
         numbers (the seal counts frames), so they must be written before all others."""
         self._view = memoryview(buffer)
+        self._given = self._first = self._view[:FIRST_READ]
+        """What is read into next: only the first part, unless a long message has begun."""
+        self.behind = -math.inf
+        """When a read last took all that it could (s): more was probably waiting."""
         self._transport: asyncio.Transport | None = None
         self._heart = Heartbeat(0.0, timing)
         self._unheard = 0
@@ -234,16 +241,19 @@ class AsyncLink(asyncio.BufferedProtocol):
     def get_buffer(self, sizehint: int) -> memoryview:
         # A memoryview, not the bytearray: under TLS asyncio slices it, and a slice of a bytearray
         # is a copy.
-        return self._view
+        return self._given
 
     def buffer_updated(self, nbytes: int) -> None:
-        data = bytes(self._view[:nbytes])
+        data = bytes(self._given[:nbytes])
+        full = nbytes == len(self._given)
         now = self.now()
         try:
             messages = self.connection.receive_data(data)
         except ProtocolError as fault:
             self._refuse(now, fault)
             return
+        self._given = self._view if full and not messages else self._first
+        self.behind = now if full else self.behind
         if self._logs:  # kinds and ids alone: results may hold tickets
             named = [f"{type(one).__name__} {getattr(one, 'id', '')}" for one in messages]
             _log.debug("received %d bytes: %s", nbytes, ", ".join(named))
