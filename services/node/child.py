@@ -15,16 +15,12 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from petrobot.services.comm.protocol.messages import Call
 from petrobot.services.host.parent_death import STOP_ROUTINE, until_ended
 from petrobot.services.worker.keeper import KILL_ORDER
-from petrobot.services.worker.pipe import CHUNK, Item, Permits, permit_counter, pipe_pair
+from petrobot.services.worker.pipe import Item, Permits, permit_counter, pipe_pair
 from petrobot.services.worker.process import BORN, SETUP, Setup
-
-if TYPE_CHECKING:
-    from _typeshed import WriteableBuffer
 
 _log = logging.getLogger(__name__)
 
@@ -38,20 +34,9 @@ KEEPER_LIMIT = 3.0
 """Time in which a keeper must carry out an order to kill (s). After that it is killed itself, and
 the kernel kills its worker."""
 
-
 TURN = 1 << 14
-"""Most bytes that are read of a process in one turn of the loop."""
-
-
-class _TurnSocket(socket.socket):
-    """The node's end of a pipe. A read of the pipe continues while each part of it fills a `CHUNK`,
-    so a process that writes without end would keep the node from everything else: from its
-    heartbeats, its devices and an emergency stop. This socket gives less than that at a time."""
-
-    most = TURN
-
-    def recv_into(self, buffer: WriteableBuffer, nbytes: int = 0, flags: int = 0) -> int:
-        return super().recv_into(buffer, nbytes or self.most, flags)
+"""Most bytes that are read of a process in one turn of the loop. A process that writes without end
+would otherwise keep the node from all else: from heartbeats, devices and an emergency stop."""
 
 
 class Child:
@@ -73,8 +58,6 @@ class Child:
         self._loop = asyncio.get_running_loop()
         self._logs = _log.isEnabledFor(logging.DEBUG)
         self.pipe, pipe_end = pipe_pair()
-        self.pipe.socket = self._socket = _TurnSocket(fileno=self.pipe.socket.detach())
-        self._socket.setblocking(False)
         self._descriptors, descriptors_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         passed = [pipe_end, descriptors_end, *([link] if link else [])]
         counter = permit_counter()
@@ -195,9 +178,9 @@ class Child:
     def _limit(self, seconds: float, act: Callable[[], None]) -> None:
         self._limits.append(self._loop.call_later(seconds, act))
 
-    def _read(self) -> None:
+    def _read(self, most: int | None = TURN) -> None:
         try:
-            received = self.pipe.read()
+            received = self.pipe.read(most)
         except ValueError:
             received = []
             self._close_pipe()
@@ -223,8 +206,7 @@ class Child:
         for limit in self._limits:
             limit.cancel()
         if not self._let_go:
-            self._socket.most = CHUNK
-            self._read()  # all that it sent last
+            self._read(None)  # all that it sent last
             self._close_pipe()
         for limit in self._limits:
             limit.cancel()

@@ -131,15 +131,15 @@ class Pipe:
                     self.closed = True
                     self._unsent.clear()
 
-    def read(self) -> list[Item]:
-        """Return all items that arrived. Raises ValueError for data that is not msgpack: user code
-        has written into the pipe."""
+    def read(self, most: int | None = None) -> list[Item]:
+        """Return all items that arrived, or those in the next `most` bytes (up to `CHUNK`). Raises
+        ValueError for data that is not msgpack: user code has written into the pipe."""
         if _Copy.made:
             os._exit(0)
         items: list[Item] = []
         while not self.ended:
             try:
-                count = self.socket.recv_into(_BUFFER)
+                count = self.socket.recv_into(_BUFFER, most or CHUNK)
             except BlockingIOError:
                 break
             except OSError:
@@ -156,8 +156,8 @@ class Pipe:
             for unpacked in self._unpacker:
                 if (item := _item(unpacked)) is not None:
                     items.append(item)
-            if count < CHUNK and not self.closed:
-                break  # all that arrived; the end of the pipe wakes its reader again
+            if most or (count < CHUNK and not self.closed):
+                break  # what is left, and the end of the pipe, wake its reader again
         return items
 
     def close(self) -> None:

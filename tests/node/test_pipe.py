@@ -82,6 +82,20 @@ def test_a_pipe_buffers_what_does_not_fit() -> None:
     a.close()
 
 
+def test_a_bounded_read_leaves_the_rest_to_the_next() -> None:
+    """Although the other end writes without end: each read finds more than it may take."""
+    near, far = socket.socketpair()
+    a, b = Pipe(near), Pipe(far)
+    for n in range(40):
+        a.post(["n", n, bytes(1000)])
+    parts = [b.read(10_000) for _ in range(5)]
+    assert [len(part) for part in parts] == [9, 10, 10, 10, 1]
+    assert [item[1] for part in parts for item in part if isinstance(item, list)] == list(range(40))
+    a.close()
+    assert b.read(10_000) == [] and b.ended
+    b.close()
+
+
 def test_last_messages_are_read_although_the_other_end_reads_no_more() -> None:
     near, far = socket.socketpair()
     a, b = Pipe(near), Pipe(far)
