@@ -783,3 +783,22 @@ def test_two_actions_of_one_device_never_run_at_the_same_time() -> None:
     assert "seen" not in apart.quasi_live.reason
     shared = progress_of(OrdinaryView(task), 40_000, None, dict.fromkeys(actions, "arm"))
     assert not shared.quasi_live.holds and "seen can never fire" in shared.quasi_live.reason
+
+
+def test_only_runs_that_end_in_error_are_retries() -> None:
+    """A value that reads like the end of a run is none."""
+    net = {
+        "go": {"in": "a", "out": "b", "when": "word == 'one ends in error'"},
+        "back": {"in": "b", "out": "a", "when": "word == 'two ends in error'"},
+        "end": {"in": "a", "out": "done", "when": "word == 'end'"},
+    }
+    task = make_task("a=1 b done", net, variables={"word": ""}, final="done == 1")
+    x = execute(task)
+    assert len([step for step in x.steps if "ends in error" in step.text and step.firings]) == 2
+    assert x.retries == ()
+    assert execute(arm(1, give_up=False)).retries == ()
+    again = {
+        "good": {"in": "act:normal", "out": "done"},
+        "again": {"in": "act:error", "out": "act"},
+    }
+    assert execute(make_task("act!=1 done", again, final="done == 1")).retries == (("again",),)

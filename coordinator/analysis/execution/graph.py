@@ -28,36 +28,53 @@ from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.engine import (
     Begin,
     Engine,
+    EventOccurred,
     Fired,
     Instruction,
     Mode,
     Policy,
     Report,
+    RunEnded,
+    RunRaised,
     State,
     Stimulus,
+    VariableChanged,
 )
 from petrobot.coordinator.engine.step import at_end
 from petrobot.coordinator.task import Status, Task
 
 SHOWN = 20
 """The most firings of one stimulus that are written."""
-FAILED = " ends in error"
-"""Words in the text of a step by which a run ends in ERROR."""
 STEPS = 300_000
 """The most stimuli and firings for one graph; they take about twenty seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """An edge of a path: a stimulus in words, and the transitions that it fires."""
+    """An edge of a path: a stimulus in words, and the transitions that it fires. Steps with the
+    same words are equal: their stimuli differ in the ids of runs alone."""
 
     text: str
     firings: tuple[str, ...]
+    stimulus: Stimulus = field(compare=False)
+    """The first one found."""
 
     @property
     def reason(self) -> str:
         """Return the reason of a run that ended, as text; empty where no condition reads it."""
-        return self.text.partition(REASON)[2].partition(",")[0]
+        end = self.stimulus
+        return repr(end.cause) if isinstance(end, RunEnded) and REASON in self.text else ""
+
+    @property
+    def fails(self) -> bool:
+        """Whether a run ends in ERROR."""
+        return isinstance(self.stimulus, RunEnded) and self.stimulus.status is Status.ERROR
+
+    @property
+    def blind(self) -> bool:
+        """Whether it is neither a good end of a run nor something that comes from outside."""
+        outside = (RunEnded, RunRaised, EventOccurred, VariableChanged)
+        return self.fails or not isinstance(self.stimulus, outside)
 
     def __str__(self) -> str:
         firings = self.firings[:SHOWN]
@@ -124,14 +141,14 @@ class ExecutionGraph:
     def retries(self) -> tuple[tuple[str, ...], ...]:
         """Transitions that may be repeated for ever while every run ends in ERROR, by part of the
         graph that only another end of a run, an event or the operator leaves."""
-        blind = np.array([_is_blind(step.text) for step in self.steps] or [False])
+        blind = np.array([step.blind for step in self.steps] or [False])
         kept = np.flatnonzero(blind[self.label] & ~self.by_hand)
         source, target = self.source[kept], self.target[kept]
         part = Graph(len(self), source, target).components
         found: dict[int, set[str]] = {}
         for i in np.flatnonzero(part[source] == part[target]).tolist():
             step = self.steps[self.label[kept[i]]]
-            if FAILED in step.text and step.firings:
+            if step.fails and step.firings:
                 found.setdefault(int(part[source[i]]), set()).update(step.firings)
         return tuple(dict.fromkeys(tuple(sorted(names)) for names in found.values()))
 
@@ -190,7 +207,7 @@ class ExecutionGraph:
         after, said = self.engine.handle(before, cause.stimulus)
         orders = self.names.next_orders(before, self.orders[state], after)
         number = self.index[self.names.key(after, orders), _endless(said)]
-        step = self._numbers.get(Step(cause.text, _fired(said)), -1)
+        step = self._numbers.get(Step(cause.text, _fired(said), cause.stimulus), -1)
         return after, said, number, self._edges.get((state, number, step), -1)
 
     @cached_property
@@ -310,7 +327,7 @@ class _Search:
             before = self.states[i]
             state, said = self.engine.handle(before, cause.stimulus)
             j = self._found(before, self.orders[i], state, said, (i, cause.stimulus))
-            step = Step(cause.text, _fired(said))
+            step = Step(cause.text, _fired(said), cause.stimulus)
             self.handled += 1 + len(step.firings)
             if i != j or step.firings:
                 source.append(i)
@@ -384,10 +401,3 @@ def _endless(said: tuple[Instruction, ...]) -> bool:
 
 
 __all__ = ["STEPS", "ExecutionGraph", "Step", "TooManyValues", "execute"]
-
-
-def _is_blind(text: str) -> bool:
-    """Return whether a stimulus is neither a good end of a run nor something that comes from
-    outside."""
-    outside = (" ends in ", " comes", " becomes ", " raises ")
-    return FAILED in text or not any(words in text for words in outside)

@@ -44,11 +44,8 @@ RUN_FIELDS = ("status", "reason", "executed")
 OUTCOMES = 256
 """The most combinations of values and reasons that are tried for one end of a run."""
 
-BY_HAND = "the operator"
-"""First words of the operator's commands in a path."""
-
 REASON = "reason "
-"""Words before the reason of a run in a path."""
+"""Word before the reason of a run in a path, where some condition reads it."""
 
 Orders = frozenset[tuple[str, str]]
 """Pairs of armed timers, by their transitions: the first elapses before the second."""
@@ -257,9 +254,9 @@ class Names:
             if place.kind is Kind.CONTROL:
                 room = place.tokens + 1 if place.capacity is None else place.capacity
                 if held < room:
-                    yield Cause(AddTokens(place.name), f"{BY_HAND} adds a token to {place.name}")
+                    yield Cause(AddTokens(place.name), f"the operator adds a token to {place.name}")
                 if held:
-                    text = f"{BY_HAND} takes a token out of {place.name}"
+                    text = f"the operator takes a token out of {place.name}"
                     yield Cause(RemoveTokens(place.name), text)
 
     def _of_run(self, run: Run, name: str) -> Iterator[Cause]:

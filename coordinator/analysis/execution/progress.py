@@ -33,13 +33,13 @@ from petrobot.coordinator.analysis.execution.graph import (
     execute,
     with_operator,
 )
-from petrobot.coordinator.analysis.execution.names import BY_HAND, cases
+from petrobot.coordinator.analysis.execution.names import cases
 from petrobot.coordinator.analysis.limits import OutOfTime
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
 from petrobot.coordinator.analysis.time.stochastic import Measured, NoEstimate
-from petrobot.coordinator.engine import Engine, Policy
+from petrobot.coordinator.engine import AddTokens, Begin, Engine, Policy, RemoveTokens
 from petrobot.coordinator.task import Kind
 from petrobot.coordinator.task.compiled import Arcs
 from petrobot.coordinator.task.compiled_task import CompiledTransition
@@ -197,7 +197,9 @@ class Progress:
         control = {p.name for p in own.names.task.places.values() if p.kind is Kind.CONTROL}
         for i in sorted({settled(x, int(i)) for i in np.flatnonzero(x.dead)[:EXAMINED]}):
             if i >= len(own):
-                commands = [s.text for s in x.path(i) if s.text.startswith(BY_HAND)]
+                commands = [
+                    s.text for s in x.path(i) if isinstance(s.stimulus, (AddTokens, RemoveTokens))
+                ]
                 stuck.setdefault((*commands, *(p for p in x.marked(i) if p not in control)), i)
         said += [
             f"stuck with {describe(x, i)}: {explain(x, i)}; {_by(x, i)}"
@@ -666,7 +668,7 @@ class Progress:
 
     def witness(self, state: int) -> Witness:
         """Return a shortest path to a state, as firings and as stimuli with their firings."""
-        begin = Step("the mission begins", self.x.first)
+        begin = Step("the mission begins", self.x.first, Begin())
         steps = (str(begin), *map(str, self.x.path(state)))
         return Witness(self.x.firings(state), self.x.marked(state), steps=steps)
 
@@ -721,7 +723,7 @@ class _Again:
         label = np.concatenate((x.label, np.full(len(closing), len(x.steps), dtype=np.int32)))
         self.graph = Graph(len(x), source[order], target[order])
         self.label = label[order]
-        self.steps = (*x.steps, Step(NEXT, x.first))
+        self.steps = (*x.steps, Step(NEXT, x.first, Begin()))
 
     def in_every_bottom(self) -> set[str]:
         """Return the transitions that fire again and again in every bottom component."""
