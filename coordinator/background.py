@@ -41,9 +41,12 @@ class RefusedError(ValueError):
     keys."""
 
     def __init__(self, status: int, text: str, more: Mapping[str, Any] | None = None) -> None:
-        super().__init__(text)
-        self.status = status
+        super().__init__(status, text, more)
+        self.status, self.text = status, text
         self.more = dict(more or {})
+
+    def __str__(self) -> str:
+        return self.text
 
 
 class Superseded(RefusedError):  # noqa: N818 - not a fault: the drawing has changed since
@@ -54,6 +57,7 @@ class Superseded(RefusedError):  # noqa: N818 - not a fault: the drawing has cha
 
     def __init__(self) -> None:
         super().__init__(200, "a newer drawing took its place", {"superseded": True})
+        self.args = ()
 
 
 class BackgroundProcess:

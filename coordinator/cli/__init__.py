@@ -49,8 +49,11 @@ class CommandError(Exception):
     """A command cannot continue: its exit code, and the text to print."""
 
     def __init__(self, code: int, text: str) -> None:
-        super().__init__(text)
-        self.code = code
+        super().__init__(code, text)
+        self.code, self.text = code, text
+
+    def __str__(self) -> str:
+        return self.text
 
 
 PIPE_CLOSED = 128 + 13

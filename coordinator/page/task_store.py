@@ -22,19 +22,23 @@ class StoreError(Exception):
     """A task file cannot be read or written; `status` is the HTTP status to answer with."""
 
     def __init__(self, status: int, text: str) -> None:
-        super().__init__(text)
-        self.status = status
+        super().__init__(status, text)
+        self.status, self.text = status, text
+
+    def __str__(self) -> str:
+        return self.text
 
 
 class Conflict(Exception):  # noqa: N818 - not an error: two people edited the same file
     """The file is not the version that was edited."""
 
     def __init__(self, theirs: TaskText, yours: str) -> None:
-        super().__init__(
-            f"{theirs.name} was changed by another user or program since you opened it"
-        )
+        super().__init__(theirs, yours)
         self.theirs = theirs
         self.yours = yours
+
+    def __str__(self) -> str:
+        return f"{self.theirs.name} was changed by another user or program since you opened it"
 
 
 @dataclass(frozen=True, slots=True)

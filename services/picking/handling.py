@@ -74,8 +74,11 @@ class ArmError(Exception):
     """The arm did not do what it was commanded; cause and text."""
 
     def __init__(self, cause: str, text: str) -> None:
-        super().__init__(text)
+        super().__init__(cause, text)
         self.cause, self.text = cause, text
+
+    def __str__(self) -> str:
+        return self.text
 
 
 # Where to grasp

@@ -86,7 +86,7 @@ class Returned(Exception):  # noqa: N818 - not an error
     """The action has ended; `value` is what it returned."""
 
     def __init__(self, value: Any) -> None:
-        super().__init__()
+        super().__init__(value)
         self.value = value
 
 

@@ -125,15 +125,15 @@ class SdoAbortError(Exception):
     """An SDO transfer was refused; `code` is an abort code of CiA 301."""
 
     def __init__(self, code: int, index: int = 0, sub: int = 0) -> None:
-        name = (
-            AbortCode(code).name.lower().replace("_", " ")
-            if code in AbortCode._value2member_map_
-            else "unknown"
-        )
-        super().__init__(f"SDO abort {code:#010x} ({name}) at {index:#06x}:{sub}")
+        super().__init__(code, index, sub)
         self.code = code
         self.index = index
         self.sub = sub
+
+    def __str__(self) -> str:
+        known = self.code in AbortCode._value2member_map_
+        name = AbortCode(self.code).name.lower().replace("_", " ") if known else "unknown"
+        return f"SDO abort {self.code:#010x} ({name}) at {self.index:#06x}:{self.sub}"
 
 
 class Emergency(NamedTuple):

@@ -287,10 +287,13 @@ class ProtocolError(Exception):
     """
 
     def __init__(self, code: str, text: str, before: Iterable[Message] = ()) -> None:
-        super().__init__(f"{code}: {text}")
         self.code = code
         self.text = text
         self.before = tuple(before)
+        super().__init__(code, text, self.before)
+
+    def __str__(self) -> str:
+        return f"{self.code}: {self.text}"
 
 
 class _FieldError(ValueError):
