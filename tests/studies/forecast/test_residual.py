@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 import pytest
+from scipy.stats import rankdata, spearmanr
 
 from petrobot.coordinator.studies.forecast import residual
 from petrobot.coordinator.studies.forecast.history import Training
@@ -108,15 +110,38 @@ def test_independent_trials_are_seldom_doubtful() -> None:
     assert found <= 2
 
 
-def test_stopping_early_decides_as_all_permutations_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tried with correlations whose p-values lie around the level: those below it are the same."""
-    random, level = np.random.default_rng(3), residual.ORDER_LEVEL
-    one = random.normal(size=(30, 40))
-    other = 0.65 * one + random.normal(size=one.shape)
-    early = [residual._rank_test(a, b) for a, b in zip(one, other, strict=True)]
-    monkeypatch.setattr(residual, "ORDER_LEVEL", 2.0)  # no p-value reaches it
-    full = [residual._rank_test(a, b) for a, b in zip(one, other, strict=True)]
-    assert [(r, p if p < level else 1.0) for r, p in early] == [
-        (r, p if p < level else 1.0) for r, p in full
-    ]
-    assert sum(level / 3 < p < level for _, p in full) >= 2 and early != full
+def correlations(one: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Pearson's correlation of one sample of ranks with each row of others."""
+    a, b = one - one.mean(), others - others.mean(axis=1, keepdims=True)
+    return np.asarray(b @ a / np.sqrt((a @ a) * (b * b).sum(axis=1)))
+
+
+def test_stopping_early_decides_as_all_permutations_do() -> None:
+    """Correlations whose p-values lie around the level, and all permutations drawn at once: the
+    p-values below the level are the same, the others stay above it."""
+    random, level, count = np.random.default_rng(3), residual.ORDER_LEVEL, residual.PERMUTATIONS
+    near = 0
+    for sample in random.normal(size=(30, 40)):
+        follows = 0.65 * sample + random.normal(size=40)
+        r, early = residual._rank_test(sample, follows)
+        one, other = rankdata(sample), rankdata(follows)
+        assert r == pytest.approx(correlations(one, other[None])[0])
+        mixed = np.random.default_rng(0).permuted(np.tile(other, (count, 1)), axis=1)
+        beyond = int(np.sum(np.abs(correlations(one, mixed)) >= abs(r) - 1e-9))
+        full = (beyond + 1) / (count + 1)
+        assert early == full if full < level else early >= level
+        near += level / 3 < full < level
+    assert near >= 2
+
+
+@pytest.mark.parametrize("swapped", [(0, 0), (0, 1), (0, 2), (0, 3)])
+def test_the_order_of_few_trials_is_judged_as_by_all_their_orders(swapped: tuple[int, int]) -> None:
+    """All 8! orders, with a tie: at least `AT_ONCE` are drawn, so p is within 4 deviations."""
+    one, other = np.arange(8.0), np.array([0.0, 1.0, 2.0, 2.0, 4.0, 5.0, 6.0, 7.0])
+    other[list(swapped)] = other[list(swapped)[::-1]]
+    r, p = residual._rank_test(one, other)
+    orders = rankdata(other)[np.array(list(permutations(range(8))))]
+    exact = float(np.mean(np.abs(correlations(rankdata(one), orders)) >= abs(r) - 1e-9))
+    drawn = residual.PERMUTATIONS if p < residual.ORDER_LEVEL else residual.AT_ONCE
+    assert abs(p - exact) < 4 * np.sqrt(exact / drawn) + 1 / drawn
+    assert spearmanr(one, other).pvalue < residual.LIKELY
