@@ -198,7 +198,8 @@ class InlineHost:
         if verb == SEED:
             if self._reseed is not None and data:
                 self._reseed(data[SEED])
-                self._next_step = None if self._next_step == math.inf else self._next_step
+                if self._next_step == math.inf:
+                    self._next_step = None
             return "seeded", {}
         if verb == "hold":
             answer = driver.hold(now) if driver else "held"
