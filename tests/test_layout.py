@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -149,13 +150,16 @@ def within(name: str, room: str) -> bool:
     return name == room or name.startswith(room + ".")
 
 
-MODULES = [(name, path, ast.parse(path.read_text(encoding="utf-8"))) for name, path in modules()]
+@cache
+def parsed() -> list[tuple[str, Path, ast.Module]]:
+    """Every module with its syntax tree. Not while tests are collected: each process does that."""
+    return [(name, path, ast.parse(path.read_text(encoding="utf-8"))) for name, path in modules()]
 
 
 def test_no_module_imports_what_its_room_may_not_know() -> None:
     """The arrows of `ALLOWED`."""
     wrong = []
-    for name, path, tree in MODULES:
+    for name, path, tree in parsed():
         room, allowed = next((room, allowed) for room, allowed in ALLOWED if within(name, room))
         wrong += [
             f"{path.relative_to(ROOT)}:{line}: {target}"
@@ -169,7 +173,7 @@ def test_no_module_imports_what_its_room_may_not_know() -> None:
 def test_pure_rooms_stay_pure_and_nothing_is_unpickled() -> None:
     """No module loads code from data; pure rooms have no socket, process or randomness."""
     wrong = []
-    for name, path, tree in MODULES:
+    for name, path, tree in parsed():
         pure = name not in STORED and any(within(name, room) for room in PURE)
         banned = FORBIDDEN_IMPORTS | (IMPURE_IMPORTS if pure else set())
         where = path.relative_to(ROOT)
@@ -189,7 +193,7 @@ def test_pure_rooms_stay_pure_and_nothing_is_unpickled() -> None:
 def test_every_module_says_its_role() -> None:
     """The first line of a file says what it is for."""
     silent = [
-        str(path.relative_to(ROOT)) for _, path, tree in MODULES if not ast.get_docstring(tree)
+        str(path.relative_to(ROOT)) for _, path, tree in parsed() if not ast.get_docstring(tree)
     ]
     assert not silent
 
@@ -197,7 +201,7 @@ def test_every_module_says_its_role() -> None:
 def test_general_rooms_name_no_robot() -> None:
     """Names of robots and their tasks stay out of the general rooms' identifiers."""
     wrong = []
-    for name, path, tree in MODULES:
+    for name, path, tree in parsed():
         if not any(within(name, room) for room in ("coordinator", "services.comm")):
             continue
         allowed = {"camera"} if name == "services.comm.streams.camera" else set()
