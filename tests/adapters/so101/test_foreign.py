@@ -5,14 +5,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, cast
+from typing import cast
 
 import pytest
 
-from petrobot import ByteLine, Context, Ports, Remote, Result, rehearse, success
+from petrobot import ByteLine, Context, Ports, Remote, Result, success
 from petrobot.services.adapters.so101 import actions
 from petrobot.services.adapters.so101.arm import Arm
 from petrobot.services.comm.streams.line import SerialPort
+from tests.adapters.conftest import PortsClock, rehearsed
 from tests.adapters.so101.foreign import Bus, Servo
 
 BEGIN, END = 1.5, 3.5
@@ -32,12 +33,8 @@ class TerminalPorts:
         return self.lines[-1]
 
 
-class TerminalArm(Arm):
-    """Its driver: the clock of its ports is that of its steps."""
-
-    def step(self, now: float) -> None:
-        cast(Any, self.ports).now = now
-        super().step(now)
+class TerminalArm(PortsClock, Arm):
+    """Its driver."""
 
 
 @pytest.fixture
@@ -79,11 +76,7 @@ def played(bus: Bus, trouble: Callable[[Bus, bool], None]) -> tuple[Result, Resu
         return success()
 
     seen = list[tuple[Result, Result, float]]()
-    try:
-        told = rehearse(story, device=arm, world=world).result
-    finally:
-        arm.close()
-    assert seen, told
+    rehearsed(story, arm, world)
     return seen[0]
 
 

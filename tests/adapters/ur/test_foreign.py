@@ -9,10 +9,11 @@ from typing import Any, cast
 
 import pytest
 
-from petrobot import ByteLine, CommandRefused, Context, Ports, Remote, Result, rehearse, success
+from petrobot import ByteLine, CommandRefused, Context, Ports, Remote, Result, success
 from petrobot.services.adapters.ur import actions
 from petrobot.services.adapters.ur.arm import Arm
 from petrobot.services.comm.streams.line import TcpConnection
+from tests.adapters.conftest import PortsClock, rehearsed
 from tests.adapters.ur.foreign import Controller
 
 HOME = [0.0, -1.57, 1.57, -1.57, -1.57, 0.0]
@@ -29,12 +30,8 @@ class TcpPorts:
         return TcpConnection(host, port)
 
 
-class TcpArm(Arm):
-    """Its driver: the clock of its ports is that of its steps."""
-
-    def step(self, now: float) -> None:
-        cast(Any, self.ports).now = now
-        super().step(now)
+class TcpArm(PortsClock, Arm):
+    """Its driver."""
 
 
 @pytest.fixture
@@ -83,11 +80,7 @@ def played(
         seen.append((first, again, moved))
         return success()
 
-    try:
-        told = rehearse(story, device=arm, world=world).result
-    finally:
-        arm.close()
-    assert seen, told
+    rehearsed(story, arm, world)
     return seen[0]
 
 
