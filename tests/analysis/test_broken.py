@@ -194,7 +194,7 @@ def test_check_refuses_and_analyse_draws(
     """`petrobot check` refuses a broken file, `petrobot analyse --pictures` shows why."""
     path = tmp_path / "twice.toml"
     path.write_text(
-        dumps(VARIANTS["double_resource"](load(TASKS / "catch_ball.toml"))), encoding="utf-8"
+        dumps(VARIANTS["leaking_token"](load(TASKS / "catch_ball.toml"))), encoding="utf-8"
     )
     assert main(["check", str(path)]) == 2
     assert "may not run" in capsys.readouterr().out
