@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
 
     from petrobot.coordinator.analysis.may_run import Cell
     from petrobot.coordinator.analysis.time.stochastic import Measured
-    from petrobot.coordinator.learning.learning import Estimates
     from petrobot.coordinator.task import Task
     from petrobot.services.comm.location_file import Directory
 
@@ -80,7 +78,6 @@ def measurements(file: Path | None) -> Callable[[Task, Cell | None], Measured] |
     def of(task: Task, cell: Cell | None) -> Measured:
         devices = devices_of(cell)
         found = measured_from(task, kept.estimates, kinds=kept.kinds, devices=devices)
-        found = with_causes(found, kept.estimates)
         if not found.runs:
             known = ", ".join(sorted({k.primitive_task for k in kept.estimates.tallies})) or "none"
             text = f"{file}: nothing was measured of {task.name}; it has: {known}"
@@ -88,37 +85,6 @@ def measurements(file: Path | None) -> Callable[[Task, Cell | None], Measured] |
         return found
 
     return of
-
-
-def with_causes(measured: Measured, estimates: Estimates) -> Measured:
-    """Return the measurements with the causes by which runs ended by themselves."""
-    from petrobot.coordinator.learning.estimate import Tally, merge_tallies
-    from petrobot.coordinator.task import Executed, Status
-
-    whole: dict[tuple[str, str], Tally] = {}
-    for key, tally in estimates.tallies.items():
-        action = key.primitive_task, key.action
-        whole[action] = merge_tallies(whole.get(action, Tally()), tally)
-    found: dict[tuple[str, str], dict[Status, dict[tuple[str, str], float]]] = {}
-    mixed = set[tuple[str, str]]()
-    for action, tally in whole.items():
-        causes: dict[Status, dict[tuple[str, str], float]] = {s: {} for s in Status}
-        # How many runs are not known to have been executed is counted over all causes.
-        unsure = min(1.0, tally.unknown / max(1, tally.count(Status.ERROR)))
-        if 0.0 < unsure < 1.0:
-            mixed.add(action)
-        for (word, cause), n in tally.counts.items():
-            status = Status(word)
-            # A preempted run that counts has the cause `cancelled`, and did not end by itself.
-            cut = sum(m.n for e, m in tally.durations.items() if e.startswith(f"{status}:"))
-            own = max(0, n - cut) if cause == "cancelled" else n
-            part = unsure if status is Status.ERROR else 0.0
-            causes[status][cause, str(Executed.YES)] = own * (1.0 - part)
-            causes[status][cause, str(Executed.UNKNOWN)] = own * part
-        for cause, n in tally.not_executed.items():
-            causes[Status.ERROR][cause, str(Executed.NO)] = float(n)
-        found[action] = causes
-    return replace(measured, causes=found, mixed=frozenset(mixed))
 
 
 def estimates_path(given: Path) -> Path:

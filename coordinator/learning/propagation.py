@@ -19,6 +19,7 @@ import numpy as np
 from petrobot.coordinator.analysis.net.graph import sum_by
 from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.time.stochastic import (
+    Ending,
     Measured,
     contended,
     is_cause,
@@ -35,7 +36,7 @@ from petrobot.coordinator.learning.objective import (
     objective,
 )
 from petrobot.coordinator.learning.statistics import added, joined, objective_interval
-from petrobot.coordinator.task import Estimate, Kind, Status, Task
+from petrobot.coordinator.task import Estimate, Executed, Kind, Status, Task
 
 # --- competing risks ---
 
@@ -128,12 +129,17 @@ def measured_from(
     sources: dict[tuple[str, str], str] = {}
     preempted: dict[tuple[str, str], dict[str, Estimate]] = {}
     often: dict[str, dict[str, float]] = {}
+    causes: dict[tuple[str, str], dict[Status, dict[Ending, float]]] = {}
+    mixed = set[tuple[str, str]]()
     for place in task.flat.places.values():
         if place.kind is not Kind.ACTION:
             continue
         takers = _preempting(task, place.name)
         for action, by_context in estimates.of(place.task, context).items():
             tally = reduce(merge_tallies, by_context.values(), Tally())
+            causes[place.task, action], pooled = _causes(tally)
+            if pooled:
+                mixed.add((place.task, action))
             started = tally.runs + tally.censored + sum(tally.not_executed.values())
             if not tally.runs and not tally.censored:
                 continue
@@ -151,7 +157,28 @@ def measured_from(
         _switches(task, estimates, context),
         preempted,
         sources,
+        causes,
+        frozenset(mixed),
     )
+
+
+def _causes(tally: Tally) -> tuple[dict[Status, dict[Ending, float]], bool]:
+    """Return how often runs ended by themselves by each cause, executed or not, by status; and
+    whether several causes share a number of runs that are not known to have been executed."""
+    causes: dict[Status, dict[Ending, float]] = {s: {} for s in Status}
+    # How many runs are not known to have been executed is counted over all causes.
+    unsure = min(1.0, tally.unknown / max(1, tally.count(Status.ERROR)))
+    for (word, cause), n in tally.counts.items():
+        status = Status(word)
+        # A preempted run that counts has the cause `cancelled`, and did not end by itself.
+        cut = sum(m.n for e, m in tally.durations.items() if e.startswith(f"{status}:"))
+        own = max(0, n - cut) if cause == "cancelled" else n
+        part = unsure if status is Status.ERROR else 0.0
+        causes[status][cause, str(Executed.YES)] = own * (1.0 - part)
+        causes[status][cause, str(Executed.UNKNOWN)] = own * part
+    for cause, n in tally.not_executed.items():
+        causes[Status.ERROR][cause, str(Executed.NO)] = float(n)
+    return causes, 0.0 < unsure < 1.0
 
 
 def _source(tally: Tally, kinds: Mapping[str, int]) -> str:

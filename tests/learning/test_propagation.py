@@ -22,6 +22,7 @@ from petrobot.coordinator.learning.learner import LearningSelector
 from petrobot.coordinator.learning.learning import Estimates, Learning
 from petrobot.coordinator.learning.objective import Question, compare
 from petrobot.coordinator.learning.propagation import incidences, measured_from, propagate
+from petrobot.coordinator.studies.forecast.registered import exact
 from petrobot.coordinator.task import Estimate, Executed, Status, Task
 from petrobot.coordinator.task.file import loads
 from tests.learning.cell import run, sorting
@@ -208,6 +209,51 @@ def test_a_call_that_never_executed_takes_the_error_branch() -> None:
     assert propagate(task, Estimates({TallyKey("a", "do_a"): known})).conjunctive == pytest.approx(
         0.9
     )
+
+
+def by_cause(condition: str) -> Task:
+    """One primitive task whose goal is an ERROR for which the condition holds."""
+    text = f"""
+[primitive_tasks.a]
+goal = "a"
+alternatives = ["do_a"]
+deadline = 10.0
+[places.a]
+kind = "action"
+task = "a"
+[transitions.a_done]
+in = ["a:normal"]
+out = ["free"]
+[transitions.a_goal]
+in = ["a:error"]
+out = ["free"]
+priority = 1
+when = "{condition}"
+[transitions.a_failed]
+in = ["a:error"]
+out = ["free"]
+"""
+    ahead = SERIES.replace("runs_place =", 'goal_transitions = ["a_goal"]\nruns_place =')
+    return loads(ahead + text, "series")
+
+
+def of_causes(*causes: tuple[int, str, Executed]) -> Tally:
+    """Return a tally of 70 successes and of as many errors of each cause."""
+    known = tally(70, 0, 0, 1.0)
+    for n, cause, executed in causes:
+        for _ in range(n):
+            known = known.adding(Observation(Status.ERROR, 1.0, cause, executed))
+    return known
+
+
+def test_the_forecast_and_learned_task_use_the_measured_causes() -> None:
+    """20 of 100 runs jammed and 10 slipped; drawn at equal shares it would be 15."""
+    known = of_causes((20, "jam", Executed.YES), (10, "slip", Executed.YES))
+    estimates = Estimates({TallyKey("a", "do_a"): known})
+    task = by_cause("a.reason == 'jam'")
+    found = exact(task, estimates, "", {"a": {"do_a": 1.0}})
+    assert found["R_goal"] == pytest.approx(0.2, rel=1e-4), found
+    assert propagate(task, estimates).forecast.goal_reliability == pytest.approx(0.2, rel=1e-4)
 
 
 # --- competing risks --------------------------------------------------------------------------
