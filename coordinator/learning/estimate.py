@@ -185,6 +185,9 @@ class Tally:
     """How often runs were added or corrected. Of two versions of a tally, the later one has
     more."""
     sample: Sample = field(default_factory=Sample)
+    unknown_ends: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    """Runs in `unknown`, by (exit, cause). Runs from files older than this are in `unknown`
+    alone."""
 
     # --- reading ------------------------------------------------------------------------------
 
@@ -314,7 +317,7 @@ class Tally:
         return grown if seen.status is None else grown._counted(seen, seen.status)
 
     def _counted(self, seen: Observation, status: Status) -> Tally:
-        values = dict(self.values)
+        values, unsure = dict(self.values), seen.executed is Executed.UNKNOWN
         for name, value in seen.values.items():
             values[name] = values.get(name, EMPTY).adding(value)
         return replace(
@@ -322,7 +325,10 @@ class Tally:
             counts=_more(self.counts, (status.value, seen.cause)),
             cpu=self.cpu if seen.cpu_seconds is None else self.cpu.adding(seen.cpu_seconds),
             values=dict(sorted(values.items())) if seen.values else self.values,
-            unknown=self.unknown + (seen.executed is Executed.UNKNOWN),
+            unknown=self.unknown + unsure,
+            unknown_ends=_more(self.unknown_ends, (seen.exit, seen.cause))
+            if unsure
+            else self.unknown_ends,
         )
 
     def correcting(self, was: Observation, status: Status, cause: str = "") -> Tally:
@@ -332,6 +338,9 @@ class Tally:
             raise KeyError("a censored run has no status to correct")
         before, after = was.exit, replace(was, status=status).exit
         counts = _more(_more(self.counts, (was.status.value, was.cause), -1), (status.value, cause))
+        ends = self.unknown_ends
+        if ends.get((before, was.cause)) and was.executed is Executed.UNKNOWN:
+            ends = _more(_more(ends, (before, was.cause), -1), (after, cause))
         durations = _put(self.durations, before, self.durations[before].without(was.seconds))
         durations = _put(durations, after, durations.get(after, EMPTY).adding(was.seconds))
         return replace(
@@ -339,6 +348,7 @@ class Tally:
             counts=counts,
             durations=durations,
             sample=self.sample.corrected(was.seconds, before, after),
+            unknown_ends=ends,
             corrected=self.corrected + (status is not was.status),
             changes=self.changes + 1,
         )
@@ -358,6 +368,7 @@ class Tally:
             "corrected": self.corrected,
             "changes": self.changes,
             "sample": self.sample.to_plain(),
+            "unknown_ends": [[exit_, cause, n] for (exit_, cause), n in self.unknown_ends.items()],
         }
 
     @classmethod
@@ -390,6 +401,10 @@ class Tally:
             whole(data["corrected"], "corrections"),
             whole(data["changes"], "changes"),
             Sample.of_plain(data["sample"]),
+            {
+                (str(exit_), str(cause)): whole(n, "runs of one exit and cause")
+                for exit_, cause, n in data.get("unknown_ends", ())
+            },
         )
         read._check()
         return read
@@ -405,6 +420,10 @@ class Tally:
                     f"{self.count(status)} runs ended with {status}, but {timed} such runs "
                     "have a duration"
                 )
+        whole(sum(self.unknown_ends.values()), "runs in unknown_ends", self.unknown)
+        for (exit_, cause), n in self.unknown_ends.items():
+            word = exit_.partition(":")[0]
+            whole(n, f"runs in unknown_ends with {exit_}", self.counts.get((word, cause), 0))
         executed = self.runs + self.censored
         if sum(m.n for m in self.durations.values()) != executed:
             raise ValueError(f"some exits are neither one of {', '.join(Status)} nor censored")
@@ -434,6 +453,7 @@ def merge_tallies(one: Tally, other: Tally) -> Tally:
         one.corrected + other.corrected,
         one.changes + other.changes,
         one.sample.merged(other.sample),
+        _summed(one.unknown_ends, other.unknown_ends),
     )
 
 

@@ -166,19 +166,24 @@ def _causes(tally: Tally) -> tuple[dict[Status, dict[Ending, float]], bool]:
     """Return how often runs ended by themselves by each cause, executed or not, by status; and
     whether several causes share a number of runs that are not known to have been executed."""
     causes: dict[Status, dict[Ending, float]] = {s: {} for s in Status}
-    # How many runs are not known to have been executed is counted over all causes.
-    unsure = min(1.0, tally.unknown / max(1, tally.count(Status.ERROR)))
+    # Older files count how many are not known to have been executed over all causes: these are
+    # shared among the other runs with ERROR.
+    errors = sum(n for (e, _), n in tally.unknown_ends.items() if e.startswith(Status.ERROR))
+    rest = tally.unknown - sum(tally.unknown_ends.values())
+    shared = min(1.0, rest / max(1, tally.count(Status.ERROR) - errors))
     for (word, cause), n in tally.counts.items():
         status = Status(word)
         # A preempted run that counts has the cause `cancelled`, and did not end by itself.
         cut = sum(m.n for e, m in tally.durations.items() if e.startswith(f"{status}:"))
         own = max(0, n - cut) if cause == "cancelled" else n
-        part = unsure if status is Status.ERROR else 0.0
-        causes[status][cause, str(Executed.YES)] = own * (1.0 - part)
-        causes[status][cause, str(Executed.UNKNOWN)] = own * part
+        unsure = float(tally.unknown_ends.get((word, cause), 0))
+        if status is Status.ERROR:
+            unsure += (own - unsure) * shared
+        causes[status][cause, str(Executed.YES)] = own - unsure
+        causes[status][cause, str(Executed.UNKNOWN)] = unsure
     for cause, n in tally.not_executed.items():
         causes[Status.ERROR][cause, str(Executed.NO)] = float(n)
-    return causes, 0.0 < unsure < 1.0
+    return causes, 0.0 < shared < 1.0
 
 
 def _source(tally: Tally, kinds: Mapping[str, int]) -> str:

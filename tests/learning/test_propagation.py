@@ -17,7 +17,7 @@ from petrobot.coordinator.analysis.time.gspn import Chain
 from petrobot.coordinator.analysis.time.stochastic import Measured, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.launch import with_runs
-from petrobot.coordinator.learning.estimate import Observation, Tally, TallyKey
+from petrobot.coordinator.learning.estimate import Observation, Tally, TallyKey, merge_tallies
 from petrobot.coordinator.learning.learner import LearningSelector
 from petrobot.coordinator.learning.learning import Estimates, Learning
 from petrobot.coordinator.learning.objective import Question, compare
@@ -254,6 +254,18 @@ def test_the_forecast_and_learned_task_use_the_measured_causes() -> None:
     found = exact(task, estimates, "", {"a": {"do_a": 1.0}})
     assert found["R_goal"] == pytest.approx(0.2, rel=1e-4), found
     assert propagate(task, estimates).forecast.goal_reliability == pytest.approx(0.2, rel=1e-4)
+
+
+def test_executed_unknown_is_kept_by_cause() -> None:
+    """All 20 jams are unknown and no slip is. A file that has only their number shares it."""
+    known = of_causes((20, "jam", Executed.UNKNOWN), (10, "slip", Executed.YES))
+    task = by_cause("a.reason == 'jam' and a.executed == 'unknown'")
+    plain = known.to_plain()
+    assert Tally.of_plain(plain) == known
+    older = Tally.of_plain({k: v for k, v in plain.items() if k != "unknown_ends"})
+    for kept, goal in ((known, 0.2), (older, 0.2 * 2 / 3), (merge_tallies(known, known), 0.2)):
+        found = propagate(task, Estimates({TallyKey("a", "do_a"): kept})).forecast
+        assert found.goal_reliability == pytest.approx(goal, rel=1e-4)
 
 
 # --- competing risks --------------------------------------------------------------------------
