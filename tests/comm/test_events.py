@@ -149,7 +149,7 @@ def test_every_latched_event_arrives_once_and_in_order_of_its_source(
     callee = Callee("motion", "n1", {})
     caller = Caller("motion", m.Hello(2, 2, "coordinator", "coord", "b"))
     caller.subscribe(0.0, ("a", "b"))
-    raised: list[m.Event] = []
+    raised: list[m.Event | None] = []
     arrived: list[m.Event] = []
     towards: list[m.Message] = []
 
