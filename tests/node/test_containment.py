@@ -279,7 +279,8 @@ async def test_a_run_that_reports_without_end_disturbs_no_other(
     limit = Limit("the run to end at its deadline")
     while not chatting.done() and limit.left():
         others.append(await operator.call("nap", 20.0, seconds=0.05))
-    assert (await chatting).cause == ("too_many_events" if what == "events" else "deadline")
+    # A coordinator that stores them as fast as they come lets it run to its deadline.
+    assert (await chatting).cause in {"deadline", *(["too_many_events"] * (what == "events"))}
     assert others and {run.status for run in others} == {"success"}
     assert not [notice for notice in operator.notices if isinstance(notice, PeerLost)]
 
