@@ -222,8 +222,25 @@ def test_the_view_has_the_figures_of_the_execution_graph_at_length(task: Task) -
     figures_agree(task)
 
 
+def timer_before_a_full_place(capacity: int) -> Task:
+    """A timer that starts again and again, and stands still while the place after it is full."""
+    return loads(
+        'schema = 1\n[task]\nname = "t"\nfinal = "left == 0"\n[primitive_tasks]\n'
+        'p = { goal = "g", alternatives = ["x"], deadline = 0.5 }\n[places]\n'
+        f'work = {{ kind = "action", task = "p", servers = 1, capacity = {capacity} }}\n'
+        'first = { kind = "action", task = "p", tokens = 1 }\nleft = { kind = "control" }\n'
+        'clock = { kind = "control", tokens = 1 }\n[transitions]\n'
+        f"{arcs('done', 'work:normal', '')}{arcs('lost', 'work:error', '')}"
+        f"{arcs('over', 'first:normal', '')}{arcs('gone', 'first:error', '')}"
+        f"{arcs('next', 'clock', 'clock,work', ', after = 1.5')}",
+        "t.toml",
+    )
+
+
 @settings(COMMON, max_examples=25)
 @given(any_tasks())
+@example(timer_before_a_full_place(1))
+@example(timer_before_a_full_place(2))
 def test_the_view_of_any_task_has_the_figures_of_its_graph(task: Task) -> None:
     """Joins, weights, capacities, inhibitors, priorities, servers; without conditions that no view
     of markings keeps."""

@@ -445,6 +445,8 @@ class _Derivation:
         self.stages, self.timer_stages = stages, timer_stages
         net = task.net
         self.places: Weights = dict(zip(net.places, net.initial, strict=True))
+        limits = zip(net.places, net.capacity, strict=True)
+        self.capacity: Weights = {place: most for place, most in limits if most is not None}
         self.arcs: dict[str, tuple[Weights, Weights]] = {}
         self.inhibit: dict[str, Weights] = {}
         self.priority: Weights = {}
@@ -512,16 +514,11 @@ class _Derivation:
 
     def result(self) -> StochasticView:
         """Return the finished view."""
-        capacity = {
-            p: c
-            for p, c in zip(self.task.net.places, self.task.net.capacity, strict=True)
-            if c is not None
-        }
         net = Net.build(
             self.places,
             self.arcs,
             inhibitors=self.inhibit,
-            capacity=capacity,
+            capacity=self.capacity,
             priority=self.priority,
         )
         gspn = Gspn.of(net, self.rates, weights=self.weights, servers=self.servers)
@@ -1162,7 +1159,7 @@ class _Derivation:
         """Add a fixed delay as Erlang phases, counted by tokens in a place of its own.
 
         The count is reset as soon as the transition is disabled: an immediate transition empties it
-        when a needed token is missing or an inhibitor place is marked.
+        when a needed token is missing, an inhibitor place is marked or an output place is full.
         """
         assert t.after is not None
         duration = self._duration(f"{t.name}.after", t.after, 0.0, self.timer_stages)
@@ -1175,10 +1172,15 @@ class _Derivation:
         self.places[count] = 0
         tick = f"{name}.tick"
         self._timed(tick, dict(need), {**need, count: 1}, branch.rate, source, 1)
-        self.inhibit[tick] = {i.place: i.threshold for i in t.inhibitors} | {count: last}
+        barred = {i.place: i.threshold for i in t.inhibitors}
+        for place, n in give.items():
+            if place in self.capacity and n > need.get(place, 0):
+                full = self.capacity[place] - n + need.get(place, 0) + 1
+                barred[place] = min(full, barred.get(place, full))
+        self.inhibit[tick] = barred | {count: last}
         for place, n in need.items():
             self._immediate(f"{name}.reset {place}", {count: 1}, {}, 1.0, FLUSH)
             self.inhibit[f"{name}.reset {place}"] = {place: n}
-        for i in t.inhibitors:
-            back = {i.place: i.threshold}
-            self._immediate(f"{name}.barred {i.place}", {count: 1, **back}, back, 1.0, FLUSH)
+        for place, n in barred.items():
+            back = {place: n}
+            self._immediate(f"{name}.barred {place}", {count: 1, **back}, back, 1.0, FLUSH)
