@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any
 from petrobot.coordinator.cli import CommandError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
     from petrobot.coordinator.task import Task
 
 

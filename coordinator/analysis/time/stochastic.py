@@ -445,8 +445,6 @@ class _Derivation:
         self.stages, self.timer_stages = stages, timer_stages
         net = task.net
         self.places: Weights = dict(zip(net.places, net.initial, strict=True))
-        limits = zip(net.places, net.capacity, strict=True)
-        self.capacity: Weights = {place: most for place, most in limits if most is not None}
         self.arcs: dict[str, tuple[Weights, Weights]] = {}
         self.inhibit: dict[str, Weights] = {}
         self.priority: Weights = {}
@@ -514,11 +512,16 @@ class _Derivation:
 
     def result(self) -> StochasticView:
         """Return the finished view."""
+        capacity = {
+            p: c
+            for p, c in zip(self.task.net.places, self.task.net.capacity, strict=True)
+            if c is not None
+        }
         net = Net.build(
             self.places,
             self.arcs,
             inhibitors=self.inhibit,
-            capacity=self.capacity,
+            capacity=capacity,
             priority=self.priority,
         )
         gspn = Gspn.of(net, self.rates, weights=self.weights, servers=self.servers)
@@ -1159,7 +1162,7 @@ class _Derivation:
         """Add a fixed delay as Erlang phases, counted by tokens in a place of its own.
 
         The count is reset as soon as the transition is disabled: an immediate transition empties it
-        when a needed token is missing, an inhibitor place is marked or an output place is full.
+        when a needed token is missing, or a place bars it: an inhibitor place or a full one.
         """
         assert t.after is not None
         duration = self._duration(f"{t.name}.after", t.after, 0.0, self.timer_stages)
@@ -1172,11 +1175,8 @@ class _Derivation:
         self.places[count] = 0
         tick = f"{name}.tick"
         self._timed(tick, dict(need), {**need, count: 1}, branch.rate, source, 1)
-        barred = {i.place: i.threshold for i in t.inhibitors}
-        for place, n in give.items():
-            if place in self.capacity and n > need.get(place, 0):
-                full = self.capacity[place] - n + need.get(place, 0) + 1
-                barred[place] = min(full, barred.get(place, full))
+        bars = self.compiled[self.task.net.transition_index[t.name]].bars
+        barred = self._named(({}, dict(bars)))[1]
         self.inhibit[tick] = barred | {count: last}
         for place, n in need.items():
             self._immediate(f"{name}.reset {place}", {count: 1}, {}, 1.0, FLUSH)

@@ -36,8 +36,8 @@ READ_BUFFER = 1 << 16
 """Most bytes read at once. They are decoded before another connection is read; in the worst case
 (only empty maps) that takes about 25 ms."""
 FIRST_READ = 1 << 13
-"""Most bytes read at once while messages are shorter: whoever owns the connection handles all that
-came together (a coordinator stores each event) before it hears anybody else."""
+"""Most bytes read at once while messages are shorter. All messages that were read at once are
+handled before another connection is read; a coordinator stores each event."""
 HEARD = 4096
 """So many bytes of an incomplete frame count as a sign of life. Fewer do not: a frame that arrives
 byte by byte, or whose length was changed on its way, must not block the frames behind it for longer
