@@ -1,7 +1,8 @@
 """The stochastic view of a task: its ordinary net with choices, statuses, durations and events.
 
 The result is a GSPN (docs/analysis.md, section 4). Every place and arc of the ordinary net stays,
-so dropping the added places projects each firing sequence on one of the ordinary net. An action
+so dropping the added places projects each firing sequence on one of the ordinary net. (Where others
+may lose a timer or a latched event between taking and giving, a firing has two steps.) An action
 place p gets, beside itself, `p.going` (a run is active) and `p.success`, `p.failure`, `p.error` (a
 run has finished and waits for an outgoing transition).
 
@@ -23,7 +24,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Seq
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations, combinations_with_replacement, product
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.structure import (
@@ -66,6 +67,11 @@ never began."""
 SERVE, CALL = 1_500_000, 4_000_000
 """Priorities of the transitions that a pulse serves together, and of finding out which these are:
 all are found in the marking in which the pulse comes."""
+REST = 750_000
+"""Priority of what the engine only does when nothing can fire any more, before runs begin."""
+GIVING = "to give"
+"""Place with a token between the moment at which a firing takes its tokens and the moment at which
+it gives them, as far as another transition loses its timer or its latched event in between."""
 STAGES = 8
 """Default limit of the phases of one duration. Phases of parallel runs multiply the number of
 markings, so it is small."""
@@ -158,6 +164,25 @@ EndKind = tuple[str, ...]
 as far as they ask."""
 Told = dict[str, Scalar]
 """Values of names that a condition reads."""
+
+
+class _Case(NamedTuple):
+    """One way in which a transition of the task may fire: one combination of kinds of the runs that
+    it takes, and of values of variables."""
+
+    need: Weights
+    """What it takes, the places of variables apart."""
+    values: Weights
+    """The places of the variables that it reads or writes, before the firing."""
+    back: Weights
+    """What it gives in the moment in which it takes: runs that stay, marks of preempted runs,
+    servers, and the places of the variables after the firing."""
+    give: Weights
+    """Tokens of its outputs."""
+    open_: bool
+    """Whether its condition may still be false."""
+
+
 _Shared = dict[
     tuple[Status, PhaseType, str, tuple[tuple[EndKind, float], ...]], list[tuple[str, float]]
 ]
@@ -482,6 +507,11 @@ class _Derivation:
         self.values: dict[str, dict[Scalar, str]] = {}
         """By variable that only transitions set, to known values: the place of each value."""
         self._variables()
+        self.losers = [x for x in self.compiled if x.after is not None]
+        """Transitions with a timer, or with a latched event that the engine may drop."""
+        self.timers: dict[tuple[str, frozenset[tuple[str, int]]], str] = {}
+        """By transition with a timer and what it takes: the first of its cases, whose name the
+        places of its timer have."""
         self.flags: set[str] = set()
         """Latched events with a place of their own, `event e`."""
         self.served: dict[str, int] = {}
@@ -489,10 +519,12 @@ class _Derivation:
         self.called: dict[str, str] = {}
         """By transition that waits for a pulse together with others: the place that says that the
         pulse serves it."""
+        self.bounds = dict(zip(task.places, place_bounds(net), strict=True))
+        """By place: the most tokens that the place invariants allow; None without a limit."""
         self.queues = frozenset(
             p.name
-            for p, bound in zip(task.places.values(), place_bounds(net), strict=True)
-            if p.kind is Kind.ACTION and (bound is None or bound > p.most_active)
+            for p in task.places.values()
+            if p.kind is Kind.ACTION and self._may_hold(p.name, p.most_active + 1)
         )
         """Action places where a token may have to wait for a server."""
         for device in sorted(self.contended):
@@ -905,6 +937,11 @@ class _Derivation:
             entries += [(f"{stem}{longest - b.stages + 1}", b.probability) for b in branches]
         return entries
 
+    def _may_hold(self, place: str, tokens: int) -> bool:
+        """Return whether the place invariants allow so many tokens in a place."""
+        bound = self.bounds[place]
+        return bound is None or bound >= tokens
+
     def _server(self, name: str) -> Weights:
         """Return what a run of a place takes to begin and gives back when it ends."""
         return {f"{name}.server": 1} if name in self.queues else {}
@@ -958,10 +995,21 @@ class _Derivation:
             self._pulse(flag, waiting)
             return
         self.flags.add(event.name)
+        if not kept:
+            self.losers += waiting
         for i, case in enumerate([] if kept else list(_none_enabled(waiting))):
             need, inhibit = self._named(case)
-            self._immediate(f"{flag} dropped {i + 1}", {**need, flag: 1}, need, 1.0, FLUSH - 2)
-            self.inhibit[f"{flag} dropped {i + 1}"] = inhibit
+            self._lost(f"{flag} dropped {i + 1}", flag, need, inhibit)
+
+    def _lost(self, name: str, what: str, need: Weights, inhibit: Weights) -> None:
+        """Take a token of a place as the engine drops a timer or a latched event: between taking
+        and giving of a firing, or when nothing can fire any more."""
+        self.places[GIVING] = 0
+        tests: list[tuple[str, Weights, int]]
+        tests = [("", {}, REST), (f" {GIVING}", {GIVING: 1}, FLUSH - 2)]
+        for when, test, priority in tests:
+            self._immediate(name + when, {**need, what: 1, **test}, {**need, **test}, 1.0, priority)
+            self.inhibit[name + when] = inhibit
 
     def _pulse(self, flag: str, waiting: Sequence[CompiledTransition]) -> None:
         """Let a pulse serve each transition that is fireable when it comes, once."""
@@ -972,8 +1020,8 @@ class _Derivation:
             self.served[x.name] = SERVE + 1 + ranks.index((x.rank, 0 if drawn else x.index))
             called = self.called[x.name] = f"{x.name}.called"
             self.places[called] = 0
-            for i, (need, _, _) in enumerate(self._cases(self.task.transitions[x.name])):
-                name, test = f"{called} {i + 1}", {**need, flag: 1}
+            for i, case in enumerate(self._cases(self.task.transitions[x.name])):
+                name, test = f"{called} {i + 1}", {**case.need, **case.values, flag: 1}
                 self._immediate(name, test, {**test, called: 1}, 1.0, CALL)
                 self.inhibit[name] = {**self._named(({}, dict(x.bars)))[1], called: 1}
             self._immediate(f"{called} no more", {called: 1}, {}, 1.0, SERVE)
@@ -1008,33 +1056,39 @@ class _Derivation:
                 f"{', '.join(measured)}: the measured wait is that of {t.name} since its tokens "
                 "came, and so contains its run; it is taken for the wait for the event"
             )
-        cases = list(self._cases(t))
-        for i, (need, give, open_) in enumerate(cases):
+        for arc in self.compiled[self.task.net.transition_index[t.name]].actions:
+            ended = arc.end in (End.NORMAL, End.ERROR)
+            if t.after is not None and ended and self._may_hold(arc.name, arc.weight + 1):
+                self.doubts.append(
+                    f"{t.name}: its time belongs to the run of {arc.name} that ended first, and "
+                    "the numbers do not tell the runs of a place apart"
+                )
+        cases = self._cases(t)
+        for i, case in enumerate(cases):
             name = t.name if len(cases) == 1 else f"{t.name} {i + 1}"
             self.origin[name] = t.name
-            inhibit = {i.place: i.threshold for i in t.inhibitors}
-            if inhibit:
-                self.inhibit[name] = inhibit
-            self._fires(t, name, need, give, open_)
+            bars = self.compiled[self.task.net.transition_index[t.name]].bars
+            self.inhibit[name] = self._named(({}, dict(bars)))[1]
+            self._fires(t, name, case)
 
-    def _cases(self, t: Transition) -> list[tuple[Weights, Weights, bool]]:
-        """Return what a firing takes and gives, for each combination of kinds of its runs and of
-        values of variables, and whether its condition then still is open."""
+    def _cases(self, t: Transition) -> list[_Case]:
+        """Return the ways in which a transition may fire."""
         net, index = self.task.net, self.task.net.transition_index[t.name]
-        base_need = {net.places[p]: w for p, w in net.consume[index]}
-        base_give = {net.places[p]: w for p, w in net.produce[index]}
-        for output in t.outputs:
-            if self.task.places[output.place].kind is Kind.ACTION:
-                for suffix in ("begin", "going"):
-                    base_give[f"{output.place}.{suffix}"] = output.weight
-        out = []
-        actions = self.compiled[index].actions
+        x = self.compiled[index]
+        plain = {net.places[p]: w for p, w in x.plain}
+        give: Weights = {}
+        for p, w, is_action in x.produce:
+            place = net.places[p]
+            give |= dict.fromkeys(
+                (place, f"{place}.begin", f"{place}.going")[: 3 if is_action else 1], w
+            )
         parameters = dict(self.task.parameters)
         names = set(t.when.names) if t.when is not None else set()
         names |= {n for name, value in t.sets if name in self.values for n in (name, *value.names)}
         kept = sorted(names & set(self.values))
         choices = [self.values[name].items() for name in kept]
-        takings = product(*(self._takings(t, arc) for arc in actions))
+        takings = product(*(self._takings(t, arc) for arc in x.actions))
+        out = []
         for combination, chosen in product(takings, product(*choices)):
             told = dict(zip(kept, (value for value, _ in chosen), strict=True)) | parameters
             for one, _, _ in combination:
@@ -1042,16 +1096,18 @@ class _Derivation:
             may_hold, open_ = self._judged(t, told)
             if not may_hold:
                 continue
-            need, give = dict(base_need), dict(base_give)
-            for _, takes, back in combination:
-                need |= takes
-                for place, n in back.items():
-                    give[place] = give.get(place, 0) + n
             after = {n: e.value(told) for n, e in t.sets if n in self.values}
-            for name, (value, label) in zip(kept, chosen, strict=True):
-                need[label] = 1
-                give[self.values[name][after.get(name, value)]] = 1
-            out.append((need, give, open_))
+            back = Counter(
+                {
+                    self.values[n][after.get(n, value)]: 1
+                    for n, (value, _) in zip(kept, chosen, strict=True)
+                }
+            )
+            need = Counter(plain)
+            for _, takes, returned in combination:
+                need += takes
+                back += returned
+            out.append(_Case(need, {label: 1 for _, label in chosen}, back, give, open_))
         return out
 
     def _takings(self, t: Transition, arc: ActionArc) -> list[tuple[Told, Weights, Weights]]:
@@ -1060,7 +1116,7 @@ class _Derivation:
         p, w, going = arc.name, arc.weight, f"{arc.name}.going"
         if arc.end is End.GOING:
             flags = {f"{p}.raised {e}": w for e in arc.raised}
-            return [({}, {going: w, **flags}, {going: w})]
+            return [({}, {p: w, going: w, **flags}, {p: w, going: w})]
         if (p, t.name) in self.by:
             if arc.takes_done:
                 self.assumptions.append(
@@ -1069,7 +1125,7 @@ class _Derivation:
                 )
             if _cut(arc.counts) == LOST:
                 self.spoils.add(t.name)
-            return [({}, {going: w, self.by[p, t.name]: w}, self._server(p))]
+            return [({}, {p: w, going: w, self.by[p, t.name]: w}, self._server(p))]
         kinds = [
             self._ended(p, s, kind, raised)
             for s in Status
@@ -1087,7 +1143,7 @@ class _Derivation:
             flags = {f"{p}.raised {e}": taken[going] for e in arc.raised if taken[going]}
             own = [self.told.get(label, {}) for label in chosen]
             told = dict(set(own[0].items()).intersection(*(o.items() for o in own)))
-            out.append((told, taken | flags, given))
+            out.append((told, {p: w, **taken, **flags}, given))
         return out
 
     def _judged(self, t: Transition, told: Told) -> tuple[bool, bool]:
@@ -1108,19 +1164,20 @@ class _Derivation:
         events = (self.task.events[e] for e in t.events if e not in self.flags)
         return next((e.name for e in events if e.scope is Scope.EXTERNAL), "")
 
-    def _fires(self, t: Transition, name: str, need: Weights, give: Weights, open_: bool) -> None:
+    def _fires(self, t: Transition, name: str, case: _Case) -> None:
         """Add a case: it fires at once, after an exponential wait for its events, or after a
         timer."""
-        share = self._switch(t) if open_ else 1.0
+        share = self._switch(t) if case.open_ else 1.0
         # Among equals a run's end comes before a preemption, unless weights are declared.
         preempts = t.weight is None and any(a.end is End.PREEMPT for a in t.inputs)
         priority = TASK + 2 * t.priority - preempts
-        if not any((a.place, t.name) in self.by for a in t.inputs):
-            need = need | {f"event {e}": 1 for e in t.events if e in self.flags}
+        need, give = case.need | case.values, self._given(t, name, case)
         if any((a.place, t.name) in self.by for a in t.inputs):
             self._immediate(name, need, give, 1.0, priority)
-        elif t.after is not None:
-            self._timer(t, name, need, give)
+            return
+        need |= {f"event {e}": 1 for e in t.events if e in self.flags}
+        if t.after is not None:
+            self._timer(t, name, case, give, priority)
         elif t.name in self.called:
             self._immediate(name, need | {self.called[t.name]: 1}, give, share, self.served[t.name])
         elif event := self._awaited_event(t):
@@ -1129,9 +1186,30 @@ class _Derivation:
         else:
             weight = share * (t.weight if t.weight is not None else 1.0)
             source = "weight declared in the task file" if t.weight is not None else ""
-            if open_ and t.name in self.measured.switches:
+            if case.open_ and t.name in self.measured.switches:
                 source = "measured frequency of its condition"
             self._immediate(name, need, give, weight, priority, source)
+
+    def _given(self, t: Transition, name: str, case: _Case) -> Weights:
+        """Return what a case gives. If others may lose a timer or a latched event by what it takes,
+        although it gives it back, it gives in a second step."""
+        lost = self._lost_by(self.compiled[self.task.net.transition_index[t.name]])
+        if not lost:
+            return Counter(case.back) + Counter(case.give)
+        step = f"{name} gives"
+        self.places |= {step: 0, GIVING: 0}
+        self._immediate(step, {step: 1, GIVING: 1}, case.give, 1.0, FLUSH - 3)
+        return {**case.back, step: 1, GIVING: 1}
+
+    def _lost_by(self, fired: CompiledTransition) -> bool:
+        """Return whether others may lose a timer or a latched event between the moment at which the
+        transition takes its tokens and the moment at which it gives them."""
+        taken = {p for p, _ in fired.plain} | {
+            a.place for a in fired.actions if a.end is not End.GOING
+        }
+        both = taken & {p for p, _, _ in fired.produce}
+        others = (x for x in self.losers if x.index != fired.index)
+        return any(x.bars or both & {p for p, _ in x.needs} for x in others)
 
     def _switch(self, t: Transition) -> float:
         """Return how often an open condition is true, relative to its competitors."""
@@ -1158,29 +1236,34 @@ class _Derivation:
         measured = event in self.measured.waits
         return "measured mean wait" if measured else "mean wait declared in the task file"
 
-    def _timer(self, t: Transition, name: str, need: Weights, give: Weights) -> None:
+    def _timer(self, t: Transition, name: str, case: _Case, give: Weights, priority: int) -> None:
         """Add a fixed delay as Erlang phases, counted by tokens in a place of its own.
 
-        The count is reset as soon as the transition is disabled: an immediate transition empties it
-        when a needed token is missing, or a place bars it: an inhibitor place or a full one.
+        The count is reset as soon as the transition loses a token that it needs, or a place bars
+        it: an inhibitor place or a full one. A condition is judged when the time is over.
         """
         assert t.after is not None
         duration = self._duration(f"{t.name}.after", t.after, 0.0, self.timer_stages)
         (branch,) = duration.branches
-        count, last = f"{name}.phase", branch.stages - 1
+        need = case.need
+        stem = self.timers.setdefault((t.name, frozenset(need.items())), name)
+        count, tick = f"{stem}.phase", f"{stem}.tick"
+        ticks = branch.stages if case.values else branch.stages - 1
         source = f"declared: after {t.after:g} s"
-        self._timed(name, need | ({count: last} if last else {}), give, branch.rate, source, 1)
-        if not last:
+        counted = need | ({count: ticks} if ticks else {})
+        if case.values:
+            self._immediate(name, counted | case.values, give, 1.0, priority)
+        else:
+            self._timed(name, counted, give, branch.rate, source, 1)
+        if not ticks or stem != name:  # values of variables do not concern the timer
             return
         self.places[count] = 0
-        tick = f"{name}.tick"
-        self._timed(tick, dict(need), {**need, count: 1}, branch.rate, source, 1)
+        self._timed(tick, need, {**need, count: 1}, branch.rate, source, 1)
         bars = self.compiled[self.task.net.transition_index[t.name]].bars
         barred = self._named(({}, dict(bars)))[1]
-        self.inhibit[tick] = barred | {count: last}
+        self.inhibit[tick] = barred | {count: ticks}
         for place, n in need.items():
             self._immediate(f"{name}.reset {place}", {count: 1}, {}, 1.0, FLUSH)
             self.inhibit[f"{name}.reset {place}"] = {place: n}
         for place, n in barred.items():
-            back = {place: n}
-            self._immediate(f"{name}.barred {place}", {count: 1, **back}, back, 1.0, FLUSH)
+            self._lost(f"{name}.barred {place}", count, {place: n}, {})
