@@ -164,13 +164,13 @@ class AfterTimers:
             timer.due, timer.held = now + timer.held, None
 
     def over(self, now: float) -> list[str]:
-        """Remove and return the timers that have elapsed, the earliest first."""
-        keys = sorted(
-            (t.due, k) for k, t in self._timers.items() if t.held is None and t.due <= now
-        )
-        for _, key in keys:
+        """Remove and return the timers that have elapsed, the earliest first; of those that elapse
+        together, the one that was armed first."""
+        elapsed = {k: t for k, t in self._timers.items() if t.held is None and t.due <= now}
+        keys = sorted(elapsed, key=lambda key: elapsed[key].due)
+        for key in keys:
             del self._timers[key]
-        return [key for _, key in keys]
+        return keys
 
     def due(self) -> float | None:
         """Return when the next timer elapses."""

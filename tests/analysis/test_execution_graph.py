@@ -240,7 +240,8 @@ class Player:
         self.due = {key: due for key, due in self.due.items() if key in armed}
         first = min(self.due.values(), default=None)
         possible = self._possible(state)
-        possible += [TimerFired(key) for key, due in self.due.items() if due == first]
+        # of timers that elapse together, the one that was armed first
+        possible += [TimerFired(key) for key, due in self.due.items() if due == first][:1]
         if not possible:
             return None
         chosen = self.data.draw(st.sampled_from(possible))

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.engine import Begin, Hold, Pause, Phase, Resume, RunEnded, StartRun
-from petrobot.coordinator.run.calls import ESCALATION, STOP_MARGIN, Dispatch
+from petrobot.coordinator.run.calls import ESCALATION, STOP_MARGIN, AfterTimers, Dispatch
 from petrobot.coordinator.run.journal import JournalError, JournalWriter
 from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task import Executed, Status
@@ -380,3 +380,17 @@ def test_arguments_too_large_for_a_message_end_only_their_run(arguments: dict[st
     assert "arguments." in end.text and not dispatch.flights
     assert dispatch.carry_out(0.0, StartRun("work#2", "work", "work", "do_work", {}, 1.0)) == []
     assert list(dispatch.flights) == ["work#2"]
+
+
+# --- timers -----------------------------------------------------------------------------------
+
+
+def test_of_timers_that_elapse_together_the_one_armed_first_is_first() -> None:
+    """The execution graph assumes this order, whatever the timers are called."""
+    timers = AfterTimers()
+    for key in ("open#9", "open#10", "close#11"):
+        timers.arm(0.0, key, 2.0)
+    timers.arm(1.0, "late#12", 0.5)
+    timers.arm(1.0, "never#13", 5.0)
+    assert timers.over(2.0) == ["late#12", "open#9", "open#10", "close#11"]
+    assert len(timers) == 1
