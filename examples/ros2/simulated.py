@@ -16,8 +16,7 @@ class Robot:
     def __init__(self):
         self.x = self.y = 0.0
         self.goal = None
-        self.last = self.told = 0.0
-        self.pressed = False
+        self.last = self.told = self.pressed = 0.0
 
     def receive(self, now, message):
         """Return what rosbridge sends at once after a message."""
@@ -38,8 +37,8 @@ class Robot:
 
     def step(self, now):
         """Return what rosbridge sends because time has passed."""
-        if not self.pressed and now > 1.0:
-            self.pressed = True
+        if self.goal is None and now - self.pressed > 1.0:  # someone waits, and presses again
+            self.pressed = now
             return [{"op": "publish", "topic": "/button", "msg": {"data": True}}]
         if self.goal is None:
             return []
