@@ -106,7 +106,7 @@ async def start_page(
     listener = _listen(host, port)
     number = listener.getsockname()[1]
     access = AccessRules(
-        token or secrets.token_urlsafe(24), number, names_for(host, names), tls is not None
+        token or secrets.token_hex(24), number, names_for(host, names), tls is not None
     )
     page_state = PageState(
         port_object, TaskStore(tasks_folder, shipped), access, offers, history, starts
