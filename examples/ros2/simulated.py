@@ -37,11 +37,11 @@ class Robot:
 
     def step(self, now):
         """Return what rosbridge sends because time has passed."""
-        if self.goal is None and now - self.pressed > 1.0:  # someone waits, and presses again
-            self.pressed = now
-            return [{"op": "publish", "topic": "/button", "msg": {"data": True}}]
         if self.goal is None:
-            return []
+            if now - self.pressed <= 1.0:
+                return []
+            self.pressed = now  # someone waits, and presses again
+            return [{"op": "publish", "topic": "/button", "msg": {"data": True}}]
         pose = self.goal["args"]["pose"]["pose"]["position"]
         left = math.hypot(pose["x"] - self.x, pose["y"] - self.y)
         share = min(1.0, SPEED * (now - self.last) / left) if left > 0 else 1.0

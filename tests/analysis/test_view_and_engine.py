@@ -278,7 +278,7 @@ BETWEEN = {
     "a run and a latched event": arcs("swap", "left,arm", "arm", ', event = "tick"')
     + arcs("end", "arm,work:normal", "done", ', event = "flag"')
     + arcs("bad", "arm,work:error", "done"),
-    "a run that goes on": arcs("seen", "left,work:going", "", ', event = "tick"')
+    "a run that stays active": arcs("seen", "left,work:going", "", ', event = "tick"')
     + arcs("end", "arm,work:normal", "done")
     + arcs("bad", "arm,work:error", "done")
     + arcs("late", "arm,work:preempt=failure", "done", ", after = 2.0"),
@@ -296,11 +296,11 @@ BETWEEN = {
     )
     + arcs("end", "arm", "done", ', after = 2.0, when = "v == 1"'),
 }
-"""By what is lost or kept between two firings, or between taking and giving of one: transitions."""
+"""Transitions, by what is dropped or kept between two firings or between taking and giving."""
 
 
 @pytest.mark.parametrize("kind", BETWEEN)
-def test_the_view_loses_timers_and_events_where_the_engine_does(kind: str) -> None:
+def test_the_view_drops_timers_and_events_where_the_engine_does(kind: str) -> None:
     work = 'work = { kind = "action", task = "work", tokens = 1 }\n' * ("work" in BETWEEN[kind])
     task = loads(
         'schema = 1\n[task]\nname = "t"\nfinal = "done == 1 and left >= 0 and arm >= 0"\n'
@@ -327,6 +327,15 @@ def test_the_time_of_one_of_several_ended_runs_is_doubtful() -> None:
     )
     (doubt,) = stochastic_view(task).doubts
     assert doubt.startswith("late: its time belongs to the run of work that ended first")
+
+
+def test_an_open_condition_of_a_timer_is_assumed_to_hold() -> None:
+    text = Text(1, done=', after = 1.0, when = "score > 3"')
+    text.moves.append(arcs("bad", "work:error", "arm"))
+    text.rest = '[variables]\nscore = { type = "int", initial = 0 }\n'
+    assert (
+        "did: its condition holds when its time is over" in stochastic_view(text.task()).assumptions
+    )
 
 
 class Clock:

@@ -1,8 +1,8 @@
 """The stochastic view of a task: its ordinary net with choices, statuses, durations and events.
 
 The result is a GSPN (docs/analysis.md, section 4). Every place and arc of the ordinary net stays,
-so dropping the added places projects each firing sequence on one of the ordinary net. (Where others
-may lose a timer or a latched event between taking and giving, a firing has two steps.) An action
+so leaving out the added places projects each firing sequence on one of the ordinary net. (A firing
+has two steps where the engine may drop a timer or a latched event in between.) An action
 place p gets, beside itself, `p.going` (a run is active) and `p.success`, `p.failure`, `p.error` (a
 run has finished and waits for an outgoing transition).
 
@@ -71,7 +71,7 @@ REST = 750_000
 """Priority of what the engine only does when nothing can fire any more, before runs begin."""
 GIVING = "to give"
 """Place with a token between the moment at which a firing takes its tokens and the moment at which
-it gives them, as far as another transition loses its timer or its latched event in between."""
+it gives them, where the engine may drop a timer or a latched event in between."""
 STAGES = 8
 """Default limit of the phases of one duration. Phases of parallel runs multiply the number of
 markings, so it is small."""
@@ -491,7 +491,7 @@ class _Derivation:
         """By action place: internal events of its runs that some arc waits for."""
         self.doubts: list[str] = []
         self.by: dict[tuple[str, str], str] = {}
-        self.compiled = compile_transitions(task)
+        self.compiled = {x.name: x for x in compile_transitions(task)}
         self.domains = condition_domains(task)
         self.conditions = {
             t.name: with_values(t.when, dict(task.parameters))
@@ -507,7 +507,7 @@ class _Derivation:
         self.values: dict[str, dict[Scalar, str]] = {}
         """By variable that only transitions set, to known values: the place of each value."""
         self._variables()
-        self.losers = [x for x in self.compiled if x.after is not None]
+        self.droppable = [x for x in self.compiled.values() if x.after is not None]
         """Transitions with a timer, or with a latched event that the engine may drop."""
         self.timers: dict[tuple[str, frozenset[tuple[str, int]]], str] = {}
         """By transition with a timer and what it takes: the first of its cases, whose name the
@@ -651,7 +651,7 @@ class _Derivation:
         """Find the internal events that arcs wait for. They are latched to the run: `p.raised e`
         while it is active, then its place says with which it ended."""
         name = place.name
-        arcs = [(x.name, a) for x in self.compiled for a in x.actions if a.name == name]
+        arcs = [(x.name, a) for x in self.compiled.values() for a in x.actions if a.name == name]
         events = {e for t, a in arcs if (name, t) not in self.by for e in a.raised}
         self.raised[name] = tuple(sorted(events))
         if events and place.most_active > 1:
@@ -688,7 +688,7 @@ class _Derivation:
         fits = End.ERROR if status is Status.ERROR else End.NORMAL
         read = {
             name
-            for x in self.compiled
+            for x in self.compiled.values()
             for a in x.actions
             if x.name in self.conditions and a.name == place.name
             if a.takes_done or a.end is fits
@@ -968,7 +968,7 @@ class _Derivation:
         latched event may come before."""
         waiting = [
             x
-            for x in self.compiled
+            for x in self.compiled.values()
             if event.name in (x.pulse, *x.flags)
             and not x.never
             and not any((a.name, x.name) in self.by for a in x.actions)
@@ -996,12 +996,12 @@ class _Derivation:
             return
         self.flags.add(event.name)
         if not kept:
-            self.losers += waiting
+            self.droppable += waiting
         for i, case in enumerate([] if kept else list(_none_enabled(waiting))):
             need, inhibit = self._named(case)
-            self._lost(f"{flag} dropped {i + 1}", flag, need, inhibit)
+            self._drop(f"{flag} dropped {i + 1}", flag, need, inhibit)
 
-    def _lost(self, name: str, what: str, need: Weights, inhibit: Weights) -> None:
+    def _drop(self, name: str, what: str, need: Weights, inhibit: Weights) -> None:
         """Take a token of a place as the engine drops a timer or a latched event: between taking
         and giving of a firing, or when nothing can fire any more."""
         self.places[GIVING] = 0
@@ -1048,7 +1048,7 @@ class _Derivation:
     # Transitions of the task.
 
     def _transition(self, t: Transition) -> None:
-        if self.compiled[self.task.net.transition_index[t.name]].never:
+        if self.compiled[t.name].never:
             return
         measured = [e for e in t.events if e in self.measured.waits]
         if measured and any(a.end in (End.NORMAL, End.ERROR) for a in t.inputs):
@@ -1056,7 +1056,7 @@ class _Derivation:
                 f"{', '.join(measured)}: the measured wait is that of {t.name} since its tokens "
                 "came, and so contains its run; it is taken for the wait for the event"
             )
-        for arc in self.compiled[self.task.net.transition_index[t.name]].actions:
+        for arc in self.compiled[t.name].actions:
             ended = arc.end in (End.NORMAL, End.ERROR)
             if t.after is not None and ended and self._may_hold(arc.name, arc.weight + 1):
                 self.doubts.append(
@@ -1067,14 +1067,13 @@ class _Derivation:
         for i, case in enumerate(cases):
             name = t.name if len(cases) == 1 else f"{t.name} {i + 1}"
             self.origin[name] = t.name
-            bars = self.compiled[self.task.net.transition_index[t.name]].bars
+            bars = self.compiled[t.name].bars
             self.inhibit[name] = self._named(({}, dict(bars)))[1]
             self._fires(t, name, case)
 
     def _cases(self, t: Transition) -> list[_Case]:
         """Return the ways in which a transition may fire."""
-        net, index = self.task.net, self.task.net.transition_index[t.name]
-        x = self.compiled[index]
+        net, x = self.task.net, self.compiled[t.name]
         plain = {net.places[p]: w for p, w in x.plain}
         give: Weights = {}
         for p, w, is_action in x.produce:
@@ -1107,7 +1106,8 @@ class _Derivation:
             for _, takes, returned in combination:
                 need += takes
                 back += returned
-            out.append(_Case(need, {label: 1 for _, label in chosen}, back, give, open_))
+            values = {label: 1 for _, label in chosen}
+            out.append(_Case(dict(need), values, dict(back), give, open_))
         return out
 
     def _takings(self, t: Transition, arc: ActionArc) -> list[tuple[Told, Weights, Weights]]:
@@ -1167,7 +1167,6 @@ class _Derivation:
     def _fires(self, t: Transition, name: str, case: _Case) -> None:
         """Add a case: it fires at once, after an exponential wait for its events, or after a
         timer."""
-        share = self._switch(t) if case.open_ else 1.0
         # Among equals a run's end comes before a preemption, unless weights are declared.
         preempts = t.weight is None and any(a.end is End.PREEMPT for a in t.inputs)
         priority = TASK + 2 * t.priority - preempts
@@ -1175,10 +1174,14 @@ class _Derivation:
         if any((a.place, t.name) in self.by for a in t.inputs):
             self._immediate(name, need, give, 1.0, priority)
             return
-        need |= {f"event {e}": 1 for e in t.events if e in self.flags}
         if t.after is not None:
+            if case.open_:
+                self.assumptions.append(f"{t.name}: its condition holds when its time is over")
             self._timer(t, name, case, give, priority)
-        elif t.name in self.called:
+            return
+        share = self._switch(t) if case.open_ else 1.0
+        need |= {f"event {e}": 1 for e in t.events if e in self.flags}
+        if t.name in self.called:
             self._immediate(name, need | {self.called[t.name]: 1}, give, share, self.served[t.name])
         elif event := self._awaited_event(t):
             rate = share / self.numbers.wait(event)
@@ -1191,24 +1194,23 @@ class _Derivation:
             self._immediate(name, need, give, weight, priority, source)
 
     def _given(self, t: Transition, name: str, case: _Case) -> Weights:
-        """Return what a case gives. If others may lose a timer or a latched event by what it takes,
-        although it gives it back, it gives in a second step."""
-        lost = self._lost_by(self.compiled[self.task.net.transition_index[t.name]])
-        if not lost:
+        """Return what a case gives. Where its taking alone may drop a timer or a latched event of
+        others, it gives in a second step."""
+        if not self._drops(self.compiled[t.name]):
             return Counter(case.back) + Counter(case.give)
         step = f"{name} gives"
         self.places |= {step: 0, GIVING: 0}
         self._immediate(step, {step: 1, GIVING: 1}, case.give, 1.0, FLUSH - 3)
         return {**case.back, step: 1, GIVING: 1}
 
-    def _lost_by(self, fired: CompiledTransition) -> bool:
-        """Return whether others may lose a timer or a latched event between the moment at which the
-        transition takes its tokens and the moment at which it gives them."""
+    def _drops(self, fired: CompiledTransition) -> bool:
+        """Return whether the engine may drop what others wait for, a timer or a latched event,
+        between taking and giving of the transition."""
         taken = {p for p, _ in fired.plain} | {
             a.place for a in fired.actions if a.end is not End.GOING
         }
         both = taken & {p for p, _, _ in fired.produce}
-        others = (x for x in self.losers if x.index != fired.index)
+        others = (x for x in self.droppable if x.index != fired.index)
         return any(x.bars or both & {p for p, _ in x.needs} for x in others)
 
     def _switch(self, t: Transition) -> float:
@@ -1259,11 +1261,11 @@ class _Derivation:
             return
         self.places[count] = 0
         self._timed(tick, need, {**need, count: 1}, branch.rate, source, 1)
-        bars = self.compiled[self.task.net.transition_index[t.name]].bars
+        bars = self.compiled[t.name].bars
         barred = self._named(({}, dict(bars)))[1]
         self.inhibit[tick] = barred | {count: ticks}
         for place, n in need.items():
             self._immediate(f"{name}.reset {place}", {count: 1}, {}, 1.0, FLUSH)
             self.inhibit[f"{name}.reset {place}"] = {place: n}
         for place, n in barred.items():
-            self._lost(f"{name}.barred {place}", count, {place: n}, {})
+            self._drop(f"{name}.barred {place}", count, {place: n}, {})
