@@ -109,9 +109,7 @@ def _print(answers: dict[str, Any]) -> None:
             if troubles
             else "[red]away[/]"
         )
-        shown = _devices(
-            answer.get("status", {}).get("devices", {}), answer.get("stopped", []), troubles
-        )
+        shown = _devices(answer.get("status", {}), answer.get("stopped", []), troubles)
         ends = [_ends(answer.get("certificate_ends", ""))] if certified else []
         if answer.get("status", {}).get("dry_run"):
             state += " [yellow]dry run[/]"
@@ -120,15 +118,15 @@ def _print(answers: dict[str, Any]) -> None:
     Console().print(table)
 
 
-def _devices(
-    devices: Mapping[str, Any], stopped: Sequence[str], troubles: Mapping[str, str]
-) -> str:
+def _devices(status: Mapping[str, Any], stopped: Sequence[str], troubles: Mapping[str, str]) -> str:
     """Return the names of devices, each with its troubles: an emergency stop, why it accepts no
-    call, refusals, late cycles."""
+    call, refusals, late cycles, dropped events. (Events may also come from a service, the memory or
+    the node.)"""
     from rich.markup import escape
 
-    shown = []
-    for device in dict.fromkeys((*devices, *troubles, *stopped)):
+    shown, devices = [], status.get("devices", {})
+    dropped = status.get("events_dropped", {})
+    for device in dict.fromkeys((*devices, *troubles, *stopped, *dropped)):
         said, told = [device], devices.get(device, {})
         if device in stopped:
             said.append("[red]stopped (petrobot estop --clear)[/]")
@@ -140,6 +138,8 @@ def _devices(
         if told.get("overruns"):
             late = told.get("late_ms", 0.0)
             said.append(f"[yellow]{told['overruns']} cycles missed, at most {late:.0f} ms late[/]")
+        if dropped.get(device):
+            said.append(f"[yellow]{dropped[device]} events dropped[/]")
         shown.append(" ".join(said))
     return ", ".join(shown)
 

@@ -449,6 +449,7 @@ class Node:
                 if command.verb == "status":
                     data["emergency"] = list(self.stopped_in_emergency())
                     data["dry_run"] = self.directory.dry_run
+                    data["events_dropped"] = dict(self.callee.events.dropped)
                 self.callee.answer(now, id_, held and not command.missing, data)
 
     # --- reports of places --------------------------------------------------------------------
@@ -489,9 +490,15 @@ class Node:
         if event.run and self.callee.service_of(event.run) is None:
             return
         source = self.action_of(event.run) if event.run else event.source or key or self.name
+        dropped = self.callee.events.dropped
+        before = dropped[source]
         self.callee.raise_event(
             self._now, event.name, event.data, source=source, latched=True, run=event.run
         )
+        if dropped[source] > before == 0:
+            _log.warning(
+                "%s raises events faster than they are stored: the oldest are dropped", source
+            )
 
     def _ask(self, now: float, key: str, call: Call) -> None:
         """Call a service for a run."""

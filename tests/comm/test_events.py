@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -129,12 +130,26 @@ def test_a_caller_that_left_with_bye_receives_no_old_events_when_it_is_back() ->
     assert _heard(callee, "coord") == [("caught", 1)]
 
 
-def test_events_that_no_caller_fetches_are_dropped_and_counted() -> None:
+@pytest.mark.parametrize(
+    ("names", "stored", "dropped"),
+    [(("caught",), 0, 3), (("caught",), 2, 1), (("other",), 0, 0), ((), 0, 0)],
+)
+def test_the_oldest_events_are_dropped_and_counted_if_a_subscriber_has_not_stored_them(
+    names: tuple[str, ...], stored: int, dropped: int
+) -> None:
     board = EventBoard()
-    for _ in range(KEPT + 3):
+    board.subscribe("coord", names, durable=True)
+    board.subscribe("page", ("caught",) if stored else (), durable=False)
+    for number in range(1, KEPT + 1):
+        board.raise_event(m.Event("caught", "barrier", 0), True, "")
+        if number == stored:
+            board.acknowledge("page", "barrier", number)
+            board.acknowledge("coord", "barrier", number)
+    for _ in range(3):
         board.raise_event(m.Event("caught", "barrier", 0), True, "")
     waiting = board.subscribe("coord", ("caught",), True)
-    assert (board.lost, len(waiting), waiting[0].number) == (3, KEPT, 4)
+    assert board.dropped == ({"barrier": dropped} if dropped else {})
+    assert (len(waiting), waiting[0].number) == (KEPT, 4)
 
 
 _steps = st.lists(

@@ -16,8 +16,11 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.cli import main
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.events import KEPT
 from petrobot.services.comm.location_file import Directory, parse
-from petrobot.services.comm.protocol.messages import Call, Feedback
+from petrobot.services.comm.protocol.messages import Call, Feedback, Hello
 from petrobot.services.node.worker_host import START_LIMIT
 from tests.node.conftest import OUTSIDE
 from tests.node.test_processes import PATIENCE, ROOT, Operator, operator_of
@@ -245,6 +248,40 @@ async def test_nodes_shows_refusals_and_missed_cycles(
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert code == 0 and f"{status['refused']} refused" in shown and "cycles missed" in shown, shown
     assert "cycles were left out" in node.log.read_text()
+
+
+async def test_events_that_a_subscriber_never_stores_are_dropped_and_shown(
+    node: OneNode,
+    operator: Operator,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("COLUMNS", "400")
+    hello = Hello(2, 2, "client", "deaf", "deaf", 0, node.directory.hash)
+    deaf = Caller("only", hello)  # it stores nothing, so it acknowledges nothing
+    host, port = node.directory.address("only")
+    client = Client(host, port, deaf, on_notices=lambda now, notices: None)
+    client.start()
+    try:
+        assert await client.connected(PATIENCE)
+        deaf.subscribe(client.now(), ["noise"])
+        client.flush()
+        # The same connection has carried the subscription before this call.
+        added = await asyncio.wait_for(client.call("add", {"a": 1, "b": 2}), PATIENCE)
+        assert added.values == {"sum": 3}
+        end = await operator.call("good", None, send=[{"raise": KEPT + 7}], seconds=0.05)
+        assert end.status == "success"
+        dropped, limit = 0, Limit("the node to count what it dropped")
+        while dropped < 7 and limit.left():
+            answer = await operator.command("only", "status", "the_good")
+            dropped = answer.data["events_dropped"].get("the_good", 0)
+        assert dropped == 7
+        assert await asyncio.to_thread(main, ["nodes", "--services", str(node.file)]) == 0
+        shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+        assert f"{dropped} events dropped" in shown, shown
+        assert "the_good raises events faster than they are stored" in node.log.read_text()
+    finally:
+        await client.close()
 
 
 async def test_a_driver_that_blocks_is_named_at_the_deadline(

@@ -6,7 +6,7 @@ Also the format of deferred verdicts, which are sent as latched events.
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -48,9 +48,9 @@ class EventBoard:
         self._numbers: dict[str, int] = {}
         self._runs: set[str] = set()
         """Runs that have raised latched events."""
-        self.lost = 0
-        """Latched events that were dropped for newer ones before any caller had acknowledged
-        them."""
+        self.dropped = Counter[str]()
+        """By source: how many latched events were dropped for newer ones while a subscriber had not
+        acknowledged them."""
 
     def skip(self, peer: str) -> None:
         """No event of the time before is for this caller: a button that was pressed before a
@@ -93,8 +93,9 @@ class EventBoard:
         event = Event(event.name, event.source, number, event.data, event.run)
         kept = self._kept.setdefault(event.source, deque())
         if len(kept) >= KEPT:
-            kept.popleft()
-            self.lost += 1
+            oldest = kept.popleft()
+            if any(self._wants(p, oldest) and p not in oldest.safe for p in self._listeners):
+                self.dropped[event.source] += 1
         kept.append(_Kept(event, owner))
         if event.run:
             self._runs.add(event.run)

@@ -160,9 +160,12 @@ class Broken:
             raise LookupError(f"nothing is right in {where}")
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """`{"break": true}`, `{"go": true}`, or one of those that are refused."""
+        """`{"break": true}`, `{"go": true}`, `{"raise": events}`, or one of those that are
+        refused."""
         if body.get("break"):
             self._armed = True
+        for _ in range(int(body.get("raise", 0))):
+            self._ports.raise_event("noise")
         if "odd" in body:
             raise ValueError(f"the base takes no odd numbers: {body['odd']}")
         if body.get("need") is True:
