@@ -29,6 +29,7 @@ from petrobot.coordinator.analysis.net.picture import graph_svg
 from petrobot.coordinator.analysis.net.space import EngineName, SearchLimits, explore
 from petrobot.coordinator.analysis.report import CUT, Analysis, analyse
 from petrobot.coordinator.analysis.time.gspn import Gspn
+from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
 from petrobot.coordinator.analysis.time.measures import Measure as UserMeasure
 from petrobot.coordinator.analysis.time.measures import read_measure, value_of
 from petrobot.coordinator.analysis.time.simulate import (
@@ -37,7 +38,7 @@ from petrobot.coordinator.analysis.time.simulate import (
     goal_by_marking,
     simulate,
 )
-from petrobot.coordinator.analysis.time.stochastic import Measured, NoEstimate, stochastic_view
+from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.whatif import (
     Change,
     change_gspn,

@@ -48,7 +48,8 @@ from petrobot.coordinator.analysis.net.structure import (
 from petrobot.coordinator.analysis.net.verdict import PropertyVerdict
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.analysis.time.markov import LongRun, long_run
-from petrobot.coordinator.analysis.time.stochastic import STAGES, Measured, stochastic_view
+from petrobot.coordinator.analysis.time.measured import Measured
+from petrobot.coordinator.analysis.time.stochastic import STAGES, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.net import Marking, Net

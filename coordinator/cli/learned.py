@@ -45,7 +45,7 @@ def show_task(kept: FileContents, options: argparse.Namespace) -> int:
 def figures(kept: FileContents, name: str, options: argparse.Namespace) -> dict[str, Any]:
     """Return the figures as plain data: of the primitive tasks, and of the task for one token in
     its runs place."""
-    from petrobot.coordinator.analysis.time.stochastic import NoEstimate
+    from petrobot.coordinator.analysis.time.measured import NoEstimate
     from petrobot.coordinator.launch import with_runs
     from petrobot.coordinator.learning.propagation import propagate
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from petrobot.coordinator.analysis.may_run import Cell
-    from petrobot.coordinator.analysis.time.stochastic import Measured
+    from petrobot.coordinator.analysis.time.measured import Measured
     from petrobot.coordinator.task import Task
     from petrobot.services.comm.location_file import Directory
 

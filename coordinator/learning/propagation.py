@@ -18,13 +18,8 @@ import numpy as np
 
 from petrobot.coordinator.analysis.net.graph import sum_by
 from petrobot.coordinator.analysis.net.space import SearchLimits
-from petrobot.coordinator.analysis.time.stochastic import (
-    Ending,
-    Measured,
-    contended,
-    is_cause,
-    stochastic_view,
-)
+from petrobot.coordinator.analysis.time.measured import Ending, Measured, is_cause
+from petrobot.coordinator.analysis.time.stochastic import contended, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.learning.batch import Array
 from petrobot.coordinator.learning.estimate import CENSORED, Tally, merge_tallies

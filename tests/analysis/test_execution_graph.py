@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from petrobot.coordinator.analysis.execution.causes import explain, settled
 from petrobot.coordinator.analysis.execution.chain import TooLarge, chain_of
 from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, TooManyValues, execute
-from petrobot.coordinator.analysis.time.stochastic import NoEstimate
+from petrobot.coordinator.analysis.time.measured import NoEstimate
 from petrobot.coordinator.engine import (
     ArmTimer,
     Begin,

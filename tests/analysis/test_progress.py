@@ -20,7 +20,8 @@ from petrobot.coordinator.analysis.net.graph import Graph
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.space import explore
 from petrobot.coordinator.analysis.report import analyse
-from petrobot.coordinator.analysis.time.stochastic import Measured, stochastic_view
+from petrobot.coordinator.analysis.time.measured import Measured
+from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.task import Estimate, Status, Task
 from petrobot.coordinator.task.conditions import parse

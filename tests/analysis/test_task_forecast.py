@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from petrobot.coordinator.analysis.time.stochastic import Measured, stochastic_view
+from petrobot.coordinator.analysis.time.measured import Measured
+from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.task import Estimate, Status
 from petrobot.coordinator.task.file import loads

@@ -17,12 +17,9 @@ from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, execut
 from petrobot.coordinator.analysis.may_run import BUDGET, may_run
 from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.report import analyse
+from petrobot.coordinator.analysis.time.measured import Measured
 from petrobot.coordinator.analysis.time.simulate import goal_by_marking, simulate
-from petrobot.coordinator.analysis.time.stochastic import (
-    Measured,
-    StochasticView,
-    stochastic_view,
-)
+from petrobot.coordinator.analysis.time.stochastic import StochasticView, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.engine import (
     ArmTimer,

@@ -23,15 +23,10 @@ from petrobot.coordinator.analysis.report import analyse
 from petrobot.coordinator.analysis.time.completion import Completion, completion
 from petrobot.coordinator.analysis.time.gspn import Chain
 from petrobot.coordinator.analysis.time.markov import visits_before
+from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
 from petrobot.coordinator.analysis.time.measures import read_measure, value_of
 from petrobot.coordinator.analysis.time.simulate import simulate
-from petrobot.coordinator.analysis.time.stochastic import (
-    Measured,
-    NoEstimate,
-    StochasticView,
-    contended,
-    stochastic_view,
-)
+from petrobot.coordinator.analysis.time.stochastic import StochasticView, contended, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.analysis.time.whatif import change_task, read_change
 from petrobot.coordinator.task import (

@@ -10,7 +10,7 @@ import pytest
 from petrobot.coordinator.analysis.commands import analyse_command, simulate_command
 from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.report import analyse
-from petrobot.coordinator.analysis.time.stochastic import Measured
+from petrobot.coordinator.analysis.time.measured import Measured
 from petrobot.coordinator.analysis.time.whatif import change_net, change_task, read_change
 from petrobot.coordinator.task import Estimate, Status
 from petrobot.coordinator.task.file import dumps, load

@@ -14,7 +14,8 @@ from scipy.stats import t as student
 
 from petrobot.coordinator.analysis.time.completion import completion
 from petrobot.coordinator.analysis.time.gspn import Chain
-from petrobot.coordinator.analysis.time.stochastic import Measured, stochastic_view
+from petrobot.coordinator.analysis.time.measured import Measured
+from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.launch import with_runs
 from petrobot.coordinator.learning.estimate import Observation, Tally, TallyKey, merge_tallies

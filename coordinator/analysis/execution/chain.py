@@ -4,7 +4,7 @@ A state of the chain is a state of the execution graph with a clock for each act
 armed timer. A run draws its action and its status when it starts, and then takes the phase-type
 duration of that status; a timer takes an Erlang duration; an awaited event and an internal event
 come after an exponential wait. Choices, draws and stops take no time. The numbers, those of the
-causes by which runs end among them, are those of the stochastic view (`time.stochastic`). What a
+causes by which runs end among them, are those of the stochastic view (`time.measured`). What a
 run writes is not measured: values that lead to different firings are equally likely, unless the
 frequency of a condition was measured.
 """
@@ -25,8 +25,7 @@ from petrobot.coordinator.analysis.limits import keep_time
 from petrobot.coordinator.analysis.net.graph import Graph, Mask, sum_by
 from petrobot.coordinator.analysis.time.gspn import Values
 from petrobot.coordinator.analysis.time.linear import SolveOrder, solve, stationary
-from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit
-from petrobot.coordinator.analysis.time.stochastic import (
+from petrobot.coordinator.analysis.time.measured import (
     FIELDS,
     Ending,
     Measured,
@@ -34,6 +33,7 @@ from petrobot.coordinator.analysis.time.stochastic import (
     Numbers,
     is_cause,
 )
+from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit
 from petrobot.coordinator.engine import (
     CancelRun,
     Chosen,

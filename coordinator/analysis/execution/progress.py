@@ -38,7 +38,7 @@ from petrobot.coordinator.analysis.limits import OutOfTime
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
-from petrobot.coordinator.analysis.time.stochastic import Measured, NoEstimate
+from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
 from petrobot.coordinator.engine import AddTokens, Begin, Engine, Policy, RemoveTokens
 from petrobot.coordinator.task import Kind
 from petrobot.coordinator.task.compiled import Arcs

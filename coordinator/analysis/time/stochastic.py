@@ -20,11 +20,11 @@ chosen its action waits until it is free. Devices that never have to be waited f
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations, combinations_with_replacement, product
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.structure import (
@@ -33,6 +33,16 @@ from petrobot.coordinator.analysis.net.structure import (
     place_semiflows,
 )
 from petrobot.coordinator.analysis.time.gspn import Gspn
+from petrobot.coordinator.analysis.time.measured import (
+    DECLARED,
+    FIELDS,
+    MEASURED,
+    Ending,
+    Measured,
+    NoEstimate,
+    Numbers,
+    is_cause,
+)
 from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit, gamma_quantile
 from petrobot.coordinator.task import (
     Counts,
@@ -77,58 +87,6 @@ STAGES = 8
 markings, so it is small."""
 
 Weights = dict[str, int]
-K = TypeVar("K", bound=Hashable)
-Ending = tuple[str, str]
-"""Why a run ended: its cause, and whether it was executed (`yes`, `no`, `unknown`)."""
-FIELDS = ("reason", "executed")
-"""What conditions call the two: `PLACE.reason`, `PLACE.executed`."""
-EMERGENCY = "emergency_stop"
-"""Cause of a run that an emergency stop ended."""
-DECLARED, MEASURED = "declared in the task file", "measured"
-"""Where the numbers of an action come from."""
-
-
-@dataclass(frozen=True)
-class Measured:
-    """Numbers measured in runs. Missing ones are replaced by the estimates in the task file.
-
-    - `runs[(place or primitive task, action)]`: share, mean (s) and cv by status.
-    - `choice[primitive task][action]`: current probability of each alternative.
-    - `waits[event]`: mean time (s) that a transition waits for the event.
-    - `switches[transition]`: how often its condition is true, relative to the transitions that
-      compete with it.
-    - `causes[(place or primitive task, action)]`: by status, how often its own ends with that
-      status came by each cause, executed or not.
-    - `preempted[(place, action)]`: share, mean (s) and cv of the runs that each transition
-      preempted. If all actions of a place have it, the preempting event is one of the causes by
-      which a run ends (the shares here and in `runs` sum to 1), not an independent race.
-    """
-
-    runs: Mapping[tuple[str, str], Mapping[Status, Estimate]] = field(default_factory=dict)
-    choice: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    waits: Mapping[str, float] = field(default_factory=dict)
-    switches: Mapping[str, float] = field(default_factory=dict)
-    preempted: Mapping[tuple[str, str], Mapping[str, Estimate]] = field(default_factory=dict)
-    sources: Mapping[tuple[str, str], str] = field(default_factory=dict)
-    """Where the numbers in `runs` and `preempted` come from, in words, by the same keys."""
-    causes: Mapping[tuple[str, str], Mapping[Status, Mapping[Ending, float]]] = field(
-        default_factory=dict
-    )
-    mixed: frozenset[tuple[str, str]] = frozenset()
-    """Keys of `causes` where each cause was given the same share of runs that are not known to have
-    been executed, because only their number over all causes was measured."""
-
-
-def is_cause(transition: Transition) -> bool:
-    """Return whether a preemption by this transition is a cause of its own by which a run ends.
-
-    It is one if an event or a timer takes exactly one run: then it has its own distribution of the
-    time since the run began. A transition that fires as soon as its arcs allow it (another run has
-    finished, a token has arrived) only cuts the run short: the net determines when.
-    """
-    runs = [a for a in transition.inputs if a.end is not None]
-    waits = bool(transition.events) or transition.after is not None
-    return waits and len(runs) == 1 and runs[0].end is End.PREEMPT
 
 
 def contended(task: Task, devices: Mapping[str, str]) -> frozenset[str]:
@@ -237,128 +195,6 @@ def _some_enabled(waiting: Sequence[CompiledTransition]) -> Iterator[Needs]:
         for case in _none_enabled(waiting[:i]):
             if (found := _both(case, (dict(x.needs), dict(x.bars)))) is not None:
                 yield found
-
-
-class NoEstimate(ValueError):  # noqa: N818 - names what is missing
-    """A number that the stochastic view needs was neither measured nor declared."""
-
-
-@dataclass(frozen=True)
-class Numbers:
-    """What is measured or declared of a task, measured first."""
-
-    task: Task
-    measured: Measured
-    assumptions: list[str] = field(default_factory=list)
-    """What was assumed in the answers so far."""
-
-    def alternatives(self, place: Place) -> dict[str, float]:
-        """Return the probability of each alternative of a place."""
-        primitive = self.task.primitive_task_of(place.name)
-        known = self.measured.choice.get(primitive.name)
-        if known is None:
-            if len(primitive.alternatives) > 1:
-                self.assumptions.append(
-                    f"{primitive.name}: its alternatives are equally likely (no selector "
-                    "state given)"
-                )
-            return {action: 1.0 / len(primitive.alternatives) for action in primitive.alternatives}
-        return {
-            action: known[action] for action in primitive.alternatives if known.get(action, 0.0) > 0
-        }
-
-    def estimates(self, place: Place, action: str) -> Mapping[Status, Estimate]:
-        """Return share, mean (s) and cv by status. Raises NoEstimate."""
-        primitive = self.task.primitive_task_of(place.name)
-        for key in ((place.name, action), (primitive.name, action)):
-            if key in self.measured.runs:
-                return self.measured.runs[key]
-        if not primitive.estimates:
-            raise NoEstimate(
-                f"primitive_tasks.{primitive.name}: the duration of {action} is unknown: it was "
-                "neither measured nor declared; "
-                f"add [primitive_tasks.{primitive.name}.estimates] or give measurements"
-            )
-        self.assumptions.append(
-            f"{primitive.name}: estimates declared in the task file, not measured"
-        )
-        return primitive.estimates
-
-    def causes(self, place: Place, action: str) -> Mapping[Status, Mapping[Ending, float]]:
-        """Return how often its runs ended by each cause, by status; empty if not measured."""
-        return self.measured.causes.get(self._key(place, action), {})
-
-    def _key(self, place: Place, action: str) -> tuple[str, str]:
-        own = (place.name, action)
-        return own if own in self.measured.causes else (place.task, action)
-
-    def by_switches(self, place: Place) -> bool:
-        """Return whether conditions on the causes of a place have measured frequencies, and the
-        causes themselves were not measured."""
-        if any(self.causes(place, action) for action in self.alternatives(place)):
-            return False
-        names = {f"{place.name}.{field}" for field in FIELDS}
-        return any(
-            t.when is not None and t.name in self.measured.switches and names & t.when.names
-            for t in self.task.transitions.values()
-        )
-
-    def endings(
-        self,
-        place: Place,
-        action: str,
-        status: Status,
-        examples: Sequence[Ending],
-        region: Callable[[Ending], K],
-    ) -> dict[K, float]:
-        """Return how probable each kind of end is among the runs that end with a status.
-
-        `region` gives the kind: conditions do not tell ends of one kind apart. `examples` has one
-        end of each kind. Where no cause was measured, a run is taken to have been executed, and not
-        to have been ended by an emergency stop: declared estimates are those of the action itself.
-        """
-        kinds = list(dict.fromkeys(map(region, examples)))
-        if len(kinds) == 1:
-            return {kinds[0]: 1.0}
-        known = {e: n for e, n in self.causes(place, action).get(status, {}).items() if n > 0}
-        if known and {region(e) for e in known} <= set(kinds):
-            if self._key(place, action) in self.measured.mixed:
-                self._mixed(place.name, {e: region(e) for e in known})
-            total, found = sum(known.values()), dict[K, float]()
-            for ending, n in known.items():
-                found[region(ending)] = found.get(region(ending), 0.0) + n / total
-            return found
-        own = {region((c, str(Executed.YES))) for c, _ in examples if c != EMERGENCY}
-        equal = [kind for kind in kinds if kind in own] or kinds
-        text = f"{place.name}: why its runs end in {status.name} was not measured"
-        if len(equal) < len(kinds):
-            text += "; they were executed, and not ended by an emergency stop"
-        text += "; causes that lead to different firings are equally likely" * (len(equal) > 1)
-        self.assumptions.append(text)
-        return dict.fromkeys(equal, 1.0 / len(equal))
-
-    def _mixed(self, place: str, kinds: Mapping[Ending, Hashable]) -> None:
-        """Note it if the kinds of ends depend on the cause, and for one cause on whether the run
-        was executed: then they need both numbers of the same runs."""
-        by_cause, by_both = {c: k for (c, _), k in kinds.items()}, set(kinds.values())
-        split = any(k != by_cause[c] for (c, _), k in kinds.items())
-        if split and len(by_both) > len({x for _, x in kinds}):
-            self.assumptions.append(
-                f"{place}: it was not measured which causes of ERROR came with executed = unknown; "
-                "each did as often"
-            )
-
-    def wait(self, event: str) -> float:
-        """Return the mean time (s) until an event comes. Raises NoEstimate."""
-        mean = self.measured.waits.get(event, self.task.events[event].mean_wait)
-        if mean is None:
-            raise NoEstimate(
-                f"events.{event}: its mean wait is unknown: neither measured nor declared; add "
-                "mean_wait = SECONDS"
-            )
-        if event not in self.measured.waits:
-            self.assumptions.append(f"{event}: mean wait declared in the task file, not measured")
-        return mean
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.time.gspn import Gspn
-from petrobot.coordinator.analysis.time.stochastic import Measured
+from petrobot.coordinator.analysis.time.measured import Measured
 from petrobot.coordinator.task import Estimate, Kind, Status, Task
 from petrobot.coordinator.task.net import Net
 

@@ -8,7 +8,7 @@ from itertools import product
 
 import numpy as np
 
-from petrobot.coordinator.analysis.time.stochastic import is_cause
+from petrobot.coordinator.analysis.time.measured import is_cause
 from petrobot.coordinator.studies.forecast.history import STATUSES, RunVocabulary, reads_variables
 from petrobot.coordinator.task import Counts, End, Kind, Status, Task, Transition
 from petrobot.coordinator.task.compiled import CompiledNet

@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from petrobot.coordinator.analysis.time.stochastic import is_cause, stochastic_view
+from petrobot.coordinator.analysis.time.measured import is_cause
+from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.learning.propagation import incidences, propagate, unended
 from petrobot.coordinator.studies.campaign.observed import estimates_of
 from petrobot.coordinator.studies.campaign.rows import TrialRow
