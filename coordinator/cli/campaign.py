@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from petrobot.coordinator.studies.campaign.plan import CampaignPlan
     from petrobot.coordinator.task import Task
 
+BATCH = 20
+"""Runs between two updates of what is learned, if none are given."""
 EXAMPLE = (
     "petrobot campaign catch_ball --runs 200 --regime A,B --selector nikolic_fu "
     "--workers 2 --json out.json"
@@ -43,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_trials(parser)
     _add_choices(parser)
     _add_execution(parser)
+    _add_plan(parser)
     _add_output(parser)
     add_services_argument(parser)
 
@@ -114,6 +117,9 @@ def _add_execution(parser: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="workers of this dask scheduler instead, as tcp://host:8786",
     )
+
+
+def _add_plan(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seed",
         type=whole(0, LARGEST_SEED),
@@ -133,22 +139,21 @@ def _add_execution(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--batch",
         type=whole(),
-        default=20,
         metavar="N",
-        help="runs between two updates of what is learned (%(default)s)",
+        help=f"runs between two updates of what is learned ({BATCH})",
     )
     parser.add_argument(
         "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
     )
-
-
-def _add_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="FOLDER",
         type=Path,
         help="where table and estimates go (campaigns/TASK-SELECTOR-S-ID)",
     )
+
+
+def _add_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--resume",
         metavar="FOLDER",
@@ -177,6 +182,7 @@ def run(options: argparse.Namespace) -> int:
     shown.wanted = shown.wanted and not options.quiet
     try:
         if options.resume is not None:
+            _refuse_beside_resume(options)
             folder, plan = options.resume, read_manifest(options.resume)
         elif options.task is None:
             raise CommandError(2, "give a TASK, or --resume FOLDER")
@@ -217,6 +223,21 @@ def run(options: argparse.Namespace) -> int:
         print(text_of(result))
         _print_check(check)
     return 0 if check is None or check["agrees"] else 1
+
+
+def _refuse_beside_resume(options: argparse.Namespace) -> None:
+    """Raise CommandError for an option that would have no effect: the campaign's own manifest says
+    what it runs."""
+    parser = argparse.ArgumentParser()
+    _add_trials(parser)
+    _add_choices(parser)
+    _add_plan(parser)
+    add_services_argument(parser)
+    for name, default in vars(parser.parse_args([])).items():
+        if getattr(options, name) != default:
+            given = "TASK" if name == "task" else f"--{name}"
+            text = "a campaign is continued as it began; leave this out beside --resume"
+            raise CommandError(2, f"{given}: {text}, or begin another one with --out")
 
 
 @contextmanager
@@ -310,7 +331,7 @@ def _plan(options: argparse.Namespace, task: Task) -> CampaignPlan:
         chosen=chosen,
         parameters={name: parameter_of(task, name, text) for name, text in given.items()},
         block=_block(task, options.block),
-        batch=options.batch if learns(options.selector) else 0,
+        batch=(options.batch or BATCH) if learns(options.selector) else 0,
         options=_selector_options(options),
         digests={key: digest(path) for key, path in paths.items()},
         physics=_physics(options.services),
@@ -339,8 +360,15 @@ def _block(task: Task, wanted: int | None) -> int:
 
 
 def _selector_options(options: argparse.Namespace) -> dict[str, Any]:
-    from petrobot.coordinator.studies.campaign.policies import learned_choices
+    from petrobot.coordinator.studies.campaign.policies import learned_choices, learns
 
+    for name in () if learns(options.selector) else ("credit", "batch"):
+        if (value := getattr(options, name)) is not None:
+            raise CommandError(
+                2,
+                f"--{name} {value}: --selector {options.selector} does not learn; give one that "
+                f"does, such as nikolic_fu_fast, or leave --{name} out",
+            )
     found: dict[str, Any] = {
         name: value
         for name in ("target", "rho", "credit")
