@@ -24,6 +24,7 @@ from petrobot.coordinator.cli.loading import (
     task_path,
     write_json,
 )
+from petrobot.coordinator.cli.options import refuse_idle
 from petrobot.services.comm.location_file import physics_of
 from petrobot.services.host.command_line import LARGEST_SEED, MOST_RUNS, number, probability, whole
 
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     from petrobot.coordinator.studies.campaign.plan import CampaignPlan
     from petrobot.coordinator.task import Task
 
+HEEDED = {"resume", "workers", "cluster", "check", "json", "quiet"}
+"""Options that `--resume` heeds."""
 BATCH = 20
 """Runs between two updates of what is learned, if none are given."""
 EXAMPLE = (
@@ -45,7 +48,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_trials(parser)
     _add_choices(parser)
     _add_execution(parser)
-    _add_plan(parser)
     _add_output(parser)
     add_services_argument(parser)
 
@@ -117,9 +119,6 @@ def _add_execution(parser: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="workers of this dask scheduler instead, as tcp://host:8786",
     )
-
-
-def _add_plan(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seed",
         type=whole(0, LARGEST_SEED),
@@ -182,7 +181,8 @@ def run(options: argparse.Namespace) -> int:
     shown.wanted = shown.wanted and not options.quiet
     try:
         if options.resume is not None:
-            _refuse_beside_resume(options)
+            why = "a campaign is continued as it began; leave this out beside --resume, or begin"
+            refuse_idle(options, add_arguments, f"{why} another one with --out", heeded=HEEDED)
             folder, plan = options.resume, read_manifest(options.resume)
         elif options.task is None:
             raise CommandError(2, "give a TASK, or --resume FOLDER")
@@ -223,21 +223,6 @@ def run(options: argparse.Namespace) -> int:
         print(text_of(result))
         _print_check(check)
     return 0 if check is None or check["agrees"] else 1
-
-
-def _refuse_beside_resume(options: argparse.Namespace) -> None:
-    """Raise CommandError for an option that would have no effect: the campaign's own manifest says
-    what it runs."""
-    parser = argparse.ArgumentParser()
-    _add_trials(parser)
-    _add_choices(parser)
-    _add_plan(parser)
-    add_services_argument(parser)
-    for name, default in vars(parser.parse_args([])).items():
-        if getattr(options, name) != default:
-            given = "TASK" if name == "task" else f"--{name}"
-            text = "a campaign is continued as it began; leave this out beside --resume"
-            raise CommandError(2, f"{given}: {text}, or begin another one with --out")
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from petrobot.coordinator.cli.loading import (
     load_task,
     write_json,
 )
+from petrobot.coordinator.cli.options import pairs, refuse_idle
 from petrobot.services.comm.location_file import FIRST_PHYSICS, physics_of, same_physics
 from petrobot.services.host.command_line import whole
 from petrobot.services.host.whole_file import make_folder, write_whole
@@ -119,6 +120,8 @@ def run(options: argparse.Namespace) -> int:
 
     try:
         if options.compare is not None:
+            why = "a registered forecast is compared as it is; leave this out beside --compare"
+            refuse_idle(options, add_arguments, why, heeded={"compare", "markdown", "json"})
             registered, folder = options.compare
             return _compare(registered, folder, options)
         if options.task is None or options.estimates is None:
@@ -309,7 +312,6 @@ def _refuse_other_names(task: Task, path: Path, found: Mapping[str, Iterable[str
 def _request(
     task: Task, trainings: Mapping[str, Training], regime: str, options: argparse.Namespace
 ) -> Request:
-    from petrobot.coordinator.cli.options import pairs
     from petrobot.coordinator.studies.campaign.policies import learned_choices
     from petrobot.coordinator.studies.forecast.choices import choices_of
     from petrobot.coordinator.studies.forecast.predict import Request

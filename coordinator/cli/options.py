@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -51,6 +51,25 @@ def parameter_texts(options: argparse.Namespace) -> dict[str, str]:
     """Return the texts of all parameters that `--set` and `--regime` give. Raises CommandError."""
     regime = [] if options.regime is None else [f"regime={options.regime}"]
     return pairs("--set", [*options.set, *regime])
+
+
+def refuse_idle(
+    options: argparse.Namespace,
+    add_arguments: Callable[[argparse.ArgumentParser], None],
+    why: str,
+    *,
+    idle: Collection[str] = (),
+    heeded: Collection[str] = (),
+) -> None:
+    """Raise CommandError for an option that was given and would have no effect: one of `idle`, or
+    one that is not in `heeded`. (Given means other than its default.) `why` says why it has none,
+    and what to do."""
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    for name, default in vars(parser.parse_args([])).items():
+        if getattr(options, name) != default and (name in idle or (heeded and name not in heeded)):
+            said = "TASK" if name == "task" else f"--{name.replace('_', '-')}"
+            raise CommandError(2, f"{said}: {why}")
 
 
 # The port of the operator's page: its option, and the message when it cannot be used.

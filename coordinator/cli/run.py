@@ -29,6 +29,7 @@ from petrobot.coordinator.cli.options import (
     pairs,
     parameter_of,
     parameter_texts,
+    refuse_idle,
 )
 from petrobot.coordinator.cli.recorded_runs import (
     add_journal_arguments,
@@ -239,6 +240,9 @@ def add_start_from_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Check the task, run it, print and write its result."""
+    if options.journal is None and (options.mode == "lockstep" or options.starts_from is not None):
+        why = "needs --journal FOLDER: without it, a run in lock step is not kept"
+        _refuse_idle(options, why, "keep", "durable")
     if options.starts_from is not None:
         return conduct(_from_record(options), options, "lockstep")
     if options.task is None:
@@ -248,6 +252,12 @@ def run(options: argparse.Namespace) -> int:
     options.mode = options.mode or MODES[0]
     options.seed = SEED if options.seed is None else options.seed
     lockstep = options.mode == "lockstep"
+    if lockstep:
+        _refuse_idle(options, "a run in lock step starts its own nodes; leave it out", "up")
+    elif not options.join:
+        _refuse_idle(
+            options, "only for --mode lockstep; in real time, nodes are joined", "processes"
+        )
     task = load_task(options.task)
     directory = load_directory(cell_path(options.services, options.task, task), options.dry_run)
     if options.join and (not lockstep or options.processes != 0):
@@ -270,6 +280,10 @@ def run(options: argparse.Namespace) -> int:
         return prepare(request, task, text, directory)
 
     return conduct(make, options, options.mode)
+
+
+def _refuse_idle(options: argparse.Namespace, why: str, *idle: str) -> None:
+    refuse_idle(options, add_arguments, why, idle=idle)
 
 
 def conduct(

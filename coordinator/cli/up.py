@@ -20,7 +20,7 @@ from petrobot.coordinator.cli.loading import (
     refuse_misplaced,
     refuse_script,
 )
-from petrobot.coordinator.cli.options import add_log_level_argument
+from petrobot.coordinator.cli.options import add_log_level_argument, refuse_idle
 from petrobot.coordinator.run.folder import NODE_LOGS
 from petrobot.services.host.command_line import number
 
@@ -67,6 +67,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Start the nodes and watch them."""
+    if options.print_unit:
+        why = "not written into the unit; leave it out, and edit the unit's ExecStart"
+        heeded = {"print_unit", "services", "logs", "dry_run"}
+        refuse_idle(options, add_arguments, why, heeded=heeded)
+    if not options.lockstep:
+        why = "needs --lockstep: in real time, nodes wait for a coordinator without a limit"
+        refuse_idle(options, add_arguments, why, idle={"await_coordinator"})
     directory = load_directory(options.services, options.dry_run)
     refuse_misplaced(directory, scripted=options.mock is not None)
     refuse_script(options.mock, directory)

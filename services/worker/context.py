@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 from petrobot.services.action import CallFailed, CommandRefused, Result, Status, Wait
 from petrobot.services.comm.calls.events import RunVerdict, mission_of, verdict_event
-from petrobot.services.comm.protocol.codec import EXECUTED, NAME_LENGTH, ProtocolError, encode
+from petrobot.services.comm.protocol.codec import (
+    EXECUTED,
+    LIMITS,
+    NAME_LENGTH,
+    ProtocolError,
+    encode,
+)
 from petrobot.services.comm.protocol.messages import (
     Answer,
     Call,
@@ -77,6 +83,7 @@ def checked_result(identity: str, returned: Any, where: str = "result") -> Outco
         values = plain(returned.values, where)
         if type(values) is not dict:
             raise ValueError(f"{where}: expected values by name, found a {type(values).__name__}")
+        _refuse_large(values, where)
         said = (plain(str(returned.cause)), plain(str(returned.text)))
         # Most are members already: to make one of its text takes 1 us.
         status = returned.status if type(returned.status) is Status else Status(returned.status)
@@ -92,6 +99,17 @@ def checked_result(identity: str, returned: Any, where: str = "result") -> Outco
             raise
         raise ValueError(f"its values cannot be read: {describe(fault)}") from None
     return result
+
+
+def _refuse_large(values: Mapping[str, Any], where: str) -> None:
+    """Raise ValueError for a text or bytes that alone are too large for a result. To encode them
+    first, only to refuse them then, would hold a node whose service returns them."""
+    for name, value in values.items():
+        if type(value) in (bytes, str) and len(value) > LIMITS[Outcome.KIND]:
+            raise ValueError(
+                f"{where}.{name}: {len(value):,} bytes are above its limit of "
+                f"{LIMITS[Outcome.KIND]:,}; store them in a file and give its name"
+            )
 
 
 class Draws:

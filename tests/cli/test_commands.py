@@ -140,6 +140,38 @@ def test_bad_input_is_exit_code_2_and_names_the_fault(
     assert said in capsys.readouterr().err
 
 
+LOCKSTEP = ["run", "catch_ball", "--mode", "lockstep"]
+COMPARE = ["forecast", "--compare", "forecast.json", "campaigns/new"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([*LOCKSTEP, "--up"], "--up: a run in lock step starts its own nodes"),
+        ([*LOCKSTEP, "--keep", "3"], "--keep: needs --journal FOLDER"),
+        ([*LOCKSTEP, "--durable"], "--durable: needs --journal FOLDER"),
+        (["run", "catch_ball", "--processes", "0"], "--processes: only for --mode lockstep"),
+        (["run", "--from", "last", "--keep", "3"], "--keep: needs --journal FOLDER"),
+        (["up", "--await-coordinator", "3"], "--await-coordinator: needs --lockstep"),
+        (["up", "--print-unit", "--no-respawn"], "--no-respawn: not written into the unit"),
+        (["up", "--print-unit", "--mock", "m.py"], "--mock: not written into the unit"),
+        ([*COMPARE, "--runs", "7"], "--runs: a registered forecast is compared as it is"),
+        ([*COMPARE, "--seed", "2"], "--seed: a registered forecast is compared as it is"),
+        ([*COMPARE, "--doubtful"], "--doubtful: a registered forecast is compared as it is"),
+        (["forecast", "catch_ball", *COMPARE[1:]], "TASK: a registered forecast is compared"),
+    ],
+)
+def test_an_option_without_effect_is_refused(
+    arguments: list[str],
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(ROOT)
+    assert main(arguments) == 2
+    assert said in capsys.readouterr().err
+
+
 def test_unreachable_nodes_are_exit_code_3(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -86,7 +86,8 @@ async def ends_alone(operator: Operator, service: str, kind: str, cause: str) ->
     end = await operator.call(service, None, kind=kind)
     assert (end.status, end.cause, end.executed) == ("error", cause, "yes"), end
     assert end.text and len(end.text) < 5_000
-    assert (await innocent).status == "success"
+    told = await innocent
+    assert told.status == "success", told
     assert not [notice for notice in operator.notices if isinstance(notice, PeerLost)]
     return end
 
@@ -181,7 +182,8 @@ async def test_a_call_that_cannot_be_encoded_is_refused_by_the_sender(
         "too_large",
         "unencodable",
     ), end
-    assert (await innocent).status == "success"
+    told = await innocent
+    assert told.status == "success", told
     lost = [notice for notice in operator.notices if isinstance(notice, PeerLost)]
     assert not lost, node.log.read_text()[-3000:]
 

@@ -514,7 +514,7 @@ def _unpackable(message: Message, fault: Exception) -> ProtocolError:
 def _small_enough(message: Message, body: bytes, row: Sequence[Any] = ()) -> bytes:
     limit = LIMITS[message.KIND]
     if len(body) > limit:
-        text = f"a {type(message).__name__} of {len(body):,} bytes is above its limit of {limit:,}"
+        text = f"{type(message).__name__}: {len(body):,} bytes are above its limit of {limit:,}"
         raise ProtocolError("too_large", text)
     if len(body) > UNCOUNTED and message.KIND in _COUNTED:
         _refuse_too_many(message, row)
@@ -551,7 +551,7 @@ def _refuse_too_many(message: Message, row: Sequence[Any]) -> None:
     try:
         _count_in(row, _Counter(MAX_CONTAINERS, _most_values(message.KIND)))
     except _FieldError as fault:
-        raise ProtocolError("too_large", f"a {type(message).__name__}: {fault}") from None
+        raise ProtocolError("too_large", f"{type(message).__name__}: {fault}") from None
 
 
 def _count_in(value: Any, counter: _Counter) -> None:

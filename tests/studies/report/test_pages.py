@@ -271,8 +271,7 @@ def test_report_of_campaigns(
             selector,
             "--block",
             "10",
-            "--batch",
-            "10",
+            *(("--batch", "10") if name == "learnt" else ()),
         ]
         assert (
             main(
