@@ -19,7 +19,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -76,6 +76,39 @@ class _Code:
     names: Mapping[str, Any]
     """Values of its global names."""
 
+    @cached_property
+    def nodes(self) -> tuple[ast.AST, ...]:
+        return tuple(ast.walk(self.tree))
+
+    @cached_property
+    def used(self) -> list[Callable[..., Any]]:
+        """Functions and classes that it names, without those of the interface."""
+        named = (self.value(n) for n in self.nodes if isinstance(n, ast.Name | ast.Attribute))
+        return [
+            thing
+            for thing in named
+            if (inspect.isfunction(thing) or inspect.isclass(thing)) and thing.__module__ not in API
+        ]
+
+    @cached_property
+    def awaited(self) -> set[ast.AST]:
+        """Calls that are awaited, or passed on to code that may await them."""
+        waits = {n.id for a in self.nodes if isinstance(a, ast.Await) for n in ast.walk(a.value)
+                 if isinstance(n, ast.Name)}  # fmt: skip
+        found: set[ast.AST] = set()
+        for node in self.nodes:
+            if isinstance(node, ast.Await | ast.Return):
+                found |= set(ast.walk(node))
+            elif isinstance(node, ast.Lambda):
+                found |= set(ast.walk(node.body))
+            elif isinstance(node, ast.Call):
+                found |= {*node.args, *(k.value for k in node.keywords)}
+            elif isinstance(node, ast.Assign) and any(
+                isinstance(t, ast.Name) and t.id in waits for t in node.targets
+            ):
+                found.add(node.value)
+        return found
+
     def value(self, node: ast.AST) -> Any:
         """Return the object of a dotted name or a constant; None if it is not known."""
         if isinstance(node, ast.Constant):
@@ -88,26 +121,32 @@ class _Code:
 
 
 @cache
-def _parsed(file: str) -> ast.Module:
-    return ast.parse(Path(file).read_bytes())
+def _definitions(file: str) -> Mapping[tuple[str, int], ast.AST]:
+    """Return the functions and classes of a file, by name and first line, decorators included."""
+    return {
+        (node.name, min([node.lineno, *(d.lineno for d in node.decorator_list)])): node
+        for node in ast.walk(ast.parse(Path(file).read_bytes()))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)
+    }
 
 
-def _code(thing: Any) -> _Code | None:
+@cache
+def _code(thing: Callable[..., Any]) -> _Code | None:
     """Return the source of a function or class; None if there is none."""
     try:
         thing = inspect.unwrap(thing)
-        file, lines = inspect.getsourcefile(thing), inspect.getsourcelines(thing)
-        module = sys.modules[thing.__module__]
-        for node in ast.walk(_parsed(str(file))):
-            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-                continue
-            if node.name == thing.__name__:
-                first = min([node.lineno, *(d.lineno for d in node.decorator_list)])
-                if first == lines[1]:
-                    return _Code(node, str(file), {**vars(module), **dict(_imported(node))})
+        file = str(inspect.getsourcefile(thing))
+        # to find the first line of a class, its whole file is parsed again
+        first = (
+            thing.__code__.co_firstlineno
+            if inspect.isfunction(thing)
+            else inspect.getsourcelines(thing)[1]
+        )
+        tree = _definitions(file)[thing.__name__, first]
+        names = {**vars(sys.modules[thing.__module__]), **dict(_imported(tree))}
+        return _Code(tree, file, names)
     except (OSError, TypeError, SyntaxError, KeyError, AttributeError):
-        pass
-    return None
+        return None
 
 
 def _imported(tree: ast.AST) -> Iterator[tuple[str, Any]]:
@@ -125,26 +164,19 @@ def _reachable(thing: Any) -> Iterator[_Code]:
     """Yield the source of a function or class, and of everything in its package that it uses,
     directly or indirectly: base classes and helpers."""
     package = str(thing.__module__).partition(".")[0]
-    waiting, seen = [thing], set[int]()
+    waiting, seen = [thing], set[Callable[..., Any]]()
     while waiting:
         found = waiting.pop()
-        if id(found) in seen or (code := _code(found)) is None:
+        if found in seen or (code := _code(found)) is None:
             continue
-        seen.add(id(found))
+        seen.add(found)
         yield code
-        for node in ast.walk(code.tree):
-            if isinstance(node, ast.Name | ast.Attribute):
-                named = code.value(node)
-                home = str(getattr(named, "__module__", ""))
-                ours = home.partition(".")[0] == package and home not in API
-                if ours and (inspect.isfunction(named) or inspect.isclass(named)):
-                    waiting.append(named)
+        waiting += (u for u in code.used if str(u.__module__).partition(".")[0] == package)
 
 
 def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
     """Record the findings in one function or class."""
-    awaited = _awaited(code.tree)
-    for node in ast.walk(code.tree):
+    for node in code.nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             seen.words.add(node.value)
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Await):
@@ -160,7 +192,7 @@ def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
             text = "time.sleep stops everything that runs beside it; write `await ctx.sleep(...)`"
             seen.faults.append((code.file, node.lineno, text))
         if isinstance(node.func, ast.Attribute):
-            _method(code, node, node.func, seen, node in awaited)
+            _method(code, node, node.func, seen)
 
 
 def _ignored(code: _Code, awaited: ast.expr, seen: _Seen) -> None:
@@ -170,9 +202,7 @@ def _ignored(code: _Code, awaited: ast.expr, seen: _Seen) -> None:
         seen.ignored.append((code.file, awaited.lineno, text))
 
 
-def _method(
-    code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen, awaited: bool
-) -> None:
+def _method(code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen) -> None:
     """Record a call of a method of the context, or of a driver's ports."""
     owner, name = ast.unparse(function.value), function.attr
     first = code.value(node.args[0]) if node.args else None
@@ -180,7 +210,7 @@ def _method(
     if owner in ("ctx", "context") or ports:
         if name == "call":
             seen.complete = False
-        if name in AWAITED and not ports and not awaited:
+        if name in AWAITED and not ports and node not in code.awaited:
             text = (
                 f"`{owner}.{name}` does nothing without `await`; write `await {owner}.{name}(...)`"
             )
@@ -194,25 +224,6 @@ def _method(
                 seen.streams.setdefault(first, (code.file, node.lineno))
             elif name == "raise_event":
                 seen.events.setdefault(first, (code.file, node.lineno))
-
-
-def _awaited(tree: ast.AST) -> set[ast.AST]:
-    """Return the calls that are awaited, or passed on to code that may await them."""
-    waits = {n.id for a in ast.walk(tree) if isinstance(a, ast.Await) for n in ast.walk(a.value)
-             if isinstance(n, ast.Name)}  # fmt: skip
-    found: set[ast.AST] = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Await | ast.Return):
-            found |= set(ast.walk(node))
-        elif isinstance(node, ast.Lambda):
-            found |= set(ast.walk(node.body))
-        elif isinstance(node, ast.Call):
-            found |= {*node.args, *(k.value for k in node.keywords)}
-        elif isinstance(node, ast.Assign) and any(
-            isinstance(t, ast.Name) and t.id in waits for t in node.targets
-        ):
-            found.add(node.value)
-    return found
 
 
 def _result(code: _Code, node: ast.Call, made: Callable[..., Any], seen: _Seen) -> None:
@@ -319,7 +330,7 @@ def _sets_period(thing: type) -> bool:
         and isinstance(node.ctx, ast.Store)
         and node.attr == "period"
         for code in _reachable(thing)
-        for node in ast.walk(code.tree)
+        for node in code.nodes
     )
 
 
