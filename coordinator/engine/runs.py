@@ -26,17 +26,24 @@ def admit(draft: Draft) -> bool:
     if not waiting:
         return False
     ended = False
+    full = set[str]()  # places whose servers are all taken: each is counted once, not for each run
     for run in sorted(waiting, key=lambda r: r.order) if len(waiting) > 1 else waiting:
-        if not run.cleared:
+        if not run.cleared or run.place in full and run.phase is Phase.QUEUED:
             continue
+        failed = False
         if run.phase is Phase.WAITING:
-            ended |= _start(draft, run)
-        elif run.phase is Phase.QUEUED and _has_server(draft, run.place):
+            failed = _start(draft, run)
+        elif run.phase is Phase.QUEUED and not _has_server(draft, run.place):
+            full.add(run.place)
+        elif run.phase is Phase.QUEUED:
             alternatives = draft.compiled.primitives[run.place].alternatives
             if len(alternatives) == 1:
-                ended |= _start(draft, _translated(draft, run, alternatives[0]))
+                failed = _start(draft, _translated(draft, run, alternatives[0]))
             else:
                 _choose(draft, run, alternatives)
+        if failed:
+            ended = True
+            full.discard(run.place)
     return ended
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from types import FrameType
 from typing import Any
 
 import pytest
@@ -351,6 +353,27 @@ def test_servers_run_at_once_and_the_rest_queue_first_in_first_out(play: Plays) 
     assert p.started == ["a#1", "a#2", "a#3"] and p.marked == {"a": 3, "done": 1}
     p(RunEnded("a#1", ERR), RunEnded("a#3", OK))
     assert p.started[-1] == "a#4" and p.reports == []
+
+
+def test_a_long_queue_costs_in_proportion_to_its_length(play: Plays) -> None:
+    def calls(tokens: int) -> int:
+        p = play(f"a!1={tokens} x", {"t": {"in": "a:normal", "out": "x"}})
+        counted = 0
+
+        def count(frame: FrameType, event: str, argument: object) -> None:
+            nonlocal counted
+            counted += event == "call"
+
+        sys.setprofile(count)
+        try:
+            p(RunEnded("a#1", OK))
+        finally:
+            sys.setprofile(None)
+        assert p.started == ["a#1", "a#2"]
+        return counted
+
+    # the free server counted the runs of its place for each token that waits: 4 times
+    assert calls(400) < 3 * calls(200)
 
 
 def test_first_done_is_first_taken(play: Plays) -> None:
