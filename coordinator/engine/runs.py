@@ -28,7 +28,7 @@ def admit(draft: Draft) -> bool:
     ended = False
     full = set[str]()  # places whose servers are all taken: each is counted once, not for each run
     for run in sorted(waiting, key=lambda r: r.order) if len(waiting) > 1 else waiting:
-        if not run.cleared or run.place in full and run.phase is Phase.QUEUED:
+        if not run.cleared or (run.place in full and run.phase is Phase.QUEUED):
             continue
         failed = False
         if run.phase is Phase.WAITING:

@@ -41,7 +41,8 @@ class Robot:
             if now - self.pressed <= 1.0:
                 return []
             self.pressed = now  # someone waits, and presses again
-            return [{"op": "publish", "topic": "/button", "msg": {"data": True}}]
+            button = {"op": "publish", "topic": "/button"}
+            return [{**button, "msg": {"data": down}} for down in (True, False)]
         pose = self.goal["args"]["pose"]["pose"]["position"]
         left = math.hypot(pose["x"] - self.x, pose["y"] - self.y)
         share = min(1.0, SPEED * (now - self.last) / left) if left > 0 else 1.0

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import runpy
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -313,6 +315,17 @@ def test_topics_are_external_events(when: dict[str, Any], raised: list[int]) -> 
     link.mend()
     shown(bridge, {"data": 1})  # a latched value comes again with the link: not an edge
     assert len(ports.events) == len(raised) + (not when)
+
+
+def test_the_button_of_the_example_is_pressed_until_a_run_listens() -> None:
+    """A press before the run begins does nothing in it, so each press has to be an edge."""
+    example = Path(__file__).parents[3] / "examples" / "ros2" / "simulated.py"
+    robot, ports = runpy.run_path(str(example))["Robot"](), Ports()
+    when = {"event": "pressed", "when": {"data": True}}
+    bridge, _ = wired(ports, subscribe={"b": {**BUTTON, **when}})
+    for tenths in range(35):
+        shown(bridge, *(message["msg"] for message in robot.step(tenths / 10)))
+    assert len(ports.events) == 3
 
 
 def test_topics_are_values_that_an_action_waits_for() -> None:
