@@ -21,6 +21,7 @@ from petrobot.services.host.whole_file import write_whole
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.session import RunSession
     from petrobot.coordinator.run.mission import Mission
+    from petrobot.coordinator.run.timeline import Timeline
 
 COLOURS = {"success": "green", "failure": "yellow", "error": "red"}
 REFRESH = 0.1
@@ -66,7 +67,7 @@ def _line(mission: Mission, now: float) -> Text:
     text = Text()
     text.append(f"{now - mission.begun:7.1f} s  " if mission.begun else "", style="dim")
     done = sum(cycle.ended is not None for cycle in tally.cycles)
-    text.append(f"run {len(tally.cycles)} of {mission.runs}  ", style="bold")
+    text.append(f"run {tally.begun} of {mission.runs}  ", style="bold")
     for cycle in tally.cycles[max(0, done - 20) : done]:
         text.append("\u25cf", style=COLOURS[cycle.status.value])
     going = sorted({run.place for run in mission.executor.state.runs()})
@@ -134,7 +135,7 @@ def _cell(key: str, value: Any) -> Text:
     return Text(str(value), style=COLOURS.get(str(value), "") if key == "status" else "")
 
 
-def give(session: RunSession, options: argparse.Namespace) -> None:
+def give(session: RunSession, options: argparse.Namespace, timeline: Timeline | None) -> None:
     """Write the result beside the journal and where --json says, print it, and write the report."""
     result = session.result()
     session.keep_result()
@@ -148,7 +149,7 @@ def give(session: RunSession, options: argparse.Namespace) -> None:
                 "what led there",
                 file=sys.stderr,
             )
-    if options.report is not None:
+    if timeline is not None:
         from petrobot.coordinator.drawing import draw
         from petrobot.coordinator.studies.report import report_html
 
@@ -156,5 +157,5 @@ def give(session: RunSession, options: argparse.Namespace) -> None:
         write_json(str(options.report / "result.json"), result)
         page = options.report / "index.html"
         net = draw(task, error_branches=True)
-        write_whole(page, report_html(result, session.timeline, net, pictures_of(task, result)))
+        write_whole(page, report_html(result, timeline, net, pictures_of(task, result)))
         print(f"report: {page}")

@@ -15,7 +15,10 @@ from petrobot.coordinator.cli.recorded_runs import recorded
 from petrobot.coordinator.cli.run import add_page_arguments, conduct
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from petrobot.coordinator.operator.session import RunSession
+    from petrobot.coordinator.run.interfaces import Observer
 
 EXAMPLE = "petrobot resume last --json out.json"
 
@@ -51,10 +54,10 @@ def run(options: argparse.Namespace) -> int:
             write_json(options.json, result)
         return 0 if result["status"] == "success" else 1
 
-    def make() -> RunSession:
+    def make(observers: Sequence[Observer]) -> RunSession:
         from petrobot.coordinator.operator.prepare import resume
 
-        return resume(found)
+        return resume(found, observers)
 
     return conduct(make, options, mode, resumed=True)
 

@@ -6,7 +6,7 @@ import argparse
 import asyncio
 import os
 import sys
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from petrobot.coordinator.operator.prepare import RunRequest
     from petrobot.coordinator.operator.session import RunSession
     from petrobot.coordinator.operator.start_from import Recorded
+    from petrobot.coordinator.run.interfaces import Observer
     from petrobot.coordinator.task import Task
     from petrobot.services.comm.location_file import Directory
 
@@ -274,10 +275,10 @@ def run(options: argparse.Namespace) -> int:
         _refuse_stopped(directory)
     text = task_path(options.task).read_text(encoding="utf-8")
 
-    def make() -> RunSession:
+    def make(observers: Sequence[Observer]) -> RunSession:
         from petrobot.coordinator.operator.prepare import prepare
 
-        return prepare(request, task, text, directory)
+        return prepare(request, task, text, directory, observers)
 
     return conduct(make, options, options.mode)
 
@@ -287,7 +288,7 @@ def _refuse_idle(options: argparse.Namespace, why: str, *idle: str) -> None:
 
 
 def conduct(
-    make: Callable[[], RunSession],
+    make: Callable[[Sequence[Observer]], RunSession],
     options: argparse.Namespace,
     mode: str,
     *,
@@ -308,14 +309,16 @@ def conduct(
     from petrobot.coordinator.run.realtime import UnreachableError
     from petrobot.coordinator.run.recording import ReplayError
     from petrobot.coordinator.run.supervisor import LaunchError
+    from petrobot.coordinator.run.timeline import Timeline
     from petrobot.services.comm.location_file import DirectoryError
     from petrobot.services.comm.lockstep.cell import CellError
 
     made: list[RunSession] = []
+    timeline = None if options.report is None else Timeline()  # it grows with the run
 
     async def lead() -> None:
         with interruptible():  # importing a simulated cell may take seconds
-            made.append(make())
+            made.append(make([] if timeline is None else [timeline]))
         await (_lead_lockstep if mode == "lockstep" else _lead_realtime)(made[0], options)
 
     try:
@@ -329,7 +332,7 @@ def conduct(
     except (RequestError, DepartureError, EstimatesError, ReplayError, DirectoryError) as fault:
         raise CommandError(2, str(fault)) from fault
     [session] = made
-    give(session, options)
+    give(session, options, timeline)
     if not resumed:
         tidy(options, session.folder)
     return 0 if session.result()["status"] == "success" else 1
@@ -496,7 +499,7 @@ def _learning(options: argparse.Namespace) -> LearningSetting | None:
 # --- from a recorded run ----------------------------------------------------------------------
 
 
-def _from_record(options: argparse.Namespace) -> Callable[[], RunSession]:
+def _from_record(options: argparse.Namespace) -> Callable[[Sequence[Observer]], RunSession]:
     """Return a function that prepares a simulated run from a point of a recorded one."""
     for name, why in REFUSED.items():
         said = f"--{name.replace('_', '-')}"
@@ -511,7 +514,7 @@ def _from_record(options: argparse.Namespace) -> Callable[[], RunSession]:
     name, record = _named(options.starts_from)
     found: Recorded = recorded(name)
 
-    def make() -> RunSession:
+    def make(observers: Sequence[Observer]) -> RunSession:
         from petrobot.coordinator.operator.prepare import RecordedPoint, RunRequest, prepare_from
         from petrobot.coordinator.run.folder import DEFAULT
 
@@ -526,7 +529,7 @@ def _from_record(options: argparse.Namespace) -> Callable[[], RunSession]:
             durable=options.durable,
             mock=options.mock,
         )
-        return prepare_from(request, found)
+        return prepare_from(request, found, observers)
 
     return make
 

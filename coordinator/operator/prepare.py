@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -51,7 +51,6 @@ from petrobot.coordinator.run.folder import DEFAULT, JOURNAL, header
 from petrobot.coordinator.run.interfaces import FirstAlternative, Observer
 from petrobot.coordinator.run.journal import JournalWriter
 from petrobot.coordinator.run.recording import JournalStore, RetracingStore, clock_reading
-from petrobot.coordinator.run.timeline import Timeline
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import dumps
 from petrobot.services.comm.location_file import (
@@ -105,7 +104,13 @@ class RunRequest:
     """Kind of lock-step cell: ONE_PROCESS, LAUNCHED or JOINED."""
 
 
-def prepare(request: RunRequest, task: Task, text: str, directory: Directory) -> RunSession:
+def prepare(
+    request: RunRequest,
+    task: Task,
+    text: str,
+    directory: Directory,
+    observers: Sequence[Observer] = (),
+) -> RunSession:
     """Make a new run of a task; `text` is the task file's. In real time, call it in the event loop
     that leads the run; in lock step it may take seconds (it loads the simulated cell).
 
@@ -139,6 +144,7 @@ def prepare(request: RunRequest, task: Task, text: str, directory: Directory) ->
         (text, directory.text),
         {"chosen": dict(request.chosen), **more},
         learning,
+        observers,
     )
 
 
@@ -153,7 +159,9 @@ def _refuse_too_many(runs: int | None, task: Task) -> None:
         )
 
 
-def prepare_from(request: RunRequest, found: Recorded) -> RunSession:
+def prepare_from(
+    request: RunRequest, found: Recorded, observers: Sequence[Observer] = ()
+) -> RunSession:
     """Make a lock-step run of a recorded run's task that starts at `request.start`.
 
     Raises DepartureError (a ValueError) for a point that does not exist, and what `prepare` raises.
@@ -178,14 +186,16 @@ def prepare_from(request: RunRequest, found: Recorded) -> RunSession:
         (then["task"], then["services"]),
         {"chosen": dict(then.get("chosen", {})), "from": point.plain()},
         None,
+        observers,
     )
     made.origin = {"run": point.run, "record": point.record, "going": dict(point.going)}
     return made
 
 
-def resume(found: Recorded) -> RunSession:
+def resume(found: Recorded, observers: Sequence[Observer] = ()) -> RunSession:
     """Continue a run whose coordinator was killed. A lock-step cell that ended with its coordinator
-    is built again from its seed; nodes that wait for their coordinator are joined.
+    is built again from its seed; nodes that wait for their coordinator are joined. `observers` see
+    the recorded steps, too.
 
     Raises EstimatesError, RequestError, JournalError, ReplayError, KeyFileError.
     """
@@ -204,20 +214,19 @@ def resume(found: Recorded) -> RunSession:
         script = scripted_actions(mock, found.directory)
         store = RetracingStore(JournalWriter(found.journal.path), found.journal)
         cell, party = lockstep_cell(found.directory, setting, script, None, store)
-        return LockstepSession(party, selector, learning, folder, cell=cell, pace=0.0)
-    timeline = Timeline()
-    observers: list[Observer] = [timeline]
-    if learning is not None:
-        observers.append(learning.selector)
+        return LockstepSession(
+            party, selector, learning, folder, observers, cell=cell, resumed=True
+        )
+    replayed = [*observers, *([learning.selector] if learning is not None else [])]
     lockstep = then["mode"] == LOCKSTEP
     now = 0.0 if lockstep else asyncio.get_running_loop().time()
     mission, begin = resumed_mission(
-        found.directory, found.task, found.engine, found.journal, observers, now, selector
+        found.directory, found.task, found.engine, found.journal, replayed, now, selector
     )
     if lockstep:
         member, party = lockstep_member(found.directory, mission, None, begin)
-        return LockstepSession(party, selector, learning, folder, member=member, timeline=timeline)
-    return RealtimeSession(found.directory, mission, selector, learning, folder, begin, timeline)
+        return LockstepSession(party, selector, learning, folder, member=member, resumed=True)
+    return RealtimeSession(found.directory, mission, selector, learning, folder, begin=begin)
 
 
 def _physics(directory: Directory) -> str:
@@ -247,6 +256,7 @@ def _new(
     texts: tuple[str, str],
     more: Mapping[str, Any],
     learning: LearningSession | None,
+    observers: Sequence[Observer],
 ) -> RunSession:
     """Make a new run; `texts` are those of the task file and of services.toml."""
     lockstep = request.mode == LOCKSTEP
@@ -279,14 +289,23 @@ def _new(
     try:
         if not lockstep:
             mission = realtime_mission(directory, setting, identity, store)
-            return RealtimeSession(directory, mission, selector, learning, folder)
+            return RealtimeSession(directory, mission, selector, learning, folder, observers)
         if request.nodes == ONE_PROCESS:
             cell, party = lockstep_cell(directory, setting, script, None, store)
-            return LockstepSession(party, selector, learning, folder, cell=cell, pace=request.pace)
+            return LockstepSession(
+                party, selector, learning, folder, observers, cell=cell, pace=request.pace
+            )
         member, party = lockstep_member(directory, lockstep_mission(directory, setting, store))
         launched = directory if request.nodes == LAUNCHED else None
         return LockstepSession(
-            party, selector, learning, folder, member=member, launched=launched, mock=request.mock
+            party,
+            selector,
+            learning,
+            folder,
+            observers,
+            member=member,
+            launched=launched,
+            mock=request.mock,
         )
     except BaseException:
         if store is not None and folder is not None:

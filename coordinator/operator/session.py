@@ -18,7 +18,7 @@ import signal
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, Final
@@ -32,12 +32,11 @@ from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.run_address import RunAddress, published
 from petrobot.coordinator.operator.sliced_cell import TELL, SlicedCell
 from petrobot.coordinator.run.folder import RESULT
-from petrobot.coordinator.run.interfaces import FirstAlternative
+from petrobot.coordinator.run.interfaces import FirstAlternative, Observer
 from petrobot.coordinator.run.lockstep import CoordinatorParty
 from petrobot.coordinator.run.mission import Mission, Stage
 from petrobot.coordinator.run.realtime import RealtimeMission, credentials_of
-from petrobot.coordinator.run.recording import JournalStore, RetracingStore
-from petrobot.coordinator.run.timeline import Timeline
+from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task import Task
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.lockstep.cell import LockStepCell
@@ -66,18 +65,15 @@ class RunSession(ABC):
         selector: FirstAlternative,
         learning: LearningSession | None,
         folder: Path | None,
-        timeline: Timeline | None,
+        observers: Sequence[Observer],
         *,
         resumed: bool = False,
     ) -> None:
-        """`timeline` already holds the recorded steps of a resumed run."""
         self.mission = mission
         self.selector = selector
         self.folder = folder
         self.identity = folder.name if folder is not None else mission.executor.mission
-        self.timeline = timeline or Timeline()
-        if timeline is None:
-            mission.executor.observers.append(self.timeline)
+        mission.executor.observers.extend(observers)
         self.operation: Operation | None = None
         self.address: RunAddress | None = None
         """Where the run can be controlled; the address is in the run's folder while the run is
@@ -222,11 +218,12 @@ class RealtimeSession(RunSession):
         selector: FirstAlternative,
         learning: LearningSession | None,
         folder: Path | None,
+        observers: Sequence[Observer] = (),
+        *,
         begin: Callable[[float], None] | None = None,
-        timeline: Timeline | None = None,
     ) -> None:
         """`begin` makes a resumed mission continue."""
-        super().__init__(mission, selector, learning, folder, timeline, resumed=begin is not None)
+        super().__init__(mission, selector, learning, folder, observers, resumed=begin is not None)
         self.shell = RealtimeMission(mission, directory, credentials_of(directory))
         self._begin = begin or mission.start
 
@@ -277,17 +274,17 @@ class LockstepSession(RunSession):
         selector: FirstAlternative,
         learning: LearningSession | None,
         folder: Path | None,
+        observers: Sequence[Observer] = (),
         *,
         cell: LockStepCell | None = None,
         pace: float = 0.0,
         member: Member | None = None,
         launched: Directory | None = None,
         mock: Path | None = None,
-        timeline: Timeline | None = None,
+        resumed: bool = False,
     ) -> None:
         """`launched`: the cell whose other members are to be launched, None if they wait."""
-        resumed = timeline is not None or isinstance(party.mission.executor.store, RetracingStore)
-        super().__init__(party.mission, selector, learning, folder, timeline, resumed=resumed)
+        super().__init__(party.mission, selector, learning, folder, observers, resumed=resumed)
         self.shell = None if cell is None else SlicedCell(cell, party, pace)
         self._party = party
         self._member = member

@@ -18,7 +18,6 @@ from petrobot.coordinator.engine.instructions import (
     Report,
     RunRecorded,
     Severity,
-    StartRun,
 )
 from petrobot.coordinator.engine.stimuli import Begin, Point, Stimulus
 from petrobot.coordinator.run.executor import Executor
@@ -41,6 +40,9 @@ _log = logging.getLogger(__package__)
 MOST_TOLD = 20_000
 """Most entries of cycles, and of their open runs, that a score is told: 3,333 cycles without open
 runs. A message carries little more (docs/protocol.md)."""
+KEPT = 5_000
+"""Least number of the newest cycles and runs that are kept, for a score and for verdicts that come
+late. A mission run may last for months."""
 SERVICE_DEADLINE = 20.0
 TOLD_ERRORS = 6
 """How many of its last failed runs the result of a mission run that ended in ERROR names."""
@@ -114,17 +116,32 @@ def _count(n: int, what: str) -> str:
     return f"{n} {what}{'' if n == 1 else 's'}"
 
 
+def _forget(oldest: list[Any]) -> None:
+    if len(oldest) >= 2 * KEPT:
+        del oldest[:KEPT]
+
+
+def _cause(record: RunRecorded) -> str:
+    return f"{record.primitive_task}: {record.cause or 'no cause'}"
+
+
 @dataclass
 class MissionTally:
-    """An observer that counts what the result needs: firings, cycles, runs and reports. Errors of
-    the net are logged at once: a task that is stuck may never have a result."""
+    """An observer that counts what the result needs: firings, runs, their errors and missing
+    values. It keeps the newest cycles and runs. Errors of the net are logged at once: a task that
+    is stuck may never have a result."""
 
     runs_place: int | None
     firings: int = 0
+    ended: int = 0
+    """Runs that ended and were not cancelled."""
+    failed: Counter[str] = field(default_factory=Counter)
+    """Runs that ended in ERROR, by primitive task and cause."""
+    missing: int = 0
+    """Values that a result lacked."""
+    first_missing: str = ""
     cycles: list[Cycle] = field(default_factory=list)
     runs: list[RunRecorded] = field(default_factory=list)
-    reports: list[Report] = field(default_factory=list)
-    chosen: dict[str, str] = field(default_factory=dict)
 
     def instruction(self, now: float, instruction: Instruction) -> None:
         """Count."""
@@ -132,17 +149,20 @@ class MissionTally:
             self.firings += 1
             self._cycle(now, instruction.before, instruction.after)
         elif isinstance(instruction, RunRecorded):
+            _forget(self.runs)
             self.runs.append(instruction)
+            self._judge(instruction, 1)
+            self.ended += not instruction.cancelled
             if self.cycles:
                 self.cycles[-1].count(
                     instruction.run, instruction.status, instruction.cause, instruction.text
                 )
         elif isinstance(instruction, Corrected):
             self._correct(instruction)
-        elif isinstance(instruction, StartRun):
-            self.chosen[instruction.run] = instruction.action
-        elif isinstance(instruction, Report) and instruction.severity is not Severity.NOTE:
-            self.reports.append(instruction)
+        elif isinstance(instruction, Report):
+            if instruction.key == BAD_VALUE:
+                self.missing += 1
+                self.first_missing = self.first_missing or instruction.text
             if instruction.severity is Severity.ERROR:
                 _log.error("%.3f s: %s", now, instruction.text)
 
@@ -154,6 +174,11 @@ class MissionTally:
 
     def settled(self, now: float, state: State) -> None:
         """Nothing to count."""
+
+    @property
+    def begun(self) -> int:
+        """How many cycles have begun."""
+        return self.cycles[-1].number if self.cycles else 0
 
     def last_errors(self, directory: Directory) -> list[dict[str, Any]]:
         """Return the last runs that ended in ERROR, in order: which action, on which node, and
@@ -174,29 +199,29 @@ class MissionTally:
     def happened(self, reached_end: bool) -> str:
         """Return what happened on the way, in words: number of runs, errors by primitive task and
         cause, and values that a result lacked."""
-        ended = [record for record in self.runs if not record.cancelled]
-        failed = Counter(
-            f"{record.primitive_task}: {record.cause or 'no cause'}"
-            for record in ended
-            if record.status is Status.ERROR
-        )
-        parts = [_count(len(ended), "run")]
+        failed = +self.failed  # a verdict may have taken the last error of a cause away
+        parts = [_count(self.ended, "run")]
         if failed:
             causes = ", ".join(f"{name} ({n})" if n > 1 else name for name, n in failed.items())
             recovered = ", all recovered" if reached_end else ""
             parts.append(f"{_count(failed.total(), 'error')}{recovered} [{causes}]")
-        missing = [report.text for report in self.reports if report.key == BAD_VALUE]
-        if missing:
-            parts.append(f"{_count(len(missing), 'value')} missing [{missing[0]}]")
+        if self.missing:
+            parts.append(f"{_count(self.missing, 'value')} missing [{self.first_missing}]")
         return "; ".join(parts)
+
+    def _judge(self, record: RunRecorded, count: int) -> None:
+        if record.status is Status.ERROR and not record.cancelled:
+            self.failed[_cause(record)] += count
 
     def _correct(self, corrected: Corrected) -> None:
         run, said = corrected.run, (corrected.status, corrected.cause, corrected.text)
         for n in reversed(range(len(self.runs))):
             if self.runs[n].run == run:
+                self._judge(self.runs[n], -1)
                 self.runs[n] = replace(
                     self.runs[n], status=said[0], cause=said[1], text=said[2], deferred=False
                 )
+                self._judge(self.runs[n], 1)
                 break
         for cycle in reversed(self.cycles):
             if run in cycle.ends:
@@ -208,7 +233,8 @@ class MissionTally:
             return
         if self.cycles:
             self.cycles[-1].ended = now
-        self.cycles.append(Cycle(len(self.cycles) + 1, now))
+        _forget(self.cycles)
+        self.cycles.append(Cycle(self.begun + 1, now))
 
 
 def _node_of(action: str, directory: Directory) -> str:
@@ -367,7 +393,7 @@ class Mission:
             left -= len(told) + sum(map(len, told.get("provisional", ())))
             if left < 0:
                 self.remarks["scored"] = (
-                    f"the newest {len(cycles):,} of {len(self.tally.cycles):,} cycles: one call "
+                    f"the newest {len(cycles):,} of {self.tally.begun:,} cycles: one call "
                     "carries no more"
                 )
                 break

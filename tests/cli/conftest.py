@@ -79,6 +79,11 @@ class Terminal:
         net = self.mission.executor.task.net
         return self.mission.executor.state.marking[net.place_index[place]]
 
+    @property
+    def acting(self) -> list[str]:
+        """Actions of the runs that have a token."""
+        return [run.action for run in self.mission.executor.state.runs()]
+
     async def __call__(self, *arguments: str) -> Said:
         """Run `petrobot ARGUMENTS --journal RUNS`."""
         self._read()

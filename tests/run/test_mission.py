@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.engine import Engine, Report, RunRecorded
+from petrobot.coordinator.engine import Corrected, Engine, Fired, Report, RunRecorded
 from petrobot.coordinator.engine.instructions import Severity
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.run.executor import Executor
@@ -49,7 +49,25 @@ def test_an_error_of_the_net_is_logged_when_it_occurs(caplog: pytest.LogCaptureF
     tally.instruction(1.5, Report(Severity.ERROR, "nowhere_to_go", "scan#1 has nowhere to go"))
     tally.instruction(2.0, Report(Severity.WARNING, "bad_value", "scan#1 gave nothing"))
     assert [r.getMessage() for r in caplog.records] == ["1.500 s: scan#1 has nowhere to go"]
-    assert len(tally.reports) == 2
+    assert tally.happened(reached_end=False) == "0 runs; 1 value missing [scan#1 gave nothing]"
+
+
+def test_a_long_mission_run_needs_no_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everything is counted, also what is no longer kept."""
+    monkeypatch.setattr("petrobot.coordinator.run.mission.KEPT", 10)
+    tally = MissionTally(0)
+    for n in range(1, 101):
+        tally.instruction(n, Fired(n, "go", (101 - n,), (100 - n,), "Begin", ()))
+        status, cause = (Status.ERROR, "slipped") if n % 5 == 0 else (Status.SUCCESS, "")
+        tally.instruction(
+            n, RunRecorded(f"w#{n}", "w", "w", "do", status, cause, "", Executed.YES, 1.0)
+        )
+    assert tally.happened(True) == "100 runs; 20 errors, all recovered [w: slipped (20)]"
+    tally.instruction(101.0, Corrected("w#95", "w", "do", Status.ERROR, Status.SUCCESS))
+    assert tally.happened(True) == "100 runs; 19 errors, all recovered [w: slipped (19)]"
+    kept = {cycle.number: cycle.status for cycle in tally.cycles}
+    assert tally.begun == 100 and kept[95] is Status.SUCCESS and kept[100] is Status.ERROR
+    assert 10 <= len(kept) <= 20 and 10 <= len(tally.runs) <= 20
 
 
 def test_four_runs_reach_final(catch_ball: Task) -> None:
