@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations
 from typing import Final
 
 from petrobot.coordinator.task import EarlyEvent, Kind, Place, PrimitiveTask, Task
@@ -133,15 +132,22 @@ def _firing_limit(flat: Task, net: Net) -> int:
 
 
 def _contested(transitions: Sequence[CompiledTransition]) -> dict[int, frozenset[int]]:
-    # A transition that waits for a pulse or a time does not wait for a token: it is left out.
-    found: dict[int, set[int]] = {}
-    for x, y in permutations(transitions, 2):
-        both = {p for p, _ in x.plain} & {p for p, _ in y.plain}
+    takers: dict[int, list[CompiledTransition]] = {}
+    for x in transitions:
+        for p, _ in x.plain:
+            takers.setdefault(p, []).append(x)
+
+    def compete(x: CompiledTransition, y: CompiledTransition) -> bool:
         drawn = x.weight is not None and y.weight is not None
-        waits = not x.pulse and x.after is None and not x.never
-        if both and waits and not drawn and x.rank == y.rank:
-            found.setdefault(x.index, set()).update(both)
-    return {t: frozenset(places) for t, places in found.items()}
+        return x is not y and not drawn and x.rank == y.rank
+
+    found = {
+        x.index: frozenset(p for p, _ in x.plain if any(compete(x, y) for y in takers[p]))
+        for x in transitions
+        # One that waits for a pulse or a time does not wait for a token.
+        if not x.pulse and x.after is None and not x.never
+    }
+    return {t: places for t, places in found.items() if places}
 
 
 def _index(pairs: Iterable[tuple[int, Iterable[str]]]) -> dict[str, tuple[int, ...]]:

@@ -19,6 +19,7 @@ from petrobot.coordinator.task.net import Net
 from petrobot.services.host.numba_kernels import COMPILED
 from tests.analysis.generators import fms, kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets
+from tests.effort import memory
 from tests.waiting import Limit
 
 ENGINES: dict[str, Callable[[Explored], ExplorationEngine]] = {
@@ -51,6 +52,18 @@ def engines_agree(net: Net) -> None:
     assume(expected is not None)
     for kind in ENGINES:
         assert listed(run(kind, net)) == expected, kind
+
+
+def test_a_large_net_needs_memory_in_proportion() -> None:
+    """Each transition kept a set of all those that it does not touch: 570 MB for 2,000 of them."""
+
+    def held(count: int) -> int:
+        net = philosophers(count)
+        return memory(
+            lambda: IntegerEngine(Explored.start(net, Layout.for_net(net, least=1), True))
+        )
+
+    assert held(200) < 3 * held(100)
 
 
 @settings(max_examples=150, deadline=None)

@@ -10,7 +10,9 @@ import pytest
 
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.check import Severity, check
+from petrobot.coordinator.task.check.conflicts import conflicts
 from petrobot.coordinator.task.conditions import parse
+from tests.effort import calls
 
 Tasks = Callable[..., Task]
 A = {"n": {"in": "a:normal", "out": "y"}, "e": {"in": "a:error", "out": "y"}}
@@ -241,6 +243,24 @@ def test_tokens_that_exclude_each_other_are_no_conflict(
 ) -> None:
     codes = found(task("x=1 y=1 a!=1", net, "e"))
     assert "unsettled-conflict" not in codes and "arrival-order" not in codes
+
+
+def test_conflicts_of_a_long_task_are_found_soon(task: Tasks) -> None:
+    """All pairs of transitions, and in each step all pairs of invariants, were compared: the cube
+    of the length, 5 s for 400 steps."""
+
+    def effort(steps: int) -> int:
+        places = " ".join(f"a{n}! u{n}~=1" for n in range(steps))
+        net = {
+            f"{end}{n}": {"in": f"a{n}:{end} u{n}", "out": f"a{(n + 1) % steps} u{n}"}
+            for n in range(steps)
+            for end in ("normal", "error")
+        }
+        long = task(f"{places} c=1", net)
+        assert long.net.transitions  # it is kept, and not counted
+        return calls(lambda: list(conflicts(long)))
+
+    assert effort(160) < 5 * effort(80)
 
 
 def test_invariant_that_excludes_two_transitions(task: Tasks) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
-from types import FrameType
 from typing import Any
 
 import pytest
@@ -31,6 +29,7 @@ from petrobot.coordinator.engine import (
 from petrobot.coordinator.engine.step import RECORDED
 from petrobot.coordinator.task import Executed, Reference, Status, Task
 from petrobot.coordinator.task.conditions import parse
+from tests.effort import calls
 
 Plays = Callable[..., Any]
 OK, FAIL, ERR = Status.SUCCESS, Status.FAILURE, Status.ERROR
@@ -356,24 +355,14 @@ def test_servers_run_at_once_and_the_rest_queue_first_in_first_out(play: Plays) 
 
 
 def test_a_long_queue_costs_in_proportion_to_its_length(play: Plays) -> None:
-    def calls(tokens: int) -> int:
+    def effort(tokens: int) -> int:
         p = play(f"a!1={tokens} x", {"t": {"in": "a:normal", "out": "x"}})
-        counted = 0
-
-        def count(frame: FrameType, event: str, argument: object) -> None:
-            nonlocal counted
-            counted += event == "call"
-
-        sys.setprofile(count)
-        try:
-            p(RunEnded("a#1", OK))
-        finally:
-            sys.setprofile(None)
+        called = calls(lambda: p(RunEnded("a#1", OK)))
         assert p.started == ["a#1", "a#2"]
-        return counted
+        return called
 
-    # the free server counted the runs of its place for each token that waits: 4 times
-    assert calls(400) < 3 * calls(200)
+    # The runs of the place were counted for each token that waits: 4 times as many.
+    assert effort(400) < 3 * effort(200)
 
 
 def test_first_done_is_first_taken(play: Plays) -> None:

@@ -111,10 +111,7 @@ class IntegerEngine:
         """Continue a search that any engine began."""
         self._net, self._keep = begun.net, begun.keep_edges
         self._dependents = begun.net.compiled.dependents()
-        self._unaffected = [
-            frozenset(range(len(begun.net.transitions))) - frozenset(deps)
-            for deps in self._dependents
-        ]
+        self._touched = [frozenset(dependents) for dependents in self._dependents]
         self._prioritised = len(set(begun.net.priority)) > 1
         self._row = array("q", begun.row.tolist())
         self._target = array("i", begun.target.tolist())
@@ -210,8 +207,8 @@ class IntegerEngine:
     def _inherit(self, before: list[int], fired: int, packed: int) -> list[int]:
         """Return the enabled transitions after a firing; those that it did not touch stay as they
         were."""
-        unaffected = self._unaffected[fired]
-        kept = [t for t in before if t in unaffected]
+        touched = self._touched[fired]
+        kept = [t for t in before if t not in touched]
         able = self._able
         gained = self._passing([t for t in self._dependents[fired] if t in able], packed)
         # Sorted, because all engines must give the edges in transition order.

@@ -86,9 +86,13 @@ def _sum(a: dict[int, int], x: int, b: dict[int, int], y: int) -> dict[int, int]
 def _minimal(rows: list[tuple[Flow, dict[int, int]]]) -> list[tuple[Flow, dict[int, int]]]:
     """Return the rows whose support contains the support of no other row."""
     kept: list[tuple[Flow, dict[int, int]]] = []
+    # A support that lies in another one has its least place there: few are left to compare.
+    by_least: dict[int, list[Flow]] = {}
     for row in sorted(rows, key=lambda r: len(r[0])):
-        if not any(other[0].keys() <= row[0].keys() for other in kept):
+        flow = row[0]
+        if not any(o.keys() <= flow.keys() for p in flow for o in by_least.get(p, ())):
             kept.append(row)
+            by_least.setdefault(min(flow), []).append(flow)
     return kept
 
 
@@ -102,7 +106,7 @@ def conflicts(task: Task) -> Iterator[Finding]:
     those that the order of arrival decides (notes). The execution graph shows whether any of them
     can occur."""
     domains, flows, net = condition_domains(task), semiflows(task), task.net
-    for t, u in combinations(task.transitions.values(), 2):
+    for t, u in _near(task):
         shared = sorted(_shared(task, t, u))
         if not shared or excluded(task, t, u) or excluded(task, u, t):
             continue
@@ -110,6 +114,17 @@ def conflicts(task: Task) -> Iterator[Finding]:
             net, flows, net.transition_index[t.name], net.transition_index[u.name]
         ):
             yield from _judge(task, t, u, shared, domains)
+
+
+def _near(task: Task) -> Iterator[tuple[Transition, Transition]]:
+    """Yield the pairs that can share something (`_shared`), in order: in a large task few do."""
+    transitions, groups = list(task.transitions.values()), dict[str, list[int]]()
+    for i, t in enumerate(transitions):
+        bars = {"inhibitors"} if t.inhibitors else set[str]()
+        for key in {a.place for a in t.inputs} | {*t.events} | _room(task, t) | bars:
+            groups.setdefault(key, []).append(i)
+    for i, k in sorted({pair for group in groups.values() for pair in combinations(group, 2)}):
+        yield transitions[i], transitions[k]
 
 
 def _judge(
