@@ -121,11 +121,7 @@ def _action_arc(
     task: Task, net: Net, t: Transition, arc: Input, end: End, events: list[Event]
 ) -> ActionArc:
     primitive = task.places[arc.place].task
-    rivals = [
-        u
-        for u in task.transitions.values()
-        if any(a.place == arc.place and a.end is End.NORMAL for a in u.inputs)
-    ]
+    rivals = task.exits.get((arc.place, End.NORMAL), ())
     return ActionArc(
         place=net.place_index[arc.place],
         name=arc.place,

@@ -95,6 +95,16 @@ class Task:
         )
 
     @cached_property
+    def exits(self) -> Mapping[tuple[str, End], tuple[Transition, ...]]:
+        """The transitions that take a token of an action place, by place and end of the run."""
+        found: dict[tuple[str, End], dict[str, Transition]] = {}
+        for transition in self.transitions.values():
+            for arc in transition.inputs:
+                if arc.end is not None:
+                    found.setdefault((arc.place, arc.end), {})[transition.name] = transition
+        return {key: tuple(ways.values()) for key, ways in found.items()}
+
+    @cached_property
     def error_elements(self) -> frozenset[str]:
         """Names of the places and transitions that only error branches reach, with macro places as
         they are."""

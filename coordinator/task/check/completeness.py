@@ -3,7 +3,7 @@ conditions cover all cases."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from petrobot.coordinator.task import (
@@ -33,21 +33,12 @@ def uncovered_exits(task: Task) -> Iterator[Finding]:
         if place.kind is not Kind.ACTION:
             continue
         for end in (End.NORMAL, End.ERROR):
-            if not _written(place, exits(task, place, end)):
+            if not _written(place, task.exits.get((place.name, end), ())):
                 yield _missing(place, end)
         for status in Status:
-            ways = exits(task, place, _EXIT_OF[status])
+            ways = task.exits.get((place.name, _EXIT_OF[status]), ())
             if _written(place, ways) and not any(w.when is None or w.events for w in ways):
                 yield from _uncovered(place, status, ways, domains)
-
-
-def exits(task: Task, place: Place, end: End) -> list[Transition]:
-    """The transitions that take a token of the place at such an end."""
-    return [
-        t
-        for t in task.transitions.values()
-        if any(a.place == place.name and a.end is end for a in t.inputs)
-    ]
 
 
 def _written(place: Place, ways: Iterable[Transition]) -> bool:
@@ -65,7 +56,7 @@ def _missing(place: Place, end: End) -> Finding:
 
 
 def _uncovered(
-    place: Place, status: Status, ways: list[Transition], domains: dict[str, Domain]
+    place: Place, status: Status, ways: Sequence[Transition], domains: dict[str, Domain]
 ) -> Iterator[Finding]:
     name = f"{place.name}.status"
     known = {**domains, name: replace(domains[name], values=(status.value,))}
