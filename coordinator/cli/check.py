@@ -257,6 +257,7 @@ def _cut(analysis: Analysis) -> str:
 def _reasons(analysis: Analysis) -> list[str]:
     """Return the reason of each verdict that does not hold, with the stimuli and firings that lead
     there, and what is assumed by those that hold."""
+    from petrobot.coordinator.analysis.execution.graph import in_words
     from petrobot.coordinator.analysis.execution.progress import AGAIN, MENDED
 
     lines, against, told = list[str](), analysis.objections, list[object]()
@@ -278,7 +279,7 @@ def _reasons(analysis: Analysis) -> list[str]:
             continue
         if verdict.witness is not None and name in against:
             told.append(verdict.witness)
-            path = "; ".join(verdict.witness.steps) or " ".join(verdict.witness.firings)
+            path = in_words(verdict.witness.steps) or " ".join(verdict.witness.firings)
             lines.append(f"        by: {path or '(initial marking)'}")
     if stuck:
         lines.append(f"{'warning':8}{', '.join(stuck)}: the task can get stuck")

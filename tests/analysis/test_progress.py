@@ -13,7 +13,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from petrobot.coordinator.analysis.execution.chain import chain_of
-from petrobot.coordinator.analysis.execution.graph import execute, with_operator
+from petrobot.coordinator.analysis.execution.graph import execute, in_words, with_operator
 from petrobot.coordinator.analysis.execution.progress import MENDED, NAMES, Progress, progress_of
 from petrobot.coordinator.analysis.may_run import Budget, may_run
 from petrobot.coordinator.analysis.net.graph import Graph
@@ -247,6 +247,19 @@ STUCK |= {
         "no transition takes what ended in place that way", dropped={"in": "place:normal"}
     ),
 }
+
+
+@pytest.mark.parametrize(
+    ("steps", "text"),
+    [
+        (0, ""),
+        (3, "1; 2; 3"),
+        (16, "; ".join(map(str, range(1, 17)))),
+        (60, "1; 2; 3; 4; 5; (45 more); 51; 52; 53; 54; 55; 56; 57; 58; 59; 60"),
+    ],
+)
+def test_of_a_long_path_people_are_told_the_beginning_and_the_end(steps: int, text: str) -> None:
+    assert in_words(range(1, steps + 1)) == text
 
 
 def test_the_right_task_has_no_fault() -> None:

@@ -10,7 +10,7 @@ replay each path along the search tree exactly.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -47,6 +47,18 @@ SHOWN = 20
 """The most firings of one stimulus that are written."""
 STEPS = 300_000
 """The most stimuli and firings for one graph; they take about twenty seconds."""
+
+
+TOLD_FIRST, TOLD_LAST = 5, 10
+"""Steps of a long path that people are told."""
+
+
+def in_words(steps: Sequence[object]) -> str:
+    """Return a path as text; of a long one its beginning and its end."""
+    told = [str(step) for step in steps]
+    if len(told) > TOLD_FIRST + TOLD_LAST + 1:
+        told[TOLD_FIRST:-TOLD_LAST] = [f"({len(told) - TOLD_FIRST - TOLD_LAST} more)"]
+    return "; ".join(told)
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,6 +31,7 @@ from petrobot.coordinator.analysis.execution.graph import (
     ExecutionGraph,
     Step,
     execute,
+    in_words,
     with_operator,
 )
 from petrobot.coordinator.analysis.execution.names import cases
@@ -758,7 +759,7 @@ class _Again:
 
 
 def _by(x: ExecutionGraph, state: int) -> str:
-    return f"by: {'; '.join(map(str, x.path(state)))}"
+    return f"by: {in_words(x.path(state))}"
 
 
 def _lack(kind: str, text: str) -> str:
