@@ -130,9 +130,18 @@ def _definitions(file: str) -> Mapping[tuple[str, int], ast.AST]:
     }
 
 
-@cache
 def _code(thing: Callable[..., Any]) -> _Code | None:
     """Return the source of a function or class; None if there is none."""
+    if id(thing) not in _read_already:
+        # kept with its source: an id may come again, and a class need not be hashable
+        _read_already[id(thing)] = thing, _source(thing)
+    return _read_already[id(thing)][1]
+
+
+_read_already: dict[int, tuple[Callable[..., Any], _Code | None]] = {}
+
+
+def _source(thing: Any) -> _Code | None:
     try:
         thing = inspect.unwrap(thing)
         file = str(inspect.getsourcefile(thing))
@@ -164,12 +173,12 @@ def _reachable(thing: Any) -> Iterator[_Code]:
     """Yield the source of a function or class, and of everything in its package that it uses,
     directly or indirectly: base classes and helpers."""
     package = str(thing.__module__).partition(".")[0]
-    waiting, seen = [thing], set[Callable[..., Any]]()
+    waiting, seen = [thing], set[int]()
     while waiting:
         found = waiting.pop()
-        if found in seen or (code := _code(found)) is None:
+        if id(found) in seen or (code := _code(found)) is None:
             continue
-        seen.add(found)
+        seen.add(id(found))
         yield code
         waiting += (u for u in code.used if str(u.__module__).partition(".")[0] == package)
 

@@ -81,18 +81,22 @@ class Cycle:
     ended: float | None = None
     ends: dict[str, tuple[Status, str, str]] = field(default_factory=dict)
     """By run, in the order in which they ended: status, cause and text."""
+    forgotten: tuple[Status, str, str] = (Status.SUCCESS, "", "")
+    """The worst of the older runs, of which nothing else is kept."""
 
     def count(self, run: str, status: Status | None, cause: str, text: str) -> None:
         """Add a run, or the verdict on an earlier one."""
         if status is not None:
             self.ends[run] = (status, cause, text)
+        if len(self.ends) >= 2 * KEPT:
+            old = [self.ends.pop(run) for run in list(self.ends)[:KEPT]]
+            self.forgotten = _worst([self.forgotten, *old])
 
     @property
     def worst(self) -> tuple[Status, str, str]:
         """Return the run with the worst status, the first one at a tie: status, cause and text."""
-        rank = {Status.SUCCESS: 0, Status.FAILURE: 1, Status.ERROR: 2}
-        worst = max(self.ends.values(), key=lambda end: rank[end[0]], default=None)
-        return (Status.SUCCESS, "", "") if worst is None or worst[0] is Status.SUCCESS else worst
+        worst = _worst([self.forgotten, *self.ends.values()])
+        return (Status.SUCCESS, "", "") if worst[0] is Status.SUCCESS else worst
 
     @property
     def status(self) -> Status:
@@ -112,17 +116,17 @@ class Cycle:
         return {"n": self.number, **ages, "status": status.value, "cause": cause, "text": text}
 
 
+def _worst(ends: list[tuple[Status, str, str]]) -> tuple[Status, str, str]:
+    return max(ends, key=lambda end: [Status.SUCCESS, Status.FAILURE, Status.ERROR].index(end[0]))
+
+
 def _count(n: int, what: str) -> str:
     return f"{n} {what}{'' if n == 1 else 's'}"
 
 
-def _forget(oldest: list[Any]) -> None:
-    if len(oldest) >= 2 * KEPT:
-        del oldest[:KEPT]
-
-
-def _cause(record: RunRecorded) -> str:
-    return f"{record.primitive_task}: {record.cause or 'no cause'}"
+def _forget_oldest(entries: list[Any]) -> None:
+    if len(entries) >= 2 * KEPT:
+        del entries[:KEPT]
 
 
 @dataclass
@@ -149,7 +153,7 @@ class MissionTally:
             self.firings += 1
             self._cycle(now, instruction.before, instruction.after)
         elif isinstance(instruction, RunRecorded):
-            _forget(self.runs)
+            _forget_oldest(self.runs)
             self.runs.append(instruction)
             self._judge(instruction, 1)
             self.ended += not instruction.cancelled
@@ -211,7 +215,7 @@ class MissionTally:
 
     def _judge(self, record: RunRecorded, count: int) -> None:
         if record.status is Status.ERROR and not record.cancelled:
-            self.failed[_cause(record)] += count
+            self.failed[f"{record.primitive_task}: {record.cause or 'no cause'}"] += count
 
     def _correct(self, corrected: Corrected) -> None:
         run, said = corrected.run, (corrected.status, corrected.cause, corrected.text)
@@ -233,7 +237,7 @@ class MissionTally:
             return
         if self.cycles:
             self.cycles[-1].ended = now
-        _forget(self.cycles)
+        _forget_oldest(self.cycles)
         self.cycles.append(Cycle(self.begun + 1, now))
 
 

@@ -47,6 +47,10 @@ def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> Non
     assert "unknown command 'fly'" in capsys.readouterr().err
 
 
+LOCKSTEP = ["run", "catch_ball", "--mode", "lockstep"]
+COMPARE = ["forecast", "--compare", "forecast.json", "campaigns/new"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -126,27 +130,7 @@ def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> Non
             ["up", "--lockstep", "--await-coordinator", "soon"],
             "--await-coordinator: soon is not a number of at least 0",
         ),
-    ],
-)
-def test_bad_input_is_exit_code_2_and_names_the_fault(
-    arguments: list[str],
-    said: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """One clear line that names what was wrong."""
-    monkeypatch.chdir(ROOT)
-    assert main(arguments) == 2
-    assert said in capsys.readouterr().err
-
-
-LOCKSTEP = ["run", "catch_ball", "--mode", "lockstep"]
-COMPARE = ["forecast", "--compare", "forecast.json", "campaigns/new"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
+        # options without effect
         ([*LOCKSTEP, "--up"], "--up: a run in lock step starts its own nodes"),
         ([*LOCKSTEP, "--keep", "3"], "--keep: needs --journal FOLDER"),
         ([*LOCKSTEP, "--durable"], "--durable: needs --journal FOLDER"),
@@ -161,12 +145,13 @@ COMPARE = ["forecast", "--compare", "forecast.json", "campaigns/new"]
         (["forecast", "catch_ball", *COMPARE[1:]], "TASK: a registered forecast is compared"),
     ],
 )
-def test_an_option_without_effect_is_refused(
+def test_bad_input_is_exit_code_2_and_names_the_fault(
     arguments: list[str],
     said: str,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """One clear line that names what was wrong."""
     monkeypatch.chdir(ROOT)
     assert main(arguments) == 2
     assert said in capsys.readouterr().err

@@ -486,6 +486,19 @@ def test_a_memory_that_is_on_a_node_is_no_mistake(
 
 
 @pytest.mark.processes
+def test_a_class_that_cannot_be_hashed_is_read_like_any_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sound: dict[str, str]
+) -> None:
+    """As some libraries for data bases make them; the process that read it ended."""
+    odd = "class Odd(metaclass=type('Meta', (type,), {'__hash__': None})):\n    pass\n\n\n"
+    mistakes = [(CODE, "class Axis(Driver):", f"{odd}class Axis(Driver):", "")]
+    mistakes += [(CODE, "await ctx.sleep(0.3)", "Odd(); ctx.sleep(0.3)", "")]
+    damaged(sound, mistakes, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    expect(r"arm_bot.py:\d+: `ctx.sleep` does nothing without", CHECK)
+
+
+@pytest.mark.processes
 def test_a_module_that_cannot_be_imported_is_told_once(
     sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

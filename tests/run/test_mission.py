@@ -13,7 +13,7 @@ from petrobot.coordinator.engine.instructions import Severity
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.run.executor import Executor
 from petrobot.coordinator.run.interfaces import FirstAlternative
-from petrobot.coordinator.run.mission import Mission, MissionTally
+from petrobot.coordinator.run.mission import Cycle, Mission, MissionTally
 from petrobot.coordinator.run.timeline import Timeline
 from petrobot.coordinator.task import Executed, Status, Task
 from petrobot.coordinator.task.file import loads
@@ -53,7 +53,7 @@ def test_an_error_of_the_net_is_logged_when_it_occurs(caplog: pytest.LogCaptureF
 
 
 def test_a_long_mission_run_needs_no_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Everything is counted, also what is no longer kept."""
+    """Runs that were forgotten still count."""
     monkeypatch.setattr("petrobot.coordinator.run.mission.KEPT", 10)
     tally = MissionTally(0)
     for n in range(1, 101):
@@ -68,6 +68,17 @@ def test_a_long_mission_run_needs_no_more_memory(monkeypatch: pytest.MonkeyPatch
     kept = {cycle.number: cycle.status for cycle in tally.cycles}
     assert tally.begun == 100 and kept[95] is Status.SUCCESS and kept[100] is Status.ERROR
     assert 10 <= len(kept) <= 20 and 10 <= len(tally.runs) <= 20
+
+
+def test_a_cycle_without_end_needs_no_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot on patrol: one token of the runs place, and runs for months."""
+    monkeypatch.setattr("petrobot.coordinator.run.mission.KEPT", 10)
+    cycle = Cycle(1, 0.0)
+    for n in range(1, 101):
+        cycle.count(f"w#{n}", Status.FAILURE if n in (3, 7) else Status.SUCCESS, f"late {n}", "")
+    assert 10 <= len(cycle.ends) <= 20 and cycle.worst == (Status.FAILURE, "late 3", "")
+    cycle.count("w#100", Status.ERROR, "slipped", "")
+    assert cycle.worst == (Status.ERROR, "slipped", "")
 
 
 def test_four_runs_reach_final(catch_ball: Task) -> None:

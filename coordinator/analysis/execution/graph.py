@@ -50,7 +50,7 @@ STEPS = 300_000
 
 
 TOLD_FIRST, TOLD_LAST = 5, 10
-"""Steps of a long path that people are told."""
+"""Steps of a long path that a text names."""
 
 
 def in_words(steps: Sequence[object]) -> str:
