@@ -407,6 +407,8 @@ class Node:
         elif command.verb == SEED and type(command.data.get(SEED)) is not int:
             text = "data: expected {seed: an integer}"
             self.callee.answer(now, command.id, False, {"cause": "bad_arguments", "text": text})
+        elif command.verb == "hold" and self._has_ended(command.data.get("run")):
+            self.callee.answer(now, command.id, True, {"answers": {}})
         elif not keys and command.target:
             text = f"{self.name} has no device {command.target!r}"
             self.callee.answer(now, command.id, False, {"cause": "unknown_device", "text": text})
@@ -423,6 +425,11 @@ class Node:
                 self._commands[command.id].note = self._stops.stop(
                     [key for key in keys if key != GENERAL]
                 )
+
+    def _has_ended(self, run: object) -> bool:
+        """Whether a run that is to be held is not active any more: a hold would catch the next run,
+        which nobody would release."""
+        return isinstance(run, str) and self.callee.service_of(run) is None
 
     def stopped_in_emergency(self) -> tuple[str, ...]:
         """Devices in emergency stop."""

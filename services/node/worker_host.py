@@ -742,11 +742,17 @@ class WorkerHost:
     def _release_if_over(self) -> None:
         """Release the device when the last held run has ended: the next run must not find it
         held."""
-        if self._runs or not self._frozen:
+        unread = [id_ for id_, verb in self._commands.items() if verb == "hold"]
+        if self._runs or not (self._frozen or unread):
             return
         self._freeze(False)
         if self._owner is not None and self._owner is not self._worker:
             self._owner.post(RELEASE)
+        elif unread and self._worker is not None:
+            # A process that computes reads a hold only after its run. Then this is behind it.
+            self._worker.post(RELEASE)
+        for id_ in unread:
+            self._commands[id_] = ""  # its answer holds nothing any more
 
     def _answered(self, answer: Answer) -> None:
         """Handle a process's answer to a command."""

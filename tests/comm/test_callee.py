@@ -477,6 +477,19 @@ def test_the_deadline_of_a_run_that_is_not_held_still_counts_during_a_pause(
     assert callee.orders() == [m.Cancel("1", "deadline")]
 
 
+def test_the_deadline_of_a_run_that_began_after_the_hold_counts() -> None:
+    """The answer came late: the run that was to be held has ended, and nobody releases the next."""
+    callee = _callee(COORD)
+    callee.receive(0.0, "coord", m.Call("1", "move", {}, 2.0, 3))
+    callee.receive(0.5, "coord", m.Command("h", "hold", "arm"))
+    callee.finish(0.6, m.Outcome("1", "success"))
+    callee.receive(0.7, "coord", m.Call("2", "move", {}, 2.0, 3))
+    callee.answer(1.0, "h", True, {"answers": {"arm": "held"}})
+    callee.orders()
+    callee.advance(2.7)
+    assert callee.orders() == [m.Cancel("2", "deadline")]
+
+
 def test_a_held_run_is_still_an_orphan_without_its_caller() -> None:
     """A pause does not let a run continue without its caller."""
     callee = _callee(COORD)

@@ -346,6 +346,18 @@ async def test_hold_and_stop_reach_all_runs_without_a_device(operator: Operator)
     assert (await operator.call("add", a=1)).values == {"sum": 2}
 
 
+async def test_a_hold_that_is_read_after_its_run_does_not_hold_the_next(operator: Operator) -> None:
+    """A process that computes reads nothing: the hold waits in its pipe, behind its run."""
+    blocked = asyncio.create_task(operator.call("block", 60.0, seconds=1.0))
+    await passing(0.3)
+    hold = asyncio.create_task(operator.command("left", "hold"))
+    assert (await blocked).status == "success"
+    ends = [await operator.call("nap", 20.0, seconds=0.05) for _ in range(3)]
+    assert [end.status for end in ends] == ["success"] * 3
+    await hold
+    assert (await operator.call("nap", 20.0, seconds=0.05)).status == "success"
+
+
 @pytest.mark.parametrize("what", ["folder", "mask", "depth", "timer", "memory", "files"])
 async def test_what_a_run_changes_in_its_process_does_not_reach_the_next(
     operator: Operator, what: str

@@ -374,6 +374,19 @@ def test_feedback_and_events_reach_the_caller() -> None:
     assert end.values["draw"] == Bench(directory("right")).call("tell", name="x").values["draw"]
 
 
+def test_a_hold_of_a_run_that_has_ended_does_not_hold_the_next() -> None:
+    """The order and the end of the run crossed. Whoever asked releases only active runs."""
+    bench = Bench(directory())
+    first = bench.coordinator.call("go", to=0.1)
+    bench.run(1.0)
+    assert bench.coordinator.ended(first).status == "success"
+    hold = Command("h", "hold", "slide", {"run": first})
+    bench.coordinator.callers["left"].command(bench.cell.now, hold)
+    assert bench.call("go", 1.0, to=0.2).status == "success"
+    [answer] = [n for _, n in bench.coordinator.heard if isinstance(n, Answer)]
+    assert answer.ok and answer.data["answers"] == {}
+
+
 def test_hold_stops_the_arm_and_its_run_but_not_the_eye() -> None:
     bench = Bench(directory())
     first = bench.coordinator.call("go", to=0.5)

@@ -351,6 +351,28 @@ def test_hold_reaches_device_and_runs() -> None:
     assert not [o for o in actions.orders() if isinstance(o, Cancel)]
 
 
+@pytest.mark.parametrize("kind", ["cyclic", "one process"])
+def test_a_hold_ends_with_its_run_even_if_it_was_not_read_before(kind: str) -> None:
+    bench = Bench()
+    if kind == "cyclic":
+        holder, actions = bench.cyclic()
+    else:
+        bench.children[-1].ready()
+        holder = actions = bench.children[-1]
+    bench.begin("first")
+    bench.place.command(bench.clock.now, Command("h", "hold"))
+    actions.say(Outcome("first", "success"))
+    bench.begin("next")
+    told = [item for item in holder.got if isinstance(item, Command) or item == RELEASE]
+    assert told == [Command("h", "hold"), RELEASE], "in this order, before the next run"
+    holder.say(answer_of("h", "held", {}))
+    assert HOLD not in actions.orders()
+    bench.begin("third")  # nor does a new process hold it
+    actions.die()
+    bench.run(5.0)
+    assert not any(HOLD in child.orders() for child in bench.children)
+
+
 def test_a_device_that_cannot_hold_goes_on() -> None:
     bench = Bench()
     driver, actions = bench.cyclic()

@@ -110,11 +110,11 @@ class ActiveRuns(dict[str, ActiveRun]):
         """At `due` (s) the run's caller may have been away for too long."""
         heapq.heappush(self._timers, (due, ORPHAN, id_))
 
-    def hold_all(self, now: float, devices: Collection[str]) -> None:
-        """Stop the clocks of the deadlines of these devices' runs ("" for runs without a
-        device)."""
+    def hold_all(self, now: float, devices: Collection[str], asked: float) -> None:
+        """Stop the clocks of the deadlines of the runs that these devices had ("" for runs without
+        a device) when the hold was asked for (s). A later run begins unheld."""
         for run in self.values():
-            if run.device in devices and run.held is None:
+            if run.device in devices and run.held is None and run.began <= asked:
                 run.held = now
 
     def release_all(self, now: float, devices: Collection[str] | None) -> None:
@@ -352,8 +352,8 @@ class Callee:
         """Runs whose ACCEPT is held: until when (s), and id. Those of finished runs are left
         out."""
         self._results = ResultStore(self._keeping, self.events.forget_run)
-        self._commands: dict[str, tuple[str, str]] = {}
-        """Caller and verb of each command that waits for its answer."""
+        self._commands: dict[str, tuple[str, str, float]] = {}
+        """Caller and verb of each command that waits for its answer, and when it came (s)."""
         self._answers: OrderedDict[tuple[str, str], Answer] = OrderedDict()
         """The newest answers by caller and command, for commands that are repeated."""
         self._orders: list[Order] = []
@@ -570,7 +570,7 @@ class Callee:
         if command.id in self._commands or (peer, command.id) in self._answers:
             self._known_command(peer, command.id)
             return
-        self._commands[command.id] = peer, command.verb
+        self._commands[command.id] = peer, command.verb, now
         if command.verb == RELEASE:
             self._running.release_all(now, [command.target] if command.target else None)
             self.soonest = min(self.soonest, self._running.due())
@@ -667,14 +667,13 @@ class Callee:
         After a `hold`, `answers` in the data says for each device what happened (this node's name
         stands for runs without a device). The deadlines of held runs stand still until a `release`.
         """
-        peer, verb = self._commands.pop(id, ("", ""))
+        peer, verb, asked = self._commands.pop(id, ("", "", now))
         if not peer:
             raise ValueError(f"command {id}: no command with this id waits for an answer")
         if verb == HOLD and data is not None:
             answers = data.get("answers", {})
-            self._running.hold_all(
-                now, ["" if d == self.name else d for d, said in answers.items() if said == HELD]
-            )
+            held = ["" if d == self.name else d for d, said in answers.items() if said == HELD]
+            self._running.hold_all(now, held, asked)
         answer = Answer(id, ok, plain(data or {}, "data"))
         self._answers[peer, id] = answer
         if len(self._answers) > ANSWERS:
@@ -704,7 +703,7 @@ class Callee:
 
     def commander(self, id_: str) -> str:
         """Return the caller of a command that waits for its answer; empty if none does."""
-        return self._commands.get(id_, ("", ""))[0]
+        return self._commands[id_][0] if id_ in self._commands else ""
 
     # Time.
 
