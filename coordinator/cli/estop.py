@@ -5,13 +5,19 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.loading import add_services_argument, load_directory, write_json
+from petrobot.coordinator.cli.loading import (
+    SHIPPED_CELL,
+    add_services_argument,
+    load_directory,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.emergency_stop import Stopped
@@ -65,6 +71,13 @@ def run(options: argparse.Namespace) -> int:
         Path(address.services) if address is not None and address.services else None
     )
     directory = load_directory(path)
+    if path is None and directory.source.resolve() == SHIPPED_CELL:
+        # The devices of the demo are stopped, too: who presses the button must not wait for this.
+        print(
+            "no services.toml in this folder and no active run: this concerns only the catching "
+            f"cell that comes with petrobot. For your robot give --services FILE, or {HARDWARE}",
+            file=sys.stderr,
+        )
     verb = CLEAR if options.clear else STOP
     begun = time.perf_counter()
     answers = asyncio.run(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from petrobot.coordinator.cli.loading import write_json
 from petrobot.coordinator.cli.options import add_log_level_argument
 from petrobot.coordinator.cli.recorded_runs import recorded
-from petrobot.coordinator.cli.run import add_page_arguments, conduct
+from petrobot.coordinator.cli.run import add_page_arguments, conduct, refuse_stopped
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,6 +53,9 @@ def run(options: argparse.Namespace) -> int:
         if options.json:
             write_json(options.json, result)
         return 0 if result["status"] == "success" else 1
+
+    if mode == "realtime":
+        refuse_stopped(found.directory)
 
     def make(observers: Sequence[Observer]) -> RunSession:
         from petrobot.coordinator.operator.prepare import resume

@@ -272,7 +272,7 @@ def run(options: argparse.Namespace) -> int:
     request = _request(task, directory, options)
     _warn(task, directory, options)
     if not lockstep:
-        _refuse_stopped(directory)
+        refuse_stopped(directory)
     text = task_path(options.task).read_text(encoding="utf-8")
 
     def make(observers: Sequence[Observer]) -> RunSession:
@@ -418,8 +418,9 @@ def _warn(task: Task, directory: Directory, options: argparse.Namespace) -> None
         print(f"warning: {objection} (details: petrobot check {options.task})", file=sys.stderr)
 
 
-def _refuse_stopped(directory: Directory) -> None:
-    """Refuse to run while an emergency stop holds devices: every action would fail at once."""
+def refuse_stopped(directory: Directory) -> None:
+    """Refuse to run, or to continue, while an emergency stop holds devices: every action would fail
+    at once."""
     from petrobot.coordinator.operator.emergency_stop import still_stopped
 
     stopped = still_stopped(directory)

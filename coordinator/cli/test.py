@@ -7,14 +7,18 @@ from __future__ import annotations
 
 import argparse
 import json
+import socket
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import add_services_argument, load_directory
-from petrobot.services.comm.location_file import DirectoryError
+from petrobot.services.comm.location_file import Directory, DirectoryError
 from petrobot.services.host.command_line import number
 
+ANSWERS_WITHIN = 1.0
+"""How long to wait for a node that may run (s)."""
 EXAMPLE = """petrobot test driver axis --command '{"to": 0.2}' --command '{"to": 0.4}'"""
 
 
@@ -75,12 +79,35 @@ def _command(text: str) -> Mapping[str, Any]:
     return body
 
 
+def _refuse_in_use(directory: Directory, device: str) -> None:
+    """Refuse to move a device that is stopped, that another process has, or that is on another
+    host."""
+    from petrobot.coordinator.cli.run import refuse_stopped
+    from petrobot.coordinator.run.supervisor import is_local
+
+    if (entry := directory.devices.get(device)) is None:
+        return  # the check itself says which devices there are
+    refuse_stopped(directory)
+    node = directory.nodes[entry.node]
+    if not is_local(node.host):
+        text = f"{device} is on the host of its node {node.name}, {node.host}: test it there"
+        raise CommandError(2, text)
+    with suppress(OSError):
+        socket.create_connection((node.host, node.port), ANSWERS_WITHIN).close()
+        text = (
+            f"node {node.name} runs on {node.host}:{node.port} and controls {device}; end it "
+            "first: two drivers must not move one device"
+        )
+        raise CommandError(2, text)
+
+
 def run(options: argparse.Namespace) -> int:
     """Test the driver, and print the faults found."""
     from petrobot.coordinator.launch import load_object
 
     check_device = load_object("petrobot.services.conformance:check_device")
     directory = load_directory(options.services)
+    _refuse_in_use(directory, options.device)
     try:
         found = check_device(
             directory,

@@ -27,6 +27,7 @@ from petrobot.coordinator.engine.instructions import (
     Subject,
 )
 from petrobot.coordinator.engine.stimuli import (
+    Abort,
     Chosen,
     EventOccurred,
     RunRaised,
@@ -56,6 +57,8 @@ from petrobot.services.comm.protocol.messages import (
     Welcome,
 )
 
+EMERGENCY_STOP: Final = "emergency_stop"
+"""Cause of a run that its node ended, or refused, because of an emergency stop."""
 MEMORY_EVENTS: Final = "memory:"
 SYNC_WITHIN: Final = 0.5
 """Time after which records are synced even if no effect needs that (s), so that nodes may forget
@@ -250,6 +253,11 @@ class Executor:
 
     def _ended(self, now: float, node: str, outcome: Outcome) -> None:
         self._acks.append(lambda: self.callers[node].acknowledge(now, outcome.id))
+        if outcome.cause == EMERGENCY_STOP and self.finished is None:
+            # Before the end of the run, so that no transition answers it. Who gave the stop also
+            # tells the coordinator, but it may have been frozen, or not have been resumed yet: then
+            # clearing the stop would let it move the devices on.
+            self._queue.append(Abort("emergency stop"))
         self._queue.extend(self.dispatch.ended(now, outcome))
 
     def _event(self, now: float, node: str, event: Event) -> None:

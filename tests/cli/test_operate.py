@@ -182,6 +182,15 @@ async def test_emergency_stop_stops_latches_and_ends_the_run(petrobot: Terminal)
     assert (await call).status == "success"
 
 
+def test_without_a_location_file_an_emergency_stop_says_which_cell_it_stops(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whoever stands in the wrong folder must not believe that the robot was stopped."""
+    monkeypatch.chdir(tmp_path)
+    main(["estop", "--clear"])
+    assert "For your robot give --services FILE" in capsys.readouterr().err
+
+
 async def test_an_emergency_stop_needs_no_controls(petrobot: Terminal) -> None:
     """Any operator may give it, also one without the controls."""
     assert (await petrobot("pause", "--as", "ana")).code == 0

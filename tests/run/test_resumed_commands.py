@@ -112,3 +112,22 @@ def test_killed_during_an_abort_it_ends_and_starts_nothing() -> None:
     finished = after.executor.finished
     assert finished is not None and finished.status is Status.ERROR and "ana" in finished.reason
     assert after.calls() == [] and after.records[0].executed is Executed.YES
+
+
+@pytest.mark.parametrize("resumed", [False, True])
+@pytest.mark.parametrize("executed", list(m.Executed))
+def test_an_emergency_stop_that_only_its_node_reports_aborts_the_run(
+    resumed: bool, executed: m.Executed
+) -> None:
+    """The coordinator was frozen or dead when it was given. Once the stop is cleared, nothing may
+    move unless somebody starts it: no transition answers such an end."""
+    bench = Bench().begin()
+    if resumed:
+        bench = bench.resumed(2.0, runs=[WORK])
+    bench.fired.clear()
+    bench.sent()
+    bench.say(2.1, m.Outcome(WORK, "error", {}, "emergency_stop", "", executed))
+    finished = bench.executor.finished
+    assert finished is not None and finished.status is Status.ERROR
+    assert "emergency stop" in finished.reason
+    assert bench.fired == [] and bench.calls() == []
