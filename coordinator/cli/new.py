@@ -1,5 +1,6 @@
 """Write a working skeleton with its test: of a whole robot (a folder that runs), of an action or a
-driver (a Python file), or of a task (a net of one action with an error branch)."""
+driver (a Python file), or of a task (a net of one action with an error branch). Or copy one of the
+examples of the pages."""
 
 from __future__ import annotations
 
@@ -12,7 +13,9 @@ from pathlib import Path
 from petrobot.coordinator.cli import CommandError
 from petrobot.services.host.whole_file import make_folder, write_whole
 
-EXAMPLE = "petrobot new robot sorter"
+EXAMPLE = "petrobot new robot carrier"
+EXAMPLES = Path(__file__).parents[2] / "examples"
+"""The robots of the pages, each a folder of its own."""
 
 ACTION = '''\
 """The primitive action {name}: say here what it is for."""
@@ -398,11 +401,19 @@ pythonpath = ["."]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument("what", choices=("robot", "driver", "action", "task"))
-    parser.add_argument("name", help="its name, such as close_gripper")
+    parser.add_argument("what", choices=("robot", "driver", "action", "task", "example"))
+    parser.add_argument(
+        "name",
+        help="its name, such as close_gripper; an example of these pages is copied: "
+        + ", ".join(_examples()),
+    )
     parser.add_argument(
         "--folder", type=Path, default=Path(), help="folder to write to (default: this folder)"
     )
+
+
+def _examples() -> list[str]:
+    return sorted(path.name for path in EXAMPLES.iterdir() if path.is_dir())
 
 
 def run(options: argparse.Namespace) -> int:
@@ -415,8 +426,14 @@ def run(options: argparse.Namespace) -> int:
             2,
             f"{name!r} cannot be the name: use small letters, digits and _, a letter first",
         )
-    make = {"robot": _robot, "driver": _driver, "action": _action, "task": _task}[options.what]
-    files, hint = make(name, folder)
+    makers = {
+        "robot": _robot,
+        "driver": _driver,
+        "action": _action,
+        "task": _task,
+        "example": _example,
+    }
+    files, hint = makers[options.what](name, folder)
     _write(files)
     print("\n".join([*(f"wrote {path}" for path in files), hint]))
     return 0
@@ -473,6 +490,15 @@ def _task(name: str, folder: Path) -> tuple[dict[Path, str], str]:
     files = {folder / f"{name}.toml": TASK, folder / f"test_{name}.py": TASK_TEST}
     hint = f"draw it: petrobot show {folder / name}.toml --errors --out {name}.svg"
     return {path: _filled(text, name) for path, text in files.items()}, hint
+
+
+def _example(name: str, folder: Path) -> tuple[dict[Path, str], str]:
+    if name not in _examples():
+        raise CommandError(2, f"no example {name!r}; there are: {', '.join(_examples())}")
+    paths = sorted(path for path in (EXAMPLES / name).iterdir() if path.is_file())
+    files = {folder / name / path.name: path.read_text(encoding="utf-8") for path in paths}
+    tasks = [path.name for path in paths if path.suffix == ".toml" and path.stem != "services"]
+    return files, f"next: cd {folder / name}; petrobot check {tasks[0]}"
 
 
 def _python(name: str, folder: Path) -> tuple[str, tuple[Path, Path]]:

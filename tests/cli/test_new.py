@@ -109,3 +109,19 @@ def test_a_robot_that_cannot_be_made_is_refused(
     assert main(["new", *given]) == 2
     assert says in capsys.readouterr().err
     assert [p.name for p in tmp_path.rglob("*") if p.is_file()] == ["kept.toml"]
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "examples").iterdir()))
+def test_an_example_is_copied_whole(name: str, tmp_path: Path) -> None:
+    """Who has only the wheel and the pages can follow them."""
+    assert main(["new", "example", name, "--folder", str(tmp_path)]) == 0
+    theirs = sorted(path for path in (ROOT / "examples" / name).iterdir() if path.is_file())
+    assert [(p.name, p.read_bytes()) for p in theirs] == [
+        (p.name, p.read_bytes()) for p in sorted((tmp_path / name).iterdir())
+    ]
+    assert main(["new", "example", name, "--folder", str(tmp_path)]) == 2, "nothing is overwritten"
+
+
+def test_an_example_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["new", "example", "crane"]) == 2
+    assert "no example 'crane'; there are: opcua, paper, pictures" in capsys.readouterr().err
