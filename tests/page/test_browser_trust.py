@@ -246,6 +246,26 @@ async def test_the_emergency_stop_works_when_messages_cannot_be_read(
     assert stage.feed.state["mission"]["state"] == "stopped"
 
 
+async def test_the_emergency_stop_goes_past_a_connection_that_has_just_died(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """Nothing that the page sends arrives, and it cannot know that yet: the stop arrives."""
+    context = await browser.new_context(viewport=SIZE)
+
+    def carry(socket: WebSocketRoute) -> None:
+        server = socket.connect_to_server()
+        socket.on_message(lambda m: None if '"command"' in str(m) else server.send(m))
+
+    await context.route_web_socket("**/api/live", carry)
+    tab = await context.new_page()
+    await tab.goto(page.url)
+    await expect(element(tab, "^Control place parts", "Task net")).to_be_visible()
+    await tab.get_by_role("button", name="Emergency stop").click()
+    await expect(tab.locator(".toast", has_text="Emergency stop sent")).to_be_visible()
+    assert stage.feed.state["mission"]["state"] == "stopped"
+    await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Emergency stop")
+
+
 async def test_a_page_that_never_connected_says_so(browser: Browser, page: Page) -> None:
     """Its files arrived, but the live connection fails: it shows a bar, not an idle mission, until
     there is a connection."""

@@ -6,7 +6,8 @@ import { icon } from "./icons.js";
 import { clearDialog, startDialog } from "./start.js";
 import { toast } from "./toast.js";
 
-export const ESTOP_KEY = "F9";
+const ESTOP_KEY = "F9";
+const STOP_MS = 1500; // without an answer for so long, an emergency stop takes another way
 
 const DONE = {
   start: "Started", pause: "Paused", resume: "Resumed", step: "Continued for one firing", abort: "Aborted", estop: "Emergency stop sent",
@@ -22,10 +23,10 @@ const PAUSE_WORD = { operator: "Paused by the operator", step: "Paused after one
 const HELD_WORD = { held: "held", cannot_hold: "cannot hold", stopped: "stopped", lost: "no answer" };
 
 /** What a pause was answered by each node, for people. */
-export const heldWords = (nodes) => Object.entries(nodes ?? {}).map(([node, answer]) => `${node}: ${HELD_WORD[answer] ?? answer}`).join(", ");
+const heldWords = (nodes) => Object.entries(nodes ?? {}).map(([node, answer]) => `${node}: ${HELD_WORD[answer] ?? answer}`).join(", ");
 
 export const stateOf = (state) => (state.paused && ["running", "stopping"].includes(state.mission.state) ? "paused" : state.mission.state);
-export const stateWord = (state) => STATE_WORD[stateOf(state)] ?? words(stateOf(state));
+const stateWord = (state) => STATE_WORD[stateOf(state)] ?? words(stateOf(state));
 
 export class Operator {
   constructor(link) {
@@ -75,9 +76,13 @@ export class Operator {
 
   async stopNow() {
     this.estop.classList.add("given");
-    setTimeout(() => this.estop.classList.remove("given"), 1500);
-    if (this.link.connected) await this.give("estop", {});
-    else if (await stopPastTheLink()) toast("ok", `${DONE.estop}; this page cannot see its effect`);
+    setTimeout(() => this.estop.classList.remove("given"), STOP_MS);
+    // A connection that breaks is noticed seconds later. A stop is sent twice rather than that late: it changes nothing twice
+    const late = new Promise((resolve) => setTimeout(resolve, STOP_MS, {}));
+    const answer = await Promise.race([this.link.command("estop"), late]);
+    if (answer.ok) toast("ok", [DONE.estop, answer.text].filter(Boolean).join(" · "));
+    else if (answer.code && answer.code !== "lost") toast("error", `${answer.text}. Use the emergency stop of the hardware.`);
+    else if (await stopPastTheLink()) toast("ok", this.link.connected ? DONE.estop : `${DONE.estop}; this page cannot see its effect`);
     else toast("error", "No connection to the coordinator. Use the emergency stop of the hardware.");
   }
 
