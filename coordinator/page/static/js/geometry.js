@@ -3,7 +3,7 @@
 export const PLACE_R = 22;
 export const BAR_W = 14;
 export const BAR_H = 44;
-export const GRID = 10;
+const GRID = 10;
 export const snap = (value) => Math.round(value / GRID) * GRID;
 
 const CLEAR = 9; // units between an arc and an element that it passes

@@ -13,7 +13,7 @@ const DOWN = 4;
 const touch = (a, b) => a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];
 
 /** The boxes [left, top, right, bottom] of an element's words on one side of it. */
-export function boxesAt(element, side) {
+function boxesAt(element, side) {
   const [x, y, below, anchor] = labelAt(element, side);
   const subY = side === "below" || side === "above" || element.shape === "place" ? below : y - 14;
   const box = (words, width, line) => {

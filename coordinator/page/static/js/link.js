@@ -54,8 +54,7 @@ export class Link {
     socket.onopen = () => {
       met = true;
       this.refused = false;
-      const name = localStorage.getItem("petrobot.name") ?? "operator";
-      socket.send(JSON.stringify({ type: "hello", protocol: 1, name, tab: tabSecret() }));
+      socket.send(JSON.stringify({ type: "hello", protocol: 1, name: "operator", tab: tabSecret() }));
     };
     socket.onmessage = (event) => this.receive(socket, event.data);
     socket.onclose = (event) => {

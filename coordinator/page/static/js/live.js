@@ -5,7 +5,6 @@ import { Canvas, panel } from "./canvas.js";
 import { Chart } from "./charts.js";
 import { attribute, fill, h, Press, rows, seconds, text, words } from "./dom.js";
 import { icon } from "./icons.js";
-import { stateOf } from "./operator.js";
 import { Learning, objectives } from "./learning.js";
 import { Selected } from "./selected.js";
 import { Selectors } from "./selectors.js";
@@ -285,10 +284,6 @@ export class Live {
   controlsChanged() {
     this.selectors.paint();
     this.selected.update(this.link.state, this.link.now(), true);
-  }
-
-  get frozen() {
-    return stateOf(this.link.state) === "paused";
   }
 }
 
