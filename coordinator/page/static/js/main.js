@@ -34,6 +34,7 @@ class App {
     this.setWall(localStorage.getItem("petrobot.wall") === "yes");
     this.show(location.hash.slice(1) in this.tabs ? location.hash.slice(1) : "Live");
     setInterval(() => this.tick(), TICK_MS);
+    new ResizeObserver(() => document.documentElement.style.setProperty("--head", `${this.header.offsetHeight}px`)).observe(this.header); // dialogs leave it free
     addEventListener("hashchange", () => location.hash.slice(1) in this.tabs && this.show(location.hash.slice(1)));
   }
 
