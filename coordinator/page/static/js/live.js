@@ -276,9 +276,11 @@ export class Live {
     if (!over) return;
     attribute(this.result, "data-state", mission.state);
     const head = { success: "The task reached its final marking", failure: "The task ended in failure", error: "The task ended in error", aborted: "The task was aborted", stopped: "Emergency stop" }[mission.state];
-    const facts = Object.entries(result ?? {}).filter(([, v]) => ["number", "string", "boolean"].includes(typeof v)).slice(0, 8);
+    const said = ["task", "status", "reason"]; // above already
+    const facts = Object.entries(result ?? {}).filter(([k, v]) => !said.includes(k) && ["number", "string", "boolean"].includes(typeof v));
+    const value = (k, v) => (typeof v !== "number" ? String(v) : k.endsWith("_s") ? seconds(v) : +v.toPrecision(4));
     fill(this.result, h("h2", {}, icon(STATUS_ICON[mission.state] ?? "error"), head), mission.reason ? h("p", {}, mission.reason) : null,
-      facts.length ? h("dl", {}, facts.map(([k, v]) => h("div", {}, h("dt", {}, words(k)), h("dd", {}, typeof v === "number" ? +v.toPrecision(4) : String(v))))) : null);
+      facts.length ? h("dl", {}, facts.map(([k, v]) => h("div", {}, h("dt", {}, words(k.replace(/_s$/, ""))), h("dd", {}, value(k, v))))) : null);
   }
 
   controlsChanged() {

@@ -88,9 +88,12 @@ export class Operator {
 
   /** Ask how the run is to go before it is started. */
   async startWith() {
+    if (this.asking) return; // a second press, while the server is asked for the options
+    this.asking = true;
     await this.loading; // of the task that was picked just now
     const { file, revision } = this.link.state.mission;
     const about = file ? await startForm(file) : null;
+    this.asking = false;
     if (about) startDialog(about, file, (data) => this.give("start", { ...data, revision }, false, true));
   }
 

@@ -77,7 +77,7 @@ export class Timeline {
       pen.fillRect(Math.round(x), HEAD - 4, 1, height);
       pen.fillStyle = this.colour("muted");
       pen.textAlign = "center";
-      if (x < width - 24) pen.fillText(step < 1 ? t.toFixed(1) : `${Math.round(t)} s`, x, 11 * this.em);
+      if (x < width - 24) pen.fillText(`${t.toFixed(step < 1 ? 1 : 0)} s`, x, 11 * this.em);
     }
   }
 
