@@ -114,8 +114,15 @@ class Station:
         answer = self.controls.fault(who, verb) or self.controls.carry_out(who, verb, data)
         if answer is not None:
             return answer
-        if verb in ("estop", "clear_estop"):
-            self._stopped = verb == "estop"
+        if verb == "estop":
+            self._stopped = True
+        answer = await self._pass_on(who, verb, data)
+        if verb == "clear_estop" and answer["ok"]:
+            self._stopped = False
+        return answer
+
+    async def _pass_on(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer:
+        """Carry out a command about the station or the next run, or let the active run do it."""
         if verb in ("start", "load"):
             return await self._guarded(
                 self._start if verb == "start" else self._load, verb, who, data
@@ -368,9 +375,10 @@ class Station:
         return await self._order(STOP)
 
     async def _clear_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
-        """Let devices accept orders again; this alone moves nothing."""
+        """Let devices accept orders again; this alone moves nothing. As long as a node has not
+        answered, the cell counts as stopped: its devices still are, and it can be cleared again."""
         answer = await self._order(CLEAR)
-        if self.feed.state["mission"]["state"] == "stopped":
+        if answer["ok"] and self.feed.state["mission"]["state"] == "stopped":
             self.feed.emit("mission", mission={"state": "idle", "reason": ""})
         return answer
 

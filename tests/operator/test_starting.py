@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.operator import station
-from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP
+from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, Stopped
 from petrobot.coordinator.operator.history import opened
 from petrobot.coordinator.operator.observation import TASK_REPORT
 from petrobot.coordinator.operator.prepare import RunRequest
@@ -323,6 +323,26 @@ async def test_an_emergency_stop_in_a_simulated_run_also_stops_the_real_devices(
     assert (await cell.say("clear_estop"))["ok"]
     assert orders == [STOP, CLEAR]
     assert cell.state["mission"]["state"] == "idle"
+
+
+async def test_a_stop_that_a_node_did_not_clear_is_still_shown(
+    cell: Simulated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its devices are still stopped: nothing starts, and the stop can be cleared again."""
+    seconds: list[float | None] = [0.1, None, 0.1]
+
+    async def order_all(directory: Any, credentials: Any, verb: str) -> list[Stopped]:
+        return [Stopped("arm", seconds=seconds.pop(0), why="connection refused")]
+
+    monkeypatch.setattr(station, "order_all", order_all)
+    assert (await cell.say("estop"))["ok"]
+    answer = await cell.say("clear_estop")
+    assert not answer["ok"] and "connection refused" in answer["text"]
+    assert cell.state["mission"]["state"] == "stopped"
+    assert (await cell.say("start", task="moving", mode="lockstep"))["code"] == "stopped"
+    assert (await cell.say("clear_estop"))["ok"]
+    assert cell.state["mission"]["state"] == "idle"
+    assert (await cell.simulate(runs=1))[1]["status"] == "success"
 
 
 async def test_a_run_in_lock_step_learns(cell: Simulated, tmp_path: Path) -> None:
