@@ -177,7 +177,7 @@ class ChangePublisher:
         before_overrides = seen.overrides if seen else {}
         if before_overrides is not state.overrides:
             self._overrides(time, before_overrides, state.overrides)
-        if self._why:  # left over: draws of conflicts, and runs that lost their token before a start
+        if self._why:  # left over: draws of conflicts, and runs that never started
             self._why = {key: why for key, why in self._why.items() if state.run(key) is not None}
         if (
             state.mode in (Mode.RUNNING, Mode.PAUSED)
@@ -260,10 +260,9 @@ class ChangePublisher:
     def _answered(self, time: float, held: RunHeld) -> None:
         self._state(time, held.run, _AFTER_HOLD[held.answer])
         node = self._where.get(self._actions.get(held.run, ""), "?")
-        before = self._held.get(node, Hold.HELD.value)
-        self._held[node] = (
-            before if before == Hold.CANNOT.value else held.answer.value
-        )  # the worst answer among a node's runs
+        # Of a node with several runs the worst answer is shown.
+        if self._held.get(node) != Hold.CANNOT.value:
+            self._held[node] = held.answer.value
         paused = self.feed.state["paused"]
         if paused is not None:
             self.feed.emit("paused", time=time, paused={**paused, "nodes": dict(self._held)})

@@ -44,8 +44,6 @@ _log = logging.getLogger(__package__)
 
 FAULTS = (JournalError, ReplayError, TaskFileError, DirectoryError, EstimatesError, OSError)
 """Exceptions of a start apart from ValueError and KeyError: faulty files."""
-
-
 LOOK, PATIENCE = 2.0, 1.5
 """Time between requests to idle nodes, and for their answers (s)."""
 LAST_WORDS = 10.0
@@ -201,9 +199,8 @@ class Station:
 
     async def _start(self, who: str, data: Mapping[str, Any]) -> Answer:
         if self._going is not None and self.feed.state["mission"]["state"] in OVER:
-            await asyncio.wait(
-                {self._going}, timeout=LAST_WORDS
-            )  # It is only closing its connections.
+            # It is only closing its connections.
+            await asyncio.wait({self._going}, timeout=LAST_WORDS)
         if (busy := self._busy()) is not None:
             return busy
         if self._stopped:
@@ -263,9 +260,8 @@ class Station:
         """Start a simulated run from a point of a recorded one."""
         run = await asyncio.to_thread(self._prepared_from, data)
         task = run.mission.executor.task.name
-        name = (
-            task if task in self._tasks.names() else ""
-        )  # Its file may have been deleted or renamed.
+        # Its file may have been deleted or renamed.
+        name = task if task in self._tasks.names() else ""
         if name != self._loaded:
             self._forget(name)
         return self._follow(run)

@@ -187,7 +187,14 @@ async def nothing_is_cut(tab: Tab) -> None:
         "dialog *",
     ):
         assert await tab.evaluate(OUTSIDE, box) == []
-    for box in (".top > *", ".operator > *", ".scrub > *", ".tabs > button", ".banner > *", ".top, dialog"):
+    for box in (
+        ".top > *",
+        ".operator > *",
+        ".scrub > *",
+        ".tabs > button",
+        ".banner > *",
+        ".top, dialog",
+    ):
         assert await tab.evaluate(OVERLAP, box) == []
     stop = await tab.get_by_role("button", name="Emergency stop").bounding_box()
     size = tab.viewport_size
