@@ -77,7 +77,9 @@ class Station:
         self._nodes: Mapping[str, Any] = {}
         self._run: RunSession | None = None
         self._apart = BackgroundProcess()
-        self._starting = self._stopped = False
+        self._starting = False
+        self._stopped = ""
+        """Why nothing may start: the emergency stop that is not cleared; empty without one."""
         self._going: asyncio.Task[None] | None = None
         self._looking = asyncio.get_running_loop().create_task(self._look())
         self.feed.replace(
@@ -113,10 +115,10 @@ class Station:
         if answer is not None:
             return answer
         if verb == "estop":
-            self._stopped = True
+            self._stopped = f"emergency stop by {who}"
         answer = await self._pass_on(who, verb, data)
         if verb == "clear_estop" and answer["ok"]:
-            self._stopped = False
+            self._stopped = ""
         return answer
 
     async def _pass_on(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer:
@@ -193,6 +195,8 @@ class Station:
         self._revision = text.revision
         self._publisher(task).begin("", "realtime", **self._kept(task))
         self._tell_file()
+        if self._stopped:
+            self._tell_stopped()
 
     def _tell_file(self) -> None:
         self.feed.emit("mission", mission={"file": self._loaded, "revision": self._revision})
@@ -365,10 +369,11 @@ class Station:
         return {"ok": True}
 
     async def _estop(self, who: str, data: Mapping[str, Any]) -> Answer:
-        self.feed.emit(
-            "mission", mission={"state": "stopped", "reason": f"emergency stop by {who}"}
-        )
+        self._tell_stopped()
         return await self._order(STOP)
+
+    def _tell_stopped(self) -> None:
+        self.feed.emit("mission", mission={"state": "stopped", "reason": self._stopped})
 
     async def _clear_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
         """Let devices accept orders again; this alone moves nothing. As long as a node has not
@@ -399,10 +404,21 @@ class Station:
             await asyncio.sleep(LOOK)
 
     async def look(self) -> None:
-        """Ask every node whether it is up and what it offers."""
+        """Ask every node whether it is up, what it offers, and whether an emergency stop holds its
+        devices: one from before this coordinator, or from a terminal."""
+        was_stopped = self._stopped
         self._nodes = await ask_all(self.directory, PATIENCE)
         if self._run is not None:
             return  # The active run reports them itself.
+        held = [
+            device
+            for answer in self._nodes.values()
+            for device in answer.get("status", {}).get("emergency", ())
+        ]
+        # If it was cleared meanwhile, the answers may be older than that.
+        if held and not was_stopped and not self._stopped:
+            self._stopped = f"an emergency stop holds {', '.join(held)}"
+            self._tell_stopped()
         for name, answer in self._nodes.items():
             state = (
                 {"state": "up", "text": ""}

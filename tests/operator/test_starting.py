@@ -345,6 +345,38 @@ async def test_a_stop_that_a_node_did_not_clear_is_still_shown(
     assert (await cell.simulate(runs=1))[1]["status"] == "success"
 
 
+async def test_a_stop_from_before_this_coordinator_is_shown(
+    cell: Simulated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The nodes report it. It is not set again by an answer that is older than its end."""
+    about: dict[str, Any] = {"up": True, "address": "here", "offers": ()}
+    cleared = asyncio.Event()
+
+    async def ask_all(directory: Any, patience: float) -> dict[str, Any]:
+        if cell.station._stopped:
+            await cleared.wait()
+        stopped = {"arm": {"emergency": ["gripper"]}, "vision": {}}
+        return {node: {**about, "status": status} for node, status in stopped.items()}
+
+    async def order_all(directory: Any, credentials: Any, verb: str) -> list[Any]:
+        return []
+
+    monkeypatch.setattr(station, "ask_all", ask_all)
+    monkeypatch.setattr(station, "order_all", order_all)
+    await cell.station.look()
+    assert cell.state["mission"]["state"] == "stopped"
+    assert cell.state["mission"]["reason"] == "an emergency stop holds gripper"
+    assert (await cell.say("load", task="moving"))["ok"]
+    assert cell.state["mission"]["state"] == "stopped", "the button that clears it stays"
+    assert (await cell.say("start", task="moving", mode="lockstep"))["code"] == "stopped"
+    asked = asyncio.create_task(cell.station.look())
+    await asyncio.sleep(0)
+    assert (await cell.say("clear_estop"))["ok"]
+    cleared.set()
+    await asked
+    assert cell.state["mission"]["state"] == "idle"
+
+
 async def test_a_run_in_lock_step_learns(cell: Simulated, tmp_path: Path) -> None:
     """It writes to the named estimates file; a second run starts with what the first one learned,
     and a frozen one adds nothing."""
