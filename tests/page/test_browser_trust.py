@@ -3,6 +3,7 @@ show, connections that fail."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 from collections.abc import Callable
@@ -230,6 +231,52 @@ async def test_an_exception_in_the_page_is_reported_and_followed_by_a_new_connec
     await expect(element(tab, "^Control place parts, 9 tokens", "Task net")).to_be_visible()
     assert any("a fault for the test" in said for said in await tab.evaluate("window.barSaid"))
     await expect(tab.get_by_role("alert")).to_be_hidden()
+
+
+async def test_missing_changes_are_asked_for_once(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """A delta is missing: however many follow before the snapshot, the page asks for one. The next
+    time it asks again."""
+    context = await browser.new_context(viewport=SIZE)
+    held: list[str | bytes] = []
+    asked, dropping = list[str](), list[bool]()
+
+    def carry(socket: WebSocketRoute) -> None:
+        server = socket.connect_to_server()
+
+        def receive(message: str | bytes) -> None:
+            if dropping and '"type":"delta"' in str(message):
+                dropping.pop()
+            elif len(asked) == 1 and '"type":"snapshot"' in str(message):
+                held.append(message)
+            else:
+                socket.send(message)
+
+        def send(message: str | bytes) -> None:
+            if '"resync"' in str(message):
+                asked.append(str(message))
+            server.send(message)
+
+        server.on_message(receive)
+        socket.on_message(send)
+
+    await context.route_web_socket("**/api/live", carry)
+    tab = await context.new_page()
+    await tab.goto(page.url)
+    await expect(element(tab, "^Control place parts", "Task net")).to_be_visible()
+    dropping.append(True)
+    for parts in range(9):
+        stage.feed.emit("marking", marking={"parts": parts})
+        await asyncio.sleep(0.05)
+    await tab.wait_for_function("petrobot.link.gaps > 3")
+    assert len(asked) == 1
+    await until(lambda: bool(held))
+    old = json.dumps({**json.loads(held[-1]), "sequence": 0})
+    await tab.evaluate("(m) => petrobot.link.receive(petrobot.link.socket, m)", old)
+    stage.feed.emit("marking", marking={"parts": 12})
+    await expect(element(tab, "^Control place parts, 12 tokens", "Task net")).to_be_visible()
+    assert len(asked) == 2
 
 
 async def test_the_emergency_stop_works_when_messages_cannot_be_read(
