@@ -5,7 +5,7 @@ import { at, BAR_H, BAR_W, labelAt, PLACE_R } from "./geometry.js";
 const SIDES = ["below", "above", "right", "left"];
 const CELL = 120;
 const SAMPLES = 16;
-const COST = { arc: 3, node: 25, words: 14, side: 0.5 };
+const COST = { arc: 3, node: 25, words: 14, side: 0.5 }; // of what is covered; of each side behind the preferred one
 const WIDTH = { place: 7.2, transition: 6.2, sub: 5.8 }; // of a character, about
 const UP = 11;
 const DOWN = 4;
