@@ -135,8 +135,7 @@ export class History {
 
   async shown() {
     const before = this.opening;
-    this.runs = await listRuns();
-    this.paintRuns();
+    await this.refresh();
     if (this.opening !== before) return;
     if (!this.reel) await this.open(this.runs[0]?.id ?? SESSION);
     else if (this.reel.run.id === SESSION) this.open(SESSION, true);
@@ -153,6 +152,11 @@ export class History {
     attribute(this.startHere, "title", why || null);
   }
 
+  async refresh() {
+    this.runs = await listRuns();
+    this.paintRuns();
+  }
+
   // ---- the active run, as this page has seen it ----------------------------------------------------------------------
 
   restart() {
@@ -162,6 +166,8 @@ export class History {
 
   follow(change) {
     const { session } = this;
+    if (!this.root.hidden && change.kind === "mission") this.paintRuns();
+    if (!this.root.hidden && change.kind === "result") this.refresh();
     if (!session) return;
     if (change.kind === "fired") this.addFiring(session, change.firing);
     else if (change.kind === "marking") this.addDifference(session, change.marking);

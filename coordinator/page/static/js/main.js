@@ -75,7 +75,8 @@ class App {
   paint(changed, changes) {
     const { state } = this.link;
     this.lost.update(); // before all that may fail
-    this.banner.update(state, this.link.now());
+    this.banner.update(state);
+    this.banner.tick(this.link.now());
     this.operator.update(state);
     this.tabs.Live.paint(changed, changes);
     if (["all", "controls", "connection", "mission"].some((p) => changed.has(p))) for (const tab of Object.values(this.tabs)) tab.controlsChanged?.();
@@ -88,7 +89,7 @@ class App {
   tick() {
     this.lost.update();
     const now = this.link.now();
-    text(this.banner.time, `${now.toFixed(1)} s`);
+    this.banner.tick(now);
     if (this.shown === "Live") this.tabs.Live.tick(now);
   }
 }

@@ -201,16 +201,19 @@ export class Banner {
   constructor() {
     this.state = h("span", { class: "state" });
     this.task = h("span", { class: "task-name" });
-    this.time = h("span", { class: "time" });
+    this.time = h("span", { class: "time", "aria-live": "off" }); // read out with each change of the rest, not each second
     this.mode = h("span", { class: "mode", hidden: true });
     this.root = h("div", { class: "banner", role: "status", "aria-label": "Mission state" }, this.state, this.task, this.mode, this.time);
   }
 
-  update(state, now) {
+  tick(now) {
+    text(this.time, now < 100 ? `${now.toFixed(1)} s` : seconds(now));
+  }
+
+  update(state) {
     attribute(this.root, "data-state", stateOf(state));
     text(this.state, stateWord(state));
     text(this.task, words(state.task?.name ?? "no task"));
-    text(this.time, seconds(now));
     const { from, mode, id } = state.mission;
     this.mode.hidden = mode !== "lockstep" || !id;
     text(this.mode, from ? `from record ${from.record}` : "simulated");
