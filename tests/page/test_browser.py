@@ -226,6 +226,22 @@ async def test_states_and_times_on_the_page_are_those_of_now(
     await expect(runs).to_contain_text("12.5 s")
 
 
+async def test_firings_of_another_run_are_not_taken_for_those_shown(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """Each run counts its firings from 1. A window that slept sees the next run's at once."""
+    tab = await opened(browser, page)
+    firings = tab.get_by_role("region", name="Last firings")
+    about = {"number": 1, "at": 0.5, "error": False, "cause": "event"}
+    stage.feed.emit("fired", firing={**about, "transition": "begin"})
+    await expect(firings).to_contain_text("begin")
+    parts = {key: stage.feed.state[key] for key in ("task", "marking", "nodes", "events")}
+    mission = {**stage.feed.state["mission"], "id": "the next run"}
+    stage.feed.replace(**parts, mission=mission, firings=[{**about, "transition": "placed"}])
+    await expect(firings).to_contain_text("placed")
+    await expect(firings).not_to_contain_text("begin")
+
+
 async def test_an_open_list_of_alternatives_stays_usable_while_a_run_learns(
     browser: Browser, page: Page, stage: Stage
 ) -> None:

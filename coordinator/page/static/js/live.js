@@ -223,9 +223,10 @@ export class Live {
     // each new row shifts all others: a busy net is read at four lists a second
     if (!now && performance.now() - (this.firingsAt ?? 0) < FIRINGS_MS) return this.stale.add("firings");
     this.firingsAt = performance.now();
-    const list = this.link.state.firings.slice(-FIRINGS_SHOWN).reverse();
-    this.firings.count(this.link.state.mission.firings ?? "");
-    rows(this.firings.content, list, (f) => f.number, (f) => this.firingRow(f));
+    const { firings, mission } = this.link.state;
+    const list = firings.slice(-FIRINGS_SHOWN).reverse();
+    this.firings.count(mission.firings ?? "");
+    rows(this.firings.content, list, (f) => `${mission.id} ${f.number}`, (f) => this.firingRow(f)); // each run counts from 1
     if (!list.length) this.firings.content.dataset.empty = "Nothing has fired yet.";
     else delete this.firings.content.dataset.empty;
     return null;

@@ -30,7 +30,7 @@ export class Selected {
     if (this.root.hidden) return;
     const run = place ? Object.values(state.runs).find((r) => r.place === this.name) : null;
     const stop = state.breakpoints.includes(`${place ? "places" : "transitions"}.${this.name}`);
-    const key = JSON.stringify([this.name, state.marking[this.name], run?.id, run?.state, stop, this.link.mayAct, state.mission.state, transition && this.missing(state, transition), this.lastFiring(state)?.number]);
+    const key = JSON.stringify([this.name, state.marking[this.name], run?.id, run?.state, stop, this.link.mayAct, state.mission.id, state.mission.state, transition && this.missing(state, transition), this.lastFiring(state)?.number]);
     if (key === this.key) return;
     if (this.drawn === this.name && this.press.holds(() => this.update(this.link.state, this.link.now()))) return;
     Object.assign(this, { key, drawn: this.name });
