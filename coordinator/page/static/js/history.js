@@ -216,9 +216,11 @@ export class History {
   async open(id, keep = false) {
     const ticket = (this.opening = (this.opening ?? 0) + 1);
     attribute(this.root, "aria-busy", "true");
+    if (!this.reel) fill(this.about, "Opening the run …"); // replaying a long journal takes seconds
     const reel = await this.fetchReel(id);
     if (ticket !== this.opening) return; // another run was chosen meanwhile
     attribute(this.root, "aria-busy", null);
+    if (!reel && !this.reel) fill(this.about);
     if (!reel) return;
     this.reel = reel;
     this.screens[0].load(reel);
