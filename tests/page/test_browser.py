@@ -226,6 +226,26 @@ async def test_states_and_times_on_the_page_are_those_of_now(
     await expect(runs).to_contain_text("12.5 s")
 
 
+async def test_what_a_short_form_adds_has_a_name_for_people(browser: Browser, page: Page) -> None:
+    """On every tab a copy of a transition is called as it is, and a retry by its place."""
+    tab = await opened(browser, page)
+    task = {
+        "places": [{"name": "grip", "label": ""}, {"name": "grip.left", "label": ""}],
+        "transitions": [
+            {"name": "has_it", "label": "", "made_from": ""},
+            {"name": "has_it.1", "label": "", "made_from": "has_it"},
+            {"name": "grip.retry", "label": "", "made_from": "grip"},
+        ],
+    }
+    script = """async (task) => {
+      const { labelsOf } = await import("/page/js/sheet.js");
+      return Object.fromEntries(labelsOf(task));
+    }"""
+    labels = await tab.evaluate(script, task)
+    assert labels["has_it"] == labels["has_it.1"] == "has it"
+    assert labels["grip.retry"] == "grip: retry"
+
+
 async def test_firings_of_another_run_are_not_taken_for_those_shown(
     browser: Browser, page: Page, stage: Stage
 ) -> None:

@@ -269,7 +269,7 @@ async def test_missing_changes_are_asked_for_once(
     for parts in range(9):
         stage.feed.emit("marking", marking={"parts": parts})
         await asyncio.sleep(0.05)
-    await tab.wait_for_function("petrobot.link.gaps > 3")
+    await tab.wait_for_function("() => petrobot.link.gaps > 3")
     assert len(asked) == 1
     await until(lambda: bool(held))
     old = json.dumps({**json.loads(held[-1]), "sequence": 0})

@@ -6,7 +6,7 @@ import { listRuns, openRun } from "./files.js";
 import { icon } from "./icons.js";
 import { reasonText } from "./live.js";
 import { simulateDialog } from "./start.js";
-import { alarms, drawnOn, sheetOf, tokensOf, trailOf } from "./sheet.js";
+import { alarms, drawnOn, labelsOf, sheetOf, tokensOf, trailOf } from "./sheet.js";
 
 const SESSION = "(this run)";
 const ROWS_AROUND = 120;
@@ -297,9 +297,11 @@ export class History {
     return this.every.checked || record.firings.length > 0 || Object.keys(record.marking).length > 0 || record.notes?.length > 0;
   }
 
-  /** How a transition is called on the drawing. */
+  /** How an element is called on the drawing. */
   labelOf(name) {
-    return words(this.reel.run.task?.transitions.find((t) => t.name === name)?.label || name);
+    const { task } = this.reel.run;
+    this.reel.labels ??= task && labelsOf(task);
+    return this.reel.labels?.get(name) ?? words(name);
   }
 
   toError(step) {
@@ -323,16 +325,15 @@ export class History {
       return row;
     }));
     if (!current) return;
-    const { offsetTop: top, offsetHeight: tall } = current;
-    const box = this.recordsBox;
-    if (top < box.scrollTop + 40 || top + tall > box.scrollTop + box.clientHeight - 40) box.scrollTop = top - box.clientHeight / 2;
+    const box = [this.rowsBox, this.recordsBox].find((b) => b.scrollHeight > b.clientHeight + 1) ?? this.recordsBox; // in a small window the rows scroll
+    const top = current.getBoundingClientRect().top - box.getBoundingClientRect().top;
+    if (top < 40 || top + current.offsetHeight > box.clientHeight - 40) box.scrollTop += top - box.clientHeight / 2;
   }
 
   simulate() {
     const { run, records } = this.reel;
     const record = this.index ? records[this.index - 1] : null;
-    const labelOf = (place) => words(run.task.places.find((p) => p.name === place)?.label || place);
-    simulateDialog(run, record?.number ?? 0, record?.going ?? [], labelOf, async (data) => {
+    simulateDialog(run, record?.number ?? 0, record?.going ?? [], (place) => this.labelOf(place), async (data) => {
       const answer = await this.operator.give("start", data, false, true);
       if (answer.ok) location.hash = "#Live";
       return answer;

@@ -8,7 +8,7 @@ import { icon } from "./icons.js";
 import { Learning, objectives } from "./learning.js";
 import { Selected } from "./selected.js";
 import { Selectors } from "./selectors.js";
-import { alarms, drawnOn, runsOn, sheetOf, tokensOf, trailOf } from "./sheet.js";
+import { alarms, drawnOn, labelsOf, runsOn, sheetOf, tokensOf, trailOf } from "./sheet.js";
 import { Timeline } from "./timeline.js";
 
 const FIRINGS_SHOWN = 25;
@@ -124,12 +124,8 @@ export class Live {
   /** How an element is called on the drawing. */
   labelOf(name) {
     const { task } = this.link.state;
-    if (this.labelled !== task) {
-      this.labelled = task;
-      this.labels = new Map([...(task?.places ?? []), ...(task?.transitions ?? [])].map((e) => [e.name, e.label]));
-      for (const t of task?.transitions ?? []) if (this.labels.has(t.made_from) && !t.label) this.labels.set(t.name, this.labels.get(t.made_from) || t.made_from);
-    }
-    return words(this.labels.get(name) || name);
+    if (this.labelled !== task) [this.labelled, this.labels] = [task, task && labelsOf(task)];
+    return this.labels?.get(name) ?? words(name);
   }
 
   /** What represents an element on the open sheet; null if it is outside. */
