@@ -22,6 +22,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+Point = tuple[float, float]
 Edge = tuple[str, str]
 WayPoint = tuple[str, str, int]
 """A way point of an arc: its two ends and its column."""
@@ -34,6 +35,25 @@ _SWEEPS = 10
 """Sweeps over the columns for each starting order."""
 _TIGHTENINGS = 12
 """Passes that move nodes closer to their neighbours' columns."""
+COLUMN = 120.0
+"""Distance between two columns (drawing units)."""
+ROW = 105.0
+"""Least distance between two nodes of a column; a way point needs less room."""
+_BESIDE_NODE = 58.0
+"""The same between a node and a way point."""
+_BESIDE_ARC = 24.0
+"""The same between two way points."""
+MARGIN = 80.0
+WIDEST = 14
+"""Columns of one band: about what a screen shows."""
+FOLDED_FROM = 28
+"""Columns from which a layout is folded: a fold costs crossings, so what a reader can still follow
+stays in one band."""
+_SETTLINGS = 20
+"""Passes in which the heights of nodes approach those of their neighbours."""
+_STRAIGHT = (1.0, 3.0, 9.0)
+"""Weights of level arcs: between nodes, from a node to a way point, between way points. Bends
+between way points look worst, so these weigh most."""
 
 
 class Layers:
@@ -127,7 +147,8 @@ class Layers:
         column.sort(key=lambda s: mean[s])
 
     def _exchange(self) -> None:
-        """Swap neighbours in a column as long as that removes crossings."""
+        """Swap neighbours in a column while that removes crossings, in four passes at most: a sweep
+        follows anyway."""
         for _ in range(4):
             better = False
             row = self._rows()
@@ -235,24 +256,6 @@ def _longest_paths(
             if not waiting[child]:
                 ready.append(child)
     return column
-
-
-Point = tuple[float, float]
-
-COLUMN = 120.0
-ROW = 105.0
-MARGIN = 80.0
-WIDEST = 14
-"""Columns of one band: about what a screen shows."""
-FOLDED_FROM = 28
-"""Columns from which a layout is folded: a fold costs crossings, so what a reader can still follow
-stays in one band."""
-_BESIDE_NODE = 58.0
-_BESIDE_ARC = 24.0
-_SETTLINGS = 20
-_STRAIGHT = (1.0, 3.0, 9.0)
-"""Weights of level arcs: between nodes, from a node to a way point, between way points. Bends
-between way points look worst, so these weigh most."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -64,6 +64,8 @@ def _settle(
 ) -> list[Match] | Draw:
     claims, step = Claims(), list[Match]()
     while rest:
+        # What does not fit beside the claims is left to the next step, for which the firings of
+        # this one mark it again.
         rest = [m for old in rest if (m := match(draft, old.transition, pulse, claims))]
         if not rest:
             break
@@ -78,6 +80,8 @@ def _settle(
                         tuple(m.transition.name for m in contest),
                         tuple(m.transition.weight or 0.0 if weighed else 0.0 for m in contest),
                     )
+                # After each draw the step is built again from its beginning: a state keeps the
+                # outcomes, not a half-built step.
                 drawn = choices.pop(0)
                 head = next((m for m in contest if m.transition.name == drawn), head)
             else:
@@ -119,7 +123,7 @@ def _rank_and_place(m: Match) -> tuple[int, bool, int]:
 def _first(draft: Draft, pulse: str, rest: list[Match], claims: Claims) -> Match:
     """Return the first match by rank, unless it would block (by inhibitor or capacity) another one
     that does not block it."""
-    head, passed = rest[0], set[int]()
+    head, passed = rest[0], set[int]()  # blocking can go in a circle: none is examined twice
     while True:
         passed.add(head.transition.index)
         sooner = (

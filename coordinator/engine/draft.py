@@ -12,7 +12,11 @@ from petrobot.coordinator.task.wording import Severity
 
 
 class Draft:
-    """The working copy. `freeze` gives the next state; the old one does not change."""
+    """The working copy. `freeze` gives the next state; the old one does not change.
+
+    The containers are copied, but not what they hold: runs and timers are immutable and replaced.
+    So a state stays valid however many stimuli are tried from it, as the analysis does.
+    """
 
     def __init__(self, compiled: Compiled, state: State) -> None:
         self.compiled = compiled

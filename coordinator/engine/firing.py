@@ -64,7 +64,7 @@ class Claims:
         self.sets.update(name for name, _ in x.sets)
 
 
-_NOTHING = Claims()
+_NOTHING = Claims()  # shared by all calls, so never added to
 
 
 def match(
@@ -255,6 +255,7 @@ def fire(draft: Draft, fireable: Match, cause: str) -> None:
     draft.timeless += 1
     draft.told.discard(x.name)
     draft.told.discard(DEAD_END)
+    # The record comes before the orders that the firing gave, but has the marking after them.
     draft.instructions.insert(
         at, Fired(draft.firings, x.name, before, draft.snapshot(), cause, taken)
     )
@@ -281,6 +282,7 @@ def disarm(draft: Draft, name: str) -> None:
 
 def _take_runs(draft: Draft, fireable: Match) -> Iterator[Run]:
     for arc, runs in zip(fireable.transition.actions, fireable.runs, strict=True):
+        # Looked up again: an earlier firing of this step may have consumed an event of the run.
         for run in (draft.find(r.id) or r for r in runs):
             if arc.end is End.GOING:
                 draft.put(run, raised=run.raised.difference(arc.raised))

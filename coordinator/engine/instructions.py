@@ -171,7 +171,11 @@ class Corrected:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A message for people. `key` is a fixed word for programs, `of` the element concerned."""
+    """A message for people. `key` is a fixed word for programs, `of` the element concerned.
+
+    A journal's digest covers the text, too: a message in other words makes older journals that have
+    it differ when they are replayed.
+    """
 
     severity: Severity
     key: str

@@ -217,7 +217,7 @@ class Engine:
 
     def _take(self, draft: Draft, stimulus: Stimulus) -> None:
         kind = type(stimulus)
-        if kind is not Chosen:
+        if kind is not Chosen:  # an answer takes no time: a loop through choices is endless, too
             draft.timeless = 0
         if draft.mode is Mode.FRESH and kind not in _BEFORE_THE_BEGIN:
             _note(draft, "not_begun", f"{kind.__name__} came before the mission run began")
@@ -370,7 +370,7 @@ class Engine:
             _warn(draft, "bad_choice", text, stimulus.key)
             return
         draft.suspended = None
-        draft.touch_all()
+        draft.touch_all()  # the marks of the stimulus that led to the draw are not kept
         choices = (*waiting.choices, stimulus.alternative)
         step = Suspended(
             waiting.pulse, waiting.cause, choices, passed=waiting.passed, only=waiting.only

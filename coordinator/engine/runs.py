@@ -70,7 +70,6 @@ def end_run(draft: Draft, run: Run, end: RunEnded) -> None:
         executed=end.executed if run.place in draft.compiled.executed else None,
         ended=draft.end_order,
         arguments={},
-        raised=run.raised,
     )
     _write_results(draft, run, end)
     for name, value in verdict_variables(done).items():
@@ -90,25 +89,23 @@ def end_stopping(draft: Draft, run: Run, end: RunEnded) -> None:
     """Take a result that arrived after the cancel: the run has stopped. The result is recorded, but
     writes no variable and moves no token."""
     _forget(draft, run)
-    counted = run.counts or Counts.NONE
-    status = (
-        None if counted is Counts.NONE or end.executed is Executed.NO else Status(counted.value)
-    )
     text = f"{run.reason}; it had ended with {end.status}" + (f", {end.cause}" if end.cause else "")
-    _record(draft, run, status, replace(end, text=text), cancelled=True)
+    _record(draft, run, _counted(run, end.executed), replace(end, text=text), cancelled=True)
 
 
 def confirm_stop(draft: Draft, run: Run, stop: StopConfirmed) -> None:
     """Note that a cancelled run has stopped: its device is free."""
     _forget(draft, run)
-    counted = run.counts or Counts.NONE
-    status = (
-        None if counted is Counts.NONE or stop.executed is Executed.NO else Status(counted.value)
-    )
     end = RunEnded(
         run.id, Status.ERROR, "cancelled", run.reason, stop.executed, seconds=stop.seconds
     )
-    _record(draft, run, status, end, cancelled=True)
+    _record(draft, run, _counted(run, stop.executed), end, cancelled=True)
+
+
+def _counted(run: Run, executed: Executed) -> Status | None:
+    """Return the status with which a cancelled run counts; None if it does not count."""
+    counts = run.counts or Counts.NONE
+    return None if counts is Counts.NONE or executed is Executed.NO else Status(counts.value)
 
 
 def fail_stop(draft: Draft, run: Run, stop: StopFailed) -> None:

@@ -107,14 +107,14 @@ def _reader(hint: Any) -> Reader:
 
 
 def _union_reader(hint: Any) -> Reader:
-    if set(get_args(hint)) == set(get_args(Stimulus)):
+    if set(get_args(hint)) == set(get_args(Stimulus)):  # any other union here is `X | None`
         return lambda value, where: _tagged(Stimulus, value)
     inner = _reader(next(a for a in get_args(hint) if a is not type(None)))
     return lambda value, where: None if value is None else inner(value, where)
 
 
 def _container_reader(origin: Any, args: tuple[Any, ...]) -> Reader:
-    item = _reader(args[-1] if origin not in (tuple,) else args[0])
+    item = _reader(args[0] if origin is tuple else args[-1])
     if issubclass(origin, Mapping):
         return lambda value, where: {
             k: item(v, f"{where}.{k}")

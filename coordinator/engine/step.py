@@ -91,11 +91,13 @@ def settle(
             _fire_until_stable(draft, policy, current)
             if draft.mode not in MOVING or draft.suspended is not None or not admit(draft):
                 break
+            # A run ended instead of starting, because its device is fenced.
             current = Suspended("", "stability")
     elif draft.mode is Mode.PAUSED:
         admit(draft)
     if draft.flags:
         forget_flags(draft)
+    # Last: arcs that were satisfied only between two firings of this stimulus arm no timer.
     if draft.retime and draft.mode is not Mode.FINISHED:
         refresh_timers(draft)
     first_come = policy.first_come and not policy.ask_undecided
@@ -140,7 +142,7 @@ def resume(draft: Draft, mode: Mode) -> None:
             draft.put(run, cleared=True)
     if mode is Mode.RUNNING:
         release(draft)
-    draft.touch_all()
+    draft.touch_all()  # marks are not kept: what changed during the pause was not examined
 
 
 def release(draft: Draft) -> None:
@@ -202,6 +204,7 @@ def _set_variables(draft: Draft, values: Mapping[str, Value]) -> None:
     the same step."""
     for name, value in values.items():
         draft.write(name, value)
+        # Others that write it were kept out of this step, and perhaps none of their places changed.
         draft.dirty.update(draft.compiled.setting[name])
 
 
@@ -228,6 +231,7 @@ def _breaks(draft: Draft, current: Suspended, step: list[Match]) -> bool:
     hit = [n for n in names if n in draft.breakpoints and n not in current.passed]
     if not hit:
         return False
+    # The whole step has passed: it fires together, so it pauses once, however many are hit.
     draft.suspended = Suspended(
         current.pulse, current.cause, current.choices, passed=tuple(names), only=current.only
     )

@@ -48,6 +48,8 @@ class OperatorClient:
         self._changes: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
         self._changed = asyncio.Event()
         self._watched = False
+        self._behind = False
+        """Whether changes are missing, and a snapshot has been asked for."""
         self._over = ""
 
     async def __aenter__(self) -> Self:
@@ -167,6 +169,7 @@ class OperatorClient:
         elif kind == "snapshot":
             self.who = message["you"]
             self.state = {key: message.get(key, value) for key, value in empty_state().items()}
+            self._behind = False
             self._tell({"kind": "reset"})
         elif kind == "delta":
             await self._take_delta(message)
@@ -175,7 +178,9 @@ class OperatorClient:
     async def _take_delta(self, delta: dict[str, Any]) -> None:
         assert self._socket is not None
         if delta["first"] != self.state["sequence"] + 1:
-            await self._socket.send_json({"type": "resync"})
+            if not self._behind:
+                await self._socket.send_json({"type": "resync"})
+            self._behind = True
             return
         for change in delta["changes"]:
             apply(self.state, change)

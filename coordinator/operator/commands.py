@@ -1,9 +1,8 @@
 """The operator's side of a live mission run: the state that clients see, and their commands as
 stimuli.
 
-Implements `coordinator.operator.port.MissionPort` for a mission run in real time. Every command is
-a journaled stimulus; this module also decides which client holds the controls. The emergency stop
-waits for nothing and is sent directly to the nodes.
+Implements `coordinator.operator.port.MissionPort` for one mission run. A command that concerns the
+net is a journaled stimulus. The emergency stop waits for nothing and is sent directly to the nodes.
 """
 
 from __future__ import annotations
@@ -51,7 +50,6 @@ _log = logging.getLogger(__package__)
 
 ANSWERS = 1.5
 """Time for nodes to answer a pause (s)."""
-REFUSED = frozenset({"refused"})
 _BEFORE = (Stage.CONNECTING, Stage.PREPARING)
 _MAY_COME_EARLY = (SetBreakpoints, Override)
 """Commands that only configure the run and move nothing."""
@@ -129,7 +127,7 @@ class Operation:
 
     def instruction(self, now: float, instruction: Instruction) -> None:
         """Note refusals of the engine, for the answer to the command, and runs asked to hold."""
-        if isinstance(instruction, Report) and instruction.key in REFUSED:
+        if isinstance(instruction, Report) and instruction.key == "refused":
             self._refusals.append(instruction.text)
         elif isinstance(instruction, HoldRun):
             self._holding[instruction.run] = self._node_of(instruction.run)

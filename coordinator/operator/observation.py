@@ -223,9 +223,8 @@ class Watching:
         """Show what was learned from a run's result."""
         if isinstance(instruction, RunRecorded):
             self._learned(instruction.primitive_task)
-        elif isinstance(
-            instruction, Corrected
-        ):  # This is not another trial, so nothing is added to the curves.
+        elif isinstance(instruction, Corrected):
+            # This is not another trial, so nothing is added to the curves.
             self._shown(self._mission.executor.task.primitive_task_of(instruction.place).name)
 
     def _shown(self, name: str) -> list[dict[str, Any]]:

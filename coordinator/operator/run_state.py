@@ -25,7 +25,6 @@ from petrobot.coordinator.engine import (
     ReleaseRun,
     Report,
     Resumed,
-    RunEnded,
     RunHeld,
     RunRecorded,
     StartRun,
@@ -69,6 +68,7 @@ class ChangePublisher:
         self._where = where or {}
         self._net = task.net
         self._stimulus: Stimulus | None = None
+        # By run, as long as its token is there; a mission of many hours must not fill the memory.
         self._ends: dict[str, dict[str, Any]] = {}
         self._actions: dict[str, str] = {}
         self._why: dict[str, str] = {}
@@ -134,11 +134,7 @@ class ChangePublisher:
         """Publish a stimulus that the engine receives."""
         time = now - self.origin
         self._stimulus = stimulus
-        if isinstance(stimulus, RunEnded):
-            self._ends[stimulus.run] = reason_of(
-                stimulus.status, stimulus.cause, stimulus.text, stimulus.executed
-            )
-        elif isinstance(stimulus, Chosen):
+        if isinstance(stimulus, Chosen):
             self._why[stimulus.key] = stimulus.reason
         elif isinstance(stimulus, (EventOccurred, RaiseEvent)):
             known = self.feed.state["events"].get(stimulus.event)
@@ -181,6 +177,8 @@ class ChangePublisher:
         before_overrides = seen.overrides if seen else {}
         if before_overrides is not state.overrides:
             self._overrides(time, before_overrides, state.overrides)
+        if self._why:  # left over: draws of conflicts, and runs that never started
+            self._why = {key: why for key, why in self._why.items() if state.run(key) is not None}
         if (
             state.mode in (Mode.RUNNING, Mode.PAUSED)
             and self.feed.state["mission"]["state"] == "idle"
@@ -221,6 +219,9 @@ class ChangePublisher:
 
     def _fired(self, time: float, fired: Fired) -> None:
         firing = firing_of(fired, self._stimulus, self._ends, self._actions)
+        for run in fired.runs:
+            self._ends.pop(run, None)
+            self._actions.pop(run, None)
         firing |= {
             "number": fired.number,
             "at": round(time, 4),
@@ -259,17 +260,17 @@ class ChangePublisher:
     def _answered(self, time: float, held: RunHeld) -> None:
         self._state(time, held.run, _AFTER_HOLD[held.answer])
         node = self._where.get(self._actions.get(held.run, ""), "?")
-        before = self._held.get(node, Hold.HELD.value)
-        self._held[node] = (
-            before if before == Hold.CANNOT.value else held.answer.value
-        )  # the worst answer among a node's runs
+        # Of a node with several runs the worst answer is shown.
+        if self._held.get(node) != Hold.CANNOT.value:
+            self._held[node] = held.answer.value
         paused = self.feed.state["paused"]
         if paused is not None:
             self.feed.emit("paused", time=time, paused={**paused, "nodes": dict(self._held)})
 
     def _recorded(self, time: float, record: RunRecorded) -> None:
         reason = reason_recorded(record)
-        self._ends.setdefault(record.run, reason)
+        if not record.cancelled:  # its token is still there
+            self._ends[record.run] = reason
         status = record.status.value if record.status is not None else "none"
         self.feed.emit(
             "run_ended",

@@ -44,8 +44,6 @@ _log = logging.getLogger(__package__)
 
 FAULTS = (JournalError, ReplayError, TaskFileError, DirectoryError, EstimatesError, OSError)
 """Exceptions of a start apart from ValueError and KeyError: faulty files."""
-
-
 LOOK, PATIENCE = 2.0, 1.5
 """Time between requests to idle nodes, and for their answers (s)."""
 LAST_WORDS = 10.0
@@ -79,7 +77,9 @@ class Station:
         self._nodes: Mapping[str, Any] = {}
         self._run: RunSession | None = None
         self._apart = BackgroundProcess()
-        self._starting = self._stopped = False
+        self._starting = False
+        self._stopped = ""
+        """Why nothing may start: the emergency stop that is not cleared; empty without one."""
         self._going: asyncio.Task[None] | None = None
         self._looking = asyncio.get_running_loop().create_task(self._look())
         self.feed.replace(
@@ -114,8 +114,15 @@ class Station:
         answer = self.controls.fault(who, verb) or self.controls.carry_out(who, verb, data)
         if answer is not None:
             return answer
-        if verb in ("estop", "clear_estop"):
-            self._stopped = verb == "estop"
+        if verb == "estop":
+            self._stopped = f"emergency stop by {who}"
+        answer = await self._pass_on(who, verb, data)
+        if verb == "clear_estop" and answer["ok"]:
+            self._stopped = ""
+        return answer
+
+    async def _pass_on(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer:
+        """Carry out a command about the station or the next run, or let the active run do it."""
         if verb in ("start", "load"):
             return await self._guarded(
                 self._start if verb == "start" else self._load, verb, who, data
@@ -188,15 +195,16 @@ class Station:
         self._revision = text.revision
         self._publisher(task).begin("", "realtime", **self._kept(task))
         self._tell_file()
+        if self._stopped:
+            self._tell_stopped()
 
     def _tell_file(self) -> None:
         self.feed.emit("mission", mission={"file": self._loaded, "revision": self._revision})
 
     async def _start(self, who: str, data: Mapping[str, Any]) -> Answer:
         if self._going is not None and self.feed.state["mission"]["state"] in OVER:
-            await asyncio.wait(
-                {self._going}, timeout=LAST_WORDS
-            )  # It is only closing its connections.
+            # It is only closing its connections.
+            await asyncio.wait({self._going}, timeout=LAST_WORDS)
         if (busy := self._busy()) is not None:
             return busy
         if self._stopped:
@@ -256,9 +264,8 @@ class Station:
         """Start a simulated run from a point of a recorded one."""
         run = await asyncio.to_thread(self._prepared_from, data)
         task = run.mission.executor.task.name
-        name = (
-            task if task in self._tasks.names() else ""
-        )  # Its file may have been deleted or renamed.
+        # Its file may have been deleted or renamed.
+        name = task if task in self._tasks.names() else ""
         if name != self._loaded:
             self._forget(name)
         return self._follow(run)
@@ -362,15 +369,17 @@ class Station:
         return {"ok": True}
 
     async def _estop(self, who: str, data: Mapping[str, Any]) -> Answer:
-        self.feed.emit(
-            "mission", mission={"state": "stopped", "reason": f"emergency stop by {who}"}
-        )
+        self._tell_stopped()
         return await self._order(STOP)
 
+    def _tell_stopped(self) -> None:
+        self.feed.emit("mission", mission={"state": "stopped", "reason": self._stopped})
+
     async def _clear_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
-        """Let devices accept orders again; this alone moves nothing."""
+        """Let devices accept orders again; this alone moves nothing. As long as a node has not
+        answered, the cell counts as stopped: its devices still are, and it can be cleared again."""
         answer = await self._order(CLEAR)
-        if self.feed.state["mission"]["state"] == "stopped":
+        if answer["ok"] and self.feed.state["mission"]["state"] == "stopped":
             self.feed.emit("mission", mission={"state": "idle", "reason": ""})
         return answer
 
@@ -395,10 +404,21 @@ class Station:
             await asyncio.sleep(LOOK)
 
     async def look(self) -> None:
-        """Ask every node whether it is up and what it offers."""
+        """Ask every node whether it is up, what it offers, and whether an emergency stop holds its
+        devices: one from before this coordinator, or from a terminal."""
+        was_stopped = self._stopped
         self._nodes = await ask_all(self.directory, PATIENCE)
         if self._run is not None:
             return  # The active run reports them itself.
+        held = [
+            device
+            for answer in self._nodes.values()
+            for device in answer.get("status", {}).get("emergency", ())
+        ]
+        # If it was cleared meanwhile, the answers may be older than that.
+        if held and not was_stopped and not self._stopped:
+            self._stopped = f"an emergency stop holds {', '.join(held)}"
+            self._tell_stopped()
         for name, answer in self._nodes.items():
             state = (
                 {"state": "up", "text": ""}

@@ -33,7 +33,6 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
 }
-COOKIE_LIFE_S = 12 * 3600
 READING = frozenset({"GET", "HEAD"})
 _PORT = re.compile(r":\d{1,5}$")
 
@@ -129,11 +128,11 @@ class AccessRules:
         )
 
     def hand_out(self, response: web.StreamResponse) -> None:
-        """Set the browser's cookie."""
+        """Set the browser's cookie. It has no age: it is worthless when this server ends, and a
+        page that is open for longer than any age must still connect, and stop, again."""
         response.set_cookie(
             self.cookie,
             self.pass_value,
-            max_age=COOKIE_LIFE_S,
             httponly=True,
             samesite="Strict",
             secure=self.secure,

@@ -29,12 +29,10 @@ class ConnectionLimit:
         self.silent = silent
         self._waiting: set[asyncio.BaseProtocol] = set()
         self._coming = 0
-        self.turned_away = 0
 
     def __call__(self) -> asyncio.Protocol:
         """Return the protocol of a new connection."""
         if self.open_connections >= self._limit:
-            self.turned_away += 1
             return _Refused()
         handler = self._server()
         self._waiting.add(handler)

@@ -182,9 +182,8 @@ def _change(table: MutableMapping[str, Any], key: str, value: Any, path: tuple[s
         except _FAULTS:
             if not _is_element(path):
                 raise
-            del table[
-                key
-            ]  # Its lines are not together (dotted keys): this element is written again.
+            # Its lines are not together (dotted keys): this element is written again.
+            del table[key]
             _put(table, key, value, path)
     elif isinstance(value, list) and isinstance(old, Array):
         _change_array(old, value)

@@ -57,9 +57,8 @@ async def send_json(request: web.Request, text: bytes, status: int = 200) -> web
 
 def json_answer(value: Mapping[str, Any] | Sequence[Any], status: int = 200) -> web.Response:
     """Return an answer that no cache stores."""
-    body = json_text(value, ensure_ascii=False).encode(
-        "utf-8", "replace"
-    )  # A lone surrogate is not valid text.
+    # A lone surrogate is not valid text.
+    body = json_text(value, ensure_ascii=False).encode("utf-8", "replace")
     return web.Response(
         body=body,
         status=status,

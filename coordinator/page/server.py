@@ -175,9 +175,8 @@ def _application(page_state: PageState, page: bool) -> web.Application:
 async def _index(request: web.Request) -> web.StreamResponse:
     access = request.app[PAGE_STATE].access
     if "token" in request.query:
-        away = web.HTTPSeeOther(
-            "/"
-        )  # The token disappears from the address bar and the history of the browser.
+        # The token disappears from the address bar and the history of the browser.
+        away = web.HTTPSeeOther("/")
         access.hand_out(away)
         raise away
     return web.FileResponse(PAGE_FILES / "index.html", headers={"Cache-Control": "no-store"})

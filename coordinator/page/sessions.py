@@ -66,19 +66,17 @@ class Session:
         self._socket = socket
         self._port = port
         self._encoded = encoded
-        self._all_commands = (
-            commands  # Held by the server: a command continues when its client leaves.
-        )
+        # Held by the server: a command continues when its client leaves.
+        self._all_commands = commands
         self._pending = Pending()
         self._news = asyncio.Event()
         self._answers: list[dict[str, Any]] = []
         self._commands = 0
         self._numbers: deque[int] = deque(maxlen=NUMBERS_KEPT)
+        # A token bucket: a second's worth may come at once, as after a stall of the network.
         self._budget = float(MESSAGES_PER_S)
         self._budget_at = asyncio.get_running_loop().time()
         self.who = ""
-        self.deltas_sent = 0
-        self.snapshots_sent = 0
 
     async def run(self) -> None:
         """Serve the client until it leaves."""
@@ -199,11 +197,9 @@ class Session:
         if self._pending.stale:
             await self._send_snapshot()
         elif delta:
-            self.deltas_sent += 1
             await self._send(self._encoded(self._pending.take()))
-        for (
-            answer
-        ) in answers:  # After the changes by the command, so that its client has seen them.
+        # After the changes by the command, so that its client has seen them.
+        for answer in answers:
             await self._send(encode(answer))
         if delta:
             await asyncio.sleep(PACE_S)
@@ -212,7 +208,6 @@ class Session:
 
     async def _send_snapshot(self) -> None:
         self._pending.clear()
-        self.snapshots_sent += 1
         snapshot = self._port.snapshot()
         await self._send(
             encode({**snapshot, "type": "snapshot", "protocol": PROTOCOL, "you": self.who})

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
+from typing import Any
 
-from petrobot.coordinator.engine import Begin, Engine, RunEnded, StartRun
+from petrobot.coordinator.engine import Begin, Choose, Chosen, Engine, RunEnded, StartRun
 from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.history import opened
 from petrobot.coordinator.operator.run_state import ChangePublisher
@@ -62,3 +64,48 @@ def test_history_and_live_page_name_the_action_that_did_not_succeed(tmp_path: Pa
     [recorded] = opened(path, "r")["records"][-1]["firings"]
     assert (live["action"], live["reason"]["code"]) == ("move", "short")
     assert recorded == {key: live[key] for key in recorded}
+
+
+ROUNDS = """
+schema = 1
+[task]
+name = "rounds"
+final = "done > 0"
+[primitive_tasks.look]
+goal = "It is seen"
+alternatives = ["look", "glance"]
+deadline = 1.0
+[places]
+looking = { kind = "action", task = "look", tokens = 1 }
+seen = { tokens = 1 }
+done = {}
+[transitions]
+again = { in = ["looking:normal"], out = ["looking"], weight = 1.0 }
+also = { in = ["looking:normal"], out = ["looking"], weight = 1.0 }
+lost = { in = ["looking:error"], out = ["looking"] }
+"""
+
+
+def test_a_long_mission_leaves_nothing_behind_for_its_viewers() -> None:
+    """Runs that ended in each way, draws and choices: after them the publisher keeps as much as
+    after the first ones."""
+    task, feed = loads(ROUNDS, "rounds.toml"), Feed()
+    engine, publisher = Engine(task), ChangePublisher(feed, task)
+    publisher.begin("m", "lockstep")
+    state, waiting, kept = engine.initial(), list[Any]([Begin()]), list[int]()
+    ends = itertools.cycle([Status.SUCCESS, Status.ERROR, Status.FAILURE])
+    for step in range(300):
+        stimulus = waiting.pop(0)
+        publisher.stimulus(step, stimulus)
+        state, instructions = engine.handle(state, stimulus)
+        for instruction in instructions:
+            publisher.instruction(step, instruction)
+            if isinstance(instruction, Choose):
+                waiting.append(Chosen(instruction.key, instruction.alternatives[0], "draw"))
+            elif isinstance(instruction, StartRun):
+                waiting.append(RunEnded(instruction.run, next(ends), "why", "and how"))
+        publisher.settled(step, state)
+        kept.append(sum(len(v) for v in vars(publisher).values() if isinstance(v, dict)))
+    assert feed.state["mission"]["firings"] > 80
+    assert feed.state["firings"][-1]["action"] == "look"
+    assert max(kept) == max(kept[:20])

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.operator import station
-from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP
+from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, Stopped
 from petrobot.coordinator.operator.history import opened
 from petrobot.coordinator.operator.observation import TASK_REPORT
 from petrobot.coordinator.operator.prepare import RunRequest
@@ -322,6 +322,58 @@ async def test_an_emergency_stop_in_a_simulated_run_also_stops_the_real_devices(
     assert (await cell.station.command("ben", "clear_estop", {}))["code"] == "not_holder"
     assert (await cell.say("clear_estop"))["ok"]
     assert orders == [STOP, CLEAR]
+    assert cell.state["mission"]["state"] == "idle"
+
+
+async def test_a_stop_that_a_node_did_not_clear_is_still_shown(
+    cell: Simulated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its devices are still stopped: nothing starts, and the stop can be cleared again."""
+    seconds: list[float | None] = [0.1, None, 0.1]
+
+    async def order_all(directory: Any, credentials: Any, verb: str) -> list[Stopped]:
+        return [Stopped("arm", seconds=seconds.pop(0), why="connection refused")]
+
+    monkeypatch.setattr(station, "order_all", order_all)
+    assert (await cell.say("estop"))["ok"]
+    answer = await cell.say("clear_estop")
+    assert not answer["ok"] and "connection refused" in answer["text"]
+    assert cell.state["mission"]["state"] == "stopped"
+    assert (await cell.say("start", task="moving", mode="lockstep"))["code"] == "stopped"
+    assert (await cell.say("clear_estop"))["ok"]
+    assert cell.state["mission"]["state"] == "idle"
+    assert (await cell.simulate(runs=1))[1]["status"] == "success"
+
+
+async def test_a_stop_from_before_this_coordinator_is_shown(
+    cell: Simulated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The nodes report it. It is not set again by an answer that is older than its end."""
+    about: dict[str, Any] = {"up": True, "address": "here", "offers": ()}
+    cleared = asyncio.Event()
+
+    async def ask_all(directory: Any, patience: float) -> dict[str, Any]:
+        if cell.station._stopped:
+            await cleared.wait()
+        stopped = {"arm": {"emergency": ["gripper"]}, "vision": {}}
+        return {node: {**about, "status": status} for node, status in stopped.items()}
+
+    async def order_all(directory: Any, credentials: Any, verb: str) -> list[Any]:
+        return []
+
+    monkeypatch.setattr(station, "ask_all", ask_all)
+    monkeypatch.setattr(station, "order_all", order_all)
+    await cell.station.look()
+    assert cell.state["mission"]["state"] == "stopped"
+    assert cell.state["mission"]["reason"] == "an emergency stop holds gripper"
+    assert (await cell.say("load", task="moving"))["ok"]
+    assert cell.state["mission"]["state"] == "stopped", "the button that clears it stays"
+    assert (await cell.say("start", task="moving", mode="lockstep"))["code"] == "stopped"
+    asked = asyncio.create_task(cell.station.look())
+    await asyncio.sleep(0)
+    assert (await cell.say("clear_estop"))["ok"]
+    cleared.set()
+    await asked
     assert cell.state["mission"]["state"] == "idle"
 
 

@@ -85,6 +85,8 @@ async def test_the_token_is_replaced_by_a_cookie_and_removed_from_the_address(pa
     cookie = first.headers["Set-Cookie"]
     assert all(flag in cookie for flag in ("HttpOnly", "SameSite=Strict", "Path=/"))
     assert page.token not in cookie
+    # A page that is open for days still reaches its emergency stop after a broken connection.
+    assert "Max-Age" not in cookie and "Expires" not in cookie
     assert (await ask(page, "/", cookie=True)).status == 200
 
 
@@ -239,7 +241,6 @@ async def test_a_thousand_sockets_do_not_block_the_operator(page: Page) -> None:
                 base(page) + "/api/command", json={"verb": "estop", "name": "ana"}
             ) as answer:
                 assert answer.status == 200
-            assert page.limit.turned_away >= 1_000 - CONNECTIONS
             assert page.limit.open_connections <= CONNECTIONS
         finally:
             for one in crowd:

@@ -17,6 +17,7 @@ from tools.bench.hmi import SyntheticMission, ticking
 from petrobot.coordinator.operator.changes import apply, empty_state
 from petrobot.coordinator.page.server import Page, start_page
 from petrobot.coordinator.page.sessions import Session
+from petrobot.coordinator.run.folder import JOURNAL, RESULT
 from petrobot.coordinator.task import Executed, Status
 from tests.page.conftest import (
     PATIENCE_MS,
@@ -173,6 +174,92 @@ async def test_manual_interventions_in_the_net(browser: Browser, page: Page, sta
         "force_exit",
         "abort",
     ]
+
+
+async def test_a_transition_at_its_breakpoint_says_that_it_can_fire(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """Its run has ended as its arc wants, so it waits for nothing but the operator."""
+    stage.script["pick"].clear()
+    stage.script["pick"].append(Part(0.3))
+    stage.kept.add("pick")
+    tab = await opened(browser, page)
+    await hold_controls(tab)
+    selected = tab.get_by_role("region", name="Selected")
+    await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start").click()
+    await element(tab, "^Transition begin", "Task net").click()
+    await tab.get_by_role("button", name="Raise part there").click()
+    await element(tab, "^Transition picked", "Task net").click()
+    await expect(tab.get_by_role("region", name="Running now")).to_contain_text("pick")
+    await expect(selected).to_contain_text("waits for the end of the run in pick")
+    await tab.get_by_role("button", name="Set breakpoint").click()
+    await expect(tab.get_by_role("button", name="Remove breakpoint")).to_be_visible()
+    stage.kept.remove("pick")
+    await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Paused")
+    await expect(selected).to_contain_text("can fire")
+
+
+async def test_states_and_times_on_the_page_are_those_of_now(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """The list of runs follows the active run, and long times are in minutes, also between two
+    messages; they are not read out each second."""
+    tab = await opened(browser, page)
+    await tab.get_by_role("tab", name="History").click()
+    runs = tab.get_by_role("navigation", name="Runs")
+    own = runs.get_by_role("button", name="This run, as seen here")
+    stage.feed.emit("mission", time=100.0, mission={"state": "running"})
+    await expect(own).to_contain_text("running")
+    stage.feed.emit("mission", time=130.0, mission={"state": "success"})
+    await expect(own).to_contain_text("success")
+    banner = tab.get_by_role("status", name="Mission state")
+    await expect(banner.locator("[aria-live=off]")).to_have_text("2:10 min")
+    await tab.evaluate("petrobot.tick()")
+    await expect(banner.locator("[aria-live=off]")).to_have_text("2:10 min")
+    assert stage.runs_folder is not None
+    folder = stage.runs_folder / "just over"
+    folder.mkdir(parents=True)
+    (folder / JOURNAL).touch()
+    (folder / RESULT).write_text('{"status": "success", "sim_s": 12.5}', encoding="utf-8")
+    await expect(runs).not_to_contain_text("just over")
+    stage.feed.emit("result", result={"status": "success"})
+    await expect(runs).to_contain_text("12.5 s")
+
+
+async def test_what_a_short_form_adds_has_a_name_for_people(browser: Browser, page: Page) -> None:
+    """On every tab a copy of a transition is called as it is, and a retry by its place."""
+    tab = await opened(browser, page)
+    task = {
+        "places": [{"name": "grip", "label": ""}, {"name": "grip.left", "label": ""}],
+        "transitions": [
+            {"name": "has_it", "label": "", "made_from": ""},
+            {"name": "has_it.1", "label": "", "made_from": "has_it"},
+            {"name": "grip.retry", "label": "", "made_from": "grip"},
+        ],
+    }
+    script = """async (task) => {
+      const { labelsOf } = await import("/page/js/sheet.js");
+      return Object.fromEntries(labelsOf(task));
+    }"""
+    labels = await tab.evaluate(script, task)
+    assert labels["has_it"] == labels["has_it.1"] == "has it"
+    assert labels["grip.retry"] == "grip: retry"
+
+
+async def test_firings_of_another_run_are_not_taken_for_those_shown(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """Each run counts its firings from 1. A window that slept sees the next run's at once."""
+    tab = await opened(browser, page)
+    firings = tab.get_by_role("region", name="Last firings")
+    about = {"number": 1, "at": 0.5, "error": False, "cause": "event"}
+    stage.feed.emit("fired", firing={**about, "transition": "begin"})
+    await expect(firings).to_contain_text("begin")
+    parts = {key: stage.feed.state[key] for key in ("task", "marking", "nodes", "events")}
+    mission = {**stage.feed.state["mission"], "id": "the next run"}
+    stage.feed.replace(**parts, mission=mission, firings=[{**about, "transition": "placed"}])
+    await expect(firings).to_contain_text("placed")
+    await expect(firings).not_to_contain_text("begin")
 
 
 async def test_an_open_list_of_alternatives_stays_usable_while_a_run_learns(

@@ -3,6 +3,7 @@ show, connections that fail."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 from collections.abc import Callable
@@ -232,6 +233,52 @@ async def test_an_exception_in_the_page_is_reported_and_followed_by_a_new_connec
     await expect(tab.get_by_role("alert")).to_be_hidden()
 
 
+async def test_missing_changes_are_asked_for_once(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """A delta is missing: however many follow before the snapshot, the page asks for one. The next
+    time it asks again."""
+    context = await browser.new_context(viewport=SIZE)
+    held: list[str | bytes] = []
+    asked, dropping = list[str](), list[bool]()
+
+    def carry(socket: WebSocketRoute) -> None:
+        server = socket.connect_to_server()
+
+        def receive(message: str | bytes) -> None:
+            if dropping and '"type":"delta"' in str(message):
+                dropping.pop()
+            elif len(asked) == 1 and '"type":"snapshot"' in str(message):
+                held.append(message)
+            else:
+                socket.send(message)
+
+        def send(message: str | bytes) -> None:
+            if '"resync"' in str(message):
+                asked.append(str(message))
+            server.send(message)
+
+        server.on_message(receive)
+        socket.on_message(send)
+
+    await context.route_web_socket("**/api/live", carry)
+    tab = await context.new_page()
+    await tab.goto(page.url)
+    await expect(element(tab, "^Control place parts", "Task net")).to_be_visible()
+    dropping.append(True)
+    for parts in range(9):
+        stage.feed.emit("marking", marking={"parts": parts})
+        await asyncio.sleep(0.05)
+    await tab.wait_for_function("() => petrobot.link.gaps > 3")
+    assert len(asked) == 1
+    await until(lambda: bool(held))
+    old = json.dumps({**json.loads(held[-1]), "sequence": 0})
+    await tab.evaluate("(m) => petrobot.link.receive(petrobot.link.socket, m)", old)
+    stage.feed.emit("marking", marking={"parts": 12})
+    await expect(element(tab, "^Control place parts, 12 tokens", "Task net")).to_be_visible()
+    assert len(asked) == 2
+
+
 async def test_the_emergency_stop_works_when_messages_cannot_be_read(
     browser: Browser, page: Page, stage: Stage
 ) -> None:
@@ -244,6 +291,26 @@ async def test_the_emergency_stop_works_when_messages_cannot_be_read(
     await tab.get_by_role("button", name="Emergency stop").click()
     await expect(tab.locator(".toast", has_text="Emergency stop sent")).to_be_visible()
     assert stage.feed.state["mission"]["state"] == "stopped"
+
+
+async def test_the_emergency_stop_goes_past_a_connection_that_has_just_died(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """Nothing that the page sends arrives, and it cannot know that yet: the stop arrives."""
+    context = await browser.new_context(viewport=SIZE)
+
+    def carry(socket: WebSocketRoute) -> None:
+        server = socket.connect_to_server()
+        socket.on_message(lambda m: None if '"command"' in str(m) else server.send(m))
+
+    await context.route_web_socket("**/api/live", carry)
+    tab = await context.new_page()
+    await tab.goto(page.url)
+    await expect(element(tab, "^Control place parts", "Task net")).to_be_visible()
+    await tab.get_by_role("button", name="Emergency stop").click()
+    await expect(tab.locator(".toast", has_text="Emergency stop sent")).to_be_visible()
+    assert stage.feed.state["mission"]["state"] == "stopped"
+    await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Emergency stop")
 
 
 async def test_a_page_that_never_connected_says_so(browser: Browser, page: Page) -> None:

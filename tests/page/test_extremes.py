@@ -1,6 +1,6 @@
 """Extreme contents: names of eighty letters, markup, other alphabets, sixty places, twelve nodes
-and hundreds of errors, on a laptop, a wall screen, and zoomed to twice the size. Nothing is cut
-off, nothing overlaps its neighbour, and all of it is shown as text."""
+and hundreds of errors, on a laptop, a wall screen, a phone, and zoomed to twice the size. Nothing
+is cut off, nothing overlaps its neighbour, and all of it is shown as text."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if browser_missing() and os.environ.get("CI") != "true":
 from playwright.async_api import Browser, expect
 from playwright.async_api import Page as Tab
 
-from tests.page.steps import Watch
+from tests.page.steps import Watch, settled
 
 LONG = ("a_name_that_somebody_wrote_down_without_any_thought_of_screens_or_of_readers_" * 2)[:80]
 OTHER = "Überprüfung_der_Zange_für_日本語_und_العربية"
@@ -33,6 +33,7 @@ SIZES = [
     (1920, 1080, 1, "dark"),
     (640, 360, 2, "light"),
     (640, 360, 2, "dark"),
+    (390, 844, 3, "light"),
 ]
 
 
@@ -182,10 +183,18 @@ async def nothing_is_cut(tab: Tab) -> None:
         ".operator button, .operator select",
         ".scrub button",
         ".side .card, .side .firing, .run-row",
+        ".design-bar > *, .toolbox button, .inspector input",
         "dialog *",
     ):
         assert await tab.evaluate(OUTSIDE, box) == []
-    for box in (".top > *", ".operator > *", ".scrub > *", ".tabs > button", ".banner > *"):
+    for box in (
+        ".top > *",
+        ".operator > *",
+        ".scrub > *",
+        ".tabs > button",
+        ".banner > *",
+        ".top, dialog",
+    ):
         assert await tab.evaluate(OVERLAP, box) == []
     stop = await tab.get_by_role("button", name="Emergency stop").bounding_box()
     size = tab.viewport_size
@@ -231,6 +240,14 @@ async def test_nothing_is_cut(
     await expect(tab.get_by_role("navigation", name="Runs")).to_be_visible()
     await nothing_is_cut(tab)
     await tab.screenshot(path=shots / f"extremes-history-{width}-{theme}.png")
+    await tab.get_by_role("tab", name="Design").click()
+    await settled(tab)
+    await nothing_is_cut(tab)
+    drawing = await tab.get_by_role("application", name="Drawing of the task").bounding_box()
+    assert drawing is not None and drawing["width"] > 0.4 * width
+    await tab.get_by_role("button", name="Keyboard").click()
+    await expect(tab.get_by_role("dialog", name="Keyboard")).to_be_visible()
+    await nothing_is_cut(tab)
     assert await tab.title() == "petrobot" and await tab.locator("img[src=x]").count() == 0
     assert complaints == []
     await context.close()

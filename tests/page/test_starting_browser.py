@@ -60,11 +60,12 @@ def mission(tab: Tab) -> Locator:
 
 
 async def chosen(tab: Tab, task: str) -> Locator:
-    """Take the controls and open the start form of a task."""
+    """Take the controls and open the start form of a task: one form, though the button is pressed
+    twice while the server is asked."""
     await hold_controls(tab)
     toolbar = tab.get_by_role("toolbar", name="Mission")
     await toolbar.get_by_label("Task to start").select_option(task)
-    await toolbar.get_by_role("button", name="Start with").click()
+    await toolbar.get_by_role("button", name="Start with").dblclick()
     dialog = tab.get_by_role("dialog", name=f"Start {task}")
     await expect(dialog).to_be_visible()
     return dialog
@@ -104,6 +105,9 @@ async def test_every_option_of_the_command_line(
     await expect(dialog).to_be_hidden()
     await expect(mission(tab)).to_contain_text("Success")
     await expect(mission(tab)).to_contain_text("simulated")
+    result = tab.get_by_role("status").filter(has_text="reached its final marking")
+    await expect(result).to_have_text(re.compile(r"sim\d+(\.\d+)? s"))
+    await expect(result.get_by_text("reason")).to_have_count(0)  # it is above, as a sentence
     [folder] = cell.runs.iterdir()
     header = read_journal(folder / JOURNAL).header
     assert (header["mode"], header["runs"], header["seed"]) == ("lockstep", 8, 77)

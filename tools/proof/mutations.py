@@ -107,8 +107,8 @@ MUTATIONS = (
     _m(
         "a run that never began counts by its preempt arc",
         ENGINE + "runs.py",
-        "        None if counted is Counts.NONE or stop.executed is Executed.NO else",
-        "        None if counted is Counts.NONE else",
+        "return None if counts is Counts.NONE or executed is Executed.NO else",
+        "return None if counts is Counts.NONE else",
         "tests/engine",
     ),
     _m(

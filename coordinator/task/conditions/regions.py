@@ -49,7 +49,7 @@ class Domain:
 
 
 class Certainty(StrEnum):
-    """Certainty to a question about all values."""
+    """How certain the answer to a question about all values is."""
 
     PROVED = "proved"
     REFUTED = "refuted"

@@ -21,7 +21,7 @@ export class Canvas {
       h("div", { class: "group" }, tool("minus", "Zoom out", () => this.view.zoomBy(1 / 1.25)), tool("plus", "Zoom in", () => this.view.zoomBy(1.25)), tool("fit", "Show the whole net", () => this.view.fit())),
       h("div", { class: "group" }, this.errors),
       h("label", { class: "find" }, icon("search"), this.query, this.hits));
-    this.corner = h("div", { class: "corner" });
+    this.corner = h("div", { class: "corner", hidden: true });
     this.root = h("section", { class: "canvas", "aria-label": label }, this.drawing, this.bar, this.path, this.corner);
     this.view = new NetView(this.drawing, label, { ...events, foldClicked: () => this.fold(false), moved: () => this.map?.follow() });
     this.map = new Minimap(this.corner);

@@ -4,8 +4,10 @@ import { openDialog } from "./dialog.js";
 import { fill, h, words } from "./dom.js";
 import { toast } from "./toast.js";
 
-async function ask(method, path, body) {
-  const response = await fetch(path, { method, headers: body ? { "Content-Type": "application/json" } : {}, body: body ? JSON.stringify(body) : undefined });
+const STOP_ANSWER_MS = 4000; // by then all devices have come to rest, or the operator must know that they may not
+
+async function ask(method, path, body, signal) {
+  const response = await fetch(path, { method, signal, headers: body ? { "Content-Type": "application/json" } : {}, body: body ? JSON.stringify(body) : undefined });
   const isJson = response.headers.get("Content-Type")?.startsWith("application/json");
   const value = isJson ? await response.json() : await response.text();
   return { status: response.status, ok: response.ok, value };
@@ -23,11 +25,10 @@ async function need(method, path, body) {
   return null;
 }
 
-/** Give the emergency stop without a live connection. Returns whether it was carried out. */
+/** Give the emergency stop without the live connection. Returns whether it was answered that it is carried out. */
 export async function stopPastTheLink() {
   try {
-    const name = localStorage.getItem("petrobot.name") ?? "operator";
-    return (await ask("POST", "/api/command", { verb: "estop", data: {}, name })).ok;
+    return (await ask("POST", "/api/command", { verb: "estop", name: "operator" }, AbortSignal.timeout(STOP_ANSWER_MS))).ok;
   } catch {
     return false;
   }
@@ -99,7 +100,7 @@ export async function saveTask(model, name) {
 }
 
 /** Lines of two texts side by side; lines that only one has are marked. */
-export function differences(left, right) {
+function differences(left, right) {
   const [a, b] = [left.split("\n"), right.split("\n")];
   const table = Array.from({ length: a.length + 1 }, () => new Uint16Array(b.length + 1));
   for (let i = a.length - 1; i >= 0; i--) for (let j = b.length - 1; j >= 0; j--) table[i][j] = a[i] === b[j] ? table[i + 1][j + 1] + 1 : Math.max(table[i + 1][j], table[i][j + 1]);
@@ -146,7 +147,7 @@ function download(name, content, type) {
 const DRAWN = ["fill", "fill-opacity", "stroke", "stroke-width", "stroke-dasharray", "stroke-linecap", "stroke-linejoin", "font-size", "font-weight", "font-style", "font-family", "text-anchor", "paint-order", "opacity"];
 
 /** The drawing of a view as a self-contained SVG text: styles written out, in light colours, only the net. */
-export function svgOf(view) {
+function svgOf(view) {
   const box = view.extent ?? [0, 0, 100, 100];
   const theme = document.documentElement.dataset.theme;
   document.documentElement.dataset.theme = "light";
@@ -199,8 +200,7 @@ export async function exportAs(form, model, view, text) {
   return download(`${name}.${form}`, answer.value, "text/xml");
 }
 
-/** An SVG from the server in a dialog, as an image: nothing in it can run. */
-/** Show a picture in a dialog: the whole of it, or at full size around the point that was clicked. */
+/** Show an SVG in a dialog: the whole of it, or at full size around the point that was clicked. As an image, no script in it can run. */
 function showPicture(title, name, svg) {
   const address = URL.createObjectURL(new Blob([svg], { type: "image/svg+xml" }));
   const resize = (x, y) => {

@@ -3,11 +3,14 @@
 export const PLACE_R = 22;
 export const BAR_W = 14;
 export const BAR_H = 44;
-export const GRID = 10;
+const GRID = 10;
 export const snap = (value) => Math.round(value / GRID) * GRID;
 
 const CLEAR = 9; // units between an arc and an element that it passes
-const BENDS = [0, 36, -36, 72, -72, 120, -120, 180, -180];
+const BENDS = [0, 36, -36, 72, -72, 120, -120, 180, -180]; // the straight line first
+const TWIN_BENDS = [14, 40, 76, 120, -40]; // to one side: the arc back is bent to the other
+const REACH = 230; // the widest bend, and half of an element that it might touch
+const COST = { bend: 0.12, over: 8 }; // per unit; to touch an element at all is worse than most bends
 
 /** The point where the ray from an element's centre to (x, y) leaves its shape; `gap` units further out. */
 export function border(element, x, y, gap = 0) {
@@ -47,6 +50,7 @@ export function at(c, f) {
 export const path = (c) =>
   `M${c[0].toFixed(1)} ${c[1].toFixed(1)}Q${c[2].toFixed(1)} ${c[3].toFixed(1)} ${c[4].toFixed(1)} ${c[5].toFixed(1)}`;
 
+/** How far a curve comes too near to an element, in units; 0 when it passes clear of it. */
 function hits(c, element) {
   let worst = 0;
   const steps = Math.max(10, Math.min(60, Math.round(Math.hypot(c[4] - c[0], c[5] - c[1]) / 16)));
@@ -62,25 +66,25 @@ function hits(c, element) {
 
 /** The smallest bend that passes no other element; `twin` arcs (there and back) keep to their own side. */
 export function route(from, to, elements, twin) {
-  const left = Math.min(from.x, to.x) - 230;
-  const right = Math.max(from.x, to.x) + 230;
-  const top = Math.min(from.y, to.y) - 230;
-  const bottom = Math.max(from.y, to.y) + 230;
+  const left = Math.min(from.x, to.x) - REACH;
+  const right = Math.max(from.x, to.x) + REACH;
+  const top = Math.min(from.y, to.y) - REACH;
+  const bottom = Math.max(from.y, to.y) + REACH;
   const near = elements.filter(
     (e) => e !== from && e !== to && e.x > left && e.x < right && e.y > top && e.y < bottom,
   );
-  const wanted = twin ? [14, 40, 76, 120, -40] : BENDS;
   let best = null;
   let bestCost = Infinity;
-  for (const bend of wanted) {
+  for (const bend of twin ? TWIN_BENDS : BENDS) {
     const c = curve(from, to, bend);
-    let cost = Math.abs(bend) * 0.12;
+    const least = Math.abs(bend) * COST.bend;
+    let cost = least;
     for (const element of near) {
-      cost += hits(c, element) * 8;
+      cost += hits(c, element) * COST.over;
       if (cost >= bestCost) break;
     }
     if (cost < bestCost) [best, bestCost] = [c, cost];
-    if (cost <= Math.abs(bend) * 0.12 + 1e-9) break;
+    if (cost === least) break; // it touches nothing, and those that follow are bent more, or to the wrong side
   }
   return best;
 }

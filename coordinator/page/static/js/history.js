@@ -6,7 +6,7 @@ import { listRuns, openRun } from "./files.js";
 import { icon } from "./icons.js";
 import { reasonText } from "./live.js";
 import { simulateDialog } from "./start.js";
-import { alarms, drawnOn, sheetOf, tokensOf, trailOf } from "./sheet.js";
+import { alarms, drawnOn, labelsOf, sheetOf, tokensOf, trailOf } from "./sheet.js";
 
 const SESSION = "(this run)";
 const ROWS_AROUND = 120;
@@ -135,8 +135,7 @@ export class History {
 
   async shown() {
     const before = this.opening;
-    this.runs = await listRuns();
-    this.paintRuns();
+    await this.refresh();
     if (this.opening !== before) return;
     if (!this.reel) await this.open(this.runs[0]?.id ?? SESSION);
     else if (this.reel.run.id === SESSION) this.open(SESSION, true);
@@ -153,6 +152,11 @@ export class History {
     attribute(this.startHere, "title", why || null);
   }
 
+  async refresh() {
+    this.runs = await listRuns();
+    this.paintRuns();
+  }
+
   // ---- the active run, as this page has seen it ----------------------------------------------------------------------
 
   restart() {
@@ -162,6 +166,8 @@ export class History {
 
   follow(change) {
     const { session } = this;
+    if (!this.root.hidden && change.kind === "mission") this.paintRuns();
+    if (!this.root.hidden && change.kind === "result") this.refresh();
     if (!session) return;
     if (change.kind === "fired") this.addFiring(session, change.firing);
     else if (change.kind === "marking") this.addDifference(session, change.marking);
@@ -210,9 +216,11 @@ export class History {
   async open(id, keep = false) {
     const ticket = (this.opening = (this.opening ?? 0) + 1);
     attribute(this.root, "aria-busy", "true");
+    if (!this.reel) fill(this.about, "Opening the run …"); // replaying a long journal takes seconds
     const reel = await this.fetchReel(id);
     if (ticket !== this.opening) return; // another run was chosen meanwhile
     attribute(this.root, "aria-busy", null);
+    if (!reel && !this.reel) fill(this.about);
     if (!reel) return;
     this.reel = reel;
     this.screens[0].load(reel);
@@ -289,9 +297,11 @@ export class History {
     return this.every.checked || record.firings.length > 0 || Object.keys(record.marking).length > 0 || record.notes?.length > 0;
   }
 
-  /** How a transition is called on the drawing. */
+  /** How an element is called on the drawing. */
   labelOf(name) {
-    return words(this.reel.run.task?.transitions.find((t) => t.name === name)?.label || name);
+    const { task } = this.reel.run;
+    this.reel.labels ??= task && labelsOf(task);
+    return this.reel.labels?.get(name) ?? words(name);
   }
 
   toError(step) {
@@ -315,16 +325,15 @@ export class History {
       return row;
     }));
     if (!current) return;
-    const { offsetTop: top, offsetHeight: tall } = current;
-    const box = this.recordsBox;
-    if (top < box.scrollTop + 40 || top + tall > box.scrollTop + box.clientHeight - 40) box.scrollTop = top - box.clientHeight / 2;
+    const box = [this.rowsBox, this.recordsBox].find((b) => b.scrollHeight > b.clientHeight + 1) ?? this.recordsBox; // in a small window the rows scroll
+    const top = current.getBoundingClientRect().top - box.getBoundingClientRect().top;
+    if (top < 40 || top + current.offsetHeight > box.clientHeight - 40) box.scrollTop += top - box.clientHeight / 2;
   }
 
   simulate() {
     const { run, records } = this.reel;
     const record = this.index ? records[this.index - 1] : null;
-    const labelOf = (place) => words(run.task.places.find((p) => p.name === place)?.label || place);
-    simulateDialog(run, record?.number ?? 0, record?.going ?? [], labelOf, async (data) => {
+    simulateDialog(run, record?.number ?? 0, record?.going ?? [], (place) => this.labelOf(place), async (data) => {
       const answer = await this.operator.give("start", data, false, true);
       if (answer.ok) location.hash = "#Live";
       return answer;

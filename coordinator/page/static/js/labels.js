@@ -5,7 +5,7 @@ import { at, BAR_H, BAR_W, labelAt, PLACE_R } from "./geometry.js";
 const SIDES = ["below", "above", "right", "left"];
 const CELL = 120;
 const SAMPLES = 16;
-const COST = { arc: 3, node: 25, words: 14, side: 0.5 };
+const COST = { arc: 3, node: 25, words: 14, side: 0.5 }; // of what is covered; of each side behind the preferred one
 const WIDTH = { place: 7.2, transition: 6.2, sub: 5.8 }; // of a character, about
 const UP = 11;
 const DOWN = 4;
@@ -13,7 +13,7 @@ const DOWN = 4;
 const touch = (a, b) => a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];
 
 /** The boxes [left, top, right, bottom] of an element's words on one side of it. */
-export function boxesAt(element, side) {
+function boxesAt(element, side) {
   const [x, y, below, anchor] = labelAt(element, side);
   const subY = side === "below" || side === "above" || element.shape === "place" ? below : y - 14;
   const box = (words, width, line) => {

@@ -2,7 +2,7 @@
 
 import { apply, emptyState, PART } from "./state.js";
 
-const LOST_AFTER_MS = 3500;
+const LOST_AFTER_MS = 3500; // the coordinator says each second that it is alive
 const RETRY_MS = [250, 500, 1000, 2000, 4000];
 const ANSWER_MS = 20000;
 const GOING_AWAY = 1001;
@@ -27,6 +27,7 @@ export class Link {
     this.goodbye = false; // the server said that it ends, so nothing was lost
     this.refused = false; // a coordinator answers, but it does not know this browser: it was started again with another key
     this.fault = ""; // why a message could not be read or shown
+    this.behind = false; // changes are missing, and a snapshot has been asked for
     this.gaps = 0;
     this.deltas = 0;
     this.lastPaint = 0;
@@ -54,8 +55,7 @@ export class Link {
     socket.onopen = () => {
       met = true;
       this.refused = false;
-      const name = localStorage.getItem("petrobot.name") ?? "operator";
-      socket.send(JSON.stringify({ type: "hello", protocol: 1, name, tab: tabSecret() }));
+      socket.send(JSON.stringify({ type: "hello", protocol: 1, name: "operator", tab: tabSecret() }));
     };
     socket.onmessage = (event) => this.receive(socket, event.data);
     socket.onclose = (event) => {
@@ -173,7 +173,8 @@ export class Link {
     const { type, protocol, ...state } = message;
     this.state = { ...emptyState(), ...state };
     this.clock(this.state.time);
-    changes.length = 0;
+    changes.length = 0; // they are part of the snapshot already
+    this.behind = false;
     this.changed.add("all");
     this.connected = this.everConnected = true;
     this.goodbye = false;
@@ -183,8 +184,10 @@ export class Link {
 
   takeDelta(message, changes) {
     if (message.first !== this.state.sequence + 1) {
+      // asked for once: more deltas arrive before the snapshot, and each request would bring one more
+      if (!this.behind) this.socket?.send(JSON.stringify({ type: "resync" }));
+      this.behind = true;
       this.gaps += 1;
-      this.socket?.send(JSON.stringify({ type: "resync" }));
       return;
     }
     for (const change of message.changes) {

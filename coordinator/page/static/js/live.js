@@ -5,11 +5,10 @@ import { Canvas, panel } from "./canvas.js";
 import { Chart } from "./charts.js";
 import { attribute, fill, h, Press, rows, seconds, text, words } from "./dom.js";
 import { icon } from "./icons.js";
-import { stateOf } from "./operator.js";
 import { Learning, objectives } from "./learning.js";
 import { Selected } from "./selected.js";
 import { Selectors } from "./selectors.js";
-import { alarms, drawnOn, runsOn, sheetOf, tokensOf, trailOf } from "./sheet.js";
+import { alarms, drawnOn, labelsOf, runsOn, sheetOf, tokensOf, trailOf } from "./sheet.js";
 import { Timeline } from "./timeline.js";
 
 const FIRINGS_SHOWN = 25;
@@ -125,12 +124,8 @@ export class Live {
   /** How an element is called on the drawing. */
   labelOf(name) {
     const { task } = this.link.state;
-    if (this.labelled !== task) {
-      this.labelled = task;
-      this.labels = new Map([...(task?.places ?? []), ...(task?.transitions ?? [])].map((e) => [e.name, e.label]));
-      for (const t of task?.transitions ?? []) if (this.labels.has(t.made_from) && !t.label) this.labels.set(t.name, this.labels.get(t.made_from) || t.made_from);
-    }
-    return words(this.labels.get(name) || name);
+    if (this.labelled !== task) [this.labelled, this.labels] = [task, task && labelsOf(task)];
+    return this.labels?.get(name) ?? words(name);
   }
 
   /** What represents an element on the open sheet; null if it is outside. */
@@ -224,9 +219,10 @@ export class Live {
     // each new row shifts all others: a busy net is read at four lists a second
     if (!now && performance.now() - (this.firingsAt ?? 0) < FIRINGS_MS) return this.stale.add("firings");
     this.firingsAt = performance.now();
-    const list = this.link.state.firings.slice(-FIRINGS_SHOWN).reverse();
-    this.firings.count(this.link.state.mission.firings ?? "");
-    rows(this.firings.content, list, (f) => f.number, (f) => this.firingRow(f));
+    const { firings, mission } = this.link.state;
+    const list = firings.slice(-FIRINGS_SHOWN).reverse();
+    this.firings.count(mission.firings ?? "");
+    rows(this.firings.content, list, (f) => `${mission.id} ${f.number}`, (f) => this.firingRow(f)); // each run counts from 1
     if (!list.length) this.firings.content.dataset.empty = "Nothing has fired yet.";
     else delete this.firings.content.dataset.empty;
     return null;
@@ -277,18 +273,16 @@ export class Live {
     if (!over) return;
     attribute(this.result, "data-state", mission.state);
     const head = { success: "The task reached its final marking", failure: "The task ended in failure", error: "The task ended in error", aborted: "The task was aborted", stopped: "Emergency stop" }[mission.state];
-    const facts = Object.entries(result ?? {}).filter(([, v]) => ["number", "string", "boolean"].includes(typeof v)).slice(0, 8);
+    const said = ["task", "status", "reason"]; // above already
+    const facts = Object.entries(result ?? {}).filter(([k, v]) => !said.includes(k) && ["number", "string", "boolean"].includes(typeof v));
+    const value = (k, v) => (typeof v !== "number" ? String(v) : k.endsWith("_s") ? seconds(v) : +v.toPrecision(4));
     fill(this.result, h("h2", {}, icon(STATUS_ICON[mission.state] ?? "error"), head), mission.reason ? h("p", {}, mission.reason) : null,
-      facts.length ? h("dl", {}, facts.map(([k, v]) => h("div", {}, h("dt", {}, words(k)), h("dd", {}, typeof v === "number" ? +v.toPrecision(4) : String(v))))) : null);
+      facts.length ? h("dl", {}, facts.map(([k, v]) => h("div", {}, h("dt", {}, words(k.replace(/_s$/, ""))), h("dd", {}, value(k, v))))) : null);
   }
 
   controlsChanged() {
     this.selectors.paint();
     this.selected.update(this.link.state, this.link.now(), true);
-  }
-
-  get frozen() {
-    return stateOf(this.link.state) === "paused";
   }
 }
 

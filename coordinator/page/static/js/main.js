@@ -34,6 +34,7 @@ class App {
     this.setWall(localStorage.getItem("petrobot.wall") === "yes");
     this.show(location.hash.slice(1) in this.tabs ? location.hash.slice(1) : "Live");
     setInterval(() => this.tick(), TICK_MS);
+    new ResizeObserver(() => document.documentElement.style.setProperty("--head", `${this.header.offsetHeight}px`)).observe(this.header); // dialogs leave it free
     addEventListener("hashchange", () => location.hash.slice(1) in this.tabs && this.show(location.hash.slice(1)));
   }
 
@@ -74,7 +75,8 @@ class App {
   paint(changed, changes) {
     const { state } = this.link;
     this.lost.update(); // before all that may fail
-    this.banner.update(state, this.link.now());
+    this.banner.update(state);
+    this.banner.tick(this.link.now());
     this.operator.update(state);
     this.tabs.Live.paint(changed, changes);
     if (["all", "controls", "connection", "mission"].some((p) => changed.has(p))) for (const tab of Object.values(this.tabs)) tab.controlsChanged?.();
@@ -87,7 +89,7 @@ class App {
   tick() {
     this.lost.update();
     const now = this.link.now();
-    text(this.banner.time, `${now.toFixed(1)} s`);
+    this.banner.tick(now);
     if (this.shown === "Live") this.tabs.Live.tick(now);
   }
 }

@@ -6,7 +6,8 @@ import { icon } from "./icons.js";
 import { clearDialog, startDialog } from "./start.js";
 import { toast } from "./toast.js";
 
-export const ESTOP_KEY = "F9";
+const ESTOP_KEY = "F9";
+const STOP_MS = 1500; // without an answer for so long, an emergency stop takes another way
 
 const DONE = {
   start: "Started", pause: "Paused", resume: "Resumed", step: "Continued for one firing", abort: "Aborted", estop: "Emergency stop sent",
@@ -22,10 +23,10 @@ const PAUSE_WORD = { operator: "Paused by the operator", step: "Paused after one
 const HELD_WORD = { held: "held", cannot_hold: "cannot hold", stopped: "stopped", lost: "no answer" };
 
 /** What a pause was answered by each node, for people. */
-export const heldWords = (nodes) => Object.entries(nodes ?? {}).map(([node, answer]) => `${node}: ${HELD_WORD[answer] ?? answer}`).join(", ");
+const heldWords = (nodes) => Object.entries(nodes ?? {}).map(([node, answer]) => `${node}: ${HELD_WORD[answer] ?? answer}`).join(", ");
 
 export const stateOf = (state) => (state.paused && ["running", "stopping"].includes(state.mission.state) ? "paused" : state.mission.state);
-export const stateWord = (state) => STATE_WORD[stateOf(state)] ?? words(stateOf(state));
+const stateWord = (state) => STATE_WORD[stateOf(state)] ?? words(stateOf(state));
 
 export class Operator {
   constructor(link) {
@@ -75,17 +76,24 @@ export class Operator {
 
   async stopNow() {
     this.estop.classList.add("given");
-    setTimeout(() => this.estop.classList.remove("given"), 1500);
-    if (this.link.connected) await this.give("estop", {});
-    else if (await stopPastTheLink()) toast("ok", `${DONE.estop}; this page cannot see its effect`);
+    setTimeout(() => this.estop.classList.remove("given"), STOP_MS);
+    // A connection that breaks is noticed seconds later. A stop is sent twice rather than that late: it changes nothing twice
+    const late = new Promise((resolve) => setTimeout(resolve, STOP_MS, {}));
+    const answer = await Promise.race([this.link.command("estop"), late]);
+    if (answer.ok) toast("ok", [DONE.estop, answer.text].filter(Boolean).join(" · "));
+    else if (answer.code && answer.code !== "lost") toast("error", `${answer.text}. Use the emergency stop of the hardware.`);
+    else if (await stopPastTheLink()) toast("ok", this.link.connected ? DONE.estop : `${DONE.estop}; this page cannot see its effect`);
     else toast("error", "No connection to the coordinator. Use the emergency stop of the hardware.");
   }
 
   /** Ask how the run is to go before it is started. */
   async startWith() {
+    if (this.asking) return; // a second press, while the server is asked for the options
+    this.asking = true;
     await this.loading; // of the task that was picked just now
     const { file, revision } = this.link.state.mission;
     const about = file ? await startForm(file) : null;
+    this.asking = false;
     if (about) startDialog(about, file, (data) => this.give("start", { ...data, revision }, false, true));
   }
 
@@ -193,16 +201,19 @@ export class Banner {
   constructor() {
     this.state = h("span", { class: "state" });
     this.task = h("span", { class: "task-name" });
-    this.time = h("span", { class: "time" });
+    this.time = h("span", { class: "time", "aria-live": "off" }); // read out with each change of the rest, not each second
     this.mode = h("span", { class: "mode", hidden: true });
     this.root = h("div", { class: "banner", role: "status", "aria-label": "Mission state" }, this.state, this.task, this.mode, this.time);
   }
 
-  update(state, now) {
+  tick(now) {
+    text(this.time, now < 100 ? `${now.toFixed(1)} s` : seconds(now));
+  }
+
+  update(state) {
     attribute(this.root, "data-state", stateOf(state));
     text(this.state, stateWord(state));
     text(this.task, words(state.task?.name ?? "no task"));
-    text(this.time, seconds(now));
     const { from, mode, id } = state.mission;
     this.mode.hidden = mode !== "lockstep" || !id;
     text(this.mode, from ? `from record ${from.record}` : "simulated");

@@ -7,6 +7,10 @@ import { caption } from "./sheet.js";
 const action = (name, label, onclick, disabled, why) =>
   h("button", { type: "button", class: "small", onclick, disabled, title: disabled ? why : null }, icon(name), label);
 
+/** Whether the run that an arc waits for has ended as the arc wants: none is active in its place, and the last one ended so. */
+const ended = (state, { place, end }) =>
+  !Object.values(state.runs).some((run) => run.place === place) && (state.ended.findLast((run) => run.place === place)?.status === "error") === (end === "error");
+
 export class Selected {
   constructor(link, operator, open) {
     Object.assign(this, { link, operator, open, name: null });
@@ -26,7 +30,7 @@ export class Selected {
     if (this.root.hidden) return;
     const run = place ? Object.values(state.runs).find((r) => r.place === this.name) : null;
     const stop = state.breakpoints.includes(`${place ? "places" : "transitions"}.${this.name}`);
-    const key = JSON.stringify([this.name, state.marking[this.name], run?.id, run?.state, stop, this.link.mayAct, state.mission.state, transition && this.missing(state, transition), this.lastFiring(state)?.number]);
+    const key = JSON.stringify([this.name, state.marking[this.name], run?.id, run?.state, stop, this.link.mayAct, state.mission.id, state.mission.state, transition && this.missing(state, transition), this.lastFiring(state)?.number]);
     if (key === this.key) return;
     if (this.drawn === this.name && this.press.holds(() => this.update(this.link.state, this.link.now()))) return;
     Object.assign(this, { key, drawn: this.name });
@@ -104,7 +108,7 @@ export class Selected {
     for (const arc of state.task.arcs.filter((a) => a.transition === transition.name)) {
       const tokens = state.marking[arc.place] ?? 0;
       if (arc.direction === "in" && tokens < arc.weight) waits.push(`a token in ${words(arc.place)}`);
-      else if (arc.direction === "in" && ["normal", "error"].includes(arc.end)) waits.push(`the end of the run in ${words(arc.place)}${arc.end === "error" ? " in error" : ""}`);
+      else if (arc.direction === "in" && ["normal", "error"].includes(arc.end) && !ended(state, arc)) waits.push(`the end of the run in ${words(arc.place)}${arc.end === "error" ? " in error" : ""}`);
       else if (arc.direction === "inhibit" && tokens >= arc.weight) waits.push(`${words(arc.place)} to hold ${arc.weight > 1 ? `fewer than ${arc.weight} tokens` : "no token"}`);
     }
     for (const event of transition.events ?? []) if (!state.events[event.name]?.armed) waits.push(`the event ${words(event.name)}`);

@@ -32,6 +32,16 @@ function around(macros, name) {
   return found;
 }
 
+/** What people call each element of the whole net, by name. Copies of a transition are called as it is; what else a short form adds, by what it is for. */
+export function labelsOf(task) {
+  const labels = new Map([...task.places, ...task.transitions].map((e) => [e.name, words(e.label || e.name)]));
+  const places = new Set(task.places.map((p) => p.name));
+  for (const { name, label, made_from: origin } of task.transitions) {
+    if (origin && !label) labels.set(name, `${labels.get(origin) ?? words(origin)}${places.has(origin) ? `: ${words(name.slice(origin.length + 1))}` : ""}`);
+  }
+  return labels;
+}
+
 /** The way to an opened macro place: [{name, label}], outermost first. */
 export function trailOf(task, inside) {
   const labels = new Map(task.places.map((p) => [p.name, p.label || p.name.split(".").at(-1)]));

@@ -77,7 +77,7 @@ export class Timeline {
       pen.fillRect(Math.round(x), HEAD - 4, 1, height);
       pen.fillStyle = this.colour("muted");
       pen.textAlign = "center";
-      if (x < width - 24) pen.fillText(step < 1 ? t.toFixed(1) : `${Math.round(t)} s`, x, 11 * this.em);
+      if (x < width - 24) pen.fillText(`${t.toFixed(step < 1 ? 1 : 0)} s`, x, 11 * this.em);
     }
   }
 
@@ -110,7 +110,7 @@ export class Timeline {
       this.barLabel(pen, bar);
       this.bars.push(bar);
     };
-    for (const run of this.ended) draw(run, run.ended, { success: "ok", failure: "warn", error: "bad" }[run.status] ?? "idle");
+    for (const run of this.ended) draw(run, run.ended, { success: "ok", failure: "warn", error: "bad" }[run.status] ?? "muted");
     for (const run of this.going) draw(run, this.now, run.state === "held" ? "hold" : "accent");
     pen.fillStyle = this.colour("accent");
     pen.fillRect(Math.min(width - 12, LEFT + (this.now - from) * scale), HEAD - 4, 1.5, HEAD + this.lanes.length * LANE);

@@ -51,7 +51,7 @@ function transitionOf(data, name, t, error, outside) {
 }
 
 /** Tokens at the start in a place; a macro place has those of all within it. */
-export function tokensIn(data, net, name, path = []) {
+function tokensIn(data, net, name, path = []) {
   const place = net.places?.[name];
   if (place?.kind !== "macro") return place?.tokens ?? 0;
   const inner = place.subnet ? data.subnets?.[place.subnet] : net;
