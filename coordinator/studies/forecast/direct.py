@@ -137,7 +137,7 @@ def mean_figure(
     alone = wider * float(error[0])
     both = wider * float(np.hypot(error[0], spread[0] / np.sqrt(runs)))
     levels = norm.cdf(SCORES)
-    return _figure(
+    return time_figure(
         centre,
         centre + both * _quantiles(fresh, levels),
         centre + alone * _quantiles(truth, _BOTH),
@@ -186,7 +186,7 @@ def quantile_figure(
     known = beta.sf(q, ranks, n + 1 - ranks)
     own = beta.ppf((np.arange(100)[:, None] + 0.5) / 100, ranks, n + 1 - ranks)
     below = new.cdf(own).mean(axis=0)
-    return _figure(
+    return time_figure(
         float(law.at(np.array([(q * (n - 1) + 1) / (n + 1)]))[0]),
         law.at(_inverse(ranks, below, SCORES) / (n + 1)),
         law.at(_inverse(ranks, known, norm.ppf(_BOTH)) / (n + 1)),
@@ -223,11 +223,13 @@ class _Law:
 _BOTH = np.array([(1 - LEVEL) / 2, (1 + LEVEL) / 2])
 
 
-def _figure(value: float, curve: Values, confidence: Values) -> dict[str, Any]:
-    low, high = (float(np.interp(norm.ppf(p), SCORES, curve)) for p in _BOTH)
+def time_figure(value: float, curve: Values, confidence: Values) -> dict[str, Any]:
+    """Return a forecast time: `curve` is its predictive distribution at `SCORES`. No time is below
+    0, but the curve of few trials may be: its slope is what a comparison needs."""
+    interval = np.interp(norm.ppf(_BOTH), SCORES, curve)
     return {
         "value": round(value, 6),
-        "interval": [round(low, 6), round(high, 6)],
-        "confidence": [round(float(x), 6) for x in confidence],
+        "interval": [round(max(0.0, float(x)), 6) for x in interval],
+        "confidence": [round(max(0.0, float(x)), 6) for x in confidence],
         "curve": [round(float(x), 9) for x in curve],
     }

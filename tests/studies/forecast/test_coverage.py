@@ -105,6 +105,15 @@ def test_equal_times_have_an_interval_of_one_point() -> None:
     assert quantile_figure(times, even, 10, 0.9)["interval"] == [2.5, 2.5]
 
 
+def test_no_time_is_forecast_below_0() -> None:
+    """Three trials, one of them much shorter, leave the mean open to both sides; the distribution
+    for comparisons keeps its shape."""
+    times, even = np.array([0.3, 5.4, 5.6]), np.ones(3)
+    found = mean_figure(times, even, 20, np.random.default_rng(1))
+    assert found["interval"][0] == found["confidence"][0] == 0.0
+    assert found["curve"][0] < 0.0 < found["value"] < found["interval"][1]
+
+
 def test_quantile_limits_are_the_binomial_ones() -> None:
     """Against order statistics by hand: of 100 uniform times, P(X_(i) <= q90) = P(Bin(100, .9) >=
     i)."""
