@@ -228,6 +228,14 @@ def test_combinations_have_intervals_that_cover_them() -> None:
     assert covered.min() >= 0.9 * 150
 
 
+def test_one_trial_of_a_combination_gives_no_interval_of_j() -> None:
+    """Of its cost only one number is known."""
+    one = row(0, "look_quick", "success", 2.0, True)
+    weighting = Weighting({"look": 0.1}, 0.2)
+    assert np.isnan(objective_intervals(TOY, [one], weighting)).all()
+    assert np.isnan(objective_intervals(TOY, [], weighting)).all()
+
+
 def test_a_runs_own_pictures() -> None:
     """The same declarations serve a single run's result."""
     result = {
