@@ -281,7 +281,8 @@ def _selectors(kept: FileContents, task: str) -> dict[str, Any]:
             },
         }
         for (of, name), state in kept.selectors.items()
-        if of == task
+        # those that only count have no learned probabilities, only equal ones from the beginning
+        if of == task and name.split()[0] not in ("fixed", "round_robin")
     }
 
 

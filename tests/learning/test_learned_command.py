@@ -427,6 +427,18 @@ def test_a_narrow_terminal_cuts_no_number(
     assert "\N{HORIZONTAL ELLIPSIS}" not in told
 
 
+def test_probabilities_are_shown_of_selectors_that_learn_them(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those that only count keep equal ones, by which none of them chooses."""
+    for selector in ("fixed", "round_robin", "nikolic_fu"):
+        petrobot("--learn", "learned.db", "--selector", selector, runs=3)
+    capsys.readouterr()
+    shown, text = told(Path("learned.db"), capsys)
+    assert list(shown["pick"]["selectors"]) == ["nikolic_fu"]
+    assert "nikolic_fu " in text and "fixed" not in text and "round_robin" not in text
+
+
 def test_r_and_c_of_the_whole_task(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """R and C of the primitive tasks, and of one run of the whole task computed through its net."""
     petrobot("--learn", "learned.db", "--selector", "round_robin", runs=30)
