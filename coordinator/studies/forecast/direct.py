@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from scipy.stats import beta, f, norm
+from scipy.stats import t as student
 
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.history import Codes, Training, Values
@@ -33,6 +34,10 @@ LARGEST = 5.0
 """Largest standardised difference of means. It is exceeded where one very long trial makes up most
 of the spread: samples without it have almost none. By simulation, the limit costs no coverage and
 saves a tenth of the mean width (lognormal times with sigma 1.5, 300 trials)."""
+FEW = 4
+"""Number of training trials from which the bootstrap says how a mean varies. All samples of two
+trials that vary have the same mean, so their interval was a point; that of three held in 76 to 81 %
+of cases, Student's in 86 to 92 % (uniform, exponential and lognormal times)."""
 MANY = 4000
 """Number of new trials beyond which their mean is drawn from the normal distribution."""
 SCORES: Values = np.array([-3.0, -2.6, -2.2, norm.ppf(0.025), -1.6, -1.2, -0.8, -0.4, 0.0])
@@ -137,6 +142,9 @@ def mean_figure(
     alone = wider * float(error[0])
     both = wider * float(np.hypot(error[0], spread[0] / np.sqrt(runs)))
     levels = norm.cdf(SCORES)
+    if 1 < n < FEW:
+        few = student(n - 1)
+        return time_figure(centre, centre + both * few.ppf(levels), centre + alone * few.ppf(_BOTH))
     return time_figure(
         centre,
         centre + both * _quantiles(fresh, levels),
