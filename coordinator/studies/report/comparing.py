@@ -60,13 +60,14 @@ def compare(
     shares, negative for J and time.
 
     `weighting` gives the rho of J, so that several comparisons can use the same; without it, rho is
-    that of the actions in these two. Raises ValueError if they have no trial in common.
+    that of the actions in these two. Raises ValueError if they do not have two trials in common:
+    every sample of a single pair is that pair, so its interval would be a point.
     """
     pairs = paired(one, other)
-    if not pairs.one:
+    if len(pairs.one) < 2:
         raise ValueError(
-            "the two campaigns have no trial in common: run them with the same --seed, "
-            "--block and --regime"
+            f"the two campaigns have {'one' if pairs.one else 'no'} trial in common, a comparison "
+            "needs two: run them with the same --seed, --block and --regime"
         )
     random = np.random.default_rng(seed)
     shares = {

@@ -102,6 +102,8 @@ def test_pairs_have_equal_seeds() -> None:
     assert paired(one, other).left_out == 8
     with pytest.raises(ValueError, match="no trial in common"):
         compare(TOY, one, [row(0, "look_quick", "success", 1.0, True, regime="rough")])
+    with pytest.raises(ValueError, match="one trial in common"):
+        compare(TOY, one, other)
 
 
 def test_equal_campaigns_do_not_differ() -> None:
