@@ -12,6 +12,7 @@ from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.learned_show import (
     asked_question,
     measured_task,
+    print_table,
     refuse_unknown_context,
     refuse_unknown_cost,
     show,
@@ -128,7 +129,7 @@ def _print(found: dict[str, Any]) -> None:
             *([_declared(part["declared_costs"])] if declared else []),
             _cell(part["J"], part["J_interval"]),
         )
-    console.print(table)
+    print_table(console, table)
     for key, words in (
         ("R_conj", "every run a success"),
         ("product", "product of the primitive tasks' R (R_conj, if they run in series)"),

@@ -14,6 +14,9 @@ from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import UNKNOWN, write_json
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
     from petrobot.coordinator.learning.estimate import Tally
     from petrobot.coordinator.learning.estimates_file import FileContents
     from petrobot.coordinator.learning.objective import Comparison, Figures, Question
@@ -172,6 +175,7 @@ def _plain(
         "rho": judged.rho,
         "best": judged.best,
         "level_with_best": list(judged.level_with_best),
+        "clear": judged.clear,
         "judged_over": list(judged.scenarios),
         "contexts": sorted({c for by_context in tallies.values() for c in by_context}),
         "uncosted": list(judged.uncosted),
@@ -277,7 +281,8 @@ def _selectors(kept: FileContents, task: str) -> dict[str, Any]:
             },
         }
         for (of, name), state in kept.selectors.items()
-        if of == task
+        # those that only count have no learned probabilities, only equal ones from the beginning
+        if of == task and name.split()[0] not in ("fixed", "round_robin")
     }
 
 
@@ -324,9 +329,17 @@ def _words(asked: Question) -> str:
 
 
 WIDTH = 110
-"""Least width of the tables (characters): narrower ones would cut the numbers."""
+"""Least width of the lines below a table (characters)."""
+LARGEST_WIDTH = 1000
 
 # --- for people -------------------------------------------------------------------------------
+
+
+def print_table(console: Console, table: Table) -> None:
+    """Print a table as wide as it is: a narrow terminal, or a pipe, would cut its numbers."""
+    wide = console.options.update(max_width=LARGEST_WIDTH)
+    console.width = max(console.width, WIDTH, console.measure(table, options=wide).maximum)
+    console.print(table)
 
 
 def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> None:
@@ -335,7 +348,6 @@ def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> Non
     from rich.table import Table
 
     console = Console()
-    console.width = max(console.width, WIDTH)
     target = "" if about["target"] is None else f", target R {about['target']:g}"
     table = Table(
         title=f"{task} (C: {about['cost']}, rho {about['rho']:.4g}{target})",
@@ -363,7 +375,7 @@ def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> Non
         table.add_column(column, justify="left" if column == "action" else "right", no_wrap=True)
     for row in about["actions"]:
         own = row["source"] == about["source"]
-        clear = own and row["action"] == about["best"] and not about["level_with_best"]
+        clear = own and row["action"] == about["best"] and about["clear"]
         name = row["action"] + (" *" if clear else "")
         table.add_row(*_cells(name, row, several)[: len(columns)])
         if own and len(about["contexts"]) > 1:
@@ -371,7 +383,7 @@ def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> Non
                 if part["action"] == row["action"]:
                     cells = _cells(f"  {_named(part['context'])}", part, several)
                     table.add_row(*cells[: len(columns)])
-    console.print(table)
+    print_table(console, table)
     for line in [*_warnings(about), *_remarks(about, options)]:
         console.print(f"  {line}", highlight=False)
 

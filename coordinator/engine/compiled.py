@@ -57,6 +57,9 @@ class Compiled:
     """The values that names in conditions can have."""
     free: frozenset[str]
     """Variables that no place or transition writes: only the global memory changes them."""
+    advancing: frozenset[str]
+    """Transitions that take or give a token outside listening branches; resources do not count,
+    because such a branch may hold one."""
     firing_limit: int
     """Firings without a stimulus after which the engine gives up (docs/semantics.md, section 6)."""
 
@@ -106,8 +109,18 @@ def compile_task(task: Task, devices: Mapping[str, str]) -> Compiled:
         free=frozenset(flat.variables)
         - {v for p in flat.places.values() for v in p.out.values()}
         - {name for t in flat.transitions.values() for name, _ in t.sets},
+        advancing=frozenset(
+            t.name
+            for t in flat.transitions.values()
+            if any(_advances(flat.places[a.place]) for a in t.inputs)
+            or any(_advances(flat.places[a.place]) for a in t.outputs)
+        ),
         firing_limit=_firing_limit(flat, net),
     )
+
+
+def _advances(place: Place) -> bool:
+    return not place.listen and place.kind is not Kind.RESOURCE
 
 
 def _primitive_of(flat: Task, place: Place) -> PrimitiveTask:

@@ -141,19 +141,33 @@ def can_still_fire(draft: Draft, x: CompiledTransition) -> bool:
 
 
 def waiting_for(draft: Draft) -> str:
-    """Return in words what keeps each transition that could take an ended run, or with no such run
-    any that has some of its tokens, from firing."""
+    """Return in words which event or variable each transition waits for that can still fire, and
+    what keeps each one from firing that could take an ended run, or with no such run any that has
+    some of its tokens."""
     ended = {r.place for runs in draft.tokens.values() for r in runs if r.phase is Phase.DONE}
     near = [x for x in draft.compiled.transitions if ended & {a.name for a in x.actions}]
     if not ended:
         marked = {p for p, n in enumerate(draft.marking) if n}
         near = [x for x in draft.compiled.transitions if marked & {p for p, _ in x.needs}]
+    chances = [
+        f"{x.name} waits for {_awaited(draft, x)}"
+        for x in draft.compiled.transitions
+        if can_still_fire(draft, x)
+    ]
     found = [
         f"{x.name} {' and '.join(o.text for o in lacks)}"
         for x in near
         if (lacks := obstacles(draft, x))
     ]
-    return "; ".join(found) or "no transition takes any of its tokens"
+    return "; ".join([*chances, *found]) or "no transition takes any of its tokens"
+
+
+def _awaited(draft: Draft, x: CompiledTransition) -> str:
+    events = [event for event in (x.pulse, *x.flags) if event and event not in draft.flags]
+    timer = draft.timers.get(x.name)
+    if timer is not None and not timer.elapsed:
+        events.append(f"its {x.after:g} s")
+    return " and ".join(events) or f"a variable ({x.when})"
 
 
 class Obstacle(NamedTuple):

@@ -9,7 +9,7 @@ from typing import Any
 from petrobot.coordinator.engine import operator, runs
 from petrobot.coordinator.engine.compiled import compile_task
 from petrobot.coordinator.engine.draft import Draft
-from petrobot.coordinator.engine.firing import awaited
+from petrobot.coordinator.engine.firing import awaited, waiting_for
 from petrobot.coordinator.engine.instructions import (
     ArmTimer,
     CancelRun,
@@ -21,7 +21,7 @@ from petrobot.coordinator.engine.instructions import (
     StartRun,
     Subject,
 )
-from petrobot.coordinator.engine.state import ACTIVE, Mode, Phase, Run, State, Suspended
+from petrobot.coordinator.engine.state import ACTIVE, LIVE, Mode, Phase, Run, State, Suspended
 from petrobot.coordinator.engine.step import Policy, abort, settle
 from petrobot.coordinator.engine.stimuli import (
     Abort,
@@ -177,6 +177,22 @@ class Engine:
         """Return whether tokens enable a transition that waits for the event; if not, a pulse of it
         changes nothing."""
         return awaited(Draft(self.compiled, state), event)
+
+    def only_listens(self, state: State) -> bool:
+        """Return whether only an event or the global memory can still change something but in
+        listening branches: nothing else is active, stopping or timed."""
+        if state.mode is not Mode.RUNNING or state.suspended is not None:
+            return False
+        places, advancing = self.compiled.task.places, self.compiled.advancing
+        return not (
+            any(run.phase in LIVE and not places[run.place].listen for run in state.runs())
+            or any(run.phase is Phase.STOPPING for run in state.stopping.values())
+            or any(x in advancing and not timer.elapsed for x, timer in state.timers.items())
+        )
+
+    def waiting_for(self, state: State) -> str:
+        """Return in words what each transition waits for."""
+        return waiting_for(Draft(self.compiled, state))
 
     def outstanding(self, state: State) -> tuple[Instruction, ...]:
         """Return the orders that are still in force, for a coordinator that takes over a state:

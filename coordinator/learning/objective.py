@@ -134,7 +134,7 @@ class Comparison:
     @property
     def level_with_best(self) -> tuple[str, ...]:
         """The other actions whose J cannot be told from the lowest one: the interval of the
-        difference contains 0. The runs of two actions are taken as independent."""
+        difference contains 0, or is not known. The runs of two actions are taken as independent."""
         if self.best is None:
             return ()
         best = self.of(self.best)
@@ -145,6 +145,12 @@ class Comparison:
             and f.j < inf
             and not f.j - best.j > joined(f.j - f.j_lower, best.j_upper - best.j)
         )
+
+    @property
+    def clear(self) -> bool:
+        """Whether the lowest J is lower than every other, and not by chance."""
+        known = sum(not isnan(f.j) for f in self.figures)
+        return known > 1 and not self.level_with_best
 
     def of(self, action: str) -> Figures:
         """Return the figures of one action. Raises KeyError."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import reduce
-from math import ceil, inf, nan, sqrt
+from math import ceil, inf, isfinite, nan, sqrt
 from operator import add
 from typing import Any
 
@@ -189,8 +189,9 @@ def mean_interval(moments: Moments, level: float = 0.95) -> tuple[float, float]:
 def joined(one: float, other: float, correlation: float = 0.0) -> float:
     """Half-width of a sum from the half-widths of its two parts, with the correlation of their
     errors (G. Y. Zou and A. Donner, Statistics in Medicine 27 (2008) 1693-1702: each side by
-    itself, so that intervals which are wider on one side stay so)."""
-    if inf in (one, other):
+    itself, so that intervals which are wider on one side stay so). An unknown half (nan) has no
+    bound."""
+    if not (isfinite(one) and isfinite(other)):
         return inf
     return sqrt(max(0.0, one**2 + other**2 + 2.0 * correlation * one * other))
 

@@ -302,6 +302,7 @@ class LockstepSession(RunSession):
     ) -> Operation:
         """Let operators see and control it, which is possible only for a cell in this process."""
         assert self.shell is not None
+        self._party.attended = True
         operation = Operation(
             self.shell, self.selector, feed, controls, starts=starts, mode=LOCKSTEP
         )

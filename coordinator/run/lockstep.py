@@ -4,18 +4,56 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from petrobot.coordinator.engine import Abort, Engine, Fired, Instruction, State, Stimulus
 from petrobot.coordinator.run.mission import Mission, Stage
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.lockstep.party import Envelope
-from petrobot.services.comm.protocol.messages import Call, Message, Refuse, Welcome
+from petrobot.services.comm.protocol.messages import Call, Feedback, Message, Refuse, Welcome
 
 NAME = "coordinator"
+PATIENCE = 1800.0
+"""Simulated time for which a mission run without an operator waits for an event (s). Nothing tells
+whether the laboratory will raise it, so this must be longer than any button takes."""
+
+
+class _Waiting:
+    """An observer that notes since when the mission run has waited for events alone. What listening
+    branches do meanwhile does not end the wait."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        self.since: float | None = None
+
+    def instruction(self, now: float, instruction: Instruction) -> None:
+        """A firing of the task itself begins a new wait."""
+        if (
+            isinstance(instruction, Fired)
+            and instruction.transition in self._engine.compiled.advancing
+        ):
+            self.since = None
+
+    def settled(self, now: float, state: State) -> None:
+        """Begin or end a wait."""
+        if not self._engine.only_listens(state):
+            self.since = None
+        elif self.since is None:
+            self.since = now
+
+    def stimulus(self, now: float, stimulus: Stimulus) -> None:
+        """Nothing to note."""
+
+    def progress(self, now: float, run: str, notice: Feedback) -> None:
+        """Nothing to note."""
 
 
 class CoordinatorParty:
     """Implements `services.comm.lockstep.party.Party`. `watch(now)` is called at each tick, to show
     progress to people; `begin(now)` when every node is connected (it starts the mission, unless a
-    recorded run is continued)."""
+    recorded run is continued).
+
+    A mission run that waits for an event longer than `PATIENCE`, and twice the period of each timer
+    of the location file, is aborted, unless it is `attended`: an operator may raise the event.
+    """
 
     def __init__(
         self,
@@ -26,7 +64,12 @@ class CoordinatorParty:
     ) -> None:
         self.name = NAME
         self.mission = mission
+        self.attended = False
         self._directory = directory
+        periods = (timer.period for timer in directory.timers.values())
+        self._patience = max(PATIENCE, 2.0 * max(periods, default=0.0))
+        self._waiting = _Waiting(mission.executor.engine)
+        mission.executor.observers.append(self._waiting)
         self.watch = watch
         self._begin = begin or mission.start
         self._now = 0.0
@@ -65,6 +108,8 @@ class CoordinatorParty:
                 caller.due()  # keeps `soonest` up to date
             if notices := caller.notices():
                 mission.take(now, node, notices)
+        if self._waiting.since is not None and now >= self._waiting.since + self._patience:
+            self._give_up(now)
         mission.advance(now)
         if mission.stage is Stage.CONNECTING and all(
             caller.up for caller in mission.callers.values()
@@ -72,6 +117,16 @@ class CoordinatorParty:
             self._begin(now)
         if self.watch is not None:
             self.watch(now)
+
+    def _give_up(self, now: float) -> None:
+        executor = self.mission.executor
+        if not self.attended:
+            text = (
+                f"waited {self._patience:.0f} s of simulated time, and no operator can act: "
+                f"{executor.engine.waiting_for(executor.state)}"
+            )
+            executor.stimulate(now, Abort(text))
+        self._waiting.since = None
 
     def drain(self) -> Sequence[Envelope]:
         """Return what was sent since the last call, in order."""

@@ -187,7 +187,9 @@ def _pushed(
         push = 0.0
     change = push - before
     vx, vy, vz = vx + change * nx, vy + change * ny, vz + change * nz
-    # Friction would stop the slip of the point of contact, which moves with v - r w x n.
+    # Friction would stop the slip of the point of contact, which moves with v - r w x n. An impulse
+    # g per mass changes it by g as speed and by g / k as spin, so k / (1 + k) of the slip is enough
+    # (2/7 for a solid ball, 2/5 for a hollow one).
     sx = vx - r * (wy * nz - wz * ny) - surface[0]
     sy = vy - r * (wz * nx - wx * nz) - surface[1]
     sz = vz - r * (wx * ny - wy * nx) - surface[2]

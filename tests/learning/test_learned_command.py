@@ -408,6 +408,37 @@ def test_a_run_warns_that_a_cost_was_never_reported(
     assert "place: no run of place_soft reported value:trees" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "command", [["show", "learned.db"], ["task", "learned.db", str(TASK_FILE)]]
+)
+def test_a_narrow_terminal_cuts_no_number(
+    command: list[str],
+    cell: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A pipe has 80 columns, too."""
+    petrobot("--learn", "learned.db", runs=3)
+    capsys.readouterr()
+    monkeypatch.setenv("COLUMNS", "50")
+    assert main(["learned", *command]) == 0
+    told = capsys.readouterr().out
+    assert "95 %" in told or "primitive task" in told
+    assert "\N{HORIZONTAL ELLIPSIS}" not in told
+
+
+def test_probabilities_are_shown_of_selectors_that_learn_them(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those that only count keep equal ones, by which none of them chooses."""
+    for selector in ("fixed", "round_robin", "nikolic_fu"):
+        petrobot("--learn", "learned.db", "--selector", selector, runs=3)
+    capsys.readouterr()
+    shown, text = told(Path("learned.db"), capsys)
+    assert list(shown["pick"]["selectors"]) == ["nikolic_fu"]
+    assert "nikolic_fu " in text and "fixed" not in text and "round_robin" not in text
+
+
 def test_r_and_c_of_the_whole_task(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """R and C of the primitive tasks, and of one run of the whole task computed through its net."""
     petrobot("--learn", "learned.db", "--selector", "round_robin", runs=30)

@@ -148,4 +148,15 @@ def test_chance_rarely_makes_an_action_clearly_the_best() -> None:
         )
         assert clear <= 13  # 5 expected for two actions, fewer for more
     found = compare({"good": {"": tally(0.95)}, "bad": {"": tally(0.4)}}, Question())
-    assert found.best == "good" and found.level_with_best == ()
+    assert found.best == "good" and found.level_with_best == () and found.clear
+
+
+def test_an_action_is_not_clearly_the_best_where_too_little_is_known() -> None:
+    """One run of another action has no interval, and an action alone is compared with nothing."""
+    good = Tally()
+    for cost in (1.0, 1.1, 0.9, 1.0):
+        good = good.adding(Observation(Status.SUCCESS, cost))
+    once = Tally().adding(Observation(Status.FAILURE, 9.0))
+    found = compare({"good": {"": good}, "once": {"": once}}, Question(rho=1.0))
+    assert found.best == "good" and found.level_with_best == ("once",) and not found.clear
+    assert not compare({"good": {"": good}, "never": {}}, Question()).clear

@@ -65,7 +65,7 @@ def stands(proof: FigureProof, found: dict[str, dict[str, Any]]) -> bool:
     data = found.get(proof.name, {})
     if proof.holds_for(data):
         return True
-    if proof.sample is None or data.get("sample") != proof.sample():
+    if proof.sample is None or "sample" not in data or data["sample"] != proof.sample():
         return False
     data["same_at"] = proof.fingerprint()
     return True

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from scipy.stats import beta, f, norm
+from scipy.stats import t as student
 
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.history import Codes, Training, Values
@@ -33,6 +34,10 @@ LARGEST = 5.0
 """Largest standardised difference of means. It is exceeded where one very long trial makes up most
 of the spread: samples without it have almost none. By simulation, the limit costs no coverage and
 saves a tenth of the mean width (lognormal times with sigma 1.5, 300 trials)."""
+FEW = 4
+"""Number of training trials from which the bootstrap says how a mean varies. All samples of two
+trials that vary have the same mean, so their interval was a point; that of three held in 76 to 81 %
+of cases, Student's in 86 to 92 % (uniform, exponential and lognormal times)."""
 MANY = 4000
 """Number of new trials beyond which their mean is drawn from the normal distribution."""
 SCORES: Values = np.array([-3.0, -2.6, -2.2, norm.ppf(0.025), -1.6, -1.2, -0.8, -0.4, 0.0])
@@ -137,7 +142,10 @@ def mean_figure(
     alone = wider * float(error[0])
     both = wider * float(np.hypot(error[0], spread[0] / np.sqrt(runs)))
     levels = norm.cdf(SCORES)
-    return _figure(
+    if 1 < n < FEW:
+        few = student(n - 1)
+        return time_figure(centre, centre + both * few.ppf(levels), centre + alone * few.ppf(_BOTH))
+    return time_figure(
         centre,
         centre + both * _quantiles(fresh, levels),
         centre + alone * _quantiles(truth, _BOTH),
@@ -186,7 +194,7 @@ def quantile_figure(
     known = beta.sf(q, ranks, n + 1 - ranks)
     own = beta.ppf((np.arange(100)[:, None] + 0.5) / 100, ranks, n + 1 - ranks)
     below = new.cdf(own).mean(axis=0)
-    return _figure(
+    return time_figure(
         float(law.at(np.array([(q * (n - 1) + 1) / (n + 1)]))[0]),
         law.at(_inverse(ranks, below, SCORES) / (n + 1)),
         law.at(_inverse(ranks, known, norm.ppf(_BOTH)) / (n + 1)),
@@ -223,11 +231,13 @@ class _Law:
 _BOTH = np.array([(1 - LEVEL) / 2, (1 + LEVEL) / 2])
 
 
-def _figure(value: float, curve: Values, confidence: Values) -> dict[str, Any]:
-    low, high = (float(np.interp(norm.ppf(p), SCORES, curve)) for p in _BOTH)
+def time_figure(value: float, curve: Values, confidence: Values) -> dict[str, Any]:
+    """Return a forecast time: `curve` is its predictive distribution at `SCORES`. No time is below
+    0, but the curve of few trials may be: its slope is what a comparison needs."""
+    interval = np.interp(norm.ppf(_BOTH), SCORES, curve)
     return {
         "value": round(value, 6),
-        "interval": [round(low, 6), round(high, 6)],
-        "confidence": [round(float(x), 6) for x in confidence],
+        "interval": [round(max(0.0, float(x)), 6) for x in interval],
+        "confidence": [round(max(0.0, float(x)), 6) for x in confidence],
         "curve": [round(float(x), 9) for x in curve],
     }

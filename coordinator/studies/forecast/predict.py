@@ -17,6 +17,7 @@ from petrobot.coordinator.studies.forecast.direct import (
     mean_figure,
     missions,
     quantile_figure,
+    time_figure,
     trial_weights,
 )
 from petrobot.coordinator.studies.forecast.distributions import (
@@ -309,12 +310,8 @@ def _net_time(value: float, samples: Values, runs: int, training: int) -> dict[s
     sd = float(known.std(ddof=1)) if len(known) > 1 else 0.0
     # variance of a figure of new trials ~ 1 / training + 1 / new trials
     alone = sd / np.sqrt(1.0 + training / runs)
-    return {
-        "value": round(value, 6),
-        "interval": _rounded(value + sd * np.array([SCORES[3], -SCORES[3]])),
-        "confidence": _rounded(value + alone * np.array([SCORES[3], -SCORES[3]])),
-        "curve": [round(float(x), 9) for x in value + sd * SCORES],
-    }
+    both = np.array([SCORES[3], -SCORES[3]])
+    return time_figure(value, value + sd * SCORES, value + alone * both)
 
 
 def _played(

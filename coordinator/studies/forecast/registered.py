@@ -235,6 +235,7 @@ def _share_error(
             first = sum(d * q for d, q in by_status.values())
             variance += (sum(q * d * d for d, q in by_status.values()) - first**2) / runs
     half = 1.96 * math.sqrt(max(0.0, variance)) / p
-    if half <= 0.0:  # nothing that decides was ever seen otherwise: no interval, not one of width 0
-        return None
-    return [float(f"{p * math.exp(-half):.7g}"), float(f"{min(1.0, p * math.exp(half)):.7g}")]
+    low, high = (float(f"{min(1.0, p * math.exp(side)):.7g}") for side in (-half, half))
+    # Nothing that decides was ever seen otherwise: no interval, not one of width 0. The digits that
+    # are written decide, because the slopes then are rounding errors of the solution, not 0.
+    return [low, high] if low < high else None

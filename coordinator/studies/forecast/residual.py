@@ -3,11 +3,12 @@ compare them with the training trials."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2_contingency, rankdata, spearmanr, ttest_ind
+from scipy.stats import chi2_contingency, rankdata, spearmanr, ttest_ind_from_stats
 
 from petrobot.coordinator.studies.forecast.direct import FEWEST, missions
 from petrobot.coordinator.studies.forecast.history import Codes, Training, Values
@@ -17,6 +18,9 @@ from petrobot.coordinator.studies.forecast.shares import holm
 LEVEL = 0.01
 """Significance level at which simulated and measured trials differ, over all tests of a regime
 (Holm)."""
+EXACT = 1e-9
+"""Relative spread below which times are equal: a sum of equal durations differs by its rounding
+errors, which no test may take for a spread."""
 NEGLIGIBLE = 0.02
 """Share of trials that may rest on a guess, or by which a simulated share may miss the measured
 one. Less than this moves no forecast share by more than the margin of equivalence."""
@@ -73,10 +77,19 @@ def _shares(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 def _same_mean(one: Values, other: Values) -> float:
     """Welch's test of equal means: classes tell little about a few trials that last very long."""
-    kept_one, kept_other = one[~np.isnan(one)], other[~np.isnan(other)]
-    if min(len(kept_one), len(kept_other)) < 2 or kept_one.std() + kept_other.std() == 0:
+    kept = [times[~np.isnan(times)] for times in (one, other)]
+    if min(map(len, kept)) < 2:
         return 1.0
-    return float(ttest_ind(kept_one, kept_other, equal_var=False).pvalue)
+    means, spreads = [x.mean() for x in kept], [x.std(ddof=1) for x in kept]
+    if max(spreads) <= EXACT * means[0]:
+        return float(math.isclose(*means, rel_tol=EXACT))
+    # not ttest_ind: it warns where the times of one side are equal but for rounding
+    stats = (
+        x
+        for mean, sd, times in zip(means, spreads, kept, strict=True)
+        for x in (mean, sd, len(times))
+    )
+    return float(ttest_ind_from_stats(*stats, equal_var=False).pvalue)
 
 
 def _off(table: np.ndarray) -> float:

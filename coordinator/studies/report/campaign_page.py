@@ -267,7 +267,7 @@ class CampaignReport:
         for primitive, judged in self.summary.comparisons().items():
             front = {f.action for f in pareto(judged.figures)}
             best = next((f for f in judged.figures if f.action == judged.best), None)
-            rows = [_action_row(f, front, best, not judged.level_with_best) for f in judged.figures]
+            rows = [_action_row(f, front, best, judged.clear) for f in judged.figures]
             out.append(
                 f"<h3>{escape(primitive)} <small>rho = {judged.rho:.4g}</small></h3>{table(rows)}"
             )

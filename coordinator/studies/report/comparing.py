@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from math import nan
 from typing import Any
 
 import numpy as np
@@ -59,13 +60,14 @@ def compare(
     shares, negative for J and time.
 
     `weighting` gives the rho of J, so that several comparisons can use the same; without it, rho is
-    that of the actions in these two. Raises ValueError if they have no trial in common.
+    that of the actions in these two. Raises ValueError if they do not have two trials in common:
+    every sample of a single pair is that pair, so its interval would be a point.
     """
     pairs = paired(one, other)
-    if not pairs.one:
+    if len(pairs.one) < 2:
         raise ValueError(
-            "the two campaigns have no trial in common: run them with the same --seed, "
-            "--block and --regime"
+            f"the two campaigns have {'one' if pairs.one else 'no'} trial in common, a comparison "
+            "needs two: run them with the same --seed, --block and --regime"
         )
     random = np.random.default_rng(seed)
     shares = {
@@ -178,7 +180,7 @@ def objectives(task: Task, rows: Sequence[TrialRow], weighting: Weighting) -> di
     }
     known = [value for value in found.values() if not np.isnan(value)]
     return found | {
-        "mean": float(np.mean(known)) if known else float("nan"),
+        "mean": float(np.mean(known)) if known else nan,
         "task": float(_objective(_task_sums(rows), whole, weighting.task)[0]),
     }
 
@@ -191,8 +193,11 @@ def objective_intervals(
 
     Four trials at the mean cost are added, two of them successes: without them the interval of a
     combination that never failed would be empty (A. Agresti and B. A. Coull, The American
-    Statistician 52 (1998) 119-126). nan where nothing ran.
+    Statistician 52 (1998) 119-126). nan where nothing ran, and for one trial, which says nothing of
+    the spread of the cost.
     """
+    if len(rows) < 2:
+        return (nan, nan), (nan, nan)
     random = np.random.default_rng(seed)
     weights = random.multinomial(
         len(rows) + 4, np.full(len(rows) + 4, 1 / (len(rows) + 4)), REPLICATES
@@ -211,7 +216,7 @@ def objective_intervals(
 
     parts = [(_sums(task, name, rows), rho) for name, rho in weighting.rho.items()]
     spreads = [spread(sums, rho) for sums, rho in parts if sums[0].sum()]
-    whole = spread(_task_sums(rows), weighting.task) if rows else np.empty(0)
+    whole = spread(_task_sums(rows), weighting.task)
     mean = np.mean(spreads, axis=0) if spreads else np.empty(0)
     return _percentiles(mean), _percentiles(whole)
 
@@ -219,7 +224,7 @@ def objective_intervals(
 def _percentiles(spread: Values) -> tuple[float, float]:
     known = spread[~np.isnan(spread)]
     if not len(known):
-        return float("nan"), float("nan")
+        return nan, nan
     low, high = np.quantile(known, (0.025, 0.975))
     return float(low), float(high)
 

@@ -105,6 +105,25 @@ def test_equal_times_have_an_interval_of_one_point() -> None:
     assert quantile_figure(times, even, 10, 0.9)["interval"] == [2.5, 2.5]
 
 
+@pytest.mark.parametrize("n", [2, 3])
+def test_the_mean_of_two_or_three_trials_is_not_sure(n: int) -> None:
+    """Student's interval: a bootstrap of so few has hardly a sample whose mean differs."""
+    rng, even, held = np.random.default_rng(4), np.ones(n), 0
+    for _ in range(60):
+        low, high = mean_figure(rng.uniform(1.0, 3.0, n), even, 20, rng)["confidence"]
+        held += low <= 2.0 <= high
+    assert held >= 50  # 55 expected
+
+
+def test_no_time_is_forecast_below_0() -> None:
+    """Three trials, one of them much shorter, leave the mean open to both sides; the distribution
+    for comparisons keeps its shape."""
+    times, even = np.array([0.3, 5.4, 5.6]), np.ones(3)
+    found = mean_figure(times, even, 20, np.random.default_rng(1))
+    assert found["interval"][0] == found["confidence"][0] == 0.0
+    assert found["curve"][0] < 0.0 < found["value"] < found["interval"][1]
+
+
 def test_quantile_limits_are_the_binomial_ones() -> None:
     """Against order statistics by hand: of 100 uniform times, P(X_(i) <= q90) = P(Bin(100, .9) >=
     i)."""

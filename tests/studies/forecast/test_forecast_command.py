@@ -5,17 +5,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from petrobot.coordinator.analysis.time.completion import Completion
+from petrobot.coordinator.analysis.time.sensitivity import Slope, reliability_slopes
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest, write_manifest
 from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.table import CampaignTable
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
+from petrobot.coordinator.studies.forecast import registered
 from petrobot.coordinator.studies.forecast.choices import misfit
 from petrobot.coordinator.studies.forecast.history import Training
 from petrobot.coordinator.studies.forecast.residual import routing
@@ -310,6 +314,33 @@ def test_a_disagreement_of_the_distribution_is_a_disagreement(
     lines = capsys.readouterr().out.splitlines()
     assert any("distribution of the time" in line and "DISAGREES" in line for line in lines)
     assert lines[-1].startswith("DISAGREES") and "agrees" not in lines
+
+
+def test_rounding_errors_give_no_interval(
+    write_campaign: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A task that always completes, whatever the shares, has derivatives of rounding errors in a
+    large chain. An interval from 1 to 1 would promise that it completes."""
+
+    def rough(done: Completion) -> dict[str, Slope]:
+        exact = reliability_slopes(done)
+        return {x: replace(one, derivative=1e-14 * n) for n, (x, one) in enumerate(exact.items())}
+
+    monkeypatch.setattr(registered, "reliability_slopes", rough)
+    trials = []
+    for k in range(60):
+        status = "failure" if k % 3 else "success"
+        runs = [
+            RunEntry("first", "first_a", 0.0, 1.0, status, taken="on"),
+            RunEntry("second", "second_a", 1.0, 1.0, "success", taken="done"),
+        ]
+        trials.append(Trial(1, 0.0, 2.0 + k / 60, True, 1, runs=runs))
+    train = write_campaign("train", TASK, trials)
+    told = ["forecast", str(tmp_path / "pair.toml"), "--estimates", str(train), *QUICK]
+    assert main([*told, "--json", str(tmp_path / "f.json")]) in (0, 1)
+    found = json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))["regimes"][""]["gspn"]
+    assert found["P_complete"] == 1.0
+    assert found["P_complete_interval"] is None
 
 
 def test_trials_of_a_rare_success_keep_their_digits(

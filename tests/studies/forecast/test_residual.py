@@ -50,6 +50,17 @@ def test_doubts_need_a_significant_and_relevant_difference(
     assert not said or of in said[0]
 
 
+def test_times_that_are_equal_but_for_rounding_do_not_differ() -> None:
+    """Durations that never vary: their rounding errors are no spread, two constants that differ
+    surely do, and one constant is compared with what varies."""
+    equal, rounded = np.full(40, 0.3), np.full(40, 0.1 + 0.2)
+    rounded[::2] = 0.3
+    assert residual._same_mean(equal, rounded) == 1.0
+    assert residual._same_mean(equal, np.full(40, 0.31)) == 0.0
+    assert 0.01 < residual._same_mean(rounded, np.linspace(0.29, 0.31, 40)) <= 1.0
+    assert residual._same_mean(rounded, np.linspace(0.39, 0.41, 40)) < 1e-6
+
+
 def test_the_distance_is_the_largest_difference_of_shares_or_relative_difference_of_means() -> None:
     """Tried with trials simulated exactly as recorded, then with some that miss a goal, then with
     all taking longer."""

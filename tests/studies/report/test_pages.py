@@ -102,6 +102,8 @@ def test_pairs_have_equal_seeds() -> None:
     assert paired(one, other).left_out == 8
     with pytest.raises(ValueError, match="no trial in common"):
         compare(TOY, one, [row(0, "look_quick", "success", 1.0, True, regime="rough")])
+    with pytest.raises(ValueError, match="one trial in common"):
+        compare(TOY, one, other)
 
 
 def test_equal_campaigns_do_not_differ() -> None:
@@ -226,6 +228,14 @@ def test_combinations_have_intervals_that_cover_them() -> None:
             j = 1.0 - truth + rho * (1.0 + truth)
             covered[i] += bounds[i][0] <= j <= bounds[i][1]
     assert covered.min() >= 0.9 * 150
+
+
+def test_one_trial_of_a_combination_gives_no_interval_of_j() -> None:
+    """Of its cost only one number is known."""
+    one = row(0, "look_quick", "success", 2.0, True)
+    weighting = Weighting({"look": 0.1}, 0.2)
+    assert np.isnan(objective_intervals(TOY, [one], weighting)).all()
+    assert np.isnan(objective_intervals(TOY, [], weighting)).all()
 
 
 def test_a_runs_own_pictures() -> None:
