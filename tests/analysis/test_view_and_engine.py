@@ -442,6 +442,17 @@ def test_a_task_that_begins_at_its_end_has_no_bad_run() -> None:
     assert (found["P_complete"], found["R_conj"], found["mean time (s)"]) == (1.0, 1.0, 0.0)
 
 
+@pytest.mark.parametrize("parts", [0, 1])
+def test_a_mission_without_a_length_is_analysed(parts: int) -> None:
+    """It ends as soon as it begins, or `work` runs again and again."""
+    text = Text(parts, done=', when = "work.status == none"')
+    text.moves = [arcs(t, f"work:{end}", "work") for t, end in (("on", "normal"), ("bad", "error"))]
+    found = analyse(text.task(), view="gspn")
+    assert found.forecast is not None and set(found.forecast.throughput.values()) == {0.0}
+    assert found.forecast.completion_probability == (0.0 if parts else 1.0)
+    assert "P_complete" in found.text()
+
+
 def test_figures_of_one_trial_stand_beside_those_of_the_mission() -> None:
     """Campaigns count trials: a mission of three is all SUCCESS as often as three trials are."""
     text = Text(3)
