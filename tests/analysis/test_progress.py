@@ -365,6 +365,15 @@ def test_the_cause_of_a_dead_end_names_the_variable_without_a_value() -> None:
     assert found.details[-1] == "next is barred by seen, which holds 1"
 
 
+def test_free_resources_are_not_what_is_stuck() -> None:
+    task = make_task(
+        "go=1 arm~=1 done", {"lose": {"in": "go arm", "out": "arm"}}, final="done == 1"
+    )
+    found = judged(task).deadlock_free
+    assert found.reason.startswith("stuck with free resources alone: no transition takes what is")
+    assert found.details == ("done: nothing ever fills it", "marked: arm")
+
+
 def test_a_transition_that_never_fires_names_who_takes_its_tokens_first() -> None:
     net: dict[str, dict[str, Any]] = {
         "ask": {"in": "head", "out": "poll", "priority": 2},

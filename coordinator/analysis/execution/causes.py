@@ -44,7 +44,7 @@ class Explanation(NamedTuple):
 
 def describe(x: ExecutionGraph, state: int) -> str:
     """Return the marked places of a state, with how the runs in them ended."""
-    return _told(x, x.states[state], lambda _: True) or "nothing marked"
+    return _told(x, x.states[state], lambda _: True) or "no token"
 
 
 def left_over(x: ExecutionGraph, state: int) -> str:
@@ -60,7 +60,7 @@ def left_over(x: ExecutionGraph, state: int) -> str:
         free = own.tokens == at.marking[task.net.place_index[place]]
         return not ended and not (own.kind is Kind.RESOURCE and free)
 
-    return _told(x, at, matters) or describe(x, state)
+    return _told(x, at, matters) or ("free resources alone" if any(at.marking) else "no token")
 
 
 def _told(x: ExecutionGraph, at: State, matters: Callable[[str], bool]) -> str:
