@@ -177,8 +177,9 @@ def analysed(
     """Analyse a task file for the operator's page. `cell` holds the fields of its `Cell`.
 
     Return {complete, markings, verdicts, notes, heat, figures}; a verdict is {name, words, holds,
-    reason, assumption, witness, complete}, false ones first. With the view "gspn" the forecast is
-    included: `heat` is the share of the time that each action place takes. Raises TaskFileError.
+    reason, details, assumption, witness, complete}, false ones first. With the view "gspn" the
+    forecast is included: `heat` is the share of the time that each action place takes. Raises
+    TaskFileError.
     """
     from petrobot.coordinator.analysis.may_run import BUDGET, WORDS, Cell, assumed, devices_of
     from petrobot.coordinator.analysis.report import analyse, heat

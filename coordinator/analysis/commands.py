@@ -48,6 +48,7 @@ from petrobot.coordinator.analysis.time.whatif import (
 )
 from petrobot.coordinator.task import End, Kind, Place, Status, Task, Transition
 from petrobot.coordinator.task.net import Net
+from petrobot.coordinator.task.wording import wrapped
 from petrobot.services.host.whole_file import write_whole
 
 OK, FAULT, BAD_INPUT = 0, 1, 2
@@ -166,7 +167,7 @@ def analyse_command(
     except MemoryError:
         told = f"{path}: the memory was used up; give more --memory, or fewer --states"
         return CommandResult(BAD_INPUT, told, {"error": told})
-    said += [f"note: {note}" for note in notes]
+    said += [wrapped(f"note: {note}", 4) for note in notes]
     return CommandResult(
         OK if then.ok else FAULT,
         "\n".join(said),

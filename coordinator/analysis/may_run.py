@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING
 
 from petrobot.coordinator.task import Status, Task
 from petrobot.coordinator.task.check import CheckReport, Finding, Severity, check
+from petrobot.coordinator.task.wording import wrapped
 
 if TYPE_CHECKING:  # the search needs numpy, which a command that only reads the file does without
     from petrobot.coordinator.analysis.execution.progress import Contest
     from petrobot.coordinator.analysis.net.space import SearchLimits
+    from petrobot.coordinator.analysis.net.verdict import PropertyVerdict
     from petrobot.coordinator.analysis.report import Analysis
 
 
@@ -141,35 +143,49 @@ def _search(task: Task, budget: Budget, devices: Mapping[str, str] | None) -> An
 
 
 def _with_graph(report: CheckReport, analysis: Analysis) -> CheckReport:
-    """Return the findings with what the execution graph shows: retries without a limit, and
-    conflicts in place of those that the arcs suggest. Without a complete graph, those stand."""
+    """Return the findings with what the execution graph shows: retries without a limit, runs that
+    stay behind at the end, and conflicts in place of those that the arcs suggest. Without a
+    complete graph, those stand."""
     if analysis.progress is None or not analysis.progress.x.complete:
         return report
     rest = [f for f in report.findings if f.code not in ("unsettled-conflict", "arrival-order")]
     found = [_contest(contest) for contest in analysis.progress.contests]
     found += map(_retries, analysis.progress.x.retries)
+    found += [_left_behind(p, verdict) for p, verdict in analysis.progress.left_behind.items()]
     errors = [f for f in found if f.severity is Severity.ERROR]
-    notes = [f for f in found if f.severity is Severity.NOTE]
-    return CheckReport((*errors, *rest, *notes))
+    others = [f for f in found if f.severity is not Severity.ERROR]
+    return CheckReport((*errors, *rest, *others))
 
 
 def _contest(contest: Contest) -> Finding:
+    from petrobot.coordinator.analysis.execution.progress import contend
+
     first, *others = contest.transitions
-    names, over = " and ".join(contest.transitions), " and ".join(contest.over)
-    text = (
-        f"{names} may both want the last token of {over}, and the task does not say which one "
-        "gets it: the one that has waited longer, or else the first in the file"
-    )
-    key = f"transitions.{first}"
+    text, key = contend(contest.transitions, contest.over), f"transitions.{first}"
+    remedy = "give one a higher `priority`, each a `weight`, or exclusive conditions"
+    who = "the one that has waited longer gets it, or else the first in the file"
     if not contest.matters:
-        text += f" ({first}, so that {' and '.join(others)} may have to wait)"
-        return Finding(Severity.NOTE, "unsettled-conflict", key, text)
+        why = f"{who} ({first}), so that {' and '.join(others)} may have to wait"
+        return Finding(Severity.NOTE, "unsettled-conflict", key, text, why)
     told = "; ".join(
         f"{name.replace('_', ' ')}: {reason}" for name, reason in contest.matters.items()
     )
-    remedy = "give one a higher `priority`, each a `weight`, or exclusive conditions"
-    text = f"{text} ({first}); if it went the other way: {told}"
+    text = f"{text}; {who}, but if it went the other way: {told}"
     return Finding(Severity.ERROR, "unsettled-conflict", key, text, remedy)
+
+
+def _left_behind(places: tuple[str, ...], verdict: PropertyVerdict) -> Finding:
+    from petrobot.coordinator.analysis.report import path_lines
+
+    what = (
+        "a run that ended is" if len(places) == 1 else f"ended runs of {' and '.join(places)} are"
+    )
+    text = f"the task can end with `final` while {what} still there: {verdict.reason}"
+    empty = " and ".join(f"{place} == 0" for place in places)
+    remedy = f"let `final` ask for `{empty}`, and give that end a transition that takes it"
+    key, by = f"places.{places[0]}", path_lines(verdict.witness, "")
+    details = (*verdict.details, *by)
+    return Finding(Severity.WARNING, "left-behind", key, text, remedy, details=details)
 
 
 def _late(task: Task) -> list[Finding]:
@@ -194,13 +210,15 @@ def _late(task: Task) -> list[Finding]:
 
 
 def _retries(names: tuple[str, ...]) -> Finding:
-    text = (
-        f"{' and '.join(f'`{name}`' for name in names)} can be repeated without limit while runs "
-        "end in ERROR: a fault that stays keeps the task busy for ever"
+    words = " and ".join(f"`{name}`" for name in names)
+    text = f"{words} can be repeated without limit while runs end in ERROR"
+    remedy = (
+        "a fault that stays keeps the task busy for ever: use `tries`, or take a token of a place "
+        "that has only a few"
     )
-    remedy = "use `tries`, or take a token of a place that has only a few"
     return Finding(Severity.NOTE, "endless-retry", f"transitions.{names[0]}", text, remedy)
 
 
 def _line(finding: Finding) -> str:
-    return f"  {finding.key}: {finding.text}\n    {finding.remedy}"
+    said = wrapped(f"  {finding.key}: {finding.text}", 6)
+    return said + (f"\n{wrapped(f'    {finding.remedy}', 6)}" if finding.remedy else "")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.coordinator.analysis.execution.graph import STEPS, TooManyValues
+from petrobot.coordinator.analysis.execution.graph import STEPS, TooManyValues, in_words
 from petrobot.coordinator.analysis.execution.progress import (
     NAMES,
     Odds,
@@ -45,7 +45,7 @@ from petrobot.coordinator.analysis.net.structure import (
     place_semiflows,
     transition_semiflows,
 )
-from petrobot.coordinator.analysis.net.verdict import PropertyVerdict
+from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.analysis.time.markov import LongRun, long_run
 from petrobot.coordinator.analysis.time.measured import Measured
@@ -53,6 +53,7 @@ from petrobot.coordinator.analysis.time.stochastic import STAGES, stochastic_vie
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.net import Marking, Net
+from petrobot.coordinator.task.wording import COLUMNS, wrapped
 
 
 @dataclass(frozen=True)
@@ -131,6 +132,8 @@ BY_HAND = 20_000
 """The most stimuli and firings with the operator's tokens: as many as `petrobot check` tries."""
 SHOWN = 20
 """The most entries of a list that the text shows."""
+VERDICT = 26
+"""Columns before the reason of a verdict in the text."""
 
 
 @dataclass(frozen=True)
@@ -163,10 +166,10 @@ class Analysis:
     """Whether the task may not run for a reason beyond these verdicts (`may_run`)."""
 
     @cached_property
-    def hand_notes(self) -> list[str]:
-        """Notes on what only the operator's tokens make possible, searched up to BY_HAND stimuli
-        and firings."""
-        return self.progress.hand_notes(min(self.steps // 3, BY_HAND)) if self.progress else []
+    def by_hand(self) -> list[PropertyVerdict]:
+        """What only the operator's tokens make possible, searched up to BY_HAND stimuli and
+        firings."""
+        return self.progress.by_hand(min(self.steps // 3, BY_HAND)) if self.progress else []
 
     @property
     def ok(self) -> bool:
@@ -222,7 +225,8 @@ class Analysis:
                 {
                     "marked": list(d.witness.marking),
                     "count": d.count,
-                    "reason": d.reason,
+                    "reason": d.verdict.reason,
+                    "details": list(d.verdict.details),
                     **d.witness.to_json(),
                 }
                 for d in self.progress.dead_ends
@@ -257,7 +261,7 @@ class Analysis:
             "sound": named["sound"].holds if "sound" in named else None,
             "execution": self.progress.size() if self.progress else None,
             "verdicts": {name: verdict.to_json() for name, verdict in named.items()},
-            "notes": [*self.notes, *self.hand_notes],
+            "notes": [*self.notes, *map(_by_hand, self.by_hand)],
         }
         if structure:
             out["structure"] = self.structure.to_json()
@@ -346,8 +350,9 @@ class Analysis:
             + ("" if q.space.complete else f" (partial: {q.space.reason})"),
         ]
         lines += [f"executed: {self.progress.size_text()}", ""] if self.progress else [""]
+        told = list[Witness]()
         for name, verdict in self.verdicts().items():
-            lines += _verdict_lines(name, verdict)
+            lines += _verdict_lines(name, verdict, told)
             if self.progress is not None and name in self.progress.mended:
                 lines.append(_mended_line(self.progress.mended[name]))
         if self.progress is None:
@@ -357,8 +362,10 @@ class Analysis:
                 for d in q.deadlocks[:SHOWN]
             ]
         else:
+            ends = self.progress.dead_ends
+            several = len(ends) > 1 or any(d.count > 1 for d in ends)
             lines += [
-                f"  dead end       {d.count} x: {d.reason}" for d in self.progress.dead_ends[:SHOWN]
+                f"  dead end       {d.count} x: {d.verdict.reason}" for d in ends[:SHOWN] if several
             ]
             lines += _recovery_lines(self.progress.recoveries, self.odds)
         assumed = dict.fromkeys(  # a net of another tool is not executed
@@ -372,7 +379,12 @@ class Analysis:
             else []
         )
         lines += self._number_lines()
-        return "\n".join(lines + [f"note: {note}" for note in (*self.notes, *self.hand_notes)])
+        lines += [f"note: {note}" for note in self.notes]
+        lines += ["note: only if the operator moves tokens:"] if self.by_hand else []
+        for verdict in self.by_hand:
+            lines += [f"  {verdict.reason}", *(f"    {line}" for line in verdict.details)]
+            lines += path_lines(verdict.witness, "    ")
+        return "\n".join(wrapped(line, len(line) - len(line.lstrip()) + 4) for line in lines)
 
     def _number_lines(self) -> list[str]:
         if self.run is not None:
@@ -741,23 +753,42 @@ def _word(holds: bool | None) -> str:
     return {True: "yes", False: "NO", None: "unknown"}[holds]
 
 
-def _verdict_lines(name: str, verdict: PropertyVerdict) -> list[str]:
-    lines = [f"  {name.replace('_', ' '):15}{_word(verdict.holds):9} {verdict.reason}"]
-    if verdict.witness is not None:
-        firings = " ".join(verdict.witness.firings) or "(initial marking)"
-        lines.append(
-            f"{'':26}by: {firings}"
-            + (
-                f", then repeatedly: {' '.join(verdict.witness.loop)}"
-                if verdict.witness.loop
-                else ""
-            )
-        )
-    return lines
+def _by_hand(verdict: PropertyVerdict) -> str:
+    """Return in one line what only the operator's tokens make possible."""
+    by = (f"by: {'; '.join(in_words(verdict.witness.steps))}",) if verdict.witness else ()
+    return "; ".join(
+        (f"only if the operator moves tokens: {verdict.reason}", *verdict.details, *by)
+    )
+
+
+def path_lines(witness: Witness | None, indent: str) -> list[str]:
+    """Return the path to what a verdict found, a step in each line; of a long one the beginning and
+    the end."""
+    if witness is None:
+        return []
+    steps = in_words(witness.steps) or [" ".join(witness.firings) or "(initial marking)"]
+    steps += [f"then again and again: {' '.join(witness.loop)}"] if witness.loop else []
+    return [f"{indent}{'by: ' if not i else '    '}{step}" for i, step in enumerate(steps)]
+
+
+def _verdict_lines(name: str, verdict: PropertyVerdict, told: list[Witness]) -> list[str]:
+    """Return a verdict with its details and the firings that lead there, unless they are those of
+    one of the verdicts before it: `told`."""
+    head = f"  {name.replace('_', ' '):15}{_word(verdict.holds):9} {verdict.reason}"
+    lines, indent = wrapped(head, VERDICT).split("\n"), " " * VERDICT
+    for line in verdict.details:
+        lines += wrapped(indent + line, VERDICT + 4).split("\n")
+    if verdict.witness is None or verdict.witness in told:
+        return lines
+    told.append(verdict.witness)
+    loop = verdict.witness.loop
+    by = f"by: {' '.join(verdict.witness.firings) or '(initial marking)'}"
+    by += f", then repeatedly: {' '.join(loop)}" if loop else ""
+    return lines + wrapped(indent + by, VERDICT + 4).split("\n")
 
 
 def _mended_line(verdict: PropertyVerdict) -> str:
-    return f"{'':26}if the operator repairs it: {_word(verdict.holds)}, {verdict.reason}"
+    return f"{'':{VERDICT}}if the operator repairs it: {_word(verdict.holds)}, {verdict.reason}"
 
 
 def _recovery_lines(found: Sequence[Recovery], odds: Odds) -> list[str]:
@@ -771,7 +802,8 @@ def _recovery_lines(found: Sequence[Recovery], odds: Odds) -> list[str]:
     for alone, title in ((True, ""), (False, "only while another error is being handled:")):
         rows = [r for r in found if r.alone is alone]
         lines += [title] if rows and title else []
-        lines += [f"  {r.name:{wide}}{_columns(_recovery_row(r, odds))}" for r in rows]
+        for r in rows:
+            lines += _recovery_row(f"  {r.name:{wide}}", r, odds)
     if odds.missing:
         return [*lines, f"  no probability: {odds.missing}"]
     told = [text for text in odds.assumptions if not text.endswith(", not measured")]
@@ -786,25 +818,27 @@ def _recovery_lines(found: Sequence[Recovery], odds: Odds) -> list[str]:
 
 
 def _columns(texts: Sequence[str]) -> str:
-    widths = (5, 5, 12, 10, 28, 11, 0)
+    widths = (5, 5, 11, 9, 16, 9, 0)
     return "".join(f" {text:{w}}" for text, w in zip(texts, widths, strict=True)).rstrip()
 
 
-def _recovery_row(r: Recovery, odds: Odds) -> tuple[str, ...]:
-    named = {None: "any number", -1: "not recoverable", 0: "no further error tolerated"}
+def _recovery_row(name: str, r: Recovery, odds: Odds) -> list[str]:
+    """Return the line of an error exit; a path that is too long for it has lines of its own."""
+    named = {None: "any number", -1: "not recoverable", 0: "none"}
     if r.possible.holds:
-        named[-1] = "not recoverable for certain"
+        named[-1] = "none for certain"
     p, time = odds.by_exit.get(r.name, (None, None))
     path = " ".join(r.strategy) or ("(immediate)" if r.possible.holds and r.kappa != -1 else "-")
-    return (
+    row = (
         "some" if r.possible.holds is False and r.strategy else _word(r.possible.holds),
         _word(r.almost_sure.holds),
         "-" if p is None else _probability(p),
         "-" if not p else f"{time:.3g} s",
         named.get(r.kappa, str(r.kappa)),
         "-" if r.lost is None else " to ".join(str(n) for n in dict.fromkeys(r.lost)),
-        path,
     )
+    line = name + _columns((*row, path))
+    return [line] if len(line) <= COLUMNS else [name + _columns((*row, "")), f"{'':8}by {path}"]
 
 
 def _probability(p: float) -> str:

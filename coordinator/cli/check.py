@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-from typing import TYPE_CHECKING, Any
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
@@ -20,6 +22,7 @@ from petrobot.coordinator.cli.loading import (
     task_path,
     write_json,
 )
+from petrobot.coordinator.task.wording import Severity, wrapped
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,6 +39,10 @@ NO_CELL = "no-cell"
 """Code of the finding that no location file was given."""
 PATIENCE = 2.0
 """Seconds that a node has to answer."""
+HANG = 8
+"""Columns before the details of a finding."""
+UNLESS = "NO unless repaired"
+"""The answer of a verdict that holds if the operator repairs what `final_error` leaves."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,14 +71,13 @@ def run(options: argparse.Namespace) -> int:
     analysis, ok = judged.analysis, judged.ok and report.ok
     live = {"live": missing} if options.live else {}
     if options.json:
-        found = {} if analysis is None else _plain_analysis(analysis)
+        data = {} if analysis is None else _plain_analysis(analysis)
         findings = _plain(report, options.task)
         write_json(
-            options.json, {"task": task.name, "ok": ok, "findings": findings, **found, **live}
+            options.json, {"task": task.name, "ok": ok, "findings": findings, **data, **live}
         )
     if options.json != "-":
-        told = [f"missing {line}" for line in missing] + _told(report, options.task)
-        print("\n".join([*told, _text(options.task, analysis, ok and not missing)]))
+        print("\n".join(_text(options.task, judged, report, missing)))
     return (
         2
         if not ok
@@ -181,15 +187,23 @@ def _plain(report: CheckReport, name: str) -> list[dict[str, Any]]:
     ]
 
 
-def _told(report: CheckReport, name: str) -> list[str]:
-    """Return the findings as text for the terminal, each with the line of the task file that it is
-    about."""
-    path = task_path(name)
-    places = [f"{path}:{line}: " if line else "" for line in _lines(report, name)]
-    return [
-        f"{f.severity:8}{place}{f.key}: {f.text}" + (f"\n        {f.remedy}" if f.remedy else "")
-        for f, place in zip(report.findings, places, strict=True)
-    ]
+def _told(report: CheckReport, name: str) -> Iterator[Told]:
+    """Yield the findings for people, each with the line of the task file that it is about. Of
+    several notes of one kind, the first is told, and how many there are."""
+    path, known = task_path(name), set[str]()
+    shown = path.name if str(path) != name else name  # that of a shipped task is long
+    notes = Counter(f.code for f in report.findings if f.severity is Severity.NOTE)
+    for finding, line in zip(report.findings, _lines(report, name), strict=True):
+        place = f"{shown}:{line}: " if line else ""
+        details = [finding.remedy, *finding.details] if finding.remedy else [*finding.details]
+        if finding.severity is Severity.NOTE:
+            if finding.code in known:
+                continue
+            known.add(finding.code)
+            if notes[finding.code] > 1:
+                others = notes[finding.code] - 1
+                details.append(f"and {others} more such notes: petrobot check {name} --json -")
+        yield Told(finding.severity, f"{place}{finding.key}: {finding.text}", details)
 
 
 def _lines(report: CheckReport, name: str) -> list[int | None]:
@@ -205,23 +219,65 @@ def _lines(report: CheckReport, name: str) -> list[int | None]:
     ]
 
 
-def _text(name: str, analysis: Analysis | None, ok: bool) -> str:
-    ended, lines = "", list[str]()
+class Told(NamedTuple):
+    """A finding for people: what was found, and details, each on a line of its own."""
+
+    severity: Severity
+    text: str
+    details: Sequence[str] = ()
+
+    def __str__(self) -> str:
+        lines = [wrapped(f"{self.severity:{HANG}}{self.text}", HANG + 2)]
+        for line in self.details:
+            indent = HANG + len(line) - len(line.lstrip())
+            lines.append(wrapped(f"{'':{HANG}}{line}", indent + 2))
+        return "\n".join(lines)
+
+
+def _text(name: str, judged: MayRun, report: CheckReport, missing: list[str]) -> Iterator[str]:
+    """Yield the answer first, then the verdicts by name, then what was found, errors first."""
+    analysis, told = judged.analysis, list(_told(report, name))
+    if missing or not (judged.ok and report.ok):
+        yield f"{name}: may not run"
+    elif analysis is not None and analysis.interrupted:
+        yield f"{name}: was not checked to its end (Ctrl-C)"
+    else:
+        yield f"{name}: may run"
     if analysis is not None:
+        yield from _summary(analysis)
+        told += [*_reasons(analysis), *_notes(name, analysis)]
+    if missing or told:
+        yield ""
+    yield from (wrapped(f"missing {line}", HANG) for line in missing)
+    order = (Severity.ERROR, Severity.WARNING, Severity.NOTE)
+    yield from map(str, sorted(told, key=lambda one: order.index(one.severity)))
+    if analysis is not None and analysis.objections:
+        yield f"petrobot analyse {name} --pictures FOLDER draws how it comes to that"
+
+
+def _summary(analysis: Analysis) -> list[str]:
+    """Return the names of the verdicts by their answers, and how much was searched."""
+    mended = _mendable(analysis)
+    by_word: dict[str, list[str]] = {word: [] for word in ("yes", "NO", UNLESS, "unknown")}
+    for key, verdict in analysis.verdicts().items():
         # A place of a task may have several tokens, so "safe" says nothing about it.
-        shown = {k: v for k, v in analysis.verdicts().items() if k != "safe"}
-        mended = _mendable(analysis)
-        words = {
-            key: "NO unless repaired" if key in mended else _word(v) for key, v in shown.items()
-        }
-        told = [f"{key.replace('_', ' ')} {word}" for key, word in words.items()]
-        lines += [f"{'note':8}{note}" for note in (*analysis.notes, *analysis.hand_notes)]
-        lines.append(f"{_size(analysis)}: {', '.join(told)}{_cut(analysis)}")
-        lines += _reasons(analysis)
-        if analysis.objections:
-            lines.append(f"petrobot analyse {name} --pictures FOLDER shows how it comes to that")
-        ended = "was not checked to its end (Ctrl-C)" if ok and analysis.interrupted else ""
-    return "\n".join([*lines, f"{name}: {ended or ('may run' if ok else 'may not run')}"])
+        if key != "safe":
+            word = UNLESS if key in mended else _word(verdict)
+            by_word[word].append(key.replace("_", " "))
+    rows = [(word, ", ".join(names)) for word, names in by_word.items() if names]
+    rows = [(w, f"{t} (what `final_error` leaves)" if w == UNLESS else t) for w, t in rows]
+    rows.append(("searched", f"{_size(analysis)}{_cut(analysis)}"))
+    wide = max(len(word) for word, _ in rows) + 2
+    return [wrapped(f"  {word:{wide}}{text}", wide + 2) for word, text in rows]
+
+
+def _notes(name: str, analysis: Analysis) -> Iterator[Told]:
+    for note in analysis.notes:
+        yield Told(Severity.NOTE, note)
+    if found := [verdict for verdict in analysis.by_hand if verdict.holds is False]:
+        more = [f"and {len(found) - 1} more such notes"] if len(found) > 1 else []
+        more.append(f"the way there: petrobot analyse {name}")
+        yield Told(Severity.NOTE, f"only if the operator moves tokens: {found[0].reason}", more)
 
 
 def _word(verdict: PropertyVerdict) -> str:
@@ -254,41 +310,37 @@ def _cut(analysis: Analysis) -> str:
     return f"; the search was cut short ({reason}{longer})"
 
 
-def _reasons(analysis: Analysis) -> list[str]:
-    """Return the reason of each verdict that does not hold, with the stimuli and firings that lead
-    there, and what is assumed by those that hold."""
-    from petrobot.coordinator.analysis.execution.graph import in_words
-    from petrobot.coordinator.analysis.execution.progress import AGAIN, MENDED
+def _reasons(analysis: Analysis) -> Iterator[Told]:
+    """Yield the reason of each verdict that does not hold, with details and the stimuli and firings
+    that lead there, and what is not known."""
+    from petrobot.coordinator.analysis.execution.progress import AGAIN
+    from petrobot.coordinator.analysis.report import path_lines
 
-    lines, against, told = list[str](), analysis.objections, list[object]()
+    against, known = analysis.objections, list[object]()
     mendable = _mendable(analysis)
     refused = {
         n: v
         for n, v in analysis.verdicts().items()
         if v.holds is False and n != "safe" and n not in mendable
     }
+    stuck, lost = list[str](), refused.get("sound")
     if "deadlock_free" in against:  # then these fail too, for the same reason
-        stuck = [name for name in AGAIN if refused.pop(name, None)]
-    else:
-        stuck = []
+        stuck = [name for name in ("sound", *AGAIN) if refused.pop(name, None)]
     for name in sorted(refused, key=lambda name: name not in against):
         verdict = refused[name]
-        word = "error" if name in against else "warning"
-        lines.append(f"{word:8}{name.replace('_', ' ')}: {verdict.reason}")
-        if verdict.witness in told:
-            continue
-        if verdict.witness is not None and name in against:
-            told.append(verdict.witness)
-            path = in_words(verdict.witness.steps) or " ".join(verdict.witness.firings)
-            lines.append(f"        by: {path or '(initial marking)'}")
-    if stuck:
-        lines.append(f"{'warning':8}{', '.join(stuck)}: the task can get stuck")
+        details = list(verdict.details)
+        if name == "deadlock_free" and lost is not None and lost.witness is not None:
+            details.append(f"no end can be reached any more after: {lost.witness.steps[-1]}")
+        if name in against and verdict.witness not in known:
+            known.append(verdict.witness)
+            details += path_lines(verdict.witness, "")
+        if name == "deadlock_free" and stuck:
+            details.append(f"so it is not {', '.join(stuck)}")
+        severity = Severity.ERROR if name in against else Severity.WARNING
+        yield Told(severity, f"{name.replace('_', ' ')}: {verdict.reason}", details)
     unknown = dict[str, list[str]]()
     for name, verdict in analysis.verdicts().items():
         if verdict.holds is None:
             unknown.setdefault(verdict.reason, []).append(name.replace("_", " "))
-    lines += [f"{'warning':8}{', '.join(names)}: {why}" for why, names in unknown.items()]
-    if mendable:
-        reason = analysis.verdicts()[mendable[0]].reason
-        lines.append(f"{'note':8}{', '.join(mendable)}: {reason}; yes if {MENDED}")
-    return lines
+    for why, names in unknown.items():
+        yield Told(Severity.WARNING, f"{', '.join(names)}: {why}")

@@ -67,7 +67,7 @@ def expand(task: Task) -> Task:
     if any(p.kind is Kind.MACRO for p in places.values()):
         places, transitions = _unfolded(places, transitions, task.subnets)
     else:
-        transitions = _with_holding({p.name: p.holds for p in places.values()}, transitions)
+        transitions = _with_holding({p.name: p.holds for p in places.values()}, transitions, {})
     copies: dict[str, tuple[str, ...]] = {}
     if any(p.tries > 1 for p in places.values()):
         places, transitions, copies = _with_tries(places, transitions)
@@ -179,8 +179,8 @@ class _Flat:
     entered: dict[str, Subnet] = field(default_factory=dict)
     """The subnet of each macro place."""
     holds: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    """Resources that a token in each place holds. A macro place takes them once for everything
-    inside, which may fork."""
+    """Resources that a token in each place holds. A macro place takes its own once for everything
+    inside, which may fork; what its entry or the place of an exit holds comes on top."""
 
 
 def _unfolded(
@@ -188,7 +188,8 @@ def _unfolded(
 ) -> tuple[Places, Transitions]:
     flat = _Flat(subnets)
     _unfold(flat, _Scope("", places), transitions, ())
-    holding = _with_holding(flat.holds, flat.transitions)  # arcs still name the macro places
+    # arcs still name the macro places
+    holding = _with_holding(flat.holds, flat.transitions, flat.entered)
     return flat.places, {name: _rewired(t, flat.entered) for name, t in holding.items()}
 
 
@@ -268,8 +269,12 @@ def _rewired(transition: Transition, entries: Mapping[str, Subnet]) -> Transitio
 
 def _to(arc: Output, entries: Mapping[str, Subnet]) -> Output:
     while arc.place in entries:
-        arc = replace(arc, place=f"{arc.place}.{entries[arc.place].entry}")
+        arc = _into(arc, entries)
     return arc
+
+
+def _into(arc: Output, entries: Mapping[str, Subnet]) -> Output:
+    return replace(arc, place=f"{arc.place}.{entries[arc.place].entry}")
 
 
 def _from(arc: Input, entries: Mapping[str, Subnet]) -> Input:
@@ -286,28 +291,42 @@ def _from(arc: Input, entries: Mapping[str, Subnet]) -> Input:
 # ---------------------------------------------------------------------------------- held resources
 
 
-def _with_holding(holds: Mapping[str, tuple[str, ...]], transitions: Transitions) -> Transitions:
+def _with_holding(
+    holds: Mapping[str, tuple[str, ...]], transitions: Transitions, entered: Mapping[str, Subnet]
+) -> Transitions:
     """Return transitions that take the resources that their output places hold and their input
     places do not, and give back those that only their input places hold. A token that moves between
     two holding places keeps its resources."""
     if not any(holds.values()):
         return transitions
-    return {name: _holding(t, holds) for name, t in transitions.items()}
+    return {name: _holding(t, holds, entered) for name, t in transitions.items()}
 
 
-def _holding(t: Transition, holds: Mapping[str, tuple[str, ...]]) -> Transition:
+def _holding(
+    t: Transition, holds: Mapping[str, tuple[str, ...]], entered: Mapping[str, Subnet]
+) -> Transition:
     before, after = Counter[str](), Counter[str]()
     for held, arcs in ((before, t.inputs), (after, t.outputs)):
         for arc in arcs:
             if not (isinstance(arc, Input) and arc.end is End.GOING):
-                for resource in holds[arc.place]:
-                    held[resource] += arc.weight
+                for place in _places_of(arc, entered):
+                    for resource in holds[place]:
+                        held[resource] += arc.weight
     take, give = after - before, before - after
     return replace(
         t,
         inputs=(*t.inputs, *(Input(r, n) for r, n in take.items())),
         outputs=(*t.outputs, *(Output(r, n) for r, n in give.items())),
     )
+
+
+def _places_of(arc: Input | Output, entered: Mapping[str, Subnet]) -> Iterator[str]:
+    """Yield the places in which the arc's token is, from outside to inside: a macro place, and in
+    its subnet the place of the entry or of the exit."""
+    yield arc.place
+    while arc.place in entered:
+        arc = _from(arc, entered) if isinstance(arc, Input) else _into(arc, entered)
+        yield arc.place
 
 
 # ------------------------------------------------------------------------------------------- tries

@@ -6,6 +6,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
 from enum import StrEnum
+from textwrap import wrap
+
+COLUMNS = 100
+"""The widest text in a terminal."""
 
 
 class Severity(StrEnum):
@@ -32,6 +36,20 @@ def nearest(word: str, known: Iterable[str]) -> str:
     """` (did you mean 'x'?)` when a known word is close, else nothing."""
     near = get_close_matches(word, list(known), 1)
     return f" (did you mean '{near[0]}'?)" if near else ""
+
+
+def wrapped(text: str, hang: int) -> str:
+    """Return a line as lines of at most 100 columns; those after the first are indented by `hang`.
+    Words are never broken."""
+    return "\n".join(
+        wrap(
+            text,
+            COLUMNS,
+            subsequent_indent=" " * hang,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+    )
 
 
 def listed(words: Iterable[str]) -> str:

@@ -184,7 +184,8 @@ def test_a_task_that_loops_and_never_ends_is_refused(
     )
     assert main(["check", str(path)]) == 2
     told = capsys.readouterr().out
-    assert "sound: from" in told and "no designed end can be reached" in told and "by: " in told
+    step = "stop_at_t ends in error -> stop_failed"
+    assert f"no end can be reached any more after: {step}\n" in told and "not sound" in told
 
 
 @pytest.mark.processes
@@ -199,7 +200,7 @@ def test_check_refuses_and_analyse_draws(
     assert main(["check", str(path)]) == 2
     assert "may not run" in capsys.readouterr().out
     assert main(["analyse", str(path), "--pictures", str(tmp_path / "why")]) == 1
-    assert "entered while its run is still active" in capsys.readouterr().out
+    assert "entered while its run is still there" in capsys.readouterr().out
     assert (tmp_path / "why" / "catch_ball-one_run_each.svg").exists()
 
 

@@ -151,7 +151,7 @@ def test_the_catching_task_in_one_analysis() -> None:
         "sound, but P_complete is 6.31e-07 short of 1" in text
         and "live           NO" in text
         and "if the operator repairs it: yes, from every state" in text
-        and "0.99999375   6.16 s" in text
+        and "0.99999375  6.16 s" in text
     )
 
 

@@ -5,7 +5,7 @@ Markov chain, and in missions that the engine plays by a clock."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import sqrt
+from math import exp, sqrt
 
 import numpy as np
 import pytest
@@ -17,10 +17,11 @@ from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, execut
 from petrobot.coordinator.analysis.may_run import BUDGET, may_run
 from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.report import analyse
-from petrobot.coordinator.analysis.time.measured import Measured
+from petrobot.coordinator.analysis.time.measured import Measured, Numbers, cut
 from petrobot.coordinator.analysis.time.simulate import goal_by_marking, simulate
 from petrobot.coordinator.analysis.time.stochastic import StochasticView, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
+from petrobot.coordinator.analysis.time.whatif import change_task, read_change
 from petrobot.coordinator.engine import (
     ArmTimer,
     Begin,
@@ -41,6 +42,7 @@ from petrobot.coordinator.engine import (
 )
 from petrobot.coordinator.engine.stimuli import Stimulus
 from petrobot.coordinator.task import Estimate, Executed, Scope, Status, Task
+from petrobot.coordinator.task.conditions import parse
 from petrobot.coordinator.task.file import loads
 from tests.analysis.test_execution_graph import COMMON
 from tests.analysis.test_views import timed
@@ -440,6 +442,17 @@ def test_a_task_that_begins_at_its_end_has_no_bad_run() -> None:
     assert (found["P_complete"], found["R_conj"], found["mean time (s)"]) == (1.0, 1.0, 0.0)
 
 
+@pytest.mark.parametrize("parts", [0, 1])
+def test_a_mission_without_a_length_is_analysed(parts: int) -> None:
+    """It ends as soon as it begins, or `work` runs again and again."""
+    text = Text(parts, done=', when = "work.status == none"')
+    text.moves = [arcs(t, f"work:{end}", "work") for t, end in (("on", "normal"), ("bad", "error"))]
+    found = analyse(text.task(), view="gspn")
+    assert found.forecast is not None and set(found.forecast.throughput.values()) == {0.0}
+    assert found.forecast.completion_probability == (0.0 if parts else 1.0)
+    assert "P_complete" in found.text()
+
+
 def test_figures_of_one_trial_stand_beside_those_of_the_mission() -> None:
     """Campaigns count trials: a mission of three is all SUCCESS as often as three trials are."""
     text = Text(3)
@@ -614,6 +627,103 @@ def test_missions_with_tries_have_the_figures_of_the_measured_causes() -> None:
         assert abs(seen / n - p) < 5 * sqrt(p * (1 - p) / n), name
     error = float(np.std(times)) / sqrt(len(times))
     assert abs(float(np.mean(times)) - found["mean time (s)"]) < 5 * error
+
+
+class WithDeadlines(Clock):
+    """A world in which the node ends a run at its deadline."""
+
+    def start(self, order: StartRun) -> None:
+        i = int(self.random.choice(3, p=SHARES[order.primitive_task]))
+        time = self.random.exponential(SECONDS[order.primitive_task][i])
+        if time > order.deadline:
+            late = RunEnded(order.run, Status.ERROR, "deadline")
+            self.due.append((self.now + order.deadline, late))
+        else:
+            self.due.append((self.now + time, RunEnded(order.run, list(Status)[i])))
+
+
+def with_deadline(seconds: float, tries: int, *, told: bool) -> Task:
+    """Two parts; a run that is late breaks the task, or each ERROR does."""
+    text = Text(2, tries=tries)
+    when = ", when = \"work.reason == 'deadline'\"" if told else ""
+    text.moves = [arcs("bad", "work:error", "broken", when)]
+    if told:
+        text.moves.append(
+            arcs("well", "work:error", "arm", ", when = \"work.reason != 'deadline'\"")
+        )
+    text.places.append("broken = { }\n")
+    text.final_error = 'final_error = "broken == 1"'
+    task = text.task()
+    work = replace(task.places["work"], timeout=seconds)
+    return replace(task, places={**task.places, "work": work})
+
+
+@settings(COMMON, max_examples=8)
+@given(st.floats(0.3, 8.0), st.integers(1, 3), st.booleans(), st.integers(0, 99))
+@example(0.5, 1, True, 0)
+def test_declared_durations_end_at_the_deadline(
+    seconds: float, tries: int, told: bool, seed: int
+) -> None:
+    """P_complete and R_conj within five standard errors of 300 missions; the mean time where only
+    the shares of the ends decide which missions it is taken over."""
+    task = with_deadline(seconds, tries, told=told)
+    figures_agree(task)
+    view = stochastic_view(task)
+    assert any("work: " in a and f"in ERROR after {seconds:g} s" in a for a in view.assumptions)
+    found, engine, n = forecast(view).figures, Engine(task), 300
+    random, times, good_ends, completed = np.random.default_rng(seed), list[float](), 0, 0
+    for _ in range(n):
+        world = WithDeadlines(engine, random)
+        world.play()
+        completed += world.ended is Status.SUCCESS
+        good_ends += world.good and world.ended is Status.SUCCESS
+        times.append(world.now)
+    for seen, name in ((completed, "P_complete"), (good_ends, "R_conj")):
+        p = found[name]
+        assert abs(seen / n - p) <= 5 * sqrt(p * (1 - p) / n) + 1 / n, name
+    whole = replace(task, final=parse("broken == 1 or (parts == 0 and arm == 1)"), final_error=None)
+    mean = forecast(stochastic_view(whole)).figures["mean time (s)"]
+    assert abs(float(np.mean(times)) - mean) < 5 * float(np.std(times)) / sqrt(n) + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("estimate", "deadline", "late", "mean", "cv"),
+    [
+        (Estimate(0.8, 2.0, 0.0), 3.0, 0.0, 2.0, 0.0),  # fixed, in time
+        (Estimate(0.8, 2.0, 0.0), 1.5, 0.8, None, None),  # fixed, always late
+        # exponential: E[T | T <= d] = m - d / (exp(d / m) - 1)
+        (Estimate(0.8, 2.0), 3.0, 0.8 * exp(-1.5), 2 - 3 / (exp(1.5) - 1), None),
+        (Estimate(0.8, 2.0), 1e3, 0.0, 2.0, 1.0),
+    ],
+)
+def test_what_is_left_of_a_duration_up_to_its_deadline(
+    estimate: Estimate, deadline: float, late: float, mean: float | None, cv: float | None
+) -> None:
+    before = {Status.SUCCESS: estimate, Status.ERROR: Estimate(0.2, 0.5, 0.0)}
+    found, share = cut(before, deadline)
+    assert share == pytest.approx(late, abs=1e-12)
+    assert sum(e.share for e in found.values()) == pytest.approx(1.0)
+    if mean is None:
+        assert Status.SUCCESS not in found
+    else:
+        assert found[Status.SUCCESS].mean == pytest.approx(mean)
+        assert cv is None or found[Status.SUCCESS].cv == pytest.approx(cv)
+    ended = found[Status.ERROR]
+    assert ended.share == pytest.approx(0.2 + late)
+    assert ended.mean * ended.share == pytest.approx(0.2 * 0.5 + late * deadline)
+
+
+def test_measured_durations_hold_their_deadlines_already() -> None:
+    """A measured run has ended by its deadline; a changed estimate has not."""
+    task = with_deadline(1.0, 1, told=False)
+    runs = {("work", "work_a"): dict(task.primitive_tasks["work"].estimates)}
+    place = task.places["work"]
+    assert Numbers(task, Measured(runs)).estimates(place, "work_a") == runs["work", "work_a"]
+    change = read_change("work.error.share=0.1")
+    _, changed = change_task(task, Measured(), [change])
+    assert Numbers(task, changed).estimates(place, "work_a")[Status.ERROR].share > 0.3
+    _, changed = change_task(task, Measured(runs), [change])
+    assert Numbers(task, changed).estimates(place, "work_a")[Status.ERROR].share == 0.1
 
 
 def test_a_retry_without_a_limit_is_named() -> None:

@@ -69,7 +69,7 @@ def action(
     """Return a primitive task and an action place of the same name."""
     known = EXPONENTIAL if estimates is None else estimates
     primitive = PrimitiveTask(
-        name, f"{name} is done", more.pop("alternatives", ("a",)), 10.0, estimates=known
+        name, f"{name} is done", more.pop("alternatives", ("a",)), 1e6, estimates=known
     )
     return {"primitive": primitive, "place": Place(name, Kind.ACTION, task=name, **more)}
 

@@ -296,7 +296,7 @@ def test_a_task_that_can_deadlock_is_refused(
     path.write_text(text.replace('final_error = "out_of_order == 1"\n', ""), encoding="utf-8")
     capsys.readouterr()
     assert main(["check", str(path), "--services", str(services)]) == 2
-    assert "deadlock free NO" in capsys.readouterr().out
+    assert "error   deadlock free: stuck with " in capsys.readouterr().out
     assert main(["analyse", str(path)]) == 1
     assert "failed" in capsys.readouterr().out
     assert main(["run", str(path), "--services", str(services), "--mode", "lockstep"]) == 1

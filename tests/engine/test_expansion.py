@@ -182,6 +182,43 @@ in = ["left"]
     assert found["placed"] == "put.over -> arm"
 
 
+def test_the_entry_and_the_exits_of_a_subnet_hold_what_they_say() -> None:
+    """Else `carry` enters a place that holds the hand without taking it."""
+    nested = SHORT.replace(
+        "[subnets.put.places.move]", "[subnets.put.places.move]\nholds = ['hand']"
+    )
+    nested = nested.replace(
+        "[subnets.put.places.failed]", "[subnets.put.places.failed]\nholds = ['hand']"
+    )
+    nested += "[places.hand]\nkind = 'resource'\ntokens = 1\n"
+    found = arcs(loads(nested))
+    assert found["carry"] == "in_hand hand -> put.move"
+    assert found["put.moved"] == "put.move:normal -> put.over done hand"
+    assert found["put.move.error"] == "put.move:error -> put.failed"
+    assert found["put.error"] == "put.failed -> aside arm hand"
+    inner = """[subnets.put.places.deep]
+kind = "macro"
+subnet = "deep"
+holds = ["arm"]
+[subnets.deep]
+entry = "begin"
+normal = "end"
+[subnets.deep.places.begin]
+holds = ["hand"]
+[subnets.deep.places.end]
+[subnets.deep.transitions.only]
+in = ["begin"]
+out = ["end"]
+[subnets.put.transitions.up]
+in = ["deep:normal"]
+out = ["move"]
+"""
+    found = arcs(loads(nested.replace('entry = "move"', 'entry = "deep"') + inner))
+    assert found["carry"] == "in_hand arm hand -> put.deep.begin"
+    assert found["put.deep.only"] == "put.deep.begin -> put.deep.end hand"
+    assert found["put.up"] == "put.deep.end hand -> put.move arm"
+
+
 def test_a_value_replaces_a_parameter() -> None:
     flat = loads(SHORT.replace('where = { var = "bin" }', 'where = "right"')).flat
     assert flat.places["put.move"].args == {"bin": "right"}

@@ -3,7 +3,8 @@ and which path should have returned it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,18 +29,52 @@ def settled(x: ExecutionGraph, state: int) -> int:
     return int(x.target[edges[-1]]) if edges else state
 
 
+Lack = tuple[CompiledTransition, list[Obstacle], int]
+"""A transition, what it lacks there, and how much it lacks with the ends that came otherwise."""
+
+
+class Explanation(NamedTuple):
+    """Why nothing can happen any more."""
+
+    short: str
+    """The most important cause."""
+    details: tuple[str, ...]
+    """Other causes, and where the missing tokens went, a line each."""
+
+
 def describe(x: ExecutionGraph, state: int) -> str:
     """Return the marked places of a state, with how the runs in them ended."""
-    at, net = x.states[state], x.engine.compiled.net
+    return _told(x, x.states[state], lambda _: True) or "no token"
+
+
+def left_over(x: ExecutionGraph, state: int) -> str:
+    """Return the marked places of a state without those that do not matter for what is stuck there:
+    free resources, and where runs have ended, all other tokens."""
+    at, task = x.states[state], x.engine.compiled.task
+    ended = any(run.phase is Phase.DONE for run in at.runs())
+
+    def matters(place: str) -> bool:
+        own = task.places[place]
+        if own.kind is Kind.ACTION:
+            return True
+        free = own.tokens == at.marking[task.net.place_index[place]]
+        return not ended and not (own.kind is Kind.RESOURCE and free)
+
+    return _told(x, at, matters) or ("free resources alone" if any(at.marking) else "no token")
+
+
+def _told(x: ExecutionGraph, at: State, matters: Callable[[str], bool]) -> str:
     told = []
-    for place, tokens in zip(net.places, at.marking, strict=True):
+    for place, tokens in zip(x.engine.compiled.net.places, at.marking, strict=True):
+        if not tokens or not matters(place):
+            continue
         ended = [_ended(at, place, i) for i in range(tokens)] if place in at.tokens else []
         if any(ended):
             told.append(f"{place} ({', '.join(one or 'active' for one in ended)})")
-        elif tokens:
+        else:
             told.append(f"{place}:{tokens}" if tokens > 1 else place)
     told += [f"{run.place} (stopping)" for run in at.stopping.values()]
-    return " ".join(told) or "nothing marked"
+    return " ".join(told)
 
 
 def _ended(at: State, place: str, i: int) -> str:
@@ -48,42 +83,99 @@ def _ended(at: State, place: str, i: int) -> str:
     return f"ended in {run.status}" if run is not None and run.phase is Phase.DONE else ""
 
 
-def explain(x: ExecutionGraph, state: int) -> str:
+def explain(x: ExecutionGraph, state: int) -> Explanation:
     """Return why nothing can happen any more in a settled state."""
     draft = Draft(x.engine.compiled, x.states[state])
     ended = {r.place for r in x.states[state].runs() if r.phase is Phase.DONE}
     firings = x.firings(state)
     waiting = [t for t in x.engine.compiled.transitions if _near(t, ended, draft.marking)]
-    told = list[tuple[tuple[int, bool], str]]()
-    missed, spent, left = _asked(x, draft, firings)
-    for t in waiting if ended else [t for t in waiting if not _at_rest(draft, t)] or waiting:
+    missed, spent, left, gone = _asked(x, draft, firings)
+    lacks = list[Lack]()
+    for t in waiting if ended else [t for t in waiting if not _at_rest(draft, t)]:
         found = obstacles(draft, t)
         surplus = left.intersection(p for p, _ in t.needs)
         short = {one.place for one in found if one.kind == "short"}
         if not ended and not surplus and short & spent:
             continue  # the end wants that place empty, and so it is
-        if ended and all(_other_end(draft, one) for one in found):
-            continue
-        parts = [_cause(x, draft, firings, one) for one in found if not _other_end(draft, one)]
-        nearness = len(found), not any(one.kind == "full" for one in found)
-        told.append((nearness, f"{t.name} {' and '.join(parts)}"))
-    more = f"; and {len(told) - MOST} more" if len(told) > MOST else ""
-    if told:
-        told.sort(key=lambda one: one[0])  # the transition that lacks least comes first
-        return "; ".join(text for _, text in told[:MOST]) + more
-    if ended:
-        return f"no transition takes what ended in {', '.join(sorted(ended))} that way"
-    return f"no transition takes what is left, and the end asks for {missed}"
+        own = [one for one in found if not _other_end(draft, one)]
+        if own or not ended:
+            lacks.append((t, own, len(found)))
+    if not lacks and ended:
+        names = ", ".join(sorted(ended))
+        return Explanation(f"no transition takes what ended in {names} that way", ())
+    if not lacks:
+        text = f"no transition takes what is left, and the end asks for {missed}"
+        return Explanation(text, gone)
+    # The transition that lacks least comes first.
+    lacks.sort(key=lambda one: (one[2], _rank(x.engine.compiled.net, one[0], one[1])))
+    told = [f"{t.name} {' and '.join(_words(draft, t, one) for one in own)}" for t, own, _ in lacks]
+    more = [f"and {len(told) - MOST} more"] if len(told) > MOST else []
+    known = {t.index for t, _, _ in lacks}
+    fates = [
+        fate
+        for _, own, _ in lacks[:MOST]
+        for one in own
+        for fate in _fates(x, draft, firings, one, known)
+    ]
+    return Explanation(told[0], (*told[1:MOST], *more, *dict.fromkeys(fates)))
+
+
+def fate(x: ExecutionGraph, state: int, place: int) -> str:
+    """Return which firing took the place's tokens last on the way to a state, and where they
+    went."""
+    draft = Draft(x.engine.compiled, x.states[state])
+    return _fate(x.engine.compiled.net, draft, x.firings(state), place)
+
+
+def awaiting(x: ExecutionGraph, state: int, place: str) -> str:
+    """Return what keeps a run of a place that has ended there, although events and times may still
+    come."""
+    draft = Draft(x.engine.compiled, x.states[state])
+    for t in x.engine.compiled.transitions:
+        if any(arc.name == place for arc in t.actions):
+            found = obstacles(draft, t)
+            if not found:
+                waits = [*((t.pulse,) if t.pulse else ()), *t.flags]
+                return f"{t.name} waits for {' and '.join(waits) or 'its time'}"
+            if not any(
+                _other_end(draft, one) and draft.compiled.net.places[one.place or 0] == place
+                for one in found
+            ):
+                return f"{t.name} {' and '.join(_words(draft, t, one) for one in found)}"
+    return f"no transition takes a run of {place} that ended that way"
+
+
+def _rank(net: Net, t: CompiledTransition, found: Sequence[Obstacle]) -> int:
+    """Return how far from the cause a transition is that lacks this: a full place or a condition
+    says more than an inhibitor arc or an empty place, which often only follow from it."""
+    if any(one.kind == "full" for one in found):
+        inhibitors = {p for p, _ in net.inhibit[t.index]}
+        return 2 if all(one.place in inhibitors for one in found if one.kind == "full") else 0
+    return 3 if any(one.kind == "short" for one in found) else 1
+
+
+def _words(draft: Draft, t: CompiledTransition, one: Obstacle) -> str:
+    """Return what a transition lacks; of a false condition also the variables without a value."""
+    if one.kind != "condition" or t.when is None:
+        return one.text
+    variables = draft.compiled.task.variables
+    unset = [n for n in sorted(t.when.names & set(variables)) if draft.variables.get(n) is None]
+    return f"{one.text}: {' and '.join(unset)} ha{_has(unset)} no value" if unset else one.text
+
+
+def _has(names: Sequence[str]) -> str:
+    return "s" if len(names) == 1 else "ve"
 
 
 def _asked(
     x: ExecutionGraph, draft: Draft, firings: tuple[str, ...]
-) -> tuple[str, set[int], set[int]]:
+) -> tuple[str, set[int], set[int], tuple[str, ...]]:
     """Return what of the designed ends does not hold, in words, the places that `final` wants
-    to be empty and that are, and the places with tokens that it does not want there."""
+    to be empty and that are, the places with tokens that it does not want there, and where the
+    tokens went that it asks for."""
     task, index = x.engine.compiled.task, x.engine.compiled.net.place_index
     held = {name: draft.marking[p] for name, p in index.items()}
-    missed, spent, left = list[str](), set[int](), set[int]()
+    missed, spent, left, gone = list[str](), set[int](), set[int](), list[str]()
     for node in _conjuncts(task.final.tree):
         if not (isinstance(node, Compare) and isinstance(node.left, Name)):
             missed += [str(task.final)] * (not Expression("", node).holds(held))
@@ -91,15 +183,16 @@ def _asked(
         name = node.left.name
         if not Expression("", node).holds(held):
             wanted = node.right.value if isinstance(node.right, Literal) else node.right
-            why = "" if held[name] else f": {_fate(task.net, draft, firings, index[name])}"
-            missed.append(f"{name} {node.sign} {wanted} (it holds {held[name]}{why})")
+            missed.append(f"{name} {node.sign} {wanted} (it holds {held[name]})")
+            if isinstance(wanted, int) and held[name] < wanted:
+                gone.append(f"{name}: {_fate(task.net, draft, firings, index[name])}")
             if held[name] and Expression("", node).holds({**held, name: 0}):
                 left.add(index[name])
         elif not held[name]:
             spent.add(index[name])
     ends = [" and ".join(dict.fromkeys(missed))]
     ends += [str(task.final_error)] if task.final_error is not None else []
-    return ", or for ".join(ends), spent, left
+    return ", or for ".join(ends), spent, left, tuple(gone)
 
 
 def _conjuncts(node: Node) -> Iterator[Node]:
@@ -133,15 +226,32 @@ def _other_end(draft: Draft, one: Obstacle) -> bool:
     return bool(draft.tokens.get(draft.compiled.net.places[one.place]))
 
 
-def _cause(x: ExecutionGraph, draft: Draft, firings: tuple[str, ...], one: Obstacle) -> str:
+def _fates(
+    x: ExecutionGraph, draft: Draft, firings: tuple[str, ...], one: Obstacle, known: set[int]
+) -> Iterator[str]:
+    """Yield where the tokens went that a transition lacks, or why no other transition makes room
+    for it. `known`: transitions of which it is told already what they lack."""
     net = x.engine.compiled.net
-    if one.kind == "full" and one.place is not None:
-        changes = (change for some in net.compiled.changes for change in some)
-        emptied = any(p == one.place and gain < 0 for p, gain in changes)
-        return one.text if emptied else f"{one.text}, and no transition takes any out of it"
-    if one.kind != "short" or one.place is None:
-        return one.text
-    return f"{one.text}: {_fate(net, draft, firings, one.place)}"
+    if one.place is None or one.kind not in ("short", "full"):
+        return
+    name = net.places[one.place]
+    if one.kind == "short":
+        yield f"{name}: {_fate(net, draft, firings, one.place)}"
+        return
+    takers = [
+        t for t, changes in enumerate(net.compiled.changes) if dict(changes).get(one.place, 0) < 0
+    ]
+    if not takers:
+        yield f"{name}: no transition takes any out of it"
+    for t in () if known.intersection(takers) else takers:
+        taker = x.engine.compiled.transitions[t]
+        lacks = [lack for lack in obstacles(draft, taker) if not _other_end(draft, lack)]
+        words = " and ".join(_words(draft, taker, lack) for lack in lacks)
+        if lacks:
+            yield f"{name}: `{taker.name}` would take some out of it, but it {words}"
+        for lack in lacks:
+            if lack.kind == "short":
+                yield from _fates(x, draft, firings, lack, known)
 
 
 def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:

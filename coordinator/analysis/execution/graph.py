@@ -53,12 +53,12 @@ TOLD_FIRST, TOLD_LAST = 5, 10
 """Steps of a long path that a text names."""
 
 
-def in_words(steps: Sequence[object]) -> str:
-    """Return a path as text; of a long one its beginning and its end."""
+def in_words(steps: Sequence[object]) -> list[str]:
+    """Return the steps of a path as texts; of a long one its beginning and its end."""
     told = [str(step) for step in steps]
     if len(told) > TOLD_FIRST + TOLD_LAST + 1:
         told[TOLD_FIRST:-TOLD_LAST] = [f"({len(told) - TOLD_FIRST - TOLD_LAST} more)"]
-    return "; ".join(told)
+    return told
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,13 +25,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.coordinator.analysis.execution.causes import describe, explain, settled
+from petrobot.coordinator.analysis.execution.causes import (
+    awaiting,
+    describe,
+    explain,
+    fate,
+    left_over,
+    settled,
+)
 from petrobot.coordinator.analysis.execution.chain import ExecutionChain, TooLarge, chain_of
 from petrobot.coordinator.analysis.execution.graph import (
     ExecutionGraph,
     Step,
     execute,
-    in_words,
     with_operator,
 )
 from petrobot.coordinator.analysis.execution.names import cases
@@ -134,11 +140,17 @@ class Contest:
 
 @dataclass(frozen=True)
 class DeadEnd:
-    """Dead ends with the same marked places: how many, the nearest, and its cause."""
+    """Dead ends with the same marked places: how many, and the nearest with its cause."""
 
     count: int
-    reason: str
-    witness: Witness
+    verdict: PropertyVerdict
+    """That nothing can happen any more there, with the reason and a path."""
+
+    @property
+    def witness(self) -> Witness:
+        """The path to the nearest."""
+        assert self.verdict.witness is not None
+        return self.verdict.witness
 
 
 @dataclass(frozen=True)
@@ -179,17 +191,17 @@ class Progress:
 
     # --- what the operator's tokens make possible -----------------------------------------------
 
-    def hand_notes(self, limit: int) -> list[str]:
-        """Return the dead ends and conflicts that need tokens which the operator moves, in words,
-        from a second graph within a limit in stimuli and firings. Empty for a task that gets stuck
-        even without the operator."""
+    def by_hand(self, limit: int) -> list[PropertyVerdict]:
+        """Return the dead ends and conflicts that need tokens which the operator moves, from a
+        second graph within a limit in stimuli and firings; a verdict that is unknown if the limit
+        was reached before one was found. Empty for a task that gets stuck even without the
+        operator."""
         own = self.x if self.free is None else self.free.x
         if not own.complete or own.dead.any() or own.livelocks:
             return []
         x = with_operator(own, limit=limit)
-        said = [
-            f"{' and '.join(rivals)} may both want the last token of "
-            f"{' and '.join(self._over(rivals))}; {_by(x, state)}"
+        found = [
+            PropertyVerdict(False, contend(rivals, self._over(rivals)), _witness(x, state))
             for rivals, state in x.contests.items()
             if rivals not in own.contests
         ]
@@ -202,17 +214,11 @@ class Progress:
                     s.text for s in x.path(i) if isinstance(s.stimulus, (AddTokens, RemoveTokens))
                 ]
                 stuck.setdefault((*commands, *(p for p in x.marked(i) if p not in control)), i)
-        said += [
-            f"stuck with {describe(x, i)}: {explain(x, i)}; {_by(x, i)}"
-            for i in list(stuck.values())[:GROUPS]
-        ]
-        said = [f"only if the operator moves tokens: {text}" for text in said]
-        if not said and not x.complete:
-            said = [
-                "what is possible only if the operator moves tokens was searched in "
-                f"{x.expanded} states, not to the end: nothing found"
-            ]
-        return said
+        found += [_stuck(x, i) for i in list(stuck.values())[:GROUPS]]
+        if not found and not x.complete:
+            text = f"nothing found in {x.expanded} states; the search was not completed"
+            found = [PropertyVerdict(None, text, complete=False)]
+        return found
 
     # --- stuck, or active for ever ----------------------------------------------------------
 
@@ -225,11 +231,7 @@ class Progress:
         for i in sorted(stuck.difference(x.livelocks)):
             groups.setdefault(tuple(x.marked(i)), []).append(i)
         return tuple(
-            DeadEnd(
-                len(members),
-                f"stuck with {describe(x, members[0])}: {explain(x, members[0])}",
-                self.witness(members[0]),
-            )
+            DeadEnd(len(members), _stuck(x, members[0]))
             for members in list(groups.values())[:GROUPS]
         )
 
@@ -241,7 +243,7 @@ class Progress:
             reason = f"{', '.join(names)} can fire for ever without time passing"
             return self._no(reason, state)
         for end in self.dead_ends:
-            return PropertyVerdict(False, end.reason, end.witness, complete=self.x.complete)
+            return end.verdict
         return self._yes("no state is a dead end")
 
     @cached_property
@@ -258,10 +260,10 @@ class Progress:
         if not len(lost):
             return self._yes("an end can be reached from every state")
         first = int(lost[0])
-        reason = f"from {describe(x, first)} no designed end can be reached"
-        if not x.dead.any() and not x.livelocks:
-            reason += f": the task can continue for ever, but never reaches {final}"
-        return self._no(reason, first)
+        reason = f"from {left_over(x, first)} no designed end can be reached"
+        goes_on = f"the task can continue for ever, but never reaches {final}"
+        details = () if x.dead.any() or x.livelocks else (goes_on,)
+        return self._no(reason, first, details)
 
     @cached_property
     def quasi_live(self) -> PropertyVerdict:
@@ -320,9 +322,26 @@ class Progress:
         if empty:
             return f"it needs {' and '.join(empty)}"
         if always:
-            return f"in every state at rest it {' and '.join(sorted(always))}"
+            text = f"in every state at rest it {' and '.join(sorted(always))}"
+            return text + self._first_takers(t, idle)
         needs = ", ".join(net.places[p] for p, _ in t.needs)
         return f"the tokens that it needs ({needs}) are never there together"
+
+    def _first_takers(self, t: CompiledTransition, idle: set[int]) -> str:
+        """Return which other transitions take the tokens that come into a place which is empty
+        whenever the task rests; empty if there is no such place."""
+        net = self.x.engine.compiled.net
+        for p, _ in t.plain:
+            if any(state.marking[p] for state in self.x.states):
+                continue
+            takers = [
+                f"`{net.transitions[u]}`"
+                for u, arcs in enumerate(net.consume)
+                if p in dict(arcs) and u not in idle
+            ]
+            if takers:
+                return f", because {' and '.join(takers)} take{'s' * (len(takers) == 1)} it first"
+        return ""
 
     # --- from mission to mission --------------------------------------------------------------
 
@@ -395,7 +414,7 @@ class Progress:
         if not away.any():
             return None
         first = settled(x, int(np.argmax(away)))
-        return first, f"{words} {describe(x, first)}"
+        return first, f"{words} {left_over(x, first)}"
 
     # --- what the ordinary net can only estimate ------------------------------------------------
 
@@ -403,13 +422,13 @@ class Progress:
     def one_run_each(self) -> PropertyVerdict:
         """No action place is entered while its run is there."""
         for place, state in self.x.crowded.items():
-            reason = (
-                f"{place} is entered while its run is still active: it holds "
-                f"{self.x.marked(state).get(place, 2)} tokens, but can run only once at a time; "
-                "with `servers = 1` the next one waits"
+            tokens = self.x.marked(state).get(place, 2)
+            details = (
+                f"it holds {tokens} tokens, but can run only once at a time; with `servers = 1` "
+                "the next one waits",
             )
-            return self._no(reason, state)
-        return self._yes("no action place is entered while its run is active")
+            return self._no(f"{place} is entered while its run is still there", state, details)
+        return self._yes("no action place is entered while its run is there")
 
     @cached_property
     def returned(self) -> PropertyVerdict:
@@ -426,7 +445,9 @@ class Progress:
                         f"{place.name} {word} tokens: {place.tokens} at the beginning, {left} at "
                         "the end"
                     )
-                    return self._no(reason, int(i))
+                    lost = left < place.tokens
+                    details = (f"{place.name}: {fate(self.x, int(i), p)}",) if lost else ()
+                    return self._no(reason, int(i), details)
         return self._yes("every resource has its initial number of tokens at the end")
 
     # --- recovery -------------------------------------------------------------------------------
@@ -523,12 +544,12 @@ class Progress:
         edge = int(bad[0])
         target = int(self.x.target[edge])
         step = self.x.steps[self.x.label[edge]]
-        shown = self.witness(int(self.x.source[edge]))
+        shown = _witness(self.x, int(self.x.source[edge]))
         whole = Witness(
             (*shown.firings, *step.firings), self.x.marked(target), steps=(*shown.steps, str(step))
         )
         return PropertyVerdict(
-            False, f"{no} to the nominal flow from {describe(self.x, target)}", whole
+            False, f"{no} to the nominal flow from {left_over(self.x, target)}", whole
         )
 
     @cached_property
@@ -657,21 +678,35 @@ class Progress:
         places whose tokens at the end depend on the path. Such a token may be left over, lost, or
         counted on purpose; only the author knows."""
         said = [f"assumes that {text}" for text in self.x.names.assumptions]
-        ends = [self.x.states[int(i)].marking for i in np.flatnonzero(self.x.final)]
-        for p, place in enumerate(self.x.engine.compiled.net.places):
-            held = {marking[p] for marking in ends}
-            if len(held) > 1:
-                said.append(
-                    f"{place} holds {min(held)} to {max(held)} tokens at the end, depending on the "
-                    "path"
-                )
+        x, task, held = self.x, self.x.engine.compiled.task, list[str]()
+        ends = [x.states[int(i)].marking for i in np.flatnonzero(x.final)]
+        known = {place for places in self.left_behind for place in places}
+        if self.returned.holds is False:  # that is an error
+            known |= {p.name for p in task.places.values() if p.kind is Kind.RESOURCE}
+        for p, place in enumerate(x.engine.compiled.net.places if x.complete else ()):
+            numbers = {marking[p] for marking in ends}
+            if len(numbers) > 1 and place not in known:
+                held.append(f"{place} {min(numbers)} to {max(numbers)}")
+        if held:
+            said.append(f"tokens at the end depend on the path: {', '.join(held)}")
         return tuple(said)
 
-    def witness(self, state: int) -> Witness:
-        """Return a shortest path to a state, as firings and as stimuli with their firings."""
-        begin = Step("the mission begins", self.x.first, Begin())
-        steps = (str(begin), *map(str, self.x.path(state)))
-        return Witness(self.x.firings(state), self.x.marked(state), steps=steps)
+    @cached_property
+    def left_behind(self) -> dict[tuple[str, ...], PropertyVerdict]:
+        """By action places that do not listen: that runs which have ended are still there at an end
+        with `final`, because nothing could take them."""
+        x, known, found = self.x, set[str](), dict[tuple[str, ...], PropertyVerdict]()
+        for i in np.flatnonzero(x.final).tolist():
+            places = dict.fromkeys(
+                run.place
+                for run in x.states[i].runs()
+                if not x.engine.compiled.task.places[run.place].listen
+            )
+            if not known.issuperset(places):
+                known.update(places)
+                first, *others = (awaiting(x, i, place) for place in places)
+                found[tuple(places)] = self._no(first, i, tuple(others))
+        return found
 
     @property
     def _fair(self) -> str:
@@ -682,8 +717,10 @@ class Progress:
             return self._unknown("no fault found so far")
         return PropertyVerdict(True, reason, assumption=self._fair)
 
-    def _no(self, reason: str, state: int) -> PropertyVerdict:
-        return PropertyVerdict(False, reason, self.witness(state), complete=self.x.complete)
+    def _no(self, reason: str, state: int, details: tuple[str, ...] = ()) -> PropertyVerdict:
+        return PropertyVerdict(
+            False, reason, _witness(self.x, state), complete=self.x.complete, details=details
+        )
 
     def _unknown(self, more: str) -> PropertyVerdict:
         text = f"unknown: the execution graph was not completed ({self.x.reason})"
@@ -754,12 +791,29 @@ class _Again:
                 words = f"these never {verb} again: {', '.join(never)}"
                 if len(never) == len(wanted):
                     words = f"no {nothing} again"
-                return first, f"after {describe(self.x, first)} {words}"
+                return first, f"after {left_over(self.x, first)} {words}"
         return None
 
 
-def _by(x: ExecutionGraph, state: int) -> str:
-    return f"by: {in_words(x.path(state))}"
+def contend(rivals: Sequence[str], over: Sequence[str]) -> str:
+    """Say for which tokens transitions compete."""
+    word = "both" if len(rivals) == 2 else "all"
+    return f"{' and '.join(rivals)} may {word} want the last token of {' and '.join(over)}"
+
+
+def _stuck(x: ExecutionGraph, state: int) -> PropertyVerdict:
+    """Return that nothing can happen any more in a state, and why."""
+    why, marked, left = explain(x, state), describe(x, state), left_over(x, state)
+    details = why.details if marked == left else (*why.details, f"marked: {marked}")
+    reason = f"stuck with {left}: {why.short}"
+    return PropertyVerdict(False, reason, _witness(x, state), complete=x.complete, details=details)
+
+
+def _witness(x: ExecutionGraph, state: int) -> Witness:
+    """Return a shortest path to a state, as firings and as stimuli with their firings."""
+    begin = Step("the mission begins", x.first, Begin())
+    steps = (str(begin), *map(str, x.path(state)))
+    return Witness(x.firings(state), x.marked(state), steps=steps)
 
 
 def _lack(kind: str, text: str) -> str:

@@ -32,6 +32,7 @@ class Witness:
 class PropertyVerdict:
     """Whether a property holds (True, False, or None for unknown), and the reason as a sentence.
 
+    `details` explain the reason, a line each: what else is missing, and where its tokens went.
     `assumption` is the condition under which the verdict on the ordinary net also holds for the
     executed task (empty: it holds as it is). `complete` says whether all reachable markings were
     examined; a False verdict with a witness is valid without that.
@@ -42,12 +43,14 @@ class PropertyVerdict:
     witness: Witness | None = None
     assumption: str = ""
     complete: bool = True
+    details: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return plain data."""
         return {
             "holds": self.holds,
             "reason": self.reason,
+            "details": list(self.details),
             "witness": self.witness.to_json() if self.witness else None,
             "assumption": self.assumption,
             "complete": self.complete,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf, sqrt
 from typing import TypeVar
 
 from petrobot.coordinator.task import (
@@ -58,9 +59,65 @@ class Measured:
     causes: Mapping[tuple[str, str], Mapping[Status, Mapping[Ending, float]]] = field(
         default_factory=dict
     )
+    expected: frozenset[tuple[str, str]] = frozenset()
+    """Keys of `runs` with a declared estimate that was changed, which no run was measured for."""
     mixed: frozenset[tuple[str, str]] = frozenset()
     """Keys of `causes` where each cause was given the same share of runs that are not known to have
     been executed, because only their number over all causes was measured."""
+
+
+NEVER = 1e-6
+"""Share of runs below which none is taken to reach its deadline: two moments say nothing about the
+tail of a distribution so far out."""
+LATE: Ending = ("deadline", str(Executed.YES))
+"""Why a run ends that takes longer than its deadline."""
+
+
+def cut(
+    estimates: Mapping[Status, Estimate], deadline: float
+) -> tuple[Mapping[Status, Estimate], float]:
+    """Return the estimates of runs that end in ERROR at a deadline (s), and the share of the runs
+    that do.
+
+    `estimates` are those without a deadline; their durations have gamma distributions of the given
+    means and cv (fixed with cv = 0). What is left of each is the part up to the deadline; the rest
+    of the probability goes to ERROR. Mean and variance are exact.
+    """
+    moments = {s: _up_to(e, deadline) for s, e in estimates.items() if e.share > 0}
+    late = sum(estimates[s].share * outside for s, (_, outside, *_) in moments.items())
+    if late < NEVER:
+        return estimates, 0.0
+    found = dict[Status, Estimate]()
+    for status in Status:
+        # probability, mean and second moment, each times the share
+        parts = [(late, late * deadline, late * deadline**2)] * (status is Status.ERROR)
+        if status in moments:
+            (p, _, *more), share = moments[status], estimates[status].share
+            parts.append((share * p, share * more[0], share * more[1]))
+        whole, first, second = (
+            (sum(column) for column in zip(*parts, strict=True)) if parts else (0.0,) * 3
+        )
+        if whole > 0:
+            mean = first / whole
+            found[status] = Estimate(whole, mean, sqrt(max(second / whole - mean**2, 0.0)) / mean)
+    return found, late
+
+
+def _up_to(estimate: Estimate, deadline: float) -> tuple[float, float, float, float]:
+    """Return P(T <= deadline), P(T > deadline), E[T; T <= deadline] and E[T^2; T <= deadline]."""
+    mean, square = estimate.mean, estimate.cv**2
+    if not square:
+        inside = float(mean <= deadline)
+        return inside, 1 - inside, inside * mean, inside * mean**2
+    from scipy.special import gammainc, gammaincc
+
+    shape, at = 1 / square, deadline / (mean * square)
+    return (
+        float(gammainc(shape, at)),
+        float(gammaincc(shape, at)),
+        float(mean * gammainc(shape + 1, at)),
+        float(mean**2 * (1 + square) * gammainc(shape + 2, at)),
+    )
 
 
 def is_cause(transition: Transition) -> bool:
@@ -105,10 +162,18 @@ class Numbers:
 
     def estimates(self, place: Place, action: str) -> Mapping[Status, Estimate]:
         """Return share, mean (s) and cv by status. Raises NoEstimate."""
+        return self._estimates(place, action)[0]
+
+    def _estimates(
+        self, place: Place, action: str
+    ) -> tuple[Mapping[Status, Estimate], float | None]:
+        """Return them, and the share of the runs that end at their deadline; None if the estimates
+        were measured, and so contain these runs."""
         primitive = self.task.primitive_task_of(place.name)
         for key in ((place.name, action), (primitive.name, action)):
             if key in self.measured.runs:
-                return self.measured.runs[key]
+                known = self.measured.runs[key]
+                return self._cut(place, known) if key in self.measured.expected else (known, None)
         if not primitive.estimates:
             raise NoEstimate(
                 f"primitive_tasks.{primitive.name}: the duration of {action} is unknown: it was "
@@ -118,7 +183,22 @@ class Numbers:
         self.assumptions.append(
             f"{primitive.name}: estimates declared in the task file, not measured"
         )
-        return primitive.estimates
+        return self._cut(place, primitive.estimates)
+
+    def _cut(
+        self, place: Place, estimates: Mapping[Status, Estimate]
+    ) -> tuple[Mapping[Status, Estimate], float]:
+        deadline = self.task.primitive_task_of(place.name).deadline
+        deadline = min(deadline, inf if place.timeout is None else place.timeout)
+        if any(e.share > 0 and not e.mean > 0 for e in estimates.values()):
+            return estimates, 0.0  # it is told elsewhere which mean is missing
+        found, late = cut(estimates, deadline)
+        if late:
+            self.assumptions.append(
+                f"{place.name}: {late:.3g} of its runs end in ERROR after {deadline:g} s (cause "
+                "`deadline`), by gamma distributions of the declared durations"
+            )
+        return found, late
 
     def causes(self, place: Place, action: str) -> Mapping[Status, Mapping[Ending, float]]:
         """Return how often its runs ended by each cause, by status; empty if not measured."""
@@ -164,14 +244,21 @@ class Numbers:
             for ending, n in known.items():
                 found[region(ending)] = found.get(region(ending), 0.0) + n / total
             return found
-        own = {region((c, str(Executed.YES))) for c, _ in examples if c != EMERGENCY}
+        estimates, late = self._estimates(place, action)
+        from_outside = (EMERGENCY,) if late is None else (EMERGENCY, LATE[0])
+        own = {region((c, str(Executed.YES))) for c, _ in examples if c not in from_outside}
         equal = [kind for kind in kinds if kind in own] or kinds
         text = f"{place.name}: why its runs end in {status.name} was not measured"
         if len(equal) < len(kinds):
             text += "; they were executed, and not ended by an emergency stop"
         text += "; causes that lead to different firings are equally likely" * (len(equal) > 1)
         self.assumptions.append(text)
-        return dict.fromkeys(equal, 1.0 / len(equal))
+        found = dict.fromkeys(equal, 1.0 / len(equal))
+        if status is Status.ERROR and late and region(LATE) in kinds:
+            share = late / estimates[status].share
+            found = {kind: n * (1 - share) for kind, n in found.items()}
+            found[region(LATE)] = found.get(region(LATE), 0.0) + share
+        return found
 
     def _mixed(self, place: str, kinds: Mapping[Ending, Hashable]) -> None:
         """Note it if the kinds of ends depend on the cause, and for one cause on whether the run

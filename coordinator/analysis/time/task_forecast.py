@@ -142,21 +142,27 @@ class Forecast:
     def _time(self) -> Values:
         """Expected time spent in each marking in one mission run (s)."""
         visits = visits_before(self.chain, self.transient)
-        return np.where(
+        spent: Values = np.where(
             self.transient, visits * np.where(self.transient, self.chain.sojourn, 0.0), 0.0
         )
+        return spent
+
+    def _per_second(self, value: float) -> float:
+        """Return a sum over a mission run by its length; 0 for one without a length: it ends as
+        soon as it begins, or can never end, so that no part of it comes before the last."""
+        return value / self.mission_time if self.mission_time else 0.0
 
     @cached_property
     def throughput(self) -> dict[str, float]:
         """Firings per second of each transition of the task, mission runs without pauses."""
-        return {name: n / self.mission_time for name, n in self.firings.items()}
+        return {name: self._per_second(n) for name, n in self.firings.items()}
 
     @cached_property
     def mean_tokens(self) -> dict[str, float]:
         """Time average of the tokens of each place of the task, mission runs without pauses."""
         space = self.chain.space
         places = enumerate(self.view.task.net.places)
-        return {name: float(self._time @ space.tokens(p)) / self.mission_time for p, name in places}
+        return {name: self._per_second(float(self._time @ space.tokens(p))) for p, name in places}
 
     @cached_property
     def occupancy(self) -> dict[str, float]:
@@ -165,8 +171,7 @@ class Forecast:
         space = self.chain.space
         places = enumerate(self.view.task.net.places)
         return {
-            name: float(self._time @ (space.tokens(p) > 0)) / self.mission_time
-            for p, name in places
+            name: self._per_second(float(self._time @ (space.tokens(p) > 0))) for p, name in places
         }
 
     @property
@@ -184,7 +189,7 @@ class Forecast:
             shares[key] = shares.get(key, 0.0) + chosen * shares.get(f"{place}.{action}", 0.0)
         after = {n: t.after for n, t in self.view.task.transitions.items() if t.after is not None}
         for name, seconds in after.items():
-            shares[name] = self.firings.get(name, 0.0) * seconds / self.mission_time
+            shares[name] = self._per_second(self.firings.get(name, 0.0) * seconds)
         found = []
         for key, error in self.view.fit_errors.items():
             share = shares.get(key, shares.get(key.rpartition(".")[0], 0.0))

@@ -79,7 +79,8 @@ def change_task(task: Task, measured: Measured, changes: Sequence[Change]) -> tu
         else:
             for key in _other_estimate(task, runs, change):
                 sources[key] = f"what if {change.text}"
-    return task, replace(measured, runs=runs, sources=sources)
+    expected = measured.expected | (set(sources) - set(measured.runs))
+    return task, replace(measured, runs=runs, sources=sources, expected=expected)
 
 
 def _other_tokens(task: Task, change: Change) -> Task:

@@ -22,6 +22,8 @@ class Finding:
     remedy: str = ""
     witness: Mapping[str, Any] | None = None
     """Values that show it."""
+    details: tuple[str, ...] = ()
+    """The steps that lead to it."""
 
     def __str__(self) -> str:
         seen = f" (for example {_example(self.witness)})" if self.witness else ""

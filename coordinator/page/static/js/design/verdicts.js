@@ -69,7 +69,7 @@ export class Verdicts {
   row(verdict) {
     const { witness } = verdict;
     const button = h("button", { type: "button", disabled: verdict.holds !== false || !witness, "aria-pressed": "false", onclick: () => this.show(verdict, button) },
-      icon(SIGN[verdict.holds]), h("strong", {}, `${verdict.words}: ${SAID[verdict.holds]}`), h("span", {}, verdict.reason, witness && verdict.holds === false ? `. Example: ${witness.firings.join(", ") || "the initial marking"}.` : ""));
+      icon(SIGN[verdict.holds]), h("strong", {}, `${verdict.words}: ${SAID[verdict.holds]}`), h("span", {}, [verdict.reason, ...verdict.details].join("; "), witness && verdict.holds === false ? `. Example: ${witness.firings.join(", ") || "the initial marking"}.` : ""));
     return h("li", { class: verdict.problem ? "error" : "" }, button);
   }
 

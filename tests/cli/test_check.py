@@ -1,0 +1,85 @@
+"""What `check` prints: the answer first, each finding in short lines, nothing wider than a
+terminal."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import pytest
+
+from petrobot.coordinator.cli import main
+
+HEAD = """schema = 1
+[task]
+name = "parts"
+final = "parts == 0 and arm == 1"
+[primitive_tasks.look]
+goal = "the part is found"
+alternatives = ["look_once"]
+deadline = 5.0
+[places]
+parts = { kind = "control", tokens = 2 }
+arm = { kind = "resource", tokens = 1 }
+look = { kind = "action", task = "look" }
+[transitions]
+next = { in = ["parts", "arm"], out = ["look"] }
+seen = { in = ["look:normal"], out = ["arm"] }
+"""
+
+
+def printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, command: str = "check"
+) -> tuple[int, list[str]]:
+    """Run a command on a task in a folder without a location file."""
+    (tmp_path / "parts.toml").write_text(text, encoding="utf-8")
+    with contextlib.chdir(tmp_path):
+        code = main([command, "parts.toml"])
+    return code, capsys.readouterr().out.splitlines()
+
+
+def test_a_dead_end_is_told_in_short_lines(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, lines = printed(tmp_path, capsys, HEAD + 'lost = { in = ["look:error"], out = [] }\n')
+    assert code == 2 and lines[0] == "parts.toml: may not run"
+    assert lines[1].startswith("  yes       bounded, ")
+    first = lines.index("")
+    assert lines[first + 1 : first + 7] == [
+        "error   deadlock free: stuck with parts: next needs arm, which is empty",
+        "        arm: taken by `next`, never returned by `lost`",
+        "        no end can be reached any more after: look ends in error -> lost",
+        "        by: the mission begins -> next",
+        "            look ends in error -> lost",
+        "        so it is not sound, live, proper, stable, controllable",
+    ]
+    kinds = [line.split()[0] for line in lines[first + 1 :] if line[:1].strip()]
+    assert kinds == sorted(kinds, key=["error", "warning", "note", "petrobot"].index)
+
+
+@pytest.mark.parametrize("command", ["check", "analyse"])
+def test_no_line_is_wider_than_a_terminal(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Steps and causes with long names in a task that gets stuck late, and of which the operator
+    can make more dead ends."""
+    text = HEAD.replace("look", "look_for_the_next_part_on_the_long_conveyor").replace("= 2", "= 9")
+    text += 'lost = { in = ["look_for_the_next_part_on_the_long_conveyor:error"], out = ["arm"] }\n'
+    text = text.replace(
+        '"], out = ["arm"] }', ', "tray"], out = ["arm"] }'.replace(', "', '", "'), 1
+    )
+    text = text.replace("[transitions]", 'tray = { kind = "control", tokens = 7 }\n[transitions]')
+    _, lines = printed(tmp_path, capsys, text, command)
+    assert len(lines) > 15
+    assert all(len(line) <= 100 or " " not in line.strip() for line in lines)
+
+
+def test_notes_of_one_kind_are_told_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    unused = "".join(f'[events.e{n}]\nscope = "external"\n' for n in range(3))
+    text = HEAD + 'lost = { in = ["look:error"], out = ["arm"] }\n' + unused
+    code, lines = printed(tmp_path, capsys, text)
+    assert code == 0 and lines[0] == "parts.toml: may run"
+    (at,) = [i for i, line in enumerate(lines) if "no transition waits for it" in line]
+    assert lines[at + 2].startswith("        and 2 more such notes: petrobot check ")
