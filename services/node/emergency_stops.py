@@ -15,9 +15,9 @@ LOOK = 0.25
 """Time between reads of the latch (s): `petrobot estop` sets it directly when the node does not
 answer."""
 NEVER = float("inf")
-BEAT = "beat"
-"""Message of a node to its processes every `BEAT_EVERY` seconds: its loop runs."""
 BEAT_EVERY = 0.2
+"""Time between the pings of a node to its processes (s): they show that its loop runs, and the
+answers that theirs do."""
 SILENCE = 0.8
 """Time without a message of the node after which its processes stop their devices (s). With the
 time that a stop takes to reach the drives, that is less than a second."""

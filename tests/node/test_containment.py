@@ -28,7 +28,7 @@ from tests.node.test_processes import (
     operator_of,
     pids,
 )
-from tests.processes import alive, kill
+from tests.processes import alive, kill, parent
 from tests.waiting import Limit
 
 pytestmark = pytest.mark.processes
@@ -115,7 +115,9 @@ async def test_processes_left_by_a_crashed_worker_end_with_it(
         await gone(operator, int(mark.read_text()))
 
 
-@pytest.mark.parametrize("way", ["worker killed", "node killed", "node stopped"])
+@pytest.mark.parametrize(
+    "way", ["worker killed", "worker killed, keeper frozen", "node killed", "node stopped"]
+)
 async def test_what_an_action_leaves_running_lives_as_long_as_its_worker(
     own_nodes: Nodes, tmp_path: Path, way: str
 ) -> None:
@@ -130,7 +132,9 @@ async def test_what_an_action_leaves_running_lives_as_long_as_its_worker(
                 left.append(int(mark.read_text()))
                 workers.append(end.values["pid"])
         assert all(map(alive, left)), "an action that ends well keeps what it has started"
-        if way == "worker killed":
+        if way.startswith("worker killed"):
+            if way.endswith("keeper frozen"):
+                kill(map(parent, set(workers)), signal.SIGSTOP)
             kill(set(workers))
         elif way == "node stopped":
             assert await asyncio.to_thread(nodes.stop) == {"left": 0, "right": 0}
