@@ -82,15 +82,21 @@ async def up(operator: Operator, former: set[int]) -> bool:
 
 
 async def kill(
-    operator: Operator, chance: random.Random, tally: Tally, how: str, chosen: tuple[str, ...]
+    operator: Operator,
+    node: int,
+    chance: random.Random,
+    tally: Tally,
+    how: str,
+    chosen: tuple[str, ...],
 ) -> set[int]:
     """Kill, freeze or hang the chosen processes of the device; return which."""
     status = await operator.command("left", "status", "slide")
     found = status.data.get("devices", {}).get("slide", {}).get("pids", {})
     victims = {found[name] for name in chosen if name in found}
     signals, _, keepers = how.partition(" with their ")
-    if keepers:
-        processes.kill(map(processes.parent, victims), signal.SIGSTOP)
+    if keepers:  # not the node: until a worker has reported its id, that of its keeper stands there
+        above = set(map(processes.parent, victims)) - {node}
+        processes.kill(above, signal.SIGSTOP)
     for name in signals.split(", then ") if how != LOOP else ():
         processes.kill(victims, getattr(signal, name))
         if name == "SIGSTOP":
@@ -110,6 +116,7 @@ async def storm(folder: Path, seed: int, kills: int, hows: tuple[str, ...] = KIL
     succeed."""
     chance, tally = random.Random(seed), Tally()
     running = Nodes(folder, "left")
+    node = running.processes["left"].pid
     try:
         with load():
             async with operator_of(running.directory, "left") as operator:
@@ -128,7 +135,7 @@ async def storm(folder: Path, seed: int, kills: int, hows: tuple[str, ...] = KIL
                         else operator.call("go", limit, to=to, timeout=30.0)
                     )
                     await passing(moment)
-                    killed |= await kill(operator, chance, tally, how, chosen)
+                    killed |= await kill(operator, node, chance, tally, how, chosen)
                     end = await moving
                     if end.status != "success" and end.cause not in LINK:
                         tally.ends.add((end.cause, end.executed))
