@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable
 
 from petrobot.services.comm.protocol.messages import Call
-from petrobot.services.host.parent_death import STOP_ROUTINE, until_ended
+from petrobot.services.host.parent_death import STOP_ROUTINE, state_of, until_ended
 from petrobot.services.worker.keeper import KILL_ORDER
 from petrobot.services.worker.pipe import Item, Permits, permit_counter, pipe_pair
 from petrobot.services.worker.process import BORN, SETUP, Setup
@@ -131,6 +131,11 @@ class Child:
     def unsent(self) -> bool:
         """Whether something waits until it reads."""
         return self.pipe.unsent
+
+    @property
+    def frozen(self) -> bool:
+        """Whether a signal has stopped its process, so that no code executes in it."""
+        return state_of(self.pid) == "T"
 
     def post(self, item: Item) -> None:
         """Send an item; what does not fit into the pipe now is sent when the process reads."""

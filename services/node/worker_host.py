@@ -641,13 +641,16 @@ class WorkerHost:
                 child.kill(why)
 
     def _must_answer(self, child: Child) -> bool:
-        """Whether a process is ready, and no code of a run may keep it from answering."""
+        """Whether a process is ready, and no code of a run may be what keeps it from
+        answering."""
         if child is not self._worker:
             return self._stage in (HostStage.ACTIONS_DOWN, HostStage.ACTIONS_START, HostStage.READY)
         if self._stage is not HostStage.READY:
             return False
         begun = self._given - child.not_begun()
-        return all(run.posted is None or run.number > begun for run in self._runs.values())
+        return child.frozen or all(
+            run.posted is None or run.number > begun for run in self._runs.values()
+        )
 
     @property
     def news(self) -> bool:

@@ -78,7 +78,7 @@ class FakeChild:
         self.pid = id(self) % 10_000
         self.got: list[Any] = []
         self.passed: list[socket.socket] = []
-        self.killed = self.left = self.unsent = False
+        self.killed = self.left = self.unsent = self.frozen = False
 
     def say(self, item: Item) -> None:
         self._heard(self, [item])
@@ -394,7 +394,9 @@ def beats(bench: HostBench, seconds: float, *frozen: FakeChild) -> None:
                 child.say(Pong(pings[-1].number))
 
 
-@pytest.mark.parametrize("run", ["no run", "a run", "a run that has not begun"])
+@pytest.mark.parametrize(
+    "run", ["no run", "a run", "a run in a stopped process", "a run that has not begun"]
+)
 @pytest.mark.parametrize("victim", ["driver", "actions", "only"])
 def test_a_process_that_must_answer_and_does_not_is_killed(victim: str, run: str) -> None:
     """All but one in which the code of a run may take long."""
@@ -407,7 +409,8 @@ def test_a_process_that_must_answer_and_does_not_is_killed(victim: str, run: str
     beats(bench, 10 * HUNG)
     if run != "no run":
         bench.begin()
-        bench.children[-1].begun = int(run == "a run")
+        bench.children[-1].begun = int(run != "a run that has not begun")
+        bench.children[-1].frozen = run == "a run in a stopped process"
     beats(bench, HUNG - 2 * BEAT_EVERY, frozen)
     assert not any(child.killed for child in bench.children)
     beats(bench, 4 * BEAT_EVERY, frozen)
