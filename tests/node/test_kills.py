@@ -35,7 +35,7 @@ VICTIMS = (("driver",), ("actions",), ("driver", "actions"))
 DEADLINE = 4.0
 """Deadline of a run whose own process may be frozen (s): nothing else ends it."""
 ENDS = {(cause, "unknown") for cause in ("device_died", "worker_died", "deadline")}
-ENDS |= {("deadline", "yes")}
+ENDS |= {("deadline", "yes"), ("deadline", "no")}  # no: its process was being started
 """Causes with which a run may end whose device was killed, with what it says about execution."""
 LOOP = HANGS[-1]
 LINK = ("lost", "unreachable", "not_accepted")
