@@ -18,6 +18,14 @@ def children(process: int) -> set[int]:
     return {int(child) for child in text.split()}
 
 
+def parent(process: int) -> int:
+    """The parent of a process; 0 if it has ended."""
+    try:
+        return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
+    except OSError:
+        return 0
+
+
 def below(process: int) -> set[int]:
     """All processes that descend from this one."""
     found = children(process)

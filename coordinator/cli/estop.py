@@ -61,7 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Stop, or clear. Return 0 if every device has carried it out, 3 otherwise."""
+    """Stop, or clear. Return 0 if every device has carried it out and a stop is stored, 3
+    otherwise."""
     from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
     from petrobot.services.comm.protocol.messages import COORDINATOR
     from petrobot.services.comm.tls.credentials import credentials

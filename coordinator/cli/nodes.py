@@ -120,8 +120,8 @@ def _print(answers: dict[str, Any]) -> None:
 
 def _devices(status: Mapping[str, Any], stopped: Sequence[str], troubles: Mapping[str, str]) -> str:
     """Return the names of devices, each with its troubles: an emergency stop, why it accepts no
-    call, refusals, late cycles, dropped events. (Events may also come from a service, the memory or
-    the node.)"""
+    call, restarts, refusals, late cycles, dropped events. (Events may also come from a service, the
+    memory or the node.)"""
     from rich.markup import escape
 
     shown, devices = [], status.get("devices", {})
@@ -133,6 +133,9 @@ def _devices(status: Mapping[str, Any], stopped: Sequence[str], troubles: Mappin
         elif device in troubles:
             # the text may come from a driver, with brackets that rich would read as markup
             said.append(f"[yellow]{escape(troubles[device])}[/]")
+        if told.get("restarts"):
+            last = escape(str(told.get("last_death", "")))
+            said.append(f"[yellow]started again {told['restarts']} times, last because {last}[/]")
         if told.get("refused"):
             said.append(f"[yellow]{told['refused']} refused[/]")
         if told.get("overruns"):

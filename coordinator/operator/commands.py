@@ -303,6 +303,7 @@ class Operation:
         for told in await order_all(directory, credentials_of(directory)):
             if not told.done:
                 why = told.why or ", ".join(f"{d} {told.devices[d]}" for d in told.open)
+                why = why or told.note
                 why = f"{told.node}: {why or 'no answer'}"
                 text = "; ".join(filter(None, (why, told.bus, told.latch)))
                 self.feed.emit(

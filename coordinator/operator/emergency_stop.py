@@ -71,8 +71,9 @@ class Stopped:
 
     @property
     def done(self) -> bool:
-        """Whether every device of the node is known to have carried out the order."""
-        return self.cleared or (self.answered and not self.open)
+        """Whether every device of the node is known to have carried out the order, and a stop is
+        stored."""
+        return self.cleared or (self.answered and not self.open and not self.note)
 
 
 def nodes_with_devices(directory: Directory) -> list[str]:

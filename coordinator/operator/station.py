@@ -389,6 +389,7 @@ class Station:
         missing = [
             f"{one.node}: {one.bus or one.why or 'no answer'}" for one in told if not one.answered
         ]
+        missing += [f"{one.node}: {one.note}" for one in told if one.note]
         said = [f"{device} {answer}" for one in told for device, answer in one.devices.items()]
         if not all(one.done for one in told):
             return refusal("unreachable", "; ".join([*missing, *said]))

@@ -340,7 +340,8 @@ def clock_reading(now: float) -> dict[str, Any]:
 def origin_of(header: Mapping[str, Any], now: float, last: float) -> float:
     """Return when a journal's clock began (s), on this process's clock, which reads `now`; the time
     of its last record is `last`. In lock step each process has its own simulated clock. In real
-    time the time without a coordinator counts, too."""
+    time the time without a coordinator counts, too, as far as it is known: the host's clock may
+    have been set back meanwhile, or have lost its time with the power."""
     if header["mode"] == "lockstep":
         return 0.0
     clock = header.get("clock")
@@ -348,7 +349,7 @@ def origin_of(header: Mapping[str, Any], now: float, last: float) -> float:
         return now - last
     if clock["host_boot"] == _host_boot() and clock["monotonic"] <= now:
         return float(clock["monotonic"])
-    return now - max(0.0, time.time() - float(clock["unix"]))
+    return now - max(last, time.time() - float(clock["unix"]))
 
 
 def _host_boot() -> str:

@@ -81,7 +81,7 @@ async def until_ended(process: int) -> None:
     except ProcessLookupError:
         return
     except (AttributeError, OSError):  # a kernel before 5.3, or a sandbox that does not permit it
-        while _runs(process):
+        while state_of(process) not in ("", "Z"):
             await asyncio.sleep(LOOK_AGAIN)
         return
     ended = asyncio.Event()
@@ -106,12 +106,13 @@ async def until_reaped(process: Process) -> None:
     await process.wait()
 
 
-def _runs(process: int) -> bool:
-    """Return whether a process exists and is not a zombie."""
+def state_of(process: int) -> str:
+    """Return the state of a process as `ps` shows it (R: it runs, Z: it has ended, T: a signal has
+    stopped it); empty if there is none."""
     try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:
-        return False
+        return ""
 
 
 def wanted_with_parent() -> bool:

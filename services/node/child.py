@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable
 
 from petrobot.services.comm.protocol.messages import Call
-from petrobot.services.host.parent_death import STOP_ROUTINE, until_ended
+from petrobot.services.host.parent_death import STOP_ROUTINE, state_of, until_ended
 from petrobot.services.worker.keeper import KILL_ORDER
 from petrobot.services.worker.pipe import Item, Permits, permit_counter, pipe_pair
 from petrobot.services.worker.process import BORN, SETUP, Setup
@@ -30,10 +30,6 @@ LEAVE_LIMIT = 4.0
 PIPE_LIMIT = 0.5
 """Time after the end of its pipe at which a process is killed (s): the node can reach it no
 more."""
-KEEPER_LIMIT = 3.0
-"""Time in which a keeper must carry out an order to kill (s). After that it is killed itself, and
-the kernel kills its worker."""
-
 TURN = 1 << 14
 """Most bytes that are read of a process in one turn of the loop. A process that writes without end
 would otherwise keep the node from all else: from heartbeats, devices and an emergency stop."""
@@ -127,6 +123,20 @@ class Child:
             count += 1
         return count
 
+    def not_begun(self) -> int:
+        """Return how many calls it has not begun: the last ones that it was given."""
+        return self._permits.left()
+
+    @property
+    def unsent(self) -> bool:
+        """Whether something waits until it reads."""
+        return self.pipe.unsent
+
+    @property
+    def frozen(self) -> bool:
+        """Whether a signal has stopped its process, so that no code executes in it."""
+        return state_of(self.pid) == "T"
+
     def post(self, item: Item) -> None:
         """Send an item; what does not fit into the pipe now is sent when the process reads."""
         if self._logs:
@@ -147,11 +157,12 @@ class Child:
         self.post([word])
 
     def kill(self, why: str = "") -> None:
-        """Kill it at once, with everything that it started."""
+        """Kill it at once, with everything that it started. One that hangs in the kernel does not
+        end, and neither does its keeper: its device must not get a second driver."""
         if self.process.poll() is None:
             self._killed = self._killed or why
             self.process.send_signal(KILL_ORDER)
-            self._limit(KEEPER_LIMIT, self.process.kill)
+            self.process.send_signal(signal.SIGCONT)  # a keeper may be frozen
 
     def leave(self) -> None:
         """Close its pipe, so that it stops its device and exits. It is killed after

@@ -6,18 +6,21 @@ or whose loop is blocked, can stop nothing.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection, Iterable, Sequence
 
 from petrobot.services.host.emergency_latch import ALL, Latch, LatchError
 from petrobot.services.worker.remote import EMERGENCY_STOP, NODE_SILENT
 
+_log = logging.getLogger(__name__)
+
 LOOK = 0.25
 """Time between reads of the latch (s): `petrobot estop` sets it directly when the node does not
 answer."""
 NEVER = float("inf")
-BEAT = "beat"
-"""Message of a node to its processes every `BEAT_EVERY` seconds: its loop runs."""
 BEAT_EVERY = 0.2
+"""Time between the pings of a node to its processes (s): they show that its loop runs, and the
+answers that theirs do."""
 SILENCE = 0.8
 """Time without a message of the node after which its processes stop their devices (s). With the
 time that a stop takes to reach the drives, that is less than a second."""
@@ -106,7 +109,11 @@ class EmergencyStops:
             if self._latch is not None and devices:
                 self._latch.stop(devices)
         except LatchError as fault:
-            return f"the stop will not outlive a restart of the node: {fault}"
+            _log.error("an emergency stop could not be stored: %s", fault)
+            return (
+                f"NOT STORED: {fault}; the devices are stopped until the node ends: do not start "
+                "it again before the cell is safe"
+            )
         return ""
 
     def clear(self, devices: Sequence[str]) -> str:

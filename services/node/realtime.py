@@ -25,7 +25,8 @@ from petrobot.services.comm.protocol.security import require_key
 from petrobot.services.comm.tls.credentials import credentials
 from petrobot.services.host.emergency_latch import STATE, latch_of
 from petrobot.services.host.parent_death import GOOD_ORDER, outlive, wanted_with_parent
-from petrobot.services.node.emergency_stops import BEAT, BEAT_EVERY
+from petrobot.services.node.child import LEAVE_LIMIT
+from petrobot.services.node.emergency_stops import BEAT_EVERY
 from petrobot.services.node.inline_host import Host
 from petrobot.services.node.node import GENERAL, LOOP, Node, stream_service
 from petrobot.services.node.worker_host import START_LIMIT, Hosting, WorkerHost
@@ -36,6 +37,9 @@ from petrobot.services.worker.remote import IN_EMERGENCY
 _log = logging.getLogger(__name__)
 
 _CALLS = frozenset((Call,))
+CLOSE_LIMIT = LEAVE_LIMIT + 3.0
+"""Time in which the processes of a closing node must end (s). One that hangs in the kernel does not
+end, even when it is killed."""
 LOOK = 0.25
 """Time after which a node looks at a run that it gave to a worker, at the latest (s)."""
 
@@ -131,11 +135,9 @@ class NodeShell:
         self._step()
 
     def _beat(self) -> None:
-        """Send the processes of devices a beat: without it they stop their devices."""
+        """Send the processes of devices a ping: without it they stop their devices."""
         for place in self._workers.values():
-            for child in place.children():
-                if not child.pipe.unsent:  # it does not read: more of the same would only pile up
-                    child.post([BEAT])
+            place.beat(self._now())
         self._beating = self._loop.call_later(BEAT_EVERY, self._beat)
 
     async def _until_ready(self) -> None:
@@ -159,7 +161,12 @@ class NodeShell:
         self._serving = False
         await self.server.close()
         children = [child for place in self._workers.values() for child in place.children()]
-        await asyncio.gather(*(child.wait() for child in children))
+        ends = [self._loop.create_task(child.wait()) for child in children]
+        _, hanging = await asyncio.wait(ends, timeout=CLOSE_LIMIT) if ends else (ends, ())
+        if hanging:
+            _log.error(
+                "%d processes hang in the kernel and are left to their keepers", len(hanging)
+            )
         self._alarm.cancel()
 
     # --- steps --------------------------------------------------------------------------------

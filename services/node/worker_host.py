@@ -82,6 +82,9 @@ DONE = {"hold": "held", "release": "released", CLEAR_EMERGENCY: "cleared", PICTU
 """Answers to a command for actions without a device while none of them runs; to any other command
 the answer is `stopped`."""
 DRIVER_DIED = "the process of its device's driver died"
+HUNG = 5.0
+"""Time without an answer after which a process hangs and is killed (s), beside two periods of its
+driver. The code of a run may take longer: that is limited by the run's deadline."""
 
 
 class HostStage(Enum):
@@ -140,6 +143,8 @@ class _HostedCall:
     """When it was written to the worker's pipe (s); None while it waits for a worker."""
     number: int = 0
     """Number of the call among those that were sent to this worker, from 1."""
+    ping: int = 0
+    """Number of the ping that was sent with the order to stop."""
     cause: str = ""
     """Cause and text of its stop; empty if it was not stopped."""
     text: str = ""
@@ -195,12 +200,17 @@ class WorkerHost:
         self._halt_due: float | None = None
         self._halts = 0
         self._pings = 0
+        self._beaten = -math.inf
+        """When its processes were last pinged (s)."""
+        self._unanswered: dict[Child, float] = {}
+        """Since when a process has not answered (s)."""
+        self._period = 0.0
+        """Period of its cyclic driver (s)."""
         self._given = 0
         """How many calls were sent to the worker, without those that were taken back."""
         self._withdrawn: set[str] = set()
         """Calls that were taken back and that the worker has not yet dropped: until then it might
         begin one of them with the permit of another call."""
-        self._withdrawn_at = -math.inf
         self._behind = False
         """Whether calls may wait in its process behind another call."""
         self._progress = -math.inf
@@ -213,6 +223,10 @@ class WorkerHost:
         """Whether its runs are held by the operator."""
         self._reports: list[Report] = []
         self._deaths = 0
+        self.restarts = 0
+        """How often a process died and was started again."""
+        self.last_death = ""
+        """How the last of these died."""
         self._started = -math.inf
         self._restart_at: float | None = None
         self._retiring: Child | None = None
@@ -317,19 +331,22 @@ class WorkerHost:
     def _heard(self, child: Child, received: list[Item]) -> None:
         """Handle what a process sent. Items of a former process are ignored, and of the progress of
         a run only the newest counts: an action may report it in a loop that never waits."""
+        self._unanswered.pop(child, None)
         plain_ends = True
         newest = {item.id: item for item in received if type(item) is Feedback}
         for item in received:
             if type(item) is Feedback and newest[item.id] is not item:
                 continue
-            if type(item) is not Outcome or item.cause == OUT_OF_MEMORY:
+            if type(item) is Outcome:
+                plain_ends &= item.cause != OUT_OF_MEMORY
+            elif type(item) is not Pong:
                 plain_ends = False
             if child is self._owner or child is self._worker:
                 try:
                     if isinstance(item, list):
                         self._take_word(child, item)
                     else:
-                        self._take_message(item)
+                        self._take_message(child, item)
                 except (ValueError, TypeError, IndexError, KeyError, AttributeError):
                     # The user's code has written into the pipe, or a copy of the process has.
                     child.kill("it wrote data into its pipe that is not a message, and was killed")
@@ -351,14 +368,14 @@ class WorkerHost:
         else:
             raise ValueError(f"unknown word {items[0]!r:.80}")
 
-    def _take_message(self, message: Message) -> None:
+    def _take_message(self, child: Child, message: Message) -> None:
         if isinstance(message, Outcome):
             self._take_end(message)
         elif isinstance(message, Answer):
             self._answered(message)
         elif isinstance(message, Pong):
-            for run in self._runs.values():
-                run.pong = run.pong or run.cause != ""
+            for run in self._runs.values() if child is self._worker else ():
+                run.pong = run.pong or (run.cause != "" and message.number >= run.ping)
         elif isinstance(message, Event | Feedback | Call | Cancel):
             self._reports.append(message)
         else:
@@ -368,8 +385,11 @@ class WorkerHost:
         driver = child is self._owner
         if driver and self._stage is HostStage.DRIVER_STARTS:
             self.streams = dict(data["streams"])
+            self._period = data["period"] or 0.0
             if self._emergency:
                 child.post(Command("", EMERGENCY_STOP))
+            elif self._died:
+                child.post(Command("", "stop"))  # it may still do what the former driver ordered
             if self._frozen:
                 child.post(HOLD)
             if self._seed is not None:
@@ -392,6 +412,7 @@ class WorkerHost:
 
     def _ended(self, child: Child) -> None:
         """Handle the end of a process, unless it is a former one."""
+        self._unanswered.pop(child, None)
         if child is self._owner:
             self._all_ended(child)
         elif child is self._worker:
@@ -451,6 +472,9 @@ class WorkerHost:
             child is None or child.code != LINK_LOST
         ):  # a process that lost its driver does not count: the driver died
             self._deaths = 0 if now - self._started > STABLE else self._deaths + 1
+            if child is not None:
+                self.restarts += 1
+                self.last_death = self.failed or self._died
         pause = PAUSES[min(self._deaths, len(PAUSES)) - 1] if self._deaths else 0.0
         if child is not None and child.code == LINK_LOST:
             pause = max(pause, DRIVER_GONE)
@@ -489,7 +513,6 @@ class WorkerHost:
         if self._worker is None or not (count := self._worker.take_back()):
             return
         self._given -= count
-        self._withdrawn_at = self._clock()
         for id_, run in list(self._runs.items()):
             if run.posted is not None and run.number > self._given:
                 self._withdrawn.add(id_)
@@ -593,9 +616,41 @@ class WorkerHost:
             self._end(cancel.id, cause, text)
             return
         run.cause, run.text, run.stopped_at = cause, text, now
-        self._pings += 1
         self._worker.post(cancel)
-        self._worker.post(Ping(self._pings))
+        run.ping = self._ping(self._worker)
+
+    def _ping(self, child: Child) -> int:
+        self._pings += 1
+        child.post(Ping(self._pings))
+        return self._pings
+
+    def beat(self, now: float) -> None:
+        """Ping its processes, which thereby see that the node runs, and kill those that hang."""
+        if now - self._beaten > HUNG / 2:
+            # This process itself stood still. What the others sent meanwhile is still unread.
+            self._unanswered.clear()
+        self._beaten = now
+        for child in self.children():
+            if not child.unsent:  # otherwise it does not read: more would only pile up
+                self._ping(child)
+            limit = HUNG + 2 * self._period if child is self._owner else HUNG
+            if now - self._unanswered.setdefault(child, now) >= limit and self._must_answer(child):
+                self._unanswered[child] = now  # try again later if the kill has no effect
+                why = f"it did not answer for {HUNG:g} s, and was killed"
+                _log.warning("process %d of %s: %s", child.pid, self._name(), why)
+                child.kill(why)
+
+    def _must_answer(self, child: Child) -> bool:
+        """Whether a process is ready, and no code of a run may be what keeps it from
+        answering."""
+        if child is not self._worker:
+            return self._stage in (HostStage.ACTIONS_DOWN, HostStage.ACTIONS_START, HostStage.READY)
+        if self._stage is not HostStage.READY:
+            return False
+        begun = self._given - child.not_begun()
+        return child.frozen or all(
+            run.posted is None or run.number > begun for run in self._runs.values()
+        )
 
     @property
     def news(self) -> bool:
@@ -615,9 +670,6 @@ class WorkerHost:
             self._tell_lost("the device is not known to stand still")
         if now >= self._patience_ends():
             self.withdraw()
-        if now >= self._unseen_limit() and self._worker is not None:
-            self._withdrawn_at = now  # try again later if the kill has no effect
-            self._worker.kill("it did not read its calls, and was killed")
         for id_, run in list(self._runs.items()):
             if run.posted is None and now >= self._wait_limit(run):
                 why = self.failed or self._died or "it is being started"
@@ -628,13 +680,6 @@ class WorkerHost:
     def _patience_ends(self) -> float:
         """Return when the calls that wait in its process are taken back (s)."""
         return self._progress + PATIENCE if self._behind else math.inf
-
-    def _unseen_limit(self) -> float:
-        """Return when a worker without a run must have dropped the calls that were taken back (s);
-        after that it counts as frozen."""
-        if not self._withdrawn or any(run.posted is not None for run in self._runs.values()):
-            return math.inf
-        return max(self._withdrawn_at, self._progress) + GRACE + MARGIN
 
     def _wait_limit(self, run: _HostedCall) -> float:
         """Return until when a run waits for its process (s)."""
@@ -672,7 +717,7 @@ class WorkerHost:
             soonest = min(soonest, self._halt_due)
         if self._stage in STARTING:
             soonest = min(soonest, self._started + START_LIMIT)
-        soonest = min(soonest, self._patience_ends(), self._unseen_limit())
+        soonest = min(soonest, self._patience_ends())
         for run in self._runs.values():
             due = self._due_of(run)
             if due < soonest:
@@ -724,8 +769,16 @@ class WorkerHost:
         word, why = self.condition
         done = "not ready" if self._setup.device else DONE.get(verb, "stopped")
         answer = word if verb == "status" else done
-        data = {"text": why, "runs": list(self._runs), "pids": self.pids()}
-        self._reports.append(answer_of(id_, answer, data))
+        self._reports.append(answer_of(id_, answer, {"text": why, **self._about()}))
+
+    def _about(self) -> dict[str, Any]:
+        """Return what an answer says about its processes and runs."""
+        return {
+            "runs": list(self._runs),
+            "pids": self.pids(),
+            "restarts": self.restarts,
+            "last_death": self.last_death,
+        }
 
     def _answer_commands(self) -> None:
         """Answer the commands of a process that has ended."""
@@ -767,7 +820,7 @@ class WorkerHost:
         verb = self._commands.pop(answer.id, "")
         if verb == "hold" and word != "cannot hold":
             self._freeze(True)
-        data.update(runs=list(self._runs), pids=self.pids())
+        data.update(self._about())
         if verb == "status":
             word, data["text"] = self.condition
             if word == "up" and data.get("fenced"):

@@ -163,6 +163,11 @@ class WorkerPool:
             for child in worker.children()
         ]
 
+    def beat(self, now: float) -> None:
+        """Ping the processes, and kill those that hang."""
+        for worker in self._workers.values():
+            worker.beat(now)
+
     # --- runs ---------------------------------------------------------------------------------
 
     def take(self, now: float, order: Order) -> None:

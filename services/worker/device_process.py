@@ -15,10 +15,10 @@ import os
 import socket
 import time
 
-from petrobot.services.comm.protocol.messages import SEED, Answer, Command, Event
+from petrobot.services.comm.protocol.messages import SEED, Answer, Command, Event, Ping, Pong
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import PICTURE, Driver, picture_of, stop_at_once
-from petrobot.services.node.emergency_stops import BEAT, Guard
+from petrobot.services.node.emergency_stops import Guard
 from petrobot.services.node.ports import ProcessPorts
 from petrobot.services.worker.callables import describe
 from petrobot.services.worker.pipe import NewestLink, Pipe
@@ -158,9 +158,11 @@ class DeviceLoop:
             for item in self._node.read():
                 word = item[0] if isinstance(item, list) else ""
                 if self._guard is not None:
-                    self._guard.heard(now, word in (BEAT, LINKED))
+                    self._guard.heard(now, word == LINKED or isinstance(item, Ping))
                 if word == LINKED:
                     self._attach()
+                elif isinstance(item, Ping):
+                    self._node.post(Pong(item.number))
                 elif isinstance(item, Command):
                     self._obey(now, item)
             if self._guard is not None and now >= self._guard.due:

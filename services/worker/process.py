@@ -39,7 +39,7 @@ from petrobot.services.host.command_line import log_to_stderr
 from petrobot.services.host.emergency_latch import latch_of
 from petrobot.services.host.parent_death import STOP_ROUTINE, outlive
 from petrobot.services.node.drivers import make_driver
-from petrobot.services.node.emergency_stops import BEAT, Guard
+from petrobot.services.node.emergency_stops import Guard
 from petrobot.services.node.inline_host import InlineHost
 from petrobot.services.node.ports import ProcessPorts
 from petrobot.services.scripted import load as load_script
@@ -291,7 +291,7 @@ class Worker:
     def _take(self, now: float, item: Item) -> None:
         word = item[0] if isinstance(item, list) else ""
         if self._guard is not None:
-            self._guard.heard(now, word == BEAT or isinstance(item, Call))
+            self._guard.heard(now, isinstance(item, Ping | Call))
         if not isinstance(item, list):
             self._take_message(now, item)
         elif word == STREAM_AT:

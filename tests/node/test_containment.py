@@ -9,6 +9,7 @@ import signal
 import time
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -28,7 +29,7 @@ from tests.node.test_processes import (
     operator_of,
     pids,
 )
-from tests.processes import alive, kill
+from tests.processes import alive, kill, parent
 from tests.waiting import Limit
 
 pytestmark = pytest.mark.processes
@@ -115,7 +116,9 @@ async def test_processes_left_by_a_crashed_worker_end_with_it(
         await gone(operator, int(mark.read_text()))
 
 
-@pytest.mark.parametrize("way", ["worker killed", "node killed", "node stopped"])
+@pytest.mark.parametrize(
+    "way", ["worker killed", "worker killed, keeper frozen", "node killed", "node stopped"]
+)
 async def test_what_an_action_leaves_running_lives_as_long_as_its_worker(
     own_nodes: Nodes, tmp_path: Path, way: str
 ) -> None:
@@ -130,7 +133,9 @@ async def test_what_an_action_leaves_running_lives_as_long_as_its_worker(
                 left.append(int(mark.read_text()))
                 workers.append(end.values["pid"])
         assert all(map(alive, left)), "an action that ends well keeps what it has started"
-        if way == "worker killed":
+        if way.startswith("worker killed"):
+            if way.endswith("keeper frozen"):
+                kill(map(parent, set(workers)), signal.SIGSTOP)
             kill(set(workers))
         elif way == "node stopped":
             assert await asyncio.to_thread(nodes.stop) == {"left": 0, "right": 0}
@@ -167,22 +172,27 @@ async def test_a_copy_that_returns_from_the_action_does_nothing_more(
     )
 
 
-async def test_a_stopped_worker_is_killed_at_the_deadline(own_nodes: Nodes) -> None:
+@pytest.mark.parametrize("deadline", [3.0, None], ids=["at its deadline", "without one"])
+async def test_a_stopped_worker_is_killed(own_nodes: Nodes, deadline: float | None) -> None:
     """The nodes are fresh, so their only worker is the one that runs the action."""
     async with operator_of(own_nodes.directory, "left", "right") as operator:
         for service, arguments, node, device in (
             ("nap", {"seconds": 60.0}, "left", ""),
             ("go", {"to": 90.0, "timeout": 60.0}, "left", "slide"),
         ):
-            running = asyncio.create_task(operator.call(service, 3.0 * DEADLINE, **arguments))
+            running = asyncio.create_task(operator.call(service, deadline, **arguments))
             async with asyncio.timeout(60.0):
                 while "actions" not in (found := await pids(operator, node, device)):
                     await passing(0.05)
             await passing(0.3)  # until its action runs
             os.kill(found["actions"], signal.SIGSTOP)
             end = await running
-            assert (end.cause, end.executed) == ("deadline", "yes"), end
-            assert "answered nothing" in end.text
+            if deadline is None:
+                assert (end.cause, end.executed) == ("worker_died", "unknown"), end
+                assert "did not answer for 5 s" in end.text
+            else:
+                assert (end.cause, end.executed) == ("deadline", "yes"), end
+                assert "answered nothing" in end.text
         assert (await operator.call("go", 60.0, to=0.0, timeout=50.0)).status == "success"
 
 
@@ -203,13 +213,21 @@ async def test_a_blocking_and_a_crashing_action_end_only_their_runs(operator: Op
     assert [(await nap).status for nap in naps] == ["success"] * 3
 
 
+async def served(operator: Operator, service: str, limit: float, **arguments: Any) -> Outcome:
+    """Call until a worker takes the call: on a busy host none may become free in time."""
+    tries = Limit("a free worker")
+    while (end := await operator.call(service, limit, **arguments)).cause == "busy":
+        assert end.executed == "no" and tries.left()
+    return end
+
+
 async def test_many_calls_at_once_run_once_each_beside_blocking_and_crashing_ones(
     operator: Operator, tmp_path: Path
 ) -> None:
     """Many calls at once queue in few workers. None may be lost there, run twice, or end because of
     the one before it."""
     file = tmp_path / "lines"
-    bad: dict[int, tuple[str, float, dict[str, float]]] = {
+    bad: dict[int, tuple[str, float, dict[str, Any]]] = {
         5: ("block", DEADLINE, {"seconds": 30.0}),
         20: ("segfault", 20.0, {}),
         30: ("nap", 20.0, {"seconds": 1.0}),
@@ -222,9 +240,8 @@ async def test_many_calls_at_once_run_once_each_beside_blocking_and_crashing_one
             service, limit, arguments = bad.get(number, ("write_down", 20.0, {}))
             line = f"{batch} {number}"
             if service == "write_down":
-                calls.append(operator.call(service, limit, file=str(file), line=line))
-            else:
-                calls.append(operator.call(service, limit, **arguments))
+                arguments = {"file": str(file), "line": line}
+            calls.append(served(operator, service, limit, **arguments))
         ends = await asyncio.gather(*calls)
         good = [end for number, end in enumerate(ends) if number not in bad]
         assert not [end for end in good if end.status != "success"]

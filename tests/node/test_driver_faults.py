@@ -284,15 +284,13 @@ async def test_events_that_a_subscriber_never_stores_are_dropped_and_shown(
         await client.close()
 
 
-async def test_a_driver_that_blocks_is_named_at_the_deadline(
-    node: OneNode, operator: Operator, capsys: pytest.CaptureFixture[str]
-) -> None:
-    running = asyncio.create_task(operator.call("good", 2.5, send=[{"block": 5.0}], seconds=60.0))
-    shown, limit = "", Limit("the command to say that the driver does not answer")
-    while "no answer" not in shown and limit.left():
-        assert not running.done(), shown
-        await asyncio.to_thread(main, ["nodes", "--services", str(node.file)])
-        shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+async def test_a_driver_that_blocks_is_named_at_the_deadline(operator: Operator) -> None:
+    running = asyncio.create_task(operator.call("good", 2.5, send=[{"block": 4.0}], seconds=60.0))
+    said, limit = "", Limit("the node to say that the driver does not answer")
+    while said != "no answer" and limit.left():
+        assert not running.done(), said
+        answer = await operator.command("only", "status", "the_good")
+        said = answer.data["answers"]["the_good"]
     end = await running
     assert end.cause == "deadline" and "the driver has published nothing for" in end.text, end
     await works(operator, "good")
@@ -300,7 +298,7 @@ async def test_a_driver_that_blocks_is_named_at_the_deadline(
 
 async def test_a_driver_that_takes_no_commands(operator: Operator) -> None:
     """The action returns at once, before the driver could refuse its last command."""
-    end = await operator.call("good", None, send=[{"block": 4.0}, {"go": True}])
+    end = await operator.call("good", None, send=[{"block": 3.5}, {"go": True}])
     assert (end.status, end.cause) == ("error", "command_not_taken"), end
     await works(operator, "good")
 

@@ -17,9 +17,9 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.cli import main
-from petrobot.services.comm.protocol.messages import Command
+from petrobot.services.comm.protocol.messages import Command, Ping
 from petrobot.services.host.emergency_latch import ALL, Latch, latch_of
-from petrobot.services.node.emergency_stops import AGAIN, BEAT, GUARD_LOOK, SILENCE, Guard
+from petrobot.services.node.emergency_stops import AGAIN, GUARD_LOOK, SILENCE, Guard
 from petrobot.services.worker.device_process import DeviceLoop
 from petrobot.services.worker.pipe import Pipe
 from petrobot.services.worker.remote import EMERGENCY_STOP, NODE_SILENT
@@ -297,7 +297,7 @@ class Watched(Process):
         found: list[list[Any]] = []
 
         def look() -> list[Any]:
-            self.node.post([BEAT])
+            self.node.post(Ping(1))
             state = link.newest()
             found.extend([state] if state is not None and fits(state) else [])
             time.sleep(GUARD_LOOK)

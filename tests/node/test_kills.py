@@ -1,5 +1,5 @@
-"""Processes of a cyclic device are killed at random moments, under load: each time the device
-starts again and accepts runs."""
+"""Processes of a cyclic device are killed, frozen or made to hang at random moments, under load:
+each time the device starts again and accepts runs."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ from typing import Any
 
 import pytest
 
+from petrobot.coordinator.cli import main
+from petrobot.services.node.worker_host import HUNG
 from tests import processes
 from tests.node.test_processes import ROOT, Nodes, Operator, operator_of, pids
 from tests.processes import alive
@@ -27,8 +29,15 @@ from tests.processes import alive
 pytestmark = pytest.mark.processes
 RECOVERY = 60.0
 """Seconds within which the device must be up again on a busy host."""
-HOWS = ("SIGKILL", "SIGSEGV", "SIGSTOP, then SIGKILL")
+KILLS = ("SIGKILL", "SIGSEGV", "SIGSTOP, then SIGKILL")
+HANGS = ("SIGSTOP", "SIGSTOP with their keepers", "a loop in step")
 VICTIMS = (("driver",), ("actions",), ("driver", "actions"))
+DEADLINE = 4.0
+"""Deadline of a run whose own process may be frozen (s): nothing else ends it."""
+ENDS = {(cause, "unknown") for cause in ("device_died", "worker_died", "deadline")}
+ENDS |= {("deadline", "yes"), ("deadline", "no")}  # no: its process was being started
+"""Causes with which a run may end whose device was killed, with what it says about execution."""
+LOOP = HANGS[-1]
 LINK = ("lost", "unreachable", "not_accepted")
 CALLS = 10
 """Calls that must succeed after each kill."""
@@ -54,6 +63,10 @@ class Tally:
     """Counts of kills and calls, and their results."""
 
     kills: dict[str, int] = field(default_factory=dict)
+    ends: set[tuple[str, str]] = field(default_factory=set)
+    """Cause and executed of the runs that did not succeed because of a kill."""
+    told: set[str] = field(default_factory=set)
+    """Their texts, if their driver died."""
     calls: int = 0
     links: int = 0
     """Calls during which the link to the node was lost, because the host was so busy that this
@@ -68,13 +81,23 @@ async def up(operator: Operator, former: set[int]) -> bool:
     return answer.data.get("answers") == {"slide": "up"} and former.isdisjoint(found.values())
 
 
-async def kill(operator: Operator, chance: random.Random, tally: Tally) -> set[int]:
-    """Kill one process of the device or both in one of the ways; return which."""
+async def kill(
+    operator: Operator,
+    node: int,
+    chance: random.Random,
+    tally: Tally,
+    how: str,
+    chosen: tuple[str, ...],
+) -> set[int]:
+    """Kill, freeze or hang the chosen processes of the device; return which."""
     status = await operator.command("left", "status", "slide")
     found = status.data.get("devices", {}).get("slide", {}).get("pids", {})
-    chosen, how = chance.choice(VICTIMS), chance.choice(HOWS)
     victims = {found[name] for name in chosen if name in found}
-    for name in how.split(", then "):
+    signals, _, keepers = how.partition(" with their ")
+    if keepers:  # not the node: until a worker has reported its id, that of its keeper stands there
+        above = set(map(processes.parent, victims)) - {node}
+        processes.kill(above, signal.SIGSTOP)
+    for name in signals.split(", then ") if how != LOOP else ():
         processes.kill(victims, getattr(signal, name))
         if name == "SIGSTOP":
             await passing(chance.uniform(0.0, 0.3))
@@ -88,11 +111,12 @@ async def passing(seconds: float) -> None:
     await asyncio.to_thread(select.select, [], [], [], seconds)
 
 
-async def storm(folder: Path, seed: int, kills: int) -> Tally:
+async def storm(folder: Path, seed: int, kills: int, hows: tuple[str, ...] = KILLS) -> Tally:
     """Kill so many times. After each kill, except those during a restart, all calls must
     succeed."""
     chance, tally = random.Random(seed), Tally()
     running = Nodes(folder, "left")
+    node = running.processes["left"].pid
     try:
         with load():
             async with operator_of(running.directory, "left") as operator:
@@ -100,12 +124,22 @@ async def storm(folder: Path, seed: int, kills: int) -> Tally:
                 number = -1
                 while sum(tally.kills.values()) < kills:
                     number += 1
+                    chosen, how = chance.choice(VICTIMS), chance.choice(hows)
+                    chosen = ("driver",) if how == LOOP else chosen
+                    moment = chance.uniform(0.0, 0.4)
+                    limit = DEADLINE if how in HANGS and "actions" in chosen else None
+                    to = chance.uniform(-2.0, 2.0)
                     moving = asyncio.create_task(
-                        operator.call("go", to=chance.uniform(-2.0, 2.0), timeout=30.0)
+                        operator.call("loop", after=moment)
+                        if how == LOOP
+                        else operator.call("go", limit, to=to, timeout=30.0)
                     )
-                    await passing(chance.uniform(0.0, 0.4))
-                    killed |= await kill(operator, chance, tally)
-                    await moving
+                    await passing(moment)
+                    killed |= await kill(operator, node, chance, tally, how, chosen)
+                    end = await moving
+                    if end.status != "success" and end.cause not in LINK:
+                        tally.ends.add((end.cause, end.executed))
+                        tally.told |= {end.text} if end.cause == "device_died" else set()
                     if chance.random() < WRONG_HASTE and sum(tally.kills.values()) < kills:
                         continue
                     try:
@@ -137,6 +171,24 @@ async def test_a_device_survives_kills_of_its_processes(tmp_path: Path) -> None:
     assert not tally.wedged and tally.links < CALLS and tally.calls >= 5 * CALLS, tally
 
 
+async def test_a_device_survives_hangs_of_its_processes(tmp_path: Path) -> None:
+    await hang(tmp_path, 7, 4)
+
+
+@pytest.mark.proof
+async def test_a_device_survives_sixty_hangs_of_its_processes(tmp_path: Path) -> None:
+    await hang(tmp_path, 13, 60)
+
+
+async def hang(folder: Path, seed: int, times: int) -> None:
+    tally = await storm(folder, seed, times, HANGS)
+    print(tally)
+    assert not tally.wedged and tally.links < CALLS and tally.ends <= ENDS, tally
+    says = f"it did not answer for {HUNG:g} s, and was killed"
+    assert tally.told and all(says in text for text in tally.told), tally
+    assert f"of slide: {says}" in (folder / "left.log").read_text()
+
+
 @pytest.mark.proof
 async def test_a_device_survives_two_hundred_kills_of_its_processes(tmp_path: Path) -> None:
     tally = await storm(tmp_path, 11, 200)
@@ -144,29 +196,36 @@ async def test_a_device_survives_two_hundred_kills_of_its_processes(tmp_path: Pa
     assert not tally.wedged and tally.links < CALLS, tally
 
 
-async def test_petrobot_nodes_says_up_only_if_a_call_would_be_accepted(tmp_path: Path) -> None:
+async def test_petrobot_nodes_says_up_only_if_a_call_would_be_accepted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A driver is frozen meanwhile: its node kills it and starts it again."""
     running = Nodes(tmp_path, "left")
     try:
         async with operator_of(running.directory, "left") as operator:
             assert (await asyncio.to_thread(nodes_command, running.file))["left"]["up"]
             driver = (await pids(operator, "left", "slide"))["driver"]
             os.kill(driver, signal.SIGSTOP)
-            frozen = (await asyncio.to_thread(nodes_command, running.file))["left"]
-            assert (frozen["up"], frozen["not_ready"]) == (False, {"slide": "no answer"})
-            os.kill(driver, signal.SIGKILL)
             seen = set()
 
             async def up_again() -> bool:
-                left = (await asyncio.to_thread(nodes_command, running.file))["left"]
-                seen.update(left.get("not_ready", {}).values())
-                return (
-                    bool(left["up"]) and (await pids(operator, "left", "slide"))["driver"] != driver
-                )
+                left = (await operator.command("left", "status", "slide")).data
+                said, about = left["answers"]["slide"], left["devices"].get("slide", {})
+                seen.add(f"{said}: {about.get('text', '')}")
+                return said == "up" and bool(about["pids"]["driver"] != driver)
 
             await operator.until(up_again, RECOVERY)
             assert (await operator.call("go", to=0.0)).status == "success"
-            told = "restarting: the process of its driver died: it was ended by SIGKILL"
-            assert seen <= {told, "no answer", "not ready: " + told.partition(": ")[2]}, seen
+            why = (
+                f"the process of its driver died: it did not answer for {HUNG:g} s, and was killed"
+            )
+            assert "no answer: " in seen
+            assert seen <= {"no answer: ", f"restarting: {why}", f"not ready: {why}", "up: "}, seen
+            monkeypatch.setenv("COLUMNS", "400")
+            services = ["--services", str(running.file)]
+            assert await asyncio.to_thread(main, ["nodes", *services]) == 3
+            shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+            assert f"started again 1 times, last because {why}" in shown, shown
     finally:
         running.stop()
 
@@ -210,7 +269,6 @@ async def test_a_killed_or_frozen_keeper_costs_only_its_worker(tmp_path: Path, h
                 hanging = [operator.call("hang", 1.0), operator.call("hang_moving", 1.0)]
                 assert [end.cause for end in await asyncio.gather(*hanging)] == ["deadline"] * 2
                 processes.kill(workers)
-                processes.kill(keepers, signal.SIGCONT)
             await operator.until(partial(up, operator, workers), RECOVERY)
             assert (await operator.call("go", to=0.0)).status == "success"
             assert (await operator.call("add", a=1)).values == {"sum": 2}

@@ -78,6 +78,7 @@ run = "toy_cell.actions:slow_service"
 [actions]
 go = {{ run = "toy_cell.actions:go", task = "move", device = "slide" }}
 follow = {{ run = "toy_cell.actions:follow", task = "move", device = "slide" }}
+loop = {{ run = "toy_cell.actions:loop", task = "move", device = "slide" }}
 hang_moving.run = "toy_cell.actions:hang_moving"
 hang_moving.task = "move"
 hang_moving.device = "slide"

@@ -23,8 +23,10 @@ from petrobot.services.comm.protocol.messages import (
     Ping,
     Pong,
 )
+from petrobot.services.node.emergency_stops import BEAT_EVERY
 from petrobot.services.node.inline_host import HOLD, RELEASE, answer_of
 from petrobot.services.node.worker_host import (
+    HUNG,
     MARGIN,
     NEXT,
     NOT_READY,
@@ -76,7 +78,7 @@ class FakeChild:
         self.pid = id(self) % 10_000
         self.got: list[Any] = []
         self.passed: list[socket.socket] = []
-        self.killed = self.left = False
+        self.killed = self.left = self.unsent = self.frozen = False
 
     def say(self, item: Item) -> None:
         self._heard(self, [item])
@@ -88,8 +90,11 @@ class FakeChild:
         self.given += 1
         self.post(call)
 
+    def not_begun(self) -> int:
+        return max(0, self.given - self.begun)
+
     def take_back(self) -> int:
-        count = max(0, self.given - self.begun)
+        count = self.not_begun()
         self.given -= count
         return count
 
@@ -256,7 +261,7 @@ def test_a_run_that_does_not_end_at_its_deadline(answers: bool) -> None:
     bench.run(1.0)
     assert actions.orders()[-1] == Cancel("r", "deadline: late") and type(actions.got[-1]) is Ping
     if answers:
-        actions.say(Pong(1))
+        actions.say(Pong(actions.got[-1].number))
     bench.run(SILENT + 0.01)
     assert (Command("halt", "halt") in driver.got) == (not answers), "the device is stopped first"
     patience = GRACE + STOP_LIMIT + MARGIN if answers else GRACE
@@ -399,6 +404,116 @@ def test_closing_ends_all_children() -> None:
     assert len(bench.children) == 2
 
 
+def beats(bench: HostBench, seconds: float, *frozen: FakeChild) -> None:
+    """Let the node ping its processes meanwhile; all but the frozen ones answer."""
+    until = bench.clock.now + seconds
+    while bench.clock.now < until:
+        bench.run(BEAT_EVERY)
+        bench.place.beat(bench.clock.now)
+        for child in bench.children:
+            pings = [item for item in child.got if isinstance(item, Ping)]
+            if pings and not child.dead and child not in frozen:
+                child.say(Pong(pings[-1].number))
+
+
+@pytest.mark.parametrize(
+    "run", ["no run", "a run", "a run in a stopped process", "a run that has not begun"]
+)
+@pytest.mark.parametrize("victim", ["driver", "actions", "only"])
+def test_a_process_that_must_answer_and_does_not_is_killed(victim: str, run: str) -> None:
+    """All but one in which the code of a run may take long."""
+    bench = Bench()
+    if victim == "only":
+        bench.children[0].ready()
+    else:
+        bench.cyclic()
+    frozen = bench.children[0 if victim == "driver" else -1]
+    beats(bench, 10 * HUNG)
+    if run != "no run":
+        bench.begin()
+        bench.children[-1].begun = int(run != "a run that has not begun")
+        bench.children[-1].frozen = run == "a run in a stopped process"
+    beats(bench, HUNG - 2 * BEAT_EVERY, frozen)
+    assert not any(child.killed for child in bench.children)
+    beats(bench, 4 * BEAT_EVERY, frozen)
+    killed = victim == "driver" or run != "a run"
+    assert [child.killed for child in bench.children] == [
+        killed and child is frozen for child in bench.children
+    ]
+
+
+def test_a_driver_that_hangs_is_replaced_and_its_successor_stops_the_device() -> None:
+    bench = Bench()
+    driver, _ = bench.cyclic()
+    bench.begin()
+    beats(bench, HUNG + 2 * BEAT_EVERY, driver)
+    driver.die()
+    bench.run(0.0)
+    assert (bench.ended().cause, bench.ended().executed) == ("device_died", "unknown")
+    bench.cyclic()
+    assert bench.children[-2].commands() == [Command("", "stop")] and not driver.commands()
+    bench.place.command(bench.clock.now, Command("s", "status"))
+    bench.children[-2].say(answer_of("s", "up", {}))
+    (status,) = [r for r in bench.run(0.0) if isinstance(r, Answer)]
+    assert (status.data["answer"], status.data["restarts"]) == ("up", 1)
+    assert status.data["last_death"] == "the process of its driver died: it was ended by SIGTEST"
+
+
+def test_a_process_that_survives_its_kill_is_killed_again_and_has_no_successor() -> None:
+    """Nothing can end a process that hangs in the kernel: its device must not get two drivers."""
+    bench = Bench()
+    driver, _ = bench.cyclic()
+    for _ in range(3):
+        driver.killed = False
+        beats(bench, HUNG + 2 * BEAT_EVERY, driver)
+        assert driver.killed and len(bench.children) == 2
+
+
+def test_a_driver_with_a_long_period_answers_once_in_a_period() -> None:
+    bench = Bench()
+    driver = bench.children[0]
+    driver.ready(4.0)
+    bench.children[-1].ready()
+    beats(bench, HUNG + 4.0, driver)
+    assert not driver.killed
+    beats(bench, 8.0, driver)
+    assert driver.killed
+
+
+def test_a_node_that_stood_still_does_not_kill_its_processes() -> None:
+    """What they answered meanwhile is still unread."""
+    bench = Bench()
+    children = bench.cyclic()
+    beats(bench, 1.0)
+    for _ in range(10):
+        bench.run(2 * HUNG)
+        beats(bench, HUNG - 2 * BEAT_EVERY, *children)
+    assert not any(child.killed for child in children)
+
+
+def test_a_process_that_is_being_started_need_not_answer() -> None:
+    bench = Bench()
+    beats(bench, START_LIMIT - 1.0, *bench.children)
+    assert not any(child.killed for child in bench.children)
+    bench.children[0].ready(0.004)
+    actions = bench.children[-1]
+    beats(bench, START_LIMIT - 1.0, actions)
+    assert not any(child.killed for child in bench.children)
+
+
+def test_an_answer_to_an_earlier_ping_does_not_say_that_a_run_was_told_to_stop() -> None:
+    bench = Bench()
+    driver, actions = bench.cyclic()
+    bench.place.beat(bench.clock.now)
+    before = actions.got[-1].number
+    bench.begin(deadline=1.0)
+    bench.run(1.0)
+    actions.say(Pong(before))
+    driver.say(Pong(before + 100))
+    bench.run(SILENT + 0.01)
+    assert Command("halt", "halt") in driver.got
+
+
 class Storm:
     """A worker host under events in any order, with a record of its runs and its processes."""
 
@@ -466,7 +581,16 @@ class Storm:
             drivers[-1].say(answer_of("halt1", "stopped", {}))
         elif act == "wait":
             bench.run(1.5)
+        elif act == "beats":
+            self.beat(2.0)
         bench.run(0.0)
+
+    def beat(self, seconds: float) -> None:
+        """Let time pass; a process that begins nothing is frozen, which pings show."""
+        if frozen := [child for child in self.living() if child.begun == 0]:
+            beats(self.bench, seconds, *frozen)
+        else:
+            self.bench.run(seconds)
 
     def kill_the_killed(self) -> None:
         for child in self.living():
@@ -480,7 +604,7 @@ class Storm:
             self.kill_the_killed()
             for child in self.living():
                 self.make_ready(child)
-            self.bench.run(2.0)
+            self.beat(2.0)
 
     def ends_well(self) -> None:
         """Check that the host is ready and accepts a run, and that each accepted run has ended
@@ -516,6 +640,7 @@ ACTS = (
         "garbage",
         "failed",
         "nothing begun",
+        "beats",
         "hold",
         "release",
         "status",

@@ -3,7 +3,11 @@ one, and nothing runs twice."""
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
+import sys
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -20,14 +24,16 @@ from petrobot.coordinator.launch import (
     resumed_mission,
     with_runs,
 )
+from petrobot.coordinator.run.folder import JOURNAL
 from petrobot.coordinator.run.journal import JournalWriter, read_journal
 from petrobot.coordinator.run.lockstep import CoordinatorParty
 from petrobot.coordinator.run.mission import Mission
-from petrobot.coordinator.run.recording import JournalStore, ReplayError, replay
+from petrobot.coordinator.run.recording import JournalStore, ReplayError, origin_of, replay
 from petrobot.coordinator.task import Status, Task
 from petrobot.services.action import Status as ActionStatus
 from petrobot.services.comm.lockstep.cell import LockStepCell
 from petrobot.services.scripted import ScriptedRun
+from tests.ports import free_ports
 from tests.run.scripted_cell import directory_for, scripts
 
 LINES = {
@@ -225,3 +231,55 @@ def test_replay_computes_every_marking_again(catch_ball: Task, tmp_path: Path) -
     other, _ = with_runs(catch_ball, RUNS - 1)
     with pytest.raises(ReplayError, match=r"record \d+ \(Begin\)"):
         list(replay(journal, Engine(other)))
+
+
+@pytest.mark.parametrize(
+    ("same_boot", "wall", "reads"),
+    [
+        (True, 60.0, 160.0),
+        (True, -86_400.0, 160.0),
+        (False, 60.0, 60.0),
+        (False, -86_400.0, 7.0),
+        (False, 2.0, 7.0),
+    ],
+    ids=["same boot", "clock set back", "another boot", "a lost clock", "a clock that is behind"],
+)
+def test_the_journals_clock_never_runs_backwards(
+    monkeypatch: pytest.MonkeyPatch, same_boot: bool, wall: float, reads: float
+) -> None:
+    """Whatever the host's time of day was set to before the run is resumed; 7 s is the time of the
+    last record."""
+    monkeypatch.setattr("petrobot.coordinator.run.recording._host_boot", lambda: "now")
+    monkeypatch.setattr(time, "time", lambda: 5_000.0 + wall)
+    clock = {"monotonic": 40.0, "host_boot": "now" if same_boot else "before", "unix": 5_000.0}
+    now = 200.0
+    assert now - origin_of({"mode": "realtime", "clock": clock}, now, 7.0) == reads
+
+
+JUMPS = """\
+import random
+import time
+
+_real = time.time
+time.time = lambda: _real() + random.choice((-86400.0, -7200.0, 0.0, 7200.0, 86400.0))
+"""
+
+
+@pytest.mark.processes
+def test_a_run_does_not_notice_that_the_time_of_day_jumps(tmp_path: Path) -> None:
+    """By hours, at every reading, in the coordinator and in all processes of its node."""
+    (tmp_path / "sitecustomize.py").write_text(JUMPS)
+    program = [sys.executable, "-m", "petrobot.coordinator"]
+    subprocess.run([*program, "new", "robot", "carrier"], cwd=tmp_path, check=True)
+    folder, port = tmp_path / "carrier", free_ports(1)[0]
+    cell = folder / "services.toml"
+    cell.write_text(cell.read_text().replace("port = 7501", f"port = {port}"))
+    run = [*program, "run", "carrier.toml", "--up", "--no-page", "--json", "out.json"]
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{folder}"}
+    ended = subprocess.run(run, cwd=folder, env=environment, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    result = json.loads((folder / "out.json").read_text())
+    assert result["status"] == "success" and 3.0 < result["sim_s"] < 600.0
+    journal = read_journal(next((folder / "runs").glob(f"*/{JOURNAL}")))
+    times = [r.data["t"] for r in journal.records if "t" in r.data]
+    assert len(times) > 20 and times == sorted(times)

@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 
+from petrobot.coordinator.cli import main
 from petrobot.coordinator.launch import local_programs
 from petrobot.coordinator.operator.emergency_stop import still_stopped
 from petrobot.coordinator.operator.run_address import find_address
@@ -25,7 +26,6 @@ from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.services.comm.canopen.cia301 import NmtState
 from petrobot.services.comm.canopen.cia402 import DriveState
 from petrobot.services.comm.location_file import Directory
-from tests.node.conftest import OUTSIDE
 from tests.node.test_processes import Nodes, operator_of, pids
 from tests.security.arm_cell import DRIVES, ROOT, Ear, cell_in, ear_on
 from tests.waiting import Limit, beat
@@ -220,17 +220,44 @@ async def test_a_stop_remains_after_its_node_is_killed(tmp_path: Path, answers: 
         await cell.sweep()
 
 
-async def test_estop_names_a_device_whose_driver_hangs(tmp_path: Path) -> None:
-    """Its node answers, but nothing has stopped the device: exit code 3."""
+async def test_estop_names_a_device_whose_driver_hangs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its node answers, but nothing has stopped the device: exit code 3. The driver that replaces
+    it is stopped from its start, and then the exit code is 0."""
     nodes = Nodes(tmp_path, "left", "right")
     command = ["estop", "--services", str(nodes.file), "--journal", str(tmp_path)]
     try:
-        assert (await finished(petrobot(*command, PYTHONPATH=f"{ROOT}:{OUTSIDE}")))[0] == 0
+        assert await asyncio.to_thread(main, command) == 0
+        capsys.readouterr()
         async with operator_of(nodes.directory, "left") as operator:
             os.kill((await pids(operator, "left", "slide"))["driver"], signal.SIGSTOP)
-        code, out, _ = await finished(petrobot(*command, PYTHONPATH=f"{ROOT}:{OUTSIDE}"))
-        assert code == 3 and "NOT KNOWN TO STAND STILL: slide; press the hardware's" in out, out
-        assert "eye" in out and "eye;" not in out
+            assert await asyncio.to_thread(main, command) == 3
+            out = capsys.readouterr().out
+            assert "NOT KNOWN TO STAND STILL: slide; press the hardware's" in out, out
+            assert "eye" in out and "eye;" not in out
+            limit = Limit("its successor to be in emergency stop")
+            while await asyncio.to_thread(main, command) and limit.left():
+                await beat(0.1)
+            assert "slide        stopped" in capsys.readouterr().out
+            refused = await operator.call("go", to=1.0)
+            assert (refused.cause, refused.executed) == ("emergency_stop", "no")
+    finally:
+        nodes.stop()
+
+
+async def test_estop_says_that_a_stop_is_not_stored(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The devices are stopped, but a restarted node would not know it: exit code 3."""
+    monkeypatch.setenv("PETROBOT_STATE", "/proc/none")  # nothing can be written there
+    nodes = Nodes(tmp_path, "left", "right")
+    command = ["estop", "--services", str(nodes.file), "--journal", str(tmp_path), "--json", "-"]
+    try:
+        assert await asyncio.to_thread(main, command) == 3
+        (left,) = [n for n in json.loads(capsys.readouterr().out)["nodes"] if n["node"] == "left"]
+        assert left["devices"] == {"slide": "stopped"} and "NOT STORED" in left["note"], left
+        assert "could not be stored: /proc/none" in (tmp_path / "left.log").read_text()
     finally:
         nodes.stop()
 

@@ -66,7 +66,7 @@ def test_a_stop_that_cannot_be_stored_is_reported_and_still_holds(tmp_path: Path
     with pytest.raises(LatchError, match="Not a directory"):
         nowhere.stop(["arm"])
     stops = EmergencyStops(DEVICES, nowhere)
-    assert "will not outlive a restart" in stops.stop(["arm"]) and "arm" in stops
+    assert "NOT STORED" in stops.stop(["arm"]) and "arm" in stops
     stuck = latch(tmp_path)
     stuck.paths[0].mkdir(parents=True)
     stops = EmergencyStops(DEVICES, stuck)

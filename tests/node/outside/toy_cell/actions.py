@@ -84,6 +84,15 @@ async def go(ctx: Context, *, to: float, timeout: float = 5.0) -> Result:
     return success(position=ctx.device.state["position"]) if there else failure("slow")
 
 
+async def loop(ctx: Context, *, after: float) -> Result:
+    """Move the slide, and let its driver hang after so many seconds."""
+    ctx.device.send({"to": 90.0})
+    await ctx.sleep(after)
+    ctx.device.send({"loop": True})
+    await ctx.sleep(60.0)
+    return success()
+
+
 async def follow(ctx: Context, *, seconds: float) -> Result:
     """Let the slide follow the stream for a while."""
     ctx.device.send({"follow": True})

@@ -27,23 +27,28 @@ class Slide:
         self._following = False
         self._held = False
         self._cycles = 0
+        self._loops = False
         self._heard = 0
         self._stops = 0
         self._halted_by_age = 0
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """`{"to": x}`, `{"follow": true}` or `{"halt": true}`."""
+        """`{"to": x}`, `{"follow": true}`, `{"halt": true}`, or `{"loop": true}`: never return from
+        `step` again."""
+        self._loops = bool(body.get("loop"))
         if "to" in body:
             if abs(body["to"]) > 100:
                 raise ValueError(f"{body['to']} is beyond the rail; stay within 100 m")
             self._goal, self._following = float(body["to"]), False
-        elif body.get("halt"):
+        elif body.get("halt") or self._loops:
             self._goal, self._following = self.position, False
         else:
             self._following = bool(body["follow"])
 
     def step(self, now: float) -> None:
         """Move by one cycle."""
+        while self._loops:
+            pass
         self._cycles += 1
         if self._bus is not None:
             self._heard += len(self._bus.receive())
