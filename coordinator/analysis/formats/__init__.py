@@ -216,7 +216,8 @@ def _utf8(text: bytes, file: str) -> str:
     try:
         return text.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise NetFileError(file, "file", str(error), "give a UTF-8 file") from error
+        line = text.count(b"\n", 0, error.start) + 1
+        raise NetFileError(file, "file", str(error), "give a UTF-8 file", line=line) from error
 
 
 def _timed(model: NetFile) -> Gspn:
