@@ -6,16 +6,20 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element
 
 import pytest
 
+from petrobot.coordinator.analysis import formats
 from petrobot.coordinator.analysis.commands import (
     analyse_command,
     convert_command,
     simulate_command,
 )
-from petrobot.coordinator.analysis.formats import read_net
+from petrobot.coordinator.analysis.formats import pnml as formats_pnml
+from petrobot.coordinator.analysis.formats import read_net, tree
 from petrobot.coordinator.analysis.formats.netfile import NetFileError
+from petrobot.coordinator.analysis.formats.tree import local
 from petrobot.coordinator.analysis.net.coverability import coverability, find_pump
 from petrobot.coordinator.analysis.net.qualitative import examine
 from petrobot.coordinator.analysis.net.space import SearchLimits, explore
@@ -474,3 +478,69 @@ def test_a_reference_leads_to_a_node_of_its_kind(tmp_path: Path, reference: str,
 def test_a_comment_is_not_part_of_a_number(tmp_path: Path) -> None:
     noted = place("a", 1).replace(">1<", ">1<!--2-->3<")
     assert read_net(pnml(tmp_path, noted)).net.initial == (13,)
+
+
+def chained(size: int) -> str:
+    """Return a net with arcs and references in proportion to the size, the last ones first."""
+    nodes = "".join(place(f"p{i}", 1) + f'<transition id="t{i}"/>' for i in range(size))
+    references = "".join(
+        f'<referencePlace id="r{i}" ref="{f"r{i - 1}" if i else "p0"}"/>' for i in range(size)
+    )
+    last = "".join(arc(f"r{size - 1}", f"t{i}") for i in range(size))
+    return nodes + references + last
+
+
+def test_reading_a_file_takes_time_in_proportion_to_its_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Counted in steps: tags looked at, and references followed."""
+    steps = 0
+
+    class Counted(dict[str, str]):
+        def __getitem__(self, name: str) -> str:
+            nonlocal steps
+            steps += 1
+            return super().__getitem__(name)
+
+    def counted(element: Element) -> str:
+        nonlocal steps
+        steps += 1
+        return local(element)
+
+    end_of = formats_pnml._end_of
+
+    def followed(references: dict[str, str], name: str) -> str | None:
+        watched = Counted(references)
+        found = end_of(watched, name)
+        references.update(watched)
+        return found
+
+    monkeypatch.setattr(tree, "local", counted)
+    monkeypatch.setattr(formats_pnml, "_end_of", followed)
+    taken = []
+    for size in (50, 400):
+        steps = 0
+        path = pnml(tmp_path, chained(size))
+        target = tmp_path / "again.pnml"
+        assert convert_command(path, target, load).code == 0
+        assert read_net(target).net == read_net(path).net
+        taken.append(steps)
+    assert taken[1] < 12 * taken[0]
+
+
+def test_a_chain_without_an_end_is_not_followed_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Writing a chain searches for all markings, within limits."""
+    assert formats.LARGEST_CHAIN.states is not None and formats.LARGEST_CHAIN.memory is not None
+    monkeypatch.setattr(formats, "LARGEST_CHAIN", SearchLimits(states=1000))
+    path, rates = tmp_path / "grows.pnpro", tmp_path / "grows.drn"
+    path.write_text(
+        '<project><gspn name="g"><nodes><place name="p" x="0" y="0"/><transition name="t" '
+        'type="EXP" nservers="1" x="1" y="1"/></nodes><edges><arc kind="OUTPUT" tail="t" head="p"/>'
+        "</edges></gspn></project>",
+        encoding="utf-8",
+    )
+    outcome = convert_command(path, rates, load)
+    assert outcome.code == 2 and "the search stopped: limit of 1000" in outcome.text
+    assert not rates.exists()

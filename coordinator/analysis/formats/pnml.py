@@ -497,13 +497,25 @@ class _PnmlReading:
 
     def _resolved(self, name: str, element: str) -> str:
         """Return the node at the end of a chain of references."""
-        seen = {name}
-        while name in self.references:
-            name = self.references[name]
-            if name in seen:
-                raise self.draft.fault(element, f"the references around {name!r} form a circle")
-            seen.add(name)
-        return name
+        found = _end_of(self.references, name)
+        if found is None:
+            raise self.draft.fault(element, f"the references around {name!r} form a circle")
+        return found
+
+
+def _end_of(references: dict[str, str], name: str) -> str | None:
+    """Return where a chain of references ends, None for a circle.
+
+    All on the way lead there directly afterwards, so that long chains are followed once.
+    """
+    passed = set[str]()
+    while name in references:
+        if name in passed:
+            return None
+        passed.add(name)
+        name = references[name]
+    references.update(dict.fromkeys(passed, name))
+    return name
 
 
 def _is_iso(root: Element, net: Element) -> bool:
@@ -658,7 +670,7 @@ class _PnmlWriting:
             self.element.tag[: self.element.tag.index("}") + 1] if "}" in self.element.tag else ""
         )
         self.references = {
-            node.get("id"): node.get("ref")
+            node.get("id") or "": node.get("ref") or ""
             for node in nodes(self.element)
             if local(node).startswith("reference")
         }
@@ -779,9 +791,7 @@ class _PnmlWriting:
                 SubElement(kinds, f"{self.prefix}text").text = "inhibitor"
 
     def _resolved(self, name: str | None) -> str:
-        while name in self.references:  # ends: the reader refused circles and missing ends
-            name = self.references[name]
-        return name or ""
+        return _end_of(self.references, name or "") or ""
 
 
 def _has(node: Element, tag: str) -> bool:

@@ -174,12 +174,15 @@ def children(element: Element, tag: str) -> Iterator[Element]:
 
 def label(element: Element, tag: str) -> str | None:
     """Return the text of a label (`<tag><text>..` or PIPE's `<tag><value>..`), or None."""
-    for child in children(element, tag):
-        for inner in child:
-            if local(inner) in ("text", "value"):
-                return _text(inner).strip()
-        return (child.get("value") or _text(child)).strip()
-    return None
+    return next((_said(child) for child in children(element, tag)), None)
+
+
+def _said(found: Element) -> str:
+    """Return the text of a label's element."""
+    for inner in found:
+        if local(inner) in ("text", "value"):
+            return _text(inner).strip()
+    return (found.get("value") or _text(found)).strip()
 
 
 def _text(element: Element) -> str:
@@ -211,7 +214,7 @@ def check(file: str, node: Element, known: Vocabulary, what: str) -> list[str]:
         if not tag:
             continue
         rule = known.children.get(tag)
-        text = label(node, tag) or ""
+        text = "" if rule is None or isinstance(rule, str) else _said(child)
         notes += _judged(file, child, what, f"element <{tag}>", text, rule, known.children)
         if rule is not READ and not isinstance(rule, Only):
             continue
