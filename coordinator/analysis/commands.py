@@ -471,6 +471,9 @@ def convert_command(
         write_whole(target, text)
     except (NetFileError, NoEstimate, ValueError, OverflowError) as error:
         return CommandResult(BAD_INPUT, _named(source, error), {"error": _named(source, error)})
+    except MemoryError:
+        told = f"{source}: the memory was used up; the net is too large for {target.suffix}"
+        return CommandResult(BAD_INPUT, told, {"error": told})
     except OSError as error:
         return CommandResult(
             BAD_INPUT,

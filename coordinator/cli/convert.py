@@ -15,6 +15,8 @@ from petrobot.coordinator.cli.loading import (
 )
 
 EXAMPLE = "petrobot convert catch_ball catch_ball.pnml"
+MEMORY = 2 << 30
+"""The most bytes of a conversion: a chain (`.drn`) may be far larger than its net."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,16 +55,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Convert the file, and list what could not be kept."""
     from petrobot.coordinator.analysis.commands import convert_command
-    from petrobot.coordinator.cli.analyse import give
+    from petrobot.coordinator.cli.analyse import bounded_memory, give
     from petrobot.coordinator.task.file import load
 
-    found = convert_command(
-        task_path(options.source),
-        options.target,
-        load,
-        view=options.view,
-        exact=options.exact,
-        measure=measurements(options.estimates),
-        cell_of=cell_finder(options.services, options.source),
-    )
+    with bounded_memory(MEMORY):
+        found = convert_command(
+            task_path(options.source),
+            options.target,
+            load,
+            view=options.view,
+            exact=options.exact,
+            measure=measurements(options.estimates),
+            cell_of=cell_finder(options.services, options.source),
+        )
     return give(found, options.json)

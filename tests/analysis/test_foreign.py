@@ -6,16 +6,20 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element
 
 import pytest
 
+from petrobot.coordinator.analysis import formats
 from petrobot.coordinator.analysis.commands import (
     analyse_command,
     convert_command,
     simulate_command,
 )
-from petrobot.coordinator.analysis.formats import read_net
+from petrobot.coordinator.analysis.formats import pnml as formats_pnml
+from petrobot.coordinator.analysis.formats import read_net, tree
 from petrobot.coordinator.analysis.formats.netfile import NetFileError
+from petrobot.coordinator.analysis.formats.tree import local
 from petrobot.coordinator.analysis.net.coverability import coverability, find_pump
 from petrobot.coordinator.analysis.net.qualitative import examine
 from petrobot.coordinator.analysis.net.space import SearchLimits, explore
@@ -273,3 +277,270 @@ def test_a_simulation_without_time_is_valid_json(tmp_path: Path) -> None:
     assert trapped["throughput"] is None and any(
         "time never passes" in note for note in trapped["notes"]
     )
+
+
+TAPAAL = (
+    '<pnml xmlns="http://www.informatik.hu-berlin.de/top/pnml/ptNetb">\n{before}'
+    '<net active="true" id="N" type="P/T net">\n'
+    '<place id="p" initialMarking="2" invariant="&lt; inf" name="p">{marking}</place>\n'
+    '<place id="q" initialMarking="0" invariant="&lt; inf" name="q">{sort}</place>\n'
+    '<transition id="t" name="t" player="0" priority="0" urgent="false" {stochastic}/>\n'
+    '<arc id="A1" inscription="[0,inf){pair}" source="p" target="t" {arc} weight="{weight}">'
+    '{dots}</arc>\n<arc id="A2" inscription="1" source="t" target="q" type="normal" weight="1"/>\n'
+    '</net><feature isColored="false" isGame="false"/></pnml>'
+)
+DOT_SORT = (
+    "<declaration><structure><declarations>{}</declarations></structure></declaration>\n"
+).format
+DOT = DOT_SORT('<namedsort id="dot" name="dot"><dot/></namedsort>')
+DOTS = "<{0}><text>{1}</text><structure><numberof/></structure></{0}>".format
+SORT = '<type><text>dot</text><structure><usersort declaration="dot"/></structure></type>'
+AS_SAVED = {
+    "before": "",
+    "marking": "",
+    "sort": "",
+    "stochastic": "",
+    "pair": "",
+    "arc": 'type="timed"',
+    "weight": "2",
+    "dots": "",
+}
+VERSION_4 = {
+    "before": DOT,
+    "marking": SORT + DOTS("hlinitialMarking", "(2'dot)"),
+    "sort": SORT,
+    "stochastic": 'distribution="uniform" a="0.5" b="1.5" firingMode="Oldest" weight="Infinity"',
+    "dots": DOTS("hlinscription", "2'dot"),
+}
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {},
+        VERSION_4,
+        {"before": '<constant name="N" value="2"/>\n', "weight": "N"},
+        {"pair": ":2", "arc": 'type="transport" transportID="2"'},
+    ],
+)
+def test_files_as_tapaal_saves_them(tmp_path: Path, more: dict[str, str]) -> None:
+    """Version 4 says each number again in colours, also in nets that have none."""
+    path = tmp_path / "net.tapn"
+    path.write_text(TAPAAL.format(**AS_SAVED | more), encoding="utf-8")
+    assert read_net(path).net == Net.build({"p": 2, "q": 0}, {"t": ({"p": 2}, {"q": 1})})
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (
+            {"before": DOT_SORT('<namedsort id="c"><cyclicenumeration/></namedsort>')},
+            r":2: declaration: it declares <cyclicenumeration>; it is a coloured net",
+        ),
+        (VERSION_4 | {"marking": DOTS("hlinitialMarking", "(3'dot)")}, "2 tokens, and 3 in col"),
+        (VERSION_4 | {"dots": DOTS("hlinscription", "1'dot")}, r"it has the weights \[1, 2\]"),
+        (VERSION_4 | {"dots": DOTS("hlinscription", "2'x")}, "2'x"),
+        ({"before": '<shared-place name="p"/>\n'}, ":2: pnml: element <shared-place> is not read"),
+        (
+            {"before": '<shared-place name="p"/><net id="M" type="P/T net"/>\n'},
+            "export the composed net",
+        ),
+        ({"before": '<constant name="N" value="x"/>\n'}, ":2: constant N: 'x' has no value"),
+    ],
+)
+def test_files_of_tapaal_that_say_more_than_a_net(
+    tmp_path: Path, more: dict[str, str], said: str
+) -> None:
+    path = tmp_path / "net.tapn"
+    path.write_text(TAPAAL.format(**AS_SAVED | more), encoding="utf-8")
+    with pytest.raises(NetFileError, match=said):
+        read_net(path)
+
+
+TINA_PNML = LOOP.replace(
+    '<transition id="t"/>',
+    '<transition id="t"><delay><interval xmlns="http://www.w3.org/1998/Math/MathML" '
+    'closure="{}"><cn>0</cn>{}</interval></delay></transition>',
+)
+TINA = "http://www.laas.fr/tina/tpn"
+
+
+def test_pnml_of_tina_with_endless_intervals(tmp_path: Path) -> None:
+    """Its net type is that of time Petri nets, also for nets without times."""
+    endless = pnml(tmp_path, TINA_PNML.format("closed-open", "<ci>infty</ci>"), TINA)
+    assert read_net(endless).net == read_net(pnml(tmp_path, LOOP)).net
+    with pytest.raises(NetFileError, match="<delay> is '04'; only untimed nets"):
+        read_net(pnml(tmp_path, TINA_PNML.format("closed", "<cn>4</cn>"), TINA))
+
+
+PROJECT = (
+    '<project name="P" version="121">\n'
+    '<gspn name="G" show-timed-cmd="false" view-rates="false" zoom="125"><nodes>\n'
+    '<place magnets="THREE_PER_SIDE" marking="N" name="p" x="6.0" y="5.0"/>\n'
+    '<transition delay="{delay}" {more} name="t" type="EXP" x="9.0" y="5.0"/>\n'
+    '<{kind} last-binding="3" name="N" type="INTEGER" {value} x="1.0" y="1.0"/></nodes>\n'
+    '<edges><arc broken="true" head="t" head-magnet="9" kind="INPUT" tail="p" tail-magnet="3"/>'
+    "</edges></gspn></project>"
+)
+
+
+def test_a_project_as_greatspn_saves_it(tmp_path: Path) -> None:
+    path = tmp_path / "net.PNPRO"
+    said = {"delay": "1.5", "more": "", "kind": "template", "value": 'value="2"'}
+    path.write_text(PROJECT.format(**said), encoding="utf-8")
+    model = read_net(path)
+    assert model.net == Net.build({"p": 2}, {"t": ({"p": 1}, {})})
+    assert model.gspn is not None and model.gspn.rate == (1.5,)
+    for change, words in (
+        ({"value": ""}, ":5: template N: it has no value"),
+        ({"delay": "0"}, ":4: rates: t: expected a positive, finite rate"),
+        ({"more": 'nservers="0"'}, ":4: rates: t: "),
+        ({"more": 'guard="#p &gt; 1"'}, ":4: .*guards are not read"),
+    ):
+        path.write_text(PROJECT.format(**said | change), encoding="utf-8")
+        with pytest.raises(NetFileError, match=words):
+            read_net(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "tr t a*2 b?3 -> c\ntr u c?-2 -> a*5\npl a (1K)\npl b (2)",
+        "tr t\ntr u\npl a (1K) u*5 -> t*2\npl b (2) -> t?3\npl c t -> u?-2",
+        "pl a (1K) u*5 -> t*2\npl b (2) -> t?3\npl c t -> u?-2",
+        "tr t [ 0 , w [ a*2 b?3 -> c\ntr u [0, w[ c?-2 -> a*5\npl a (1000)\npl b (1)\npl b (1)",
+    ],
+)
+def test_a_net_of_tina_is_the_sum_of_its_lines(tmp_path: Path, text: str) -> None:
+    """Arcs may stand in the lines of places, and spaces inside intervals."""
+    path = tmp_path / "net.net"
+    path.write_text(text, encoding="utf-8")
+    found = read_net(path).net
+    wanted = Net.build(
+        {"a": 1000, "b": 2, "c": 0},
+        {"t": ({"a": 2, "b": 3}, {"b": 3, "c": 1}), "u": ({}, {"a": 5})},
+        inhibitors={"u": {"c": 2}},
+    )
+    arcs = [
+        {(found.places[p], found.transitions[t], w) for t, row in enumerate(rows) for p, w in row}
+        for rows in (found.consume, found.produce, found.inhibit)
+    ]
+    assert dict(zip(found.places, found.initial, strict=True)) == {"a": 1000, "b": 2, "c": 0}
+    assert arcs == [
+        {(wanted.places[p], wanted.transitions[t], w) for t, row in enumerate(rows) for p, w in row}
+        for rows in (wanted.consume, wanted.produce, wanted.inhibit)
+    ]
+
+
+def test_large_numbers_of_tina(tmp_path: Path) -> None:
+    path = tmp_path / "net.net"
+    path.write_text("tr t p*2P -> q*1E\npl p (3E)\n", encoding="utf-8")
+    net = read_net(path).net
+    assert net.initial[0] == 3 * 10**18
+    assert net.consume == (((0, 2 * 10**15),),) and net.produce == (((1, 10**18),),)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("tr t p q\n", "net.net:1: transition t: no -> in its line"),
+        ("\npl p t -> u -> v\n", "net.net:2: place p: two -> in its line"),
+        ("pl p t?1 -> u\n", r"net.net:1: transition t: unknown arc 't\?1'"),
+        ("pl p (1) (<2)\n", "net.net:1: place p: unexpected '(<2)'"),
+        ("tr t a -> b\ntr a a -> b\n", "net.net:2: a: this id occurs twice"),
+        ("|0|\n|\n", "net.net:1: line: a line that begins with '|0|'; a net of TINA"),
+        ("tr t a -> b\npl {p\xe9}\n", "net.net:2: file: 'utf-8' codec"),
+    ],
+)
+def test_faults_of_a_tina_file_have_a_line(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "net.net"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(NetFileError) as raised:
+        read_net(path)
+    assert said.replace("\\", "") in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("reference", "said"),
+    [
+        ('<referencePlace id="r" ref="nowhere"/>', "reference r: 'nowhere' is not a place"),
+        ('<referencePlace id="r" ref="t"/>', "reference r: 't' is not a place"),
+        ('<referenceTransition id="r" ref="a"/>', "reference r: 'a' is not a transition"),
+        ('<referencePlace id="r" ref="s"/><referencePlace id="s" ref="r"/>', "form a circle"),
+    ],
+)
+def test_a_reference_leads_to_a_node_of_its_kind(tmp_path: Path, reference: str, said: str) -> None:
+    """Also one that no arc uses."""
+    with pytest.raises(NetFileError, match=said):
+        read_net(pnml(tmp_path, LOOP + reference))
+
+
+def test_a_comment_is_not_part_of_a_number(tmp_path: Path) -> None:
+    noted = place("a", 1).replace(">1<", ">1<!--2-->3<")
+    assert read_net(pnml(tmp_path, noted)).net.initial == (13,)
+
+
+def chained(size: int) -> str:
+    """Return a net with arcs and references in proportion to the size, the last ones first."""
+    nodes = "".join(place(f"p{i}", 1) + f'<transition id="t{i}"/>' for i in range(size))
+    references = "".join(
+        f'<referencePlace id="r{i}" ref="{f"r{i - 1}" if i else "p0"}"/>' for i in range(size)
+    )
+    last = "".join(arc(f"r{size - 1}", f"t{i}") for i in range(size))
+    return nodes + references + last
+
+
+def test_reading_a_file_takes_time_in_proportion_to_its_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Counted in steps: tags looked at, and references followed."""
+    steps = 0
+
+    class Counted(dict[str, str]):
+        def __getitem__(self, name: str) -> str:
+            nonlocal steps
+            steps += 1
+            return super().__getitem__(name)
+
+    def counted(element: Element) -> str:
+        nonlocal steps
+        steps += 1
+        return local(element)
+
+    end_of = formats_pnml._end_of
+
+    def followed(references: dict[str, str], name: str) -> str | None:
+        watched = Counted(references)
+        found = end_of(watched, name)
+        references.update(watched)
+        return found
+
+    monkeypatch.setattr(tree, "local", counted)
+    monkeypatch.setattr(formats_pnml, "_end_of", followed)
+    taken = []
+    for size in (50, 400):
+        steps = 0
+        path = pnml(tmp_path, chained(size))
+        target = tmp_path / "again.pnml"
+        assert convert_command(path, target, load).code == 0
+        assert read_net(target).net == read_net(path).net
+        taken.append(steps)
+    assert taken[1] < 12 * taken[0]
+
+
+def test_a_chain_without_an_end_is_not_followed_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Writing a chain searches for all markings, within limits."""
+    assert formats.LARGEST_CHAIN.states is not None and formats.LARGEST_CHAIN.memory is not None
+    monkeypatch.setattr(formats, "LARGEST_CHAIN", SearchLimits(states=1000))
+    path, rates = tmp_path / "grows.pnpro", tmp_path / "grows.drn"
+    path.write_text(
+        '<project><gspn name="g"><nodes><place name="p" x="0" y="0"/><transition name="t" '
+        'type="EXP" nservers="1" x="1" y="1"/></nodes><edges><arc kind="OUTPUT" tail="t" head="p"/>'
+        "</edges></gspn></project>",
+        encoding="utf-8",
+    )
+    outcome = convert_command(path, rates, load)
+    assert outcome.code == 2 and "the search stopped: limit of 1000" in outcome.text
+    assert not rates.exists()

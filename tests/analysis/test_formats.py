@@ -447,7 +447,7 @@ def test_tina_nets() -> None:
         ("net a b", "unexpected 'b'"),
         ("tr", "without a name"),
         ("tr t :", "no label after the colon"),
-        ("tr t : go", "no ->"),
+        ("tr t : go p", "no ->"),
         ("tr t p -> q -> r", "two ->"),
         ("tr t {p -> q", "braces come in pairs"),
         ("tr t *2 -> q", "unknown arc"),

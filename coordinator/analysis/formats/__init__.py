@@ -14,6 +14,7 @@ from re import Pattern
 
 from petrobot.coordinator.analysis.formats import exports, greatspn, pnml, tina
 from petrobot.coordinator.analysis.formats.netfile import NetFile, NetFileError
+from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 
 
@@ -62,6 +63,10 @@ def _ranks(model: NetFile) -> set[int]:
 KEPT = ""
 AS_INHIBITORS = "written as inhibitor arcs with the same effect"
 OWN_DATA = "not part of ISO PNML: written as tool-specific data, which only petrobot reads"
+
+
+LARGEST_CHAIN = SearchLimits(states=1_000_000, memory=2 << 30)
+"""Limits of the search when the chain of a net is written."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +154,7 @@ FORMATS: Mapping[str, Format] = {
         },
     ),
     ".drn": Format(
-        lambda model: exports.write_drn(Chain.of(_timed(model))),
+        lambda model: exports.write_drn(Chain.of(_timed(model), limits=LARGEST_CHAIN)),
         "Storm",
         timed=True,
         instead="the net itself: only its chain over the tangible markings is written",
@@ -216,7 +221,8 @@ def _utf8(text: bytes, file: str) -> str:
     try:
         return text.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise NetFileError(file, "file", str(error), "give a UTF-8 file") from error
+        line = text.count(b"\n", 0, error.start) + 1
+        raise NetFileError(file, "file", str(error), "give a UTF-8 file", line=line) from error
 
 
 def _timed(model: NetFile) -> Gspn:

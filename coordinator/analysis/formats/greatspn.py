@@ -39,12 +39,12 @@ WHERE: dict[str, Known] = {
     "name": READ,
     "x": READ,
     "y": READ,
-    **dict.fromkeys(("label-x", "label-y", "rotation", "superposition-tags"), DRAWN),
+    **dict.fromkeys(("label-x", "label-y", "rotation", "magnets", "superposition-tags"), DRAWN),
 }
 CONSTANT = Vocabulary(
     {
         **WHERE,
-        **dict.fromkeys(("consttype", "type"), DRAWN),
+        **dict.fromkeys(("consttype", "type", "last-binding"), DRAWN),
         "value": READ,
     }
 )
@@ -65,7 +65,10 @@ ELEMENTS = {
         {
             **WHERE,
             **dict.fromkeys(("type", "delay", "weight", "priority", "nservers"), READ),
-            **dict.fromkeys(("guard", "action"), Only(("", "true"), UNFOLD)),
+            "guard": Only(
+                ("", "true"), "guards are not read: unfold the net, or draw arcs instead"
+            ),
+            "action": Only(("", "true"), UNFOLD),
             **dict.fromkeys(
                 (
                     *("delay-x", "delay-y", "weight-x", "weight-y", "priority-x", "priority-y"),
@@ -80,8 +83,14 @@ ELEMENTS = {
 }
 ARC = Vocabulary(
     {
-        **dict.fromkeys(("head", "tail", "kind", "mult", "is-broken"), READ),
-        **dict.fromkeys(("mult-k", "mult-x", "mult-y", "broken-label"), DRAWN),
+        **dict.fromkeys(("head", "tail", "kind", "mult"), READ),
+        **dict.fromkeys(
+            (
+                *("mult-k", "mult-x", "mult-y", "head-magnet", "tail-magnet"),
+                *("broken", "is-broken", "broken-label"),
+            ),
+            DRAWN,
+        ),
     },
     {"point": DRAWN, "broken-edge": DRAWN},
 )
@@ -94,7 +103,12 @@ GSPN = Vocabulary(
     {
         "name": READ,
         **dict.fromkeys(
-            ("zoom", "show-color-cmd", "show-fluid-cmd", "show-fluid", "version"), DRAWN
+            (
+                *("zoom", "show-timed-cmd", "show-color-cmd", "show-fluid-cmd", "show-fluid"),
+                *("view-rates", "view-guards", "view-priorities", "view-names"),
+                *("view-superpos-tags", "version"),
+            ),
+            DRAWN,
         ),
     },
     {"nodes": READ, "edges": READ},
@@ -185,7 +199,9 @@ class _ProjectReading:
         name, value = self._name(node), node.get("value") or ""
         if not value:
             raise self.draft.fault(
-                f"{node.tag} {name}", "it has no value", "set a value in the editor"
+                f"{node.tag} {name}",
+                "it has no value",
+                "set a value in the editor (make a template a constant)",
             )
         if name in self.draft.constants:
             raise self.draft.fault(f"{node.tag} {name}", "it is defined twice", "keep one of them")

@@ -136,6 +136,8 @@ class NetDraft:
         self.places: dict[str, int] = {}
         self.capacity: dict[str, int] = {}
         self.transitions: dict[str, int] = {}
+        self.lines: dict[str, int | None] = {}
+        """The line of each transition."""
         self.consume: dict[str, dict[str, int]] = {}
         self.produce: dict[str, dict[str, int]] = {}
         self.inhibit: dict[str, dict[str, int]] = {}
@@ -162,7 +164,7 @@ class NetDraft:
     def transition(self, name: str, priority: int = 0) -> None:
         """Add a transition. Raises NetFileError if the id is taken."""
         self._fresh(name)
-        self.transitions[name] = priority
+        self.transitions[name], self.lines[name] = priority, self.line
         self.consume[name], self.produce[name], self.inhibit[name] = {}, {}, {}
 
     def _fresh(self, name: str) -> None:
@@ -262,7 +264,9 @@ class NetDraft:
         try:
             return Gspn.of(net, self.rates, weights=self.weights, servers=self.servers)
         except ValueError as error:
-            raise NetFileError(self.file, "rates", str(error)) from error
+            said = str(error)  # "TRANSITION: what is wrong"
+            at = next((self.lines[t] for t in self.transitions if said.startswith(f"{t}:")), None)
+            raise NetFileError(self.file, "rates", said, line=at) from error
 
 
 def _short(text: str) -> str:

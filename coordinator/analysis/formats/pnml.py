@@ -6,7 +6,8 @@ The reader also accepts what tools write beyond the standard:
   GreatSPN and Storm (`type value`), TAPAAL and Romeo (`type` attribute), or in tool-specific data;
 - PIPE: labels in `value` (`Default,1`), rates, timed flags, servers and priorities;
 - TAPAAL: `inputArc`, `outputArc`, `inhibitorArc`, `transportArc`, markings and weights as
-  attributes, if no time interval, invariant or urgent transition restricts the net;
+  attributes, if no time interval, invariant or urgent transition restricts the net; what version 4
+  says again in colours, if `dot` is the only one;
 - our own tool-specific data.
 
 `PLACE`, `TRANSITION`, `ARC` and `NET` list everything that is understood; all else is refused.
@@ -60,14 +61,20 @@ PLACE_TRANSITION = (
     "epnml-1.0",
     "epnml-1.1",
     "pnml-pt",
+    "laas.fr/tina/tpn",
 )
 
 # --- what is understood ---------------------------------------------------------------------------
 
 UNTIMED = "only untimed nets are read: remove the times, or export the net as untimed"
-ENDLESS = Only(("[0,inf)", "[0,inf]", "[0,w[", "[0,inf):1", "0", "1", ""), UNTIMED)
-"""Inscriptions of TAPAAL's timed arcs that restrict nothing."""
+ENDLESS = Only(("[0,inf]", "[0,w[", "0", "1", ""), UNTIMED, r"\[0,inf\)(:[0-9]+)?")
+"""Inscriptions of TAPAAL's timed arcs that restrict nothing; `:2` numbers a pair of transport
+arcs."""
 UNFOLD = "it is a coloured net: unfold it first"
+DOTS = Only((), UNFOLD, r"\(*[0-9]+'dot(\.all)?\)*")
+"""How TAPAAL writes a number of uncoloured tokens beside the plain number."""
+DOT_SORT = {"declaration", "structure", "declarations", "namedsort", "dot"}
+"""What the declaration of a file may contain in which `dot` is the only colour."""
 PLAYER = Note(("0", ""), "not read: every transition may fire")
 STOCHASTIC = Note(("", "constant", "1", "1.0"), "not read: give rates with --rates")
 
@@ -97,7 +104,7 @@ PLACE = Vocabulary(
         "initialMarking": READ,
         "capacity": READ,
         "type": Only(("", "dot"), UNFOLD),
-        "hlinitialMarking": Only((), UNFOLD),
+        "hlinitialMarking": DOTS,
     },
 )
 TRANSITION = Vocabulary(
@@ -114,6 +121,9 @@ TRANSITION = Vocabulary(
         "value": STOCHASTIC,
         "weight": STOCHASTIC,
         "firingMode": DRAWN,
+        # Parameters of the distribution, which has a note of its own.
+        **dict.fromkeys(("a", "b", "c", "rate", "mean", "stddev", "shape", "scale", "p"), DRAWN),
+        **dict.fromkeys(("logMean", "logStddev"), DRAWN),
     },
     {
         **NODE_PARTS,
@@ -125,7 +135,7 @@ TRANSITION = Vocabulary(
         "urgent": Only(("false", ""), UNTIMED),
         "condition": Only(("", "true"), UNFOLD),
         "guard": Only(("", "true"), UNFOLD),
-        "delay": Only((), UNTIMED),
+        "delay": Only(("0infty", "0infinity"), UNTIMED),
     },
 )
 ARC = Vocabulary(
@@ -140,6 +150,7 @@ ARC = Vocabulary(
         "kind": READ,
         "weight": READ,
         "inscription": READ,
+        "transportID": DRAWN,
     },
     {
         **NODE_PARTS,
@@ -150,7 +161,7 @@ ARC = Vocabulary(
         "arcType": READ,
         "arcpath": DRAWN,
         "tagged": Only(("false", ""), "tagged tokens are not read"),
-        "hlinscription": Only((), UNFOLD),
+        "hlinscription": DOTS,
         **dict.fromkeys(("inhibitor", "inhibition", "read", "test"), READ),
     },
 )
@@ -197,12 +208,13 @@ ROOT = Vocabulary(
         "net": READ,
         **dict.fromkeys(("name", "toolspecific", "queries", "query", "feature"), DRAWN),
         "k-bound": DRAWN,
-        **dict.fromkeys(("declaration", "variable"), Only((), UNFOLD)),
+        "declaration": READ,
+        "variable": Only((), UNFOLD),
         "shared-place": Only((), "export the composed net: it has no shared places"),
         "shared-transition": Only((), "export the composed net: it has no shared transitions"),
-        "constant": DRAWN,
+        "constant": READ,
     },
-    repeated=frozenset({"net"}),
+    repeated=frozenset({"net", "constant"}),
 )
 
 
@@ -234,6 +246,12 @@ def parse_pnml(text: str | bytes, file: str = "PNML") -> NetFile:
         raise NetFileError(
             file, f"<{local(root)}>", "this is not PNML", "expected <pnml>", line=root.line
         )
+    notes = check(file, root, ROOT, "pnml") if local(root) == "pnml" else []
+    for part in (part for one in children(root, "declaration") for part in one.iter()):
+        if local(part) and local(part) not in DOT_SORT:
+            raise NetFileError(
+                file, "declaration", f"it declares <{local(part)}>", UNFOLD, line=line_of(part)
+            )
     nets = [root] if local(root) == "net" else list(children(root, "net"))
     if len(nets) != 1:
         problem = f"{len(nets)} nets" if nets else "no <net>"
@@ -250,14 +268,13 @@ def parse_pnml(text: str | bytes, file: str = "PNML") -> NetFile:
             "only P/T nets are read",
             line=line_of(net),
         )
-    notes = check(file, root, ROOT, "pnml") if net is not root else []
-    return _PnmlReading(net, file, notes).result(root)
+    return _PnmlReading(root, net, file, notes).result(root)
 
 
 class _PnmlReading:
     """Reads one net: places, transitions, references, then arcs, which need the others."""
 
-    def __init__(self, net: Element, file: str, notes: list[str]) -> None:
+    def __init__(self, root: Element, net: Element, file: str, notes: list[str]) -> None:
         self.element = net
         self.draft = NetDraft(file)
         self.draft.notes += notes
@@ -266,6 +283,8 @@ class _PnmlReading:
         self.references: dict[str, str] = {}
         self.untimed: list[str] = []
         self._containers(net, "net")
+        for constant in children(root, "constant"):
+            self._constant(constant)
         for node in self._nodes("place"):
             self._place(node)
         for node in self._nodes("transition"):
@@ -273,6 +292,8 @@ class _PnmlReading:
         for tag in ("referencePlace", "referenceTransition"):
             for node in self._nodes(tag):
                 self._reference(node)
+        for node in self._nodes("referencePlace", "referenceTransition"):
+            self._check_reference(node)
         for node in self._nodes(*ARCS):
             self._arc(node)
 
@@ -330,6 +351,22 @@ class _PnmlReading:
             raise self.draft.fault(name, "this id occurs twice", "ids must be unique in a file")
         self.references[name] = node.get("ref") or ""
 
+    def _check_reference(self, node: Element) -> None:
+        kind = local(node).removeprefix("reference").lower()
+        element = f"reference {self._id(node)}"
+        found = self._resolved(node.get("ref") or "", element)
+        if found not in (self.draft.places if kind == "place" else self.draft.transitions):
+            raise self.draft.fault(element, f"{found!r} is not a {kind}", f"refer to a {kind}")
+
+    def _constant(self, node: Element) -> None:
+        self.draft.line = line_of(node)
+        name = node.get("name") or ""
+        self.draft.constants[name] = self.draft.number(f"constant {name}", node.get("value") or "")
+
+    def _dots(self, node: Element, tag: str) -> str:
+        """Return a number that TAPAAL says again in colours (`DOTS`), or ""."""
+        return "".join(re.findall("[0-9]", label(node, tag) or ""))
+
     def _common(self, node: Element, name: str) -> None:
         what = f"{local(node)} {name}"
         text = label(node, "name") or node.get("name")
@@ -350,6 +387,11 @@ class _PnmlReading:
         self._check(node, PLACE, f"place {name}")
         marking = label(node, "initialMarking") or node.get("initialMarking") or "0"
         tokens = self._count(f"place {name}", marking)
+        dots = self._dots(node, "hlinitialMarking")
+        if dots and self.draft.whole(f"place {name}", dots) != tokens:
+            raise self.draft.fault(
+                f"place {name}", f"{marking} tokens, and {dots} in colours", "give one number"
+            )
         self.draft.place(name, tokens, self._capacity(node, name))
         self._common(node, name)
 
@@ -438,6 +480,7 @@ class _PnmlReading:
         in the attribute `weight` or in a label.
         """
         said = [node.get("weight"), label(node, "weight"), label(node, "inscription")]
+        said += [self._dots(node, "hlinscription")]
         drawn = node.get("inscription")
         interval = [text for text in (*said, drawn) if text and text[0] in "[("]
         for text in interval:
@@ -454,13 +497,25 @@ class _PnmlReading:
 
     def _resolved(self, name: str, element: str) -> str:
         """Return the node at the end of a chain of references."""
-        seen = {name}
-        while name in self.references:
-            name = self.references[name]
-            if name in seen:
-                raise self.draft.fault(element, f"the references around {name!r} form a circle")
-            seen.add(name)
-        return name
+        found = _end_of(self.references, name)
+        if found is None:
+            raise self.draft.fault(element, f"the references around {name!r} form a circle")
+        return found
+
+
+def _end_of(references: dict[str, str], name: str) -> str | None:
+    """Return where a chain of references ends, None for a circle.
+
+    All on the way lead there directly afterwards, so that long chains are followed once.
+    """
+    passed = set[str]()
+    while name in references:
+        if name in passed:
+            return None
+        passed.add(name)
+        name = references[name]
+    references.update(dict.fromkeys(passed, name))
+    return name
 
 
 def _is_iso(root: Element, net: Element) -> bool:
@@ -615,7 +670,7 @@ class _PnmlWriting:
             self.element.tag[: self.element.tag.index("}") + 1] if "}" in self.element.tag else ""
         )
         self.references = {
-            node.get("id"): node.get("ref")
+            node.get("id") or "": node.get("ref") or ""
             for node in nodes(self.element)
             if local(node).startswith("reference")
         }
@@ -736,9 +791,7 @@ class _PnmlWriting:
                 SubElement(kinds, f"{self.prefix}text").text = "inhibitor"
 
     def _resolved(self, name: str | None) -> str:
-        while name in self.references:  # ends: the reader refused circles and missing ends
-            name = self.references[name]
-        return name or ""
+        return _end_of(self.references, name or "") or ""
 
 
 def _has(node: Element, tag: str) -> bool:

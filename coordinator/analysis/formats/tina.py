@@ -8,16 +8,17 @@ TINA toolbox.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from petrobot.coordinator.analysis.formats.netfile import NetDraft, NetFile, thresholds
 from petrobot.coordinator.task.net import Net
 
 TOKEN = re.compile(r"\s*(\{(?:\\.|[^}\\])*\}|->|[^\s{}#]+)")
 PLAIN = re.compile(r"[A-Za-z_'][A-Za-z0-9_']*\Z")
-SCALE = {"K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
-ARC = re.compile(r"(?P<kind>\*|\?-|\?|!-|!)(?P<weight>[0-9]{1,300}[KMGT]?)\Z")
-MARKING = re.compile(r"\(([0-9]{1,300}[KMGT]?)\)")
+SCALE = {"K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "P": 10**15, "E": 10**18}
+ARC = re.compile(r"(?P<kind>\*|\?-|\?|!-|!)(?P<weight>[0-9]{1,300}[KMGTPE]?)\Z")
+MARKING = re.compile(r"\(([0-9]{1,300}[KMGTPE]?)\)")
+INTERVAL = re.compile(r"[\[\]][0-9]+,([0-9]+[\[\]]|(w|inf)\[)")
 
 
 def parse_tina(text: str, file: str = "net") -> NetFile:
@@ -32,7 +33,8 @@ class _TinaReading:
         self.tokens: dict[str, int] = {}
         self.labels: dict[str, tuple[str, int]] = {}
         self.arcs: list[tuple[str, str, int, str, int]] = []
-        self.transitions: list[str] = []
+        self.transitions: dict[str, int] = {}
+        """The line on which each transition occurs first."""
         self.above: list[tuple[list[str], list[str], int]] = []
         self.beyond: list[str] = []
         self.line = 0
@@ -80,7 +82,7 @@ class _TinaReading:
                 raise self.draft.fault(
                     "line",
                     f"a line that begins with {other!r}",
-                    "expected net, tr, pl, lb, pr or nt",
+                    "a net of TINA has the lines net, tr, pl, lb, pr and nt",
                 )
 
     def _only(self, words: list[str], most: int, form: str) -> None:
@@ -110,33 +112,47 @@ class _TinaReading:
             raise self.draft.fault("tr", "a transition without a name", "write tr NAME IN -> OUT")
         name = _bare(words[0])
         element = f"transition {name}"
-        self.transitions.append(name)
+        self.transitions.setdefault(name, self.line)
         rest = self._labelled(name, words[1:])
         if rest and rest[0][0] in "[]":
-            if rest[0] not in ("[0,w[", "[0,inf["):
+            # Spaces may stand inside an interval.
+            parts = (n for n in range(1, 6) if INTERVAL.fullmatch("".join(rest[:n])))
+            length = next(parts, 1)
+            interval, rest = "".join(rest[:length]), rest[length:]
+            if interval not in ("[0,w[", "[0,inf["):
                 raise self.draft.fault(
-                    element, f"a time interval {rest[0]}", "only untimed nets are read; remove it"
+                    element, f"a time interval {interval}", "only untimed nets are read; remove it"
                 )
-            rest = rest[1:]
-        if rest.count("->") != 1:
-            problem = "no -> in a transition" if "->" not in rest else "two -> in a transition"
-            raise self.draft.fault(element, problem, "write tr NAME INPUTS -> OUTPUTS")
-        arrow = rest.index("->")
-        for word in _joined(rest[:arrow]):
-            self._arc(word, name, True)
-        for word in _joined(rest[arrow + 1 :]):
-            self._arc(word, name, False)
+        self._arcs(rest, element, lambda word, first: self._arc(word, name, True, first))
 
-    def _arc(self, word: str, transition: str, into: bool) -> None:
-        place, suffix = _split(word)
+    def _arcs(self, words: list[str], element: str, arc: Callable[[str, bool], None]) -> None:
+        """Read `INPUTS -> OUTPUTS`, or nothing; `arc` receives a word and whether it is an
+        input."""
+        if not words:
+            return
+        if words.count("->") != 1:
+            problem = "no -> in its line" if "->" not in words else "two -> in its line"
+            raise self.draft.fault(element, problem, "write INPUTS -> OUTPUTS behind it")
+        arrow = words.index("->")
+        for word in _joined(words[:arrow]):
+            arc(word, True)
+        for word in _joined(words[arrow + 1 :]):
+            arc(word, False)
+
+    def _arc(self, word: str, node: str, of_transition: bool, first: bool) -> None:
+        """Read an arc of a node: `first` is an input of it, and leads to or from the node that
+        `word` names."""
+        other, suffix = _split(word)
+        place, transition = (other, node) if of_transition else (node, other)
+        consumes = first == of_transition
         kind, weight = "normal", 1
-        if suffix or not place:
+        if suffix or not other:
             found = ARC.match(suffix)
             if (
                 found is None
-                or not place
+                or not other
                 or found["kind"][0] == "!"
-                or (found["kind"] != "*" and not into)
+                or (found["kind"] != "*" and not consumes)
             ):
                 raise self.draft.fault(
                     f"transition {transition}", f"unknown arc {word!r}", "write p, p*2, p?2 or p?-2"
@@ -144,7 +160,8 @@ class _TinaReading:
             kind = {"*": "normal", "?": "test", "?-": "inhibitor"}[found["kind"]]
             weight = _number(found["weight"])
         self.tokens.setdefault(place, 0)
-        source, target = (place, transition) if into else (transition, place)
+        self.transitions.setdefault(transition, self.line)
+        source, target = (place, transition) if consumes else (transition, place)
         self.arcs.append((source, target, weight, kind, self.line))
 
     def _place(self, words: list[str]) -> None:
@@ -152,15 +169,15 @@ class _TinaReading:
             raise self.draft.fault("pl", "a place without a name", "write pl NAME (TOKENS)")
         name = _bare(words[0])
         self.tokens.setdefault(name, 0)
-        for word in self._labelled(name, words[1:]):
-            found = MARKING.fullmatch(word)
-            if found is None:
-                raise self.draft.fault(
-                    f"place {name}",
-                    f"unexpected {word!r} after a place",
-                    "write pl NAME (TOKENS)",
-                )
+        rest = self._labelled(name, words[1:])
+        while rest and (found := MARKING.fullmatch(rest[0])):
             self.tokens[name] += _number(found[1])
+            rest = rest[1:]
+        element = f"place {name}"
+        if rest and (rest[0][0] == "(" or "->" not in rest):
+            problem = f"unexpected {rest[0]!r} after a place"
+            raise self.draft.fault(element, problem, "write pl NAME (TOKENS)")
+        self._arcs(rest, element, lambda word, first: self._arc(word, name, False, first))
 
     def result(self) -> NetFile:
         """Return the net. Raises NetFileError."""
@@ -168,8 +185,7 @@ class _TinaReading:
         for place, tokens in self.tokens.items():
             draft.place(place, tokens)
         priority = self._priorities()
-        draft.line = None
-        for transition in dict.fromkeys(self.transitions):
+        for transition, draft.line in self.transitions.items():
             draft.transition(transition, priority.get(transition, 0))
         tests_last = sorted(self.arcs, key=lambda arc: arc[3] == "test")
         for source, target, weight, kind, draft.line in tests_last:

@@ -33,10 +33,13 @@ class Only:
 
     values: tuple[str, ...]
     remedy: str
+    form: str = ""
+    """Also accepted: what this regular expression matches."""
 
     def allows(self, text: str) -> bool:
         """Return whether the value means nothing beyond a plain net."""
-        return "".join(text.lower().split()) in self.values
+        plain = "".join(text.lower().split())
+        return plain in self.values or bool(self.form and re.fullmatch(self.form, plain))
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +97,7 @@ class _Parsing:
                 self.file,
                 "XML",
                 expat.ErrorString(error.code),
-                "the file is incomplete or not XML",
+                "the file is incomplete, no XML, or not in the encoding that it declares",
                 line=error.lineno,
             ) from error
         except NetFileError:  # a ValueError too, and complete
@@ -171,12 +174,21 @@ def children(element: Element, tag: str) -> Iterator[Element]:
 
 def label(element: Element, tag: str) -> str | None:
     """Return the text of a label (`<tag><text>..` or PIPE's `<tag><value>..`), or None."""
-    for child in children(element, tag):
-        for inner in child:
-            if local(inner) in ("text", "value"):
-                return "".join(inner.itertext()).strip()
-        return (child.get("value") or "".join(child.itertext())).strip()
-    return None
+    return next((_said(child) for child in children(element, tag)), None)
+
+
+def _said(found: Element) -> str:
+    """Return the text of a label's element."""
+    for inner in found:
+        if local(inner) in ("text", "value"):
+            return _text(inner).strip()
+    return (found.get("value") or _text(found)).strip()
+
+
+def _text(element: Element) -> str:
+    """Return all text inside an element but comments, which `itertext` would include."""
+    inner = (((_text(child) if local(child) else "") + (child.tail or "")) for child in element)
+    return (element.text or "") + "".join(inner)
 
 
 LABEL = Vocabulary(
@@ -202,7 +214,7 @@ def check(file: str, node: Element, known: Vocabulary, what: str) -> list[str]:
         if not tag:
             continue
         rule = known.children.get(tag)
-        text = label(node, tag) or ""
+        text = "" if rule is None or isinstance(rule, str) else _said(child)
         notes += _judged(file, child, what, f"element <{tag}>", text, rule, known.children)
         if rule is not READ and not isinstance(rule, Only):
             continue
@@ -228,7 +240,8 @@ def _judged(
         remedy = f"read here: {read or 'nothing'}; remove it in the tool that wrote the file"
         raise NetFileError(file, what, f"unknown {part}", remedy, line=line_of(at))
     if isinstance(rule, Only) and not rule.allows(value):
-        raise NetFileError(file, what, f"{part} is {value!r}", rule.remedy, line=line_of(at))
+        found = f"{part} is {value!r}" if rule.values or rule.form else f"{part} is not read"
+        raise NetFileError(file, what, found, rule.remedy, line=line_of(at))
     if isinstance(rule, Note) and "".join(value.lower().split()) not in rule.silent:
         return [f"{what}: {part} = {value!r}: {rule.text}"]
     return []
