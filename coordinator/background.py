@@ -18,10 +18,14 @@ import os
 import resource
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from petrobot.services.host.json_text import json_text
 from petrobot.services.host.parent_death import until_reaped
+
+if TYPE_CHECKING:
+    from petrobot.coordinator.analysis.may_run import Cell
+    from petrobot.coordinator.analysis.report import Analysis
 
 HARD_END = 8
 """Seconds of processor time after which the kernel kills an analysis; results that it has already
@@ -172,23 +176,32 @@ async def analyse_in_background(
 
 
 def analysed(
-    text: str, filename: str, cell: Mapping[str, Any] | None, view: str = "ordinary"
-) -> dict[str, Any]:
+    text: str, filename: str, cell: Mapping[str, Any] | None = None
+) -> Iterator[dict[str, Any]]:
     """Analyse a task file for the operator's page. `cell` holds the fields of its `Cell`.
 
-    Return {complete, markings, verdicts, notes, heat, figures}; a verdict is {name, words, holds,
-    reason, details, assumption, witness, complete}, false ones first. With the view "gspn" the
-    forecast is included: `heat` is the share of the time that each action place takes. Raises
+    Yield the verdicts first, then the same with the forecast, because that may take long. Raises
     TaskFileError.
     """
-    from petrobot.coordinator.analysis.may_run import BUDGET, WORDS, Cell, assumed, devices_of
-    from petrobot.coordinator.analysis.report import analyse, heat
+    from petrobot.coordinator.analysis.may_run import BUDGET, Cell, devices_of
+    from petrobot.coordinator.analysis.report import analyse, with_forecast
     from petrobot.coordinator.task.file import loads
 
     task = loads(text, filename)
     known = None if cell is None else Cell(**cell)
-    devices = devices_of(known)
-    analysis = analyse(task, view=view, limits=BUDGET.limits(), steps=BUDGET.steps, devices=devices)
+    limits, devices = BUDGET.limits(), devices_of(known)
+    found = analyse(task, limits=limits, steps=BUDGET.steps, devices=devices)
+    yield _shown(found, known)
+    yield _shown(with_forecast(found, task, limits=limits, devices=devices), known)
+
+
+def _shown(analysis: Analysis, cell: Cell | None) -> dict[str, Any]:
+    """Return {complete, markings, verdicts, notes, heat, figures}; a verdict is {name, words,
+    holds, reason, details, assumption, witness, complete}, false ones first. `heat` is the share of
+    the time that each action place takes; it needs the forecast."""
+    from petrobot.coordinator.analysis.may_run import WORDS, assumed
+    from petrobot.coordinator.analysis.report import heat
+
     space = analysis.qualitative.space
     verdicts = [
         {"name": name, "words": WORDS.get(name, name.replace("_", " ")), **verdict.to_json()}
@@ -213,17 +226,10 @@ def analysed(
         "complete": space.complete,
         "markings": len(space),
         "verdicts": verdicts,
-        "notes": [*analysis.notes, assumed(known)],
+        "notes": [*analysis.notes, assumed(cell)],
         "heat": heat(analysis),
         "figures": analysis.figures(),
     }
-
-
-def _analysis(
-    text: str, filename: str, cell: Mapping[str, Any] | None = None
-) -> Iterator[dict[str, Any]]:
-    for view in ("ordinary", "gspn"):  # verdicts first, because a forecast may take long
-        yield analysed(text, filename, cell, view)
 
 
 def work_of(name: str) -> Callable[..., Any]:
@@ -234,7 +240,7 @@ def work_of(name: str) -> Callable[..., Any]:
     KeyError.
     """
     if name == "analysis":
-        return _analysis
+        return analysed
     if name == "form":
         from petrobot.coordinator.operator import start_form
 

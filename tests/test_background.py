@@ -56,9 +56,19 @@ def test_a_search_that_ran_out_of_states_leaves_verdicts_unknown(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("petrobot.coordinator.analysis.may_run.BUDGET", Budget(10))
-    answer = analysed(CATCH_BALL.replace("tokens = 4", "tokens = 4000"), "catch_ball.toml", None)
+    answer = next(analysed(CATCH_BALL.replace("tokens = 4", "tokens = 4000"), "catch_ball.toml"))
     assert answer["complete"] is False
     assert None in {verdict["holds"] for verdict in answer["verdicts"]}
+
+
+def test_the_forecast_is_added_without_another_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = analysed(CATCH_BALL, "catch_ball.toml")
+    first = next(answers)
+    monkeypatch.delattr("petrobot.coordinator.analysis.report.progress_of")
+    monkeypatch.delattr("petrobot.coordinator.analysis.report.explore")
+    second = next(answers)
+    assert second["heat"] and not first["heat"]
+    assert second["verdicts"] == first["verdicts"] and second["markings"] == first["markings"]
 
 
 @pytest.mark.processes
@@ -68,9 +78,10 @@ def test_the_kernel_ends_a_process_that_takes_too_much_processor_time() -> None:
         "from itertools import repeat\n"
         "from petrobot.coordinator import background\n"
         "background.HARD_END = 0\n"
-        "background.analysed = lambda text, name, cell, view: (\n"
-        "    all(repeat(1)) if view == 'gspn' else {'said': 1}\n"
-        ")\n"
+        "def analysed(text, filename):\n"
+        "    yield {'said': 1}\n"
+        "    yield all(repeat(1))\n"
+        "background.analysed = analysed\n"
         "background.main()\n"
     )
     order = b'{"work": "analysis", "given": {"text": "", "filename": "drawn.toml"}}\n'

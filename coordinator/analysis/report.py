@@ -549,9 +549,8 @@ def _analyse_task(
     devices: Mapping[str, str] | None,
 ) -> Analysis:
     ordinary, n, notes = OrdinaryView(task), ends_net(task), list[str]()
-    doubts = list[str]()
     found = _examined(n.net, limits, engine, notes, partial(judged, n))
-    progress = numbers = None
+    progress = None
     shown: Mapping[str, PropertyVerdict] = {}
     why = "the analysis was interrupted"
     try:
@@ -565,27 +564,55 @@ def _analyse_task(
                 why = str(fault)
             if progress is None or not progress.x.complete:
                 shown = proven(n, found.space, ordinary)
-        if view == "gspn" and CUT not in notes:
-            numbers = _forecast(task, measured, stages, limits, notes, devices)
-        if numbers is not None:
-            doubts = _doubts(numbers, progress, measured, stages, limits, notes, devices)
     except KeyboardInterrupt:
         notes.append(CUT)
-    return Analysis(
+    judgement = Analysis(
         task.name,
         task.net,
         found,
         progress,
         StructureReport(n.net),
         None,
-        numbers,
+        None,
         tuple(notes),
         "" if progress is not None else why,
         steps,
         CUT in notes,
         shown,
         n,
-        tuple(doubts),
+    )
+    if view != "gspn" or judgement.interrupted:
+        return judgement
+    return with_forecast(
+        judgement, task, measured=measured, stages=stages, limits=limits, devices=devices
+    )
+
+
+def with_forecast(
+    found: Analysis,
+    task: Task,
+    *,
+    measured: Measured | None = None,
+    stages: int = 8,
+    limits: SearchLimits | None = None,
+    devices: Mapping[str, str] | None = None,
+) -> Analysis:
+    """Return the analysis of a task with its forecast, as `analyse` with `view="gspn"` does, and
+    without searching again."""
+    notes, doubts = list(found.notes), list[str]()
+    numbers = None
+    try:
+        numbers = _forecast(task, measured, stages, limits, notes, devices)
+        if numbers is not None:
+            doubts = _doubts(numbers, found.progress, measured, stages, limits, notes, devices)
+    except KeyboardInterrupt:
+        notes.append(CUT)
+    return replace(
+        found,
+        forecast=numbers,
+        notes=tuple(notes),
+        interrupted=CUT in notes,
+        doubts=tuple(doubts),
     )
 
 

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binomtest
 
 from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.task import Status, Task
@@ -106,6 +105,8 @@ def _flag(name: str) -> Callable[[TrialRow], bool]:
 def share_difference(pairs: PairedTrials, met: Callable[[TrialRow], bool]) -> dict[str, Any]:
     """Return both shares, the discordant pairs, McNemar's p-value, and the difference with its 95 %
     interval."""
+    from scipy.stats import binomtest  # here: the page of one campaign compares nothing
+
     a = np.array([met(row) for row in pairs.one])
     b = np.array([met(row) for row in pairs.other])
     n, gained, lost = len(a), int(np.sum(a & ~b)), int(np.sum(~a & b))
