@@ -174,9 +174,10 @@ class Engine:
         return draft.freeze(), tuple(draft.instructions)
 
     def awaits(self, state: State, event: str) -> bool:
-        """Return whether tokens enable a transition that waits for the event; if not, a pulse of it
-        changes nothing."""
-        return awaited(Draft(self.compiled, state), event)
+        """Return whether an external event would change anything: tokens enable a transition that
+        waits for it, or its flag is kept until they do."""
+        sets_flag = event in self.compiled.kept and event not in state.flags
+        return sets_flag or awaited(Draft(self.compiled, state), event)
 
     def only_listens(self, state: State) -> bool:
         """Return whether only an event or the global memory can still change something but in

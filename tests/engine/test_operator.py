@@ -333,3 +333,11 @@ def test_only_awaited_events_are_worth_a_stimulus(play: Plays) -> None:
     assert p.engine.awaits(p.state, "e") and not p.engine.awaits(p.state, "f")
     p(EventOccurred("e"))
     assert not p.engine.awaits(p.state, "e")
+
+
+def test_a_kept_event_is_worth_a_stimulus_until_its_flag_is_set(play: Plays) -> None:
+    """Timers of a node do not number their events: what is not passed on is lost."""
+    p = play("x=1 a! b! y", LINE, "e f+")
+    assert p.engine.awaits(p.state, "f")
+    p(EventOccurred("f"))
+    assert "f" in p.state.flags and not p.engine.awaits(p.state, "f")
