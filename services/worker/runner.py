@@ -6,7 +6,9 @@ from __future__ import annotations
 import inspect
 import logging
 import math
+import sys
 import time
+import warnings
 from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum, auto
@@ -116,6 +118,8 @@ class Execution:
     """Whether the action could not bring its device to a safe state: standing still is not enough
     then."""
     stop_called: bool = False
+    unawaited: str = ""
+    """What its code has called and dropped without `await`: it never ran."""
 
     @property
     def over(self) -> bool:
@@ -217,11 +221,38 @@ class Execution:
             self.wait.due += pause
 
     def _timed(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Any:
-        before = time.process_time()
+        global _active
+        before, earlier, _active = time.process_time(), _active, self
         try:
             return function(*arguments, **named)
         finally:
+            _active = earlier
             self.cpu += time.process_time() - before
+
+
+_active: Execution | None = None
+"""The run whose code is running now."""
+
+
+def _watch_unawaited() -> None:
+    """Note for a run what it calls without `await`. Python only warns of that, once for each line,
+    and the run would end with SUCCESS although nothing was done."""
+    if sys.unraisablehook is not _note_unawaited:
+        global _usual_hook
+        _usual_hook, sys.unraisablehook = sys.unraisablehook, _note_unawaited
+    # As an error it is raised where the coroutine is dropped: nobody can catch it there.
+    warnings.filterwarnings("error", "coroutine .* was never awaited", RuntimeWarning)
+
+
+def _note_unawaited(raised: sys.UnraisableHookArgs) -> None:
+    fault = raised.exc_value
+    if _active is not None and isinstance(fault, RuntimeWarning) and "awaited" in str(fault):
+        _active.unawaited = str(fault)
+    else:
+        _usual_hook(raised)
+
+
+_usual_hook: Callable[[sys.UnraisableHookArgs], Any] = sys.__unraisablehook__
 
 
 _AFTER = (STOPPING, SETTLING)
@@ -262,6 +293,7 @@ class Runner:
         virtual: bool = False,
         fenced: bool = False,
     ) -> None:
+        _watch_unawaited()
         self._actions = actions
         self._clock = clock
         self._device = device
@@ -477,6 +509,10 @@ class Runner:
             self._give_up(
                 now, run, "bad_result", f"returned a {name}; return success(), failure() or error()"
             )
+            return
+        if run.unawaited and returned.status is not Status.ERROR:
+            text = f"{run.unawaited}, so it did nothing: write `await` before the call"
+            self._give_up(now, run, "exception", self._with_refusal(run, text))
             return
         try:
             result = checked_result(run.call.id, returned)

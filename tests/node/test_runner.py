@@ -66,6 +66,17 @@ async def awaits_foreign(ctx: Context) -> Result:
     return success()
 
 
+async def forgets_await(ctx: Context) -> Result:
+    naps(ctx)  # type: ignore[unused-coroutine]
+    await ctx.sleep(0.02)
+    return success()
+
+
+async def forgets_await_and_fails(ctx: Context) -> Result:
+    ctx.put("part", 3)  # type: ignore[unused-coroutine]
+    return error("lost")
+
+
 async def spins(ctx: Context) -> Result:
     while True:
         await ctx.wait(lambda: True)
@@ -106,6 +117,15 @@ ENDINGS: list[tuple[Any, dict[str, Any], str, str, str, str]] = [
         "awaits a Foreign; an action awaits only what its context gives it",
         "yes",
     ),
+    (
+        forgets_await,
+        {},
+        "error",
+        "exception",
+        "coroutine 'naps' was never awaited, so it did nothing: write `await` before the call",
+        "yes",
+    ),
+    (forgets_await_and_fails, {}, "error", "lost", "", "yes"),
     (spins, {}, "error", "exception", "times without time passing", "yes"),
     (bad_wait, {}, "error", "exception", "ZeroDivisionError", "yes"),
     (leaves, {}, "error", "exception", "SystemExit: 3", "yes"),
@@ -160,6 +180,15 @@ def test_every_kind_of_end(
     assert b.runner.runs == () and b.runner.due() is None
     if device:
         assert bool(b.device and b.device.stops) == (cause in ("exception", "bad_result"))
+
+
+def test_a_forgotten_await_is_found_in_each_run(bench: Make) -> None:
+    """Python warns only of the first at a line."""
+    b = bench(act=forgets_await, good=naps)
+    for _ in range(3):
+        run, good = b.begin("act"), b.begin("good")
+        b.tick(1.0)
+        assert (b.ended(run).cause, b.ended(good).status) == ("exception", "success")
 
 
 def test_results_are_plain_copies(bench: Make) -> None:
