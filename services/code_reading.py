@@ -40,6 +40,7 @@ API = (actions.__name__, Driver.__module__)
 METHODS = ("period", "state", "stop", "stopped", "hold", "release", "close")
 CYCLIC = ("command", "step")
 """Methods that a driver with a period needs in addition to `METHODS`."""
+CALLED_IN_CYCLE = ("step", "command", "state", "stop", "stopped", "hold", "release", "quick_stop")
 _KINDS = {bool: "bool", int: "int", float: "float", str: "str", list: "list", dict: "dict"}
 
 
@@ -49,8 +50,8 @@ class _Seen:
 
     faults: list[tuple[str, int, str]] = field(default_factory=list)
     """Faults, each with file, line and text."""
-    ignored: list[tuple[str, int, str]] = field(default_factory=list)
-    """Results of services that the code drops, in the same form."""
+    doubtful: list[tuple[str, int, str]] = field(default_factory=list)
+    """What is probably a fault, in the same form."""
     causes: set[str] = field(default_factory=set)
     """Causes: first arguments of `error`."""
     values: set[str] = field(default_factory=set)
@@ -198,17 +199,39 @@ def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
         elif made is actions.Result:
             seen.complete = False
         elif made is time.sleep and in_action:
-            text = "time.sleep stops everything that runs beside it; write `await ctx.sleep(...)`"
-            seen.faults.append((code.file, node.lineno, text))
+            _sleeps(code, node, seen)
         if isinstance(node.func, ast.Attribute):
             _method(code, node, node.func, seen)
+
+
+def _sleeps(code: _Code, node: ast.Call, seen: _Seen) -> None:
+    """Record a call of `time.sleep` in an action, or in what an action uses."""
+    if isinstance(code.tree, ast.AsyncFunctionDef):
+        text = "time.sleep stops everything that runs beside it; write `await ctx.sleep(...)`"
+        seen.faults.append((code.file, node.lineno, text))
+    else:  # it may stand for a library that blocks
+        text = "time.sleep: while it waits, its action can neither be paused nor cancelled"
+        seen.doubtful.append((code.file, node.lineno, text))
+
+
+def _steps(code: _Code, seen: _Seen) -> None:
+    """Record calls of `time.sleep` in the methods of a driver that its cycle calls."""
+    for method in getattr(code.tree, "body", ()):
+        if isinstance(method, ast.FunctionDef) and method.name in CALLED_IN_CYCLE:
+            for node in ast.walk(method):
+                if isinstance(node, ast.Call) and code.value(node.func) is time.sleep:
+                    text = f"time.sleep in `{method.name}`: the driver misses its cycles meanwhile"
+                    seen.doubtful.append((code.file, node.lineno, text))
 
 
 def _ignored(code: _Code, awaited: ast.expr, seen: _Seen) -> None:
     """Record a call of a service whose result is dropped."""
     if isinstance(awaited, ast.Call) and ast.unparse(awaited.func) in ("ctx.call", "context.call"):
-        text = "the result of `ctx.call` is dropped: a failure would go unnoticed"
-        seen.ignored.append((code.file, awaited.lineno, text))
+        text = (
+            "the result of `ctx.call` is dropped, so a failure would go unnoticed; test its "
+            "`status`, and for the memory write `ctx.put`"
+        )
+        seen.doubtful.append((code.file, awaited.lineno, text))
 
 
 def _method(code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen) -> None:
@@ -304,6 +327,8 @@ def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, An
         return {"keys": {device: [["driver", text]] for device in tables}}
     for code in _reachable(thing):
         _look(code, seen, in_action=False)
+        if issubclass(thing, Driver) and thing.period is not None:
+            _steps(code, seen)
     found = {device: _faults_of_driver(thing, table) for device, table in tables.items()}
     return {"keys": found, **_plain(seen)}
 
@@ -346,7 +371,7 @@ def _sets_period(thing: type) -> bool:
 def _plain(seen: _Seen) -> dict[str, Any]:
     return {
         "faults": sorted(set(seen.faults)),
-        "ignored": sorted(set(seen.ignored)),
+        "doubtful": sorted(set(seen.doubtful)),
         "causes": sorted(seen.causes),
         "values": sorted(seen.values),
         "complete": seen.complete,

@@ -259,6 +259,19 @@ IN_THE_CODE: list[Mistake] = [
     ),
     (
         CODE,
+        "async def grip(ctx: Context[Remote], *, slips: float = 0.2) -> Result:\n",
+        "def vendor():\n    import time\n\n    time.sleep(0.3)\n\n\n"
+        "async def grip(ctx: Context[Remote], *, slips: float = 0.2) -> Result:\n    vendor()\n",
+        r"arm_bot.py:\d+: time.sleep: while it waits, its action can neither be paused",
+    ),
+    (
+        CODE,
+        "    def step(self, now: float) -> None:\n",
+        "    def step(self, now: float) -> None:\n        import time; time.sleep(0.02)\n",
+        r"arm_bot.py:\d+: time.sleep in `step`: the driver misses its cycles",
+    ),
+    (
+        CODE,
         "*, to: float)",
         "*, goal: float)",
         r":LINE: places.fetch.args.to: .*'move' has no argument 'to'",
@@ -390,6 +403,8 @@ WARNINGS = (
     "also return jammed",
     "raises the event",
     "is dropped",
+    "time.sleep in `step`",
+    "time.sleep: while",
 )
 
 

@@ -60,13 +60,15 @@ def code_findings(
     for action in used:
         yield from _events(task, action, code[action])
     yield from _misspelt(task, [code[action].get("device", {}) for action in code])
-    for kind, severity, remedy in (
-        ("faults", Severity.ERROR, ""),
-        ("ignored", Severity.WARNING, "test its `status`; for the memory write `ctx.put`"),
+    actions = [code[action] for action in used]
+    drivers = [facts.get("device", {}) for facts in actions]
+    for kind, severity, read in (
+        ("faults", Severity.ERROR, actions),
+        ("doubtful", Severity.WARNING, [*actions, *drivers]),
     ):
-        found = {tuple(fault) for action in used for fault in code[action].get(kind, ())}
+        found = {tuple(fault) for facts in read for fault in facts.get(kind, ())}
         for file, line, text in sorted(found):
-            yield Finding(severity, "code", f"{file}:{line}", text, remedy)
+            yield Finding(severity, "code", f"{file}:{line}", text)
 
 
 def _arguments(
