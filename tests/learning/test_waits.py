@@ -13,6 +13,7 @@ from math import sqrt
 import numpy as np
 import pytest
 
+from petrobot.coordinator.analysis.may_run import BUDGET, may_run
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.engine import Begin, Choose, Chosen, Engine, EventOccurred, RunEnded
@@ -36,6 +37,7 @@ from petrobot.coordinator.studies.forecast.residual import event_doubts
 from petrobot.coordinator.task import Status, Task
 from petrobot.coordinator.task.file import loads
 
+LOST = "lost-pulse"
 MEAN = 5.0
 """Mean time between two events (s)."""
 SECONDS = {"work": 1.0, "rest": 1.0, "tidy": 0.5}
@@ -299,3 +301,20 @@ second = { in = ["other"], out = ["end"], event = "bell" }
         cut = [*ended, Waited("first", 1.0, WaitEnd.CUT)]
         (told,) = [event_doubts(Training.of(task, [Trial(1, 0.0, waits=cut)]))]
         assert ["first and second wait for one event" in doubt for doubt in told] == [True]
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_check_notes_a_pulse_that_another_branch_makes_the_task_lose(memory: str) -> None:
+    """The arm may be taken when it comes; a latched event is meant to be dropped or kept."""
+    notes = [f for f in may_run(shared(memory), None, BUDGET).report.findings if f.code == LOST]
+    assert [(f.key, f.text) for f in notes] == (
+        []
+        if memory != "pulse"
+        else [
+            (
+                "events.alarm",
+                "alarm is a pulse: if it comes while arm is taken (by grab), low does not fire and "
+                "the event is lost",
+            )
+        ]
+    )
