@@ -6,16 +6,18 @@ answer, not in the question.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from math import inf
 from typing import TYPE_CHECKING
 
-from petrobot.coordinator.task import Status, Task
+from petrobot.coordinator.task import Status, Task, Transition
 from petrobot.coordinator.task.check import CheckReport, Finding, Severity, check
-from petrobot.coordinator.task.wording import wrapped
+from petrobot.coordinator.task.validation import is_pulse
+from petrobot.coordinator.task.wording import listed, wrapped
 
 if TYPE_CHECKING:  # the search needs numpy, which a command that only reads the file does without
+    from petrobot.coordinator.analysis.execution.graph import ExecutionGraph
     from petrobot.coordinator.analysis.execution.progress import Contest
     from petrobot.coordinator.analysis.net.space import SearchLimits
     from petrobot.coordinator.analysis.net.verdict import PropertyVerdict
@@ -152,9 +154,46 @@ def _with_graph(report: CheckReport, analysis: Analysis) -> CheckReport:
     found = [_contest(contest) for contest in analysis.progress.contests]
     found += map(_retries, analysis.progress.x.retries)
     found += [_left_behind(p, verdict) for p, verdict in analysis.progress.left_behind.items()]
+    found += _lost_pulses(analysis.progress.x)
     errors = [f for f in found if f.severity is Severity.ERROR]
     others = [f for f in found if f.severity is not Severity.ERROR]
     return CheckReport((*errors, *rest, *others))
+
+
+def _lost_pulses(x: ExecutionGraph) -> Iterator[Finding]:
+    """Transitions that miss a pulse while another branch holds a token that they need."""
+    task, net = x.engine.compiled.task.flat, x.engine.compiled.net
+    for t in task.transitions.values():
+        pulses = [e for e in t.events if is_pulse(task.events[e])]
+        need = {a.place: a.weight for a in t.inputs}
+        for place in need if pulses else ():
+            others = {*need} - {place}
+            takers = [
+                u.name
+                for u in task.transitions.values()
+                if place in _places(u) and others.isdisjoint(_places(u))
+            ]
+            lost = (
+                others
+                and takers
+                and any(
+                    state.marking[net.place_index[place]] < need[place]
+                    and all(state.marking[net.place_index[p]] >= need[p] for p in others)
+                    for state in x.states
+                )
+            )
+            if lost:
+                text = (
+                    f"{pulses[0]} is a pulse: if it comes while {place} is taken (by "
+                    f"{listed(takers)}), {t.name} does not fire and the event is lost"
+                )
+                remedy = 'if it must be served then, write memory = "latched" and early = "keep"'
+                key = f"events.{pulses[0]}"
+                yield Finding(Severity.NOTE, "lost-pulse", key, text, remedy)
+
+
+def _places(t: Transition) -> set[str]:
+    return {a.place for a in t.inputs}
 
 
 def _contest(contest: Contest) -> Finding:

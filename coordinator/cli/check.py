@@ -25,6 +25,7 @@ from petrobot.coordinator.cli.loading import (
 from petrobot.coordinator.task.wording import Severity, wrapped
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from petrobot.coordinator.analysis.may_run import MayRun
@@ -109,6 +110,7 @@ def _with_code(task: Task, directory: Directory, report: CheckReport) -> CheckRe
     that file."""
     from petrobot.coordinator.task.check import CheckReport, Severity
     from petrobot.coordinator.task.check.code import code_findings
+    from petrobot.coordinator.task.check.completeness import EXTERNAL_WAIT, external_waits
     from petrobot.services.comm.location_file import read_text
     from petrobot.services.comm.location_file.code import code_faults, read_code
 
@@ -125,7 +127,37 @@ def _with_code(task: Task, directory: Directory, report: CheckReport) -> CheckRe
     found = list(code_findings(task, by_action, args, directory.services))
     errors = [f for f in found if f.severity is Severity.ERROR]
     warnings = [f for f in found if f.severity is not Severity.ERROR]
-    return CheckReport((*errors, *report.findings, *warnings))
+    known = [f for f in report.findings if f.code != EXTERNAL_WAIT]
+    if len(known) < len(report.findings):  # now it is known which events the cell raises
+        raised, complete = _raised(task, directory, code)
+        source = str(directory.source) if complete else None
+        warnings += external_waits(task.flat, raised, source)
+    return CheckReport((*errors, *known, *warnings))
+
+
+def _raised(
+    task: Task, directory: Directory, code: Mapping[str, Mapping[str, Any]]
+) -> tuple[set[str], bool]:
+    """Return the events that the cell raises, and whether it is known to raise no others: not if
+    some of its code was not read or raises events by names that it computes, and not of a
+    laboratory."""
+    raised = {*directory.timers}
+    complete = not any(node.sim for node in directory.nodes.values())
+    tables = [
+        *((action.run, action.args) for action in directory.actions.values()),
+        *((service.run, {}) for service in directory.services.values()),
+        *((device.driver, device.config) for device in directory.devices.values()),
+    ]
+    for path, table in tables:
+        if not path:  # what comes with petrobot raises nothing
+            continue
+        facts = code.get(path, {})
+        raised |= {*facts.get("events", ())}
+        if facts.get("any_event", True):
+            named = repr(table)  # names that a driver raises may be given in its device's table
+            raised |= {event for event in task.events if repr(event) in named}
+            complete = False
+    return raised, complete
 
 
 def _driver(directory: Directory, device: str) -> str:

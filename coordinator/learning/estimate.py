@@ -501,28 +501,60 @@ class Firings:
 
     fired: int = 0
     waits: Moments = EMPTY
-    """Seconds from the marking that enabled the transition to each firing. A wait belongs to the
-    place that waits, not to the event."""
+    """Seconds of each wait for an event that ended with a firing (in older sums: since the tokens
+    came last)."""
+    unfired: Moments = EMPTY
+    """Seconds of each wait that did not; unknown, and so empty, in older sums."""
+    came: int = 0
+    """How many of the unfired ones ended because the event came."""
+
+    @property
+    def changes(self) -> int:
+        """Number of firings and unfired waits, the version in estimates files."""
+        return self.fired + self.unfired.n
+
+    @property
+    def exposure(self) -> float:
+        """Seconds in which its event could have served it."""
+        return self.waits.total + self.unfired.total
+
+    @property
+    def occurrences(self) -> int:
+        """How often its event came in this time."""
+        return self.waits.n + self.came
 
     def to_plain(self) -> list[Any]:
         """Return the firings as plain data."""
-        return [self.fired, self.waits.to_plain()]
+        return [self.fired, self.waits.to_plain(), self.unfired.to_plain(), self.came]
 
     @classmethod
     def of_plain(cls, data: Sequence[Any]) -> Firings:
         """Read what `to_plain` returned. Raises ValueError or TypeError."""
         fired, waits = whole(data[0], "firings"), Moments.of_plain(data[1])
         whole(waits.n, "waits", fired)
-        return cls(fired, waits)
+        if len(data) == 2:
+            return cls(fired, waits)
+        unfired = Moments.of_plain(data[2])
+        return cls(fired, waits, unfired, whole(data[3], "events that came", unfired.n))
 
     def adding(self, waited: float | None = None) -> Firings:
         """Return the firings with one more."""
-        return Firings(self.fired + 1, self.waits if waited is None else self.waits.adding(waited))
+        waits = self.waits if waited is None else self.waits.adding(waited)
+        return replace(self, fired=self.fired + 1, waits=waits)
+
+    def unserved(self, waited: float, came: bool) -> Firings:
+        """Return the firings with one more wait that ended without one. `came`: by the event."""
+        return replace(self, unfired=self.unfired.adding(waited), came=self.came + came)
 
 
 def merge_firings(one: Firings, other: Firings) -> Firings:
     """Return the firings of both sets of runs."""
-    return Firings(one.fired + other.fired, one.waits.merged(other.waits))
+    return Firings(
+        one.fired + other.fired,
+        one.waits.merged(other.waits),
+        one.unfired.merged(other.unfired),
+        one.came + other.came,
+    )
 
 
 @dataclass(frozen=True, order=True, slots=True)

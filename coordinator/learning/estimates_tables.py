@@ -228,7 +228,7 @@ def add_flow(db: sqlite3.Connection, origin: str, key: FiringsKey, gained: Firin
 
 def flow_row(origin: str, key: FiringsKey, flow: Firings) -> tuple[Any, ...]:
     """Return a row of the table `flow`."""
-    return origin, key.task, key.transition, key.context, flow.fired, json.dumps(flow.to_plain())
+    return origin, key.task, key.transition, key.context, flow.changes, json.dumps(flow.to_plain())
 
 
 def add_trials(db: sqlite3.Connection, origin: str, key: TrialsKey, gained: TrialSums) -> None:
@@ -412,7 +412,7 @@ def flow_of(row: Sequence[Any]) -> Firings:
     _, _, transition, context, version, body = row
     try:
         flow = Firings.of_plain(json.loads(body))
-        _agree(flow.fired, version)
+        _agree(flow.changes, version)
     except (ValueError, KeyError, TypeError, IndexError) as fault:
         raise ValueError(f"transition {transition}{_in(context)}: {_said(fault)}") from fault
     return flow

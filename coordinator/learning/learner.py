@@ -39,6 +39,7 @@ from petrobot.coordinator.learning.records import (
 )
 from petrobot.coordinator.learning.selectors import TASK, cost_of, verdicts_of_task
 from petrobot.coordinator.learning.statistics import added
+from petrobot.coordinator.learning.waits import EventWaits
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.task import Status, Task
 from petrobot.coordinator.task.conditions import ConditionError, ConditionFault, Expression
@@ -171,14 +172,13 @@ class LearningSelector(FirstAlternative):
         """Runs whose verdict may still arrive, each with the number of trials of its primitive task
         and context up to its end."""
         self._trials: Counter[tuple[str, str]] = Counter()
-        self._waiting: dict[str, float] = {}
+        self._waits = EventWaits(learning.task)
         self._goals = frozenset(learning.task.flat.goal_transitions)
         runs_place = learning.task.flat.runs_place
         self._own = learning.task.net.place_index[runs_place] if runs_place else None
         self._trial: _Trial | None = None
         self._served: dict[str, _Trial] = {}
         """The trial of each active run."""
-        self._watched = _waits_for_events(learning.task)
 
     @property
     def context(self) -> str:
@@ -227,6 +227,7 @@ class LearningSelector(FirstAlternative):
         """Remember the context of a choice, and what a run's result contains beside its status."""
         if self._trial is None and self._own is None:
             self._trial = _Trial(now, context=self.context)
+        self._waits.stimulus(now, stimulus)
         if isinstance(stimulus, Chosen):
             self._choice(now, stimulus)
         elif isinstance(stimulus, RunEnded):
@@ -251,7 +252,7 @@ class LearningSelector(FirstAlternative):
         """Ignore progress: nothing is learned from it."""
 
     def settled(self, now: float, state: State) -> None:
-        """Remember the variables, the active runs, and since when transitions wait."""
+        """Remember the variables and the active runs, and record waits that ended."""
         self._values = state.variables
         for run in state.runs():
             if run.phase is Phase.DONE:
@@ -259,12 +260,8 @@ class LearningSelector(FirstAlternative):
             active = self._run(now, run.id)
             if active.context is None and run.action:
                 active.context = self.contexts.of(state.variables)
-        net = self.learning.task.net
-        for name in self._watched:
-            if net.has_concession(state.marking, net.transition_index[name]):
-                self._waiting.setdefault(name, now)
-            else:
-                self._waiting.pop(name, None)
+        for wait in self._waits.settled(now, state):
+            self._note(Passage(wait.transition, self.context, wait.seconds, wait.end))
 
     # --- records ------------------------------------------------------------------------------
 
@@ -289,9 +286,8 @@ class LearningSelector(FirstAlternative):
             if run in self._active:
                 self._active[run].taken_by, self._active[run].taken_at = fired.transition, now
         self._pass(now, fired)
-        since = self._waiting.pop(fired.transition, None)
-        waited = None if since is None else round(now - since, 6)
-        self._note(Passage(fired.transition, self.context, waited))
+        wait = self._waits.fired(now, fired.transition)
+        self._note(Passage(fired.transition, self.context, None if wait is None else wait.seconds))
 
     def _ended(self, now: float, record: RunRecorded) -> None:
         active = self._active.pop(record.run, _ActiveRun(now))
@@ -430,12 +426,3 @@ def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
         for name, value in sorted(values.items())
         if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST
     }
-
-
-def _waits_for_events(task: Task) -> Sequence[str]:
-    """Return the transitions that wait only for events, not for a run."""
-    return [
-        t.name
-        for t in task.flat.transitions.values()
-        if t.events and all(a.end is None for a in t.inputs)
-    ]

@@ -36,6 +36,7 @@ from petrobot.coordinator.learning.records import (
     Record,
     RunEnd,
     TrialEnd,
+    WaitEnd,
 )
 from petrobot.coordinator.learning.selectors import ACTION, DEFAULT, TASK, RuleSelector, make
 from petrobot.coordinator.task import Task
@@ -111,7 +112,11 @@ class Estimates:
             self.tallies[key] = corrected(self.tally(key), record)
         elif isinstance(record, Passage):
             where = FiringsKey(task, record.transition, record.context)
-            self.flows[where] = self.flows.get(where, Firings()).adding(record.waited)
+            flow = self.flows.get(where, Firings())
+            if record.waited is None or record.end is WaitEnd.FIRED:
+                self.flows[where] = flow.adding(record.waited)
+            else:
+                self.flows[where] = flow.unserved(record.waited, record.end is WaitEnd.CAME)
         elif isinstance(record, TrialEnd):
             of = TrialsKey(task, record.context)
             told = record.success, record.goal, record.cost, record.runs

@@ -313,20 +313,20 @@ def _shares(often: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, flo
 
 
 def _waits(task: Task, estimates: Estimates, context: str | None) -> dict[str, float]:
-    """Return the mean wait (s) for each event of a transition that only waits: waited seconds over
-    occurrences."""
+    """Return the mean wait (s) for each event for which transitions wait: the time in which it
+    could have served them, over its occurrences."""
     waited: dict[str, list[float]] = {}
     for key, flow in estimates.flows.items():
         if (
             key.task == task.name
             and context in (None, key.context)
-            and flow.waits.n
+            and flow.occurrences
             and key.transition in task.flat.transitions
         ):
             for event in task.flat.transitions[key.transition].events:
                 total = waited.setdefault(event, [0.0, 0.0])
-                total[0] += flow.waits.total
-                total[1] += flow.waits.n
+                total[0] += flow.exposure
+                total[1] += flow.occurrences
     return {event: max(seconds / n, SHORTEST) for event, (seconds, n) in waited.items()}
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from enum import StrEnum
+from typing import Any, NamedTuple
 
 from petrobot.coordinator.learning.estimate import Observation
 from petrobot.coordinator.task import Executed, Status
@@ -59,15 +60,43 @@ class Credit:
     verdicts."""
 
 
+class WaitEnd(StrEnum):
+    """How a wait ended."""
+
+    LATEST = ""
+    """With a firing, measured since the tokens came last: timers, several events at once, and all
+    waits in tables that are older than the other ends."""
+    FIRED = "fired"
+    """The event came, and the transition fired."""
+    CAME = "came"
+    """The event came, and the transition did not fire at once: its flag is set, another transition
+    took the token, or its condition was false."""
+    CUT = "cut"
+    """Without the event: a token was taken elsewhere, or the trial ended."""
+
+
+class Waited(NamedTuple):
+    """One wait of a transition for its event or timer."""
+
+    transition: str
+    seconds: float
+    end: WaitEnd = WaitEnd.LATEST
+
+    @property
+    def fired(self) -> bool:
+        """Whether it ended with a firing."""
+        return self.end in (WaitEnd.LATEST, WaitEnd.FIRED)
+
+
 @dataclass(frozen=True, slots=True)
 class Passage:
-    """A transition fired."""
+    """A transition fired, or a wait for its event ended without a firing."""
 
     transition: str
     context: str
     waited: float | None = None
-    """Seconds from the marking that enabled it to its firing, for transitions that wait only for
-    events."""
+    """Seconds of the wait for its event; None if the firing ended none."""
+    end: WaitEnd = WaitEnd.FIRED
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +124,7 @@ def to_plain(record: Record) -> dict[str, Any]:
             "transition": record.transition,
             "context": record.context,
             "waited": record.waited,
+            **({} if record.end is WaitEnd.FIRED else {"end": record.end.value}),
         }
     if isinstance(record, TrialEnd):
         return {
@@ -125,7 +155,8 @@ def of_plain(data: Mapping[str, Any]) -> Record:
     """Read what `to_plain` returned. Raises ValueError or KeyError."""
     kind = data["kind"]
     if kind == "Passage":
-        return Passage(str(data["transition"]), str(data["context"]), data["waited"])
+        end = WaitEnd(data.get("end", WaitEnd.FIRED))
+        return Passage(str(data["transition"]), str(data["context"]), data["waited"], end)
     if kind == "Trial":
         runs = tuple(map(str, data["runs"]))
         told = bool(data["success"]), bool(data["goal"]), data["cost"]

@@ -462,11 +462,43 @@ def test_figures_of_one_trial_stand_beside_those_of_the_mission() -> None:
     assert found.forecast is not None and found.forecast.trials == 3 and not found.doubts
     one = found.forecast.one_trial
     alone = forecast(stochastic_view(Text(1, places=text.places, moves=text.moves).task()))
-    assert one.figures == alone.figures and one.one_trial is one
+    assert one.figures == alone.one_trial.figures == one.one_trial.figures
     assert one.conjunctive_reliability > found.forecast.conjunctive_reliability
     assert "forecast of a mission run of 3 trials:" in found.text()
     assert f"one trial: P_complete 1.000000, R_goal {one.figures['R_goal']:.6f}" in found.text()
     assert found.to_json(structure=False)["forecast"]["one_trial"] == one.figures
+
+
+def test_one_trial_begins_when_its_token_is_taken() -> None:
+    """As in a campaign, without the wait for the button that takes it."""
+    text = """
+schema = 1
+[task]
+name = "pressed"
+runs_place = "parts"
+final = "parts == 0 and ready == 1"
+[events.button]
+scope = "external"
+mean_wait = 4.0
+[primitive_tasks.work]
+goal = "worked"
+alternatives = ["work"]
+deadline = 9.0
+estimates = { success = { share = 0.5, mean = 2.0 }, error = { share = 0.5, mean = 1.0 } }
+[places]
+parts = { kind = "control", tokens = TOKENS }
+ready = { tokens = 1 }
+work = { kind = "action", task = "work" }
+[transitions]
+take = { in = ["parts", "ready"], out = ["work"], event = "button" }
+done = { in = ["work:normal"], out = ["ready"] }
+lost = { in = ["work:error"], out = ["ready"] }
+"""
+    for tokens in (1, 3):
+        task = loads(text.replace("TOKENS", str(tokens)), "pressed.toml")
+        found = forecast(stochastic_view(task))
+        assert found.done.mean == pytest.approx(tokens * (4.0 + 1.5))
+        assert found.one_trial.done.mean == pytest.approx(1.5)
 
 
 def test_a_figure_that_the_execution_graph_contradicts_is_doubtful() -> None:

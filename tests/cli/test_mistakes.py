@@ -486,6 +486,45 @@ def test_an_event_that_a_driver_misspells_is_told(
     expect(told, CHECK, 0)
 
 
+RAISED = 'self.ports.raise_event("button")\n        if not self.paused:'
+TIMER = '[timers.button]\nnode = "pc"\nperiod = 1.0\n\n[nodes.pc]'
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    ("file", "old", "new", "told"),
+    [
+        (CODE, "if not self.paused:", RAISED, ""),
+        (CELL, "[nodes.pc]", TIMER, ""),
+        (CODE, "if not self.paused:", RAISED.replace('"button"', "NAME"), "if it never comes"),
+        (CODE, "", "", "no driver, action, service or timer of services.toml raises it"),
+    ],
+    ids=["by a driver", "by a timer", "by a computed name", "by nobody"],
+)
+def test_a_wait_for_an_event_is_reported_unless_the_cell_raises_it(
+    sound: dict[str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    file: str,
+    old: str,
+    new: str,
+    told: str,
+) -> None:
+    """Its code says so: no false alarm, and no word about a hang where nobody can end the wait."""
+    start = 'start = { event = "button", '
+    mistakes: list[Mistake] = [
+        (TASK, "[errors]", '[events.button]\nscope = "external"\n\n[errors]', ""),
+        (TASK, "start = { ", start, ""),
+        (file, old, new, ""),
+    ]
+    damaged(sound, mistakes, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    code, words = said(*CHECK)
+    alarms = [line for line in words.splitlines() if "can free its token" in line]
+    assert code == 0 and bool(alarms) == bool(told)
+    assert all(told in line for line in alarms)
+
+
 @pytest.mark.processes
 def test_a_memory_that_is_on_a_node_is_no_mistake(
     sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -886,12 +886,6 @@ class _Derivation:
     def _transition(self, t: Transition) -> None:
         if self.compiled[t.name].never:
             return
-        measured = [e for e in t.events if e in self.measured.waits]
-        if measured and any(a.end in (End.NORMAL, End.ERROR) for a in t.inputs):
-            self.doubts.append(
-                f"{', '.join(measured)}: the measured wait is that of {t.name} since its tokens "
-                "came, and so contains its run; it is taken for the wait for the event"
-            )
         for arc in self.compiled[t.name].actions:
             ended = arc.end in (End.NORMAL, End.ERROR)
             if t.after is not None and ended and self._may_hold(arc.name, arc.weight + 1):

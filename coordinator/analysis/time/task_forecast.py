@@ -84,11 +84,15 @@ class Forecast:
     @cached_property
     def one_trial(self) -> Forecast:
         """The forecast of a mission run with one run token: what a campaign measures, whose figures
-        are per trial. Its long-run numbers do not hold for missions of several trials."""
-        if self.trials == 1 or not self.view.task.runs_place:
+        are per trial. As there, its time begins when the token is taken, so without the wait before
+        it. Its long-run numbers do not hold for missions of several trials."""
+        own = self.view.task.runs_place
+        if not own:
             return self
-        alone = self.view.gspn.marked({self.view.task.runs_place: 1})
-        return forecast(replace(self.view, gspn=alone))
+        alone = forecast(replace(self.view, gspn=self.view.gspn.marked({own: 1})))
+        space = alone.chain.space
+        taken = space.tokens(self.view.task.net.place_index[own]) == 0
+        return replace(alone, done=completion(alone.chain, alone.done.goal, taken))
 
     @property
     def figures(self) -> dict[str, float]:

@@ -19,6 +19,7 @@ from petrobot.coordinator.learning.estimates_file import SIMULATED, EstimatesErr
 from petrobot.coordinator.learning.estimates_tables import CAMPAIGN
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.learning.records import Waited, WaitEnd
 from petrobot.coordinator.learning.statistics import added
 from petrobot.coordinator.studies.campaign.plan import CampaignError
 from petrobot.coordinator.studies.campaign.rows import TrialRow
@@ -67,15 +68,18 @@ def add_row(estimates: Estimates, task: Task, row: TrialRow, salt: str) -> None:
         estimates.tallies[key] = estimates.tallies.get(key, Tally()).adding(
             observation(task, run), name
         )
-    waits: dict[str, list[float]] = {}
-    for transition, seconds in row.trial.waits:
-        waits.setdefault(transition, []).append(seconds)
-    for transition, count in row.trial.fired.items():
+    waits: dict[str, list[Waited]] = {}
+    for wait in row.trial.waits:
+        waits.setdefault(wait.transition, []).append(wait)
+    for transition in dict.fromkeys((*row.trial.fired, *waits)):
         where = FiringsKey(task.name, transition, context)
         flow = estimates.flows.get(where, Firings())
-        known = waits.get(transition, [])
-        for i in range(count):
-            flow = flow.adding(known[i] if i < len(known) else None)
+        seconds = [wait.seconds for wait in waits.get(transition, ()) if wait.fired]
+        for i in range(row.trial.fired.get(transition, 0)):
+            flow = flow.adding(seconds[i] if i < len(seconds) else None)
+        for wait in waits.get(transition, ()):
+            if not wait.fired:
+                flow = flow.unserved(wait.seconds, wait.end is WaitEnd.CAME)
         estimates.flows[where] = flow
     of = TrialsKey(task.name, context)
     costs = [run.cost for run in row.trial.runs]

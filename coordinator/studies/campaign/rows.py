@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from petrobot.coordinator.studies.campaign.plan import Block
-from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial, waits_of
 from petrobot.coordinator.task import Kind, Task
 from petrobot.services.host.json_text import json_text
 
@@ -150,7 +150,7 @@ def read_row(record: Mapping[str, str]) -> TrialRow:
             record["status"],
             record["cause"],
             [RunEntry.from_plain(run) for run in json.loads(record["runs"])],
-            [(str(name), float(wait)) for name, wait in json.loads(record["waits"])],
+            waits_of(json.loads(record["waits"])),
             json.loads(record["fired"]),
         )
     own = {key: value_of(text) for key, text in record.items() if _is_own(key) and text != ""}

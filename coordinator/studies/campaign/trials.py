@@ -7,7 +7,7 @@ contain several trials. A task without a runs place has one trial per mission ru
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,6 +21,8 @@ from petrobot.coordinator.engine.instructions import (
     StartRun,
 )
 from petrobot.coordinator.engine.stimuli import RunEnded, Stimulus
+from petrobot.coordinator.learning.records import Waited, WaitEnd
+from petrobot.coordinator.learning.waits import EventWaits
 from petrobot.coordinator.task import End, Executed, Kind, Status, Task
 from petrobot.coordinator.task.net import Marking
 from petrobot.services.comm.protocol.messages import Feedback
@@ -94,9 +96,9 @@ class Trial:
     """The worst status of its runs."""
     cause: str = ""
     runs: list[RunEntry] = field(default_factory=list)
-    waits: list[tuple[str, float]] = field(default_factory=list)
-    """(transition, s) for each firing of a transition that waited for an event or a timer, from the
-    moment it was enabled."""
+    waits: list[Waited] = field(default_factory=list)
+    """Waits of transitions for events and timers that ended in this trial, and those for events
+    that its end cut."""
 
     fired: dict[str, int] = field(default_factory=dict)
     """How often each transition fired."""
@@ -120,13 +122,13 @@ class Trial:
     def from_plain(cls, data: Mapping[str, Any]) -> Trial:
         """Read what `to_plain` returned."""
         runs = [RunEntry.from_plain(run) for run in data["runs"]]
-        return cls(
-            **{
-                **data,
-                "runs": runs,
-                "waits": [(str(name), float(wait)) for name, wait in data["waits"]],
-            }
-        )
+        return cls(**{**data, "runs": runs, "waits": waits_of(data["waits"])})
+
+
+def waits_of(data: Iterable[Sequence[Any]]) -> list[Waited]:
+    """Read the waits of a trial; those of older tables do not say how they ended. Raises
+    ValueError."""
+    return [Waited(str(name), float(s), *map(WaitEnd, end)) for name, s, *end in data]
 
 
 class TrialLog:
@@ -138,12 +140,14 @@ class TrialLog:
         self._goals = frozenset(flat.goal_transitions)
         self._runs_place = self._net.place_index[flat.runs_place] if flat.runs_place else None
         self._actions = {p.name for p in flat.places.values() if p.kind is Kind.ACTION}
-        self._waiting = {
-            t.name: [(a.place, a.end) for a in t.inputs]
+        self._timers = {
+            t.name: [a.place for a in t.inputs]
             for t in flat.transitions.values()
-            if (t.events or t.after is not None)
-            and not any(a.end in (End.PREEMPT, End.GOING) for a in t.inputs)
+            if t.after is not None and not any(a.end in (End.PREEMPT, End.GOING) for a in t.inputs)
         }
+        self._waits = EventWaits(task)
+        self._ended_waits: list[Waited] = []
+        """Waits that ended before the first trial began."""
         self.trials: list[Trial] = []
         # By place: when its latest token entered. A transition is enabled from the latest of these
         # times over its input places.
@@ -167,6 +171,7 @@ class TrialLog:
             self._since = dict.fromkeys(self._net.places, now)
             if self._runs_place is None:
                 self._begin(now)
+        self._waits.stimulus(now, stimulus)
         if isinstance(stimulus, RunEnded):
             self._values[stimulus.run] = stimulus.values
 
@@ -187,17 +192,27 @@ class TrialLog:
         """Ignore progress."""
 
     def settled(self, now: float, state: State) -> None:
-        """Ignore the state."""
+        """Record the waits that ended without a firing."""
+        self._note_waits(self._waits.settled(now, state))
 
     # --- what happened ------------------------------------------------------------------------
 
     def _begin(self, now: float) -> None:
         if self.trials:
             self.trials[-1].completed = True
+            self._note_waits(self._waits.cut(now))
         assert self._origin is not None
         self.trials.append(Trial(len(self.trials) + 1, round(now - self._origin, DIGITS)))
 
+    def _note_waits(self, ended: list[Waited]) -> None:
+        """Note waits in the present trial, those from before the first one in the first one."""
+        self._ended_waits += ended
+        if self.trials:
+            self.trials[-1].waits += self._ended_waits
+            self._ended_waits = []
+
     def _fired(self, now: float, fired: Fired) -> None:
+        wait = self._waits.fired(now, fired.transition)  # before a new trial cuts it
         if (
             self._runs_place is not None
             and fired.after[self._runs_place] < fired.before[self._runs_place]
@@ -208,16 +223,17 @@ class TrialLog:
                 self._entries[run][1].taken = fired.transition
                 if run in self._active:  # preempted
                     self._ended(now, run)
+        self._note_waits([] if wait is None else [wait])
         if not self.trials:
             return
         trial = self.trials[-1]
         trial.goals += fired.transition in self._goals
         trial.fired[fired.transition] = trial.fired.get(fired.transition, 0) + 1
-        if fired.transition in self._waiting:
+        if fired.transition in self._timers:
             since = max(
-                (self._since[place] for place, _ in self._waiting[fired.transition]), default=now
+                (self._since[place] for place in self._timers[fired.transition]), default=now
             )
-            trial.waits.append((fired.transition, round(now - since, DIGITS)))
+            trial.waits.append(Waited(fired.transition, round(now - since, DIGITS)))
         for name, before, after in zip(self._net.places, fired.before, fired.after, strict=True):
             if after > before:
                 self._since[name] = now

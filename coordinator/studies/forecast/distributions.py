@@ -36,6 +36,7 @@ from petrobot.coordinator.studies.forecast.history import (
     Seen,
     Training,
     Values,
+    Waits,
 )
 
 ALPHA = 0.01
@@ -395,7 +396,7 @@ class Drawer:
     def __init__(
         self,
         runs: RunDistributions,
-        waits: Mapping[str, tuple[Values, Codes]],
+        waits: Mapping[str, Waits],
         weights: Values,
         random: np.random.Generator,
     ) -> None:
@@ -467,10 +468,28 @@ class Drawer:
         """Draw the wait of a transition (s) for each column; None if it was never measured."""
         if transition not in self._waits:
             return None
-        seconds, trials = self._waits[transition]
+        seconds, trials, came = self._waits[transition]
+        if came is not None:
+            mean = self._mean_waits(transition, seconds, trials, came)[replicate]
+            return -mean * np.log1p(-self.chance(len(replicate)))
         index = self._draw(transition, np.full(len(seconds), 1.0 / len(seconds)), trials, replicate)
         drawn: Values = seconds[index]
         return drawn
+
+    def as_measured(self, transition: str) -> bool:
+        """Return whether waits of the transition are drawn as they were measured: since it could
+        fire, not since its event could come."""
+        return transition in self._waits and self._waits[transition].came is None
+
+    def _mean_waits(self, key: str, seconds: Values, trials: Codes, came: Values) -> Values:
+        """Return the exposure over the occurrences by replicate; over all trials if the event never
+        came in those of the replicate."""
+        if key not in self._bounds:
+            each = self._weights[:, trials]
+            often = each @ came
+            mean = each @ seconds / np.where(often > 0, often, 1.0)
+            self._bounds[key] = np.where(often > 0, mean, seconds.sum() / came.sum())
+        return self._bounds[key]
 
     def _draw(self, key: object, weight: Values, trials: Codes, replicate: Codes) -> Codes:
         """Draw a member for each column by the weights of its replicate; by the plain weights if

@@ -3,10 +3,10 @@ its trial."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +22,20 @@ from petrobot.coordinator.learning.estimates_file import (
     said,
 )
 from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.learning.records import Waited, WaitEnd
+from petrobot.coordinator.learning.waits import memory_of
 from petrobot.coordinator.studies.campaign.observed import context_of, regime_of
 from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
-from petrobot.coordinator.task import End, Kind, Status, Task, Transition
+from petrobot.coordinator.task import (
+    EarlyEvent,
+    End,
+    EventMemory,
+    Kind,
+    Status,
+    Task,
+    Transition,
+)
 
 Codes = NDArray[np.int64]
 Values = NDArray[np.float64]
@@ -176,6 +186,17 @@ class Runs:
         return len(self.place)
 
 
+class Waits(NamedTuple):
+    """The measured waits of a transition for its event or timer."""
+
+    seconds: Values
+    trial: Codes
+    """Index of the trial of each."""
+    came: Values | None = None
+    """1 for each wait that its event ended, 0 for the others: the waits are exponential with the
+    rate that follows. None: all ended with a firing, and are drawn as they were measured."""
+
+
 @dataclass(frozen=True)
 class Training:
     """The measured trials of a regime."""
@@ -184,8 +205,8 @@ class Training:
     vocabulary: RunVocabulary
     trials: tuple[Trial, ...]
     runs: Runs
-    waits: dict[str, tuple[Values, Codes]]
-    """By waiting transition: seconds of each firing, and the index of its trial."""
+    waits: dict[str, Waits]
+    """By waiting transition."""
     whole: bool = True
     """True if the trials are those that were run. Otherwise each holds a single run or wait, and
     the result of a whole trial is unknown."""
@@ -210,26 +231,55 @@ class Training:
         waiting = {a: device for a, device in (devices or {}).items() if device in shared}
         if any(run.waited is None and run.action in waiting for t in kept for run in t.runs):
             waiting = {}  # an older table: the waits are in the durations
-        waits: dict[str, list[tuple[float, int]]] = {}
+        waits: dict[str, list[tuple[Waited, int]]] = {}
         timers = _cutting_timers(task)
         for i, trial in enumerate(kept):
-            for name, seconds in (
+            for wait in (
                 *trial.waits,
-                *((t, s) for t in timers for s in _waited(t, trial)),
+                *(Waited(t, s) for t in timers for s in _waited(t, trial)),
             ):
-                waits.setdefault(name, []).append((seconds, i))
+                waits.setdefault(wait.transition, []).append((wait, i))
+        found = {name: _waits(task, name, known) for name, known in waits.items()}
         return cls(
             task,
             vocabulary,
             kept,
             _runs(vocabulary, kept, waiting),
-            {
-                name: (np.array([s for s, _ in w]), np.array([i for _, i in w]))
-                for name, w in waits.items()
-            },
+            {name: known for name, known in found.items() if known is not None},
             whole,
             waiting,
         )
+
+
+def _waits(task: Task, transition: str, known: Sequence[tuple[Waited, int]]) -> Waits | None:
+    """Return the waits of a transition; None if its event never came.
+
+    Where a wait was cut, or the event may come before the transition can fire, no single wait can
+    be repeated as it was: only the rate of the event is known.
+    """
+    t = task.flat.transitions.get(transition)
+    remembered = None if t is None else memory_of(task.flat, t)
+    early = (t is not None and remembered is not None) and (
+        remembered[1] is EarlyEvent.KEEP
+        or (remembered[0] is EventMemory.LATCHED and any(a.end is not None for a in t.inputs))
+    )
+    ends = {wait.end for wait, _ in known}
+    by_rate = WaitEnd.LATEST not in ends and (early or not ends <= {WaitEnd.FIRED})
+    used = [(wait, i) for wait, i in known if by_rate or wait.fired]
+    came = np.array([wait.fired or _sets_flag(remembered, wait) for wait, _ in used], np.float64)
+    if not came.any():
+        return None
+    return Waits(
+        np.array([wait.seconds for wait, _ in used]),
+        np.array([i for _, i in used]),
+        came if by_rate else None,
+    )
+
+
+def _sets_flag(remembered: tuple[EventMemory, EarlyEvent] | None, wait: Waited) -> bool:
+    """Return whether the event came and waits for the transition."""
+    latched = remembered is not None and remembered[0] is EventMemory.LATCHED
+    return latched and wait.end is WaitEnd.CAME
 
 
 def by_regime(
@@ -390,8 +440,14 @@ def _trials(task: Task, estimates: Estimates, regime: str) -> list[Trial]:
                     for run in _runs_of_sums(place.name, key.action, tally)
                 ]
     for where, flow in estimates.flows.items():
-        if (where.task, where.context) == (task.name, context) and flow.waits.n:
-            out.append(Trial(1, 0.0, waits=[(where.transition, flow.waits.mean)]))
+        if (where.task, where.context) != (task.name, context) or not flow.occurrences:
+            continue
+        if not flow.unfired.n:
+            out.append(Trial(1, 0.0, waits=[Waited(where.transition, flow.waits.mean)]))
+            continue
+        wait = Waited(where.transition, flow.exposure / flow.occurrences, WaitEnd.FIRED)
+        out += [Trial(1, 0.0, waits=[wait]) for _ in range(flow.occurrences)]
+        out.append(Trial(1, 0.0, waits=[Waited(where.transition, 0.0, WaitEnd.CUT)]))
     return out
 
 

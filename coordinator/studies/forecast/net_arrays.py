@@ -9,8 +9,18 @@ from itertools import product
 import numpy as np
 
 from petrobot.coordinator.analysis.time.measured import is_cause
+from petrobot.coordinator.learning.waits import memory_of
 from petrobot.coordinator.studies.forecast.history import STATUSES, RunVocabulary, reads_variables
-from petrobot.coordinator.task import Counts, End, Kind, Status, Task, Transition
+from petrobot.coordinator.task import (
+    Counts,
+    EarlyEvent,
+    End,
+    EventMemory,
+    Kind,
+    Status,
+    Task,
+    Transition,
+)
 from petrobot.coordinator.task.compiled import CompiledNet
 from petrobot.coordinator.task.compiled_task import CompiledTransition, compile_transitions
 from petrobot.coordinator.task.conditions import ConditionFault
@@ -33,6 +43,8 @@ class Move:
     """Action places in which it starts a run."""
     waits: bool
     """For an event or a timer."""
+    memory: tuple[EventMemory, EarlyEvent] | None
+    """How the one external event for which it waits is remembered."""
     mean_wait: float | None
     """Declared mean time until all of its events have come (s); None: not declared."""
     allowed: np.ndarray | None
@@ -136,6 +148,7 @@ def _move(
         is_cause(t),
         tuple(number_of[p] for p, _, is_action in compiled.produce if is_action),
         bool(t.events) or t.after is not None,
+        memory_of(flat, t),
         max(means) if means and len(means) == len(waits_known) else None,
         _allowed(t, [vocabulary.places[q] for q in by_end[End.NORMAL] + by_end[End.ERROR]]),
         t.name in flat.goal_transitions,

@@ -4,9 +4,9 @@ says what follows.
 This is the generalised semi-Markov process of docs/forecast.md: when a token enters an action place
 an action is chosen, then how and when its run will end is drawn in one draw (competing risks: of
 itself with a status, or preempted by an event or a timer); transitions that wait for events or
-timers race with their measured waits; everything else fires at once, also what preempts a run
-because another one has ended. Runs wait for their devices, and tokens for the run before them, as
-in the engine: in the order in which they came.
+timers race with their measured waits, or with the rates of their events; everything else fires at
+once, also what preempts a run because another one has ended. Runs wait for their devices, and
+tokens for the run before them, as in the engine: in the order in which they came.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from petrobot.coordinator.analysis.net.columns import concession
 from petrobot.coordinator.studies.forecast.distributions import Drawer, Mask
 from petrobot.coordinator.studies.forecast.history import CENSORED, STATUSES, Codes, Seen, Values
 from petrobot.coordinator.studies.forecast.net_arrays import ERROR, SUCCESS, Move, Structure
-from petrobot.coordinator.task import Counts, Start, Status
+from petrobot.coordinator.task import Counts, EarlyEvent, EventMemory, Start, Status
 from petrobot.coordinator.task.net import Marking
 
 IDLE, GOING, DONE = 0, 1, 2
@@ -133,8 +133,7 @@ class Play:
             if not len(self._column):
                 break
             self._grant()
-            self._wait()
-            self._advance()
+            self._advance(self._wait())
         return replace(
             self._out,
             endless=len(self._column),
@@ -296,15 +295,33 @@ class Play:
             self._turns += 1
             self._turn[q, waits], self._end[q, waits] = self._turns, np.inf
 
-    def _wait(self) -> None:
-        """Draw when transitions that wait will fire, as soon as they can; forget it when they
-        cannot any more."""
+    def _wait(self) -> Values:
+        """Draw when the events of transitions that wait will come, as soon as they can serve them,
+        and forget it when they cannot any more. Return when each transition will fire, if nothing
+        happens before."""
+        fires = np.full_like(self._due, np.inf)
         for i, move in enumerate(self._slow):
             able = self._enabled(move)
-            fresh = np.flatnonzero(able & np.isinf(self._due[i]))
+            served = self._served(move, able)
+            fresh = np.flatnonzero(served & np.isinf(self._due[i]))
             if len(fresh):
                 self._due[i, fresh] = self._now[fresh] + self._drawn_wait(move, fresh)
-            self._due[i, ~able] = np.inf
+            self._due[i, ~served] = np.inf
+            fires[i, able] = np.maximum(self._due[i, able], self._now[able])
+        return fires
+
+    def _served(self, move: Move, able: Mask) -> Mask:
+        """Return where its event serves a transition if it comes now: as in the engine, a latched
+        one may come before the runs have ended that the transition takes, and a kept one at any
+        time."""
+        if move.memory is None or self._drawer.as_measured(move.name):
+            return able
+        memory, early = move.memory
+        if early is EarlyEvent.KEEP:
+            return np.ones_like(able)
+        if memory is EventMemory.LATCHED:
+            return concession(self._s.rule, self._tokens, move.number)
+        return able
 
     def _drawn_wait(self, move: Move, columns: Codes) -> Values:
         drawn = self._drawer.wait(move.name, self._replicate[columns])
@@ -316,12 +333,12 @@ class Play:
             return np.full(len(columns), 1e12)  # its event was never seen to come
         return -move.mean_wait * np.log1p(-self._drawer.chance(len(columns)))
 
-    def _advance(self) -> None:
+    def _advance(self, due: Values) -> None:
         """On to the next end of a run or of a wait in each column."""
         q = self._end.argmin(axis=0)
         ends = self._end[q, np.arange(len(q))]
-        i = self._due.argmin(axis=0) if len(self._slow) else np.zeros(len(q), np.int64)
-        dues = self._due[i, np.arange(len(q))] if len(self._slow) else np.full(len(q), np.inf)
+        i = due.argmin(axis=0) if len(self._slow) else np.zeros(len(q), np.int64)
+        dues = due[i, np.arange(len(q))] if len(self._slow) else np.full(len(q), np.inf)
         soonest = np.minimum(ends, dues)
         moving = np.isfinite(soonest)
         self._now = np.where(moving, soonest, self._now)

@@ -30,6 +30,7 @@ from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
 from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
 from petrobot.coordinator.studies.forecast.residual import (
     doubts,
+    event_doubts,
     measured,
     order_doubts,
     residuals,
@@ -288,7 +289,11 @@ def _from_net(training: Training, request: Request, random: np.random.Generator)
             **{name: _net_time(point[name], samples[name], request.runs, n) for name in TIMES},
         },
         "law": {**law, "trials": float(n)},
-        "doubts": doubts(residual, whole, request.point) + order_doubts(training),
+        "doubts": [
+            *doubts(residual, whole, request.point),
+            *event_doubts(training),
+            *order_doubts(training),
+        ],
         **_net_told(
             residual,
             measured_runs,

@@ -10,10 +10,19 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2_contingency, rankdata, spearmanr, ttest_ind_from_stats
 
+from petrobot.coordinator.analysis.net.structure import exclusive_places, place_semiflows
+from petrobot.coordinator.learning.records import WaitEnd
+from petrobot.coordinator.learning.waits import memory_of
 from petrobot.coordinator.studies.forecast.direct import FEWEST, missions
-from petrobot.coordinator.studies.forecast.history import Codes, Training, Values
+from petrobot.coordinator.studies.forecast.history import (
+    Codes,
+    Training,
+    Values,
+    reads_variables,
+)
 from petrobot.coordinator.studies.forecast.play import Choices, Played
 from petrobot.coordinator.studies.forecast.shares import holm
+from petrobot.coordinator.task import EarlyEvent, EventMemory
 
 LEVEL = 0.01
 """Significance level at which simulated and measured trials differ, over all tests of a regime
@@ -227,6 +236,45 @@ def order_doubts(training: Training) -> list[str]:
         for (words, r, _), p in zip(found, together, strict=True)
         if p < ORDER_LEVEL and abs(r) > ORDER
     ]
+
+
+def event_doubts(training: Training) -> list[str]:
+    """Return in words which events the simulated net cannot follow: where no single wait can be
+    repeated, it knows the rate of one event for each transition."""
+    flat = training.task.flat
+    never = exclusive_places(flat.net, place_semiflows(flat.net))
+    place = flat.net.place_index
+    cut = {w.transition for trial in training.trials for w in trial.waits if w.end is WaitEnd.CUT}
+    out = []
+    for t in flat.transitions.values():
+        remembered = memory_of(flat, t)
+        if t.name in cut and remembered is None:
+            out.append(
+                f"{t.name} waits for several events, and its waits were interrupted: which of them "
+                "had come by then is not known"
+            )
+        known = training.waits.get(t.name)
+        if known is None or known.came is None or remembered is None:
+            continue
+        memory, early = remembered
+        for u in flat.transitions.values():
+            apart = early is EarlyEvent.DROP and any(
+                tuple(sorted((place[a.place], place[b.place]))) in never
+                for a in t.inputs
+                for b in u.inputs
+            )
+            if u is not t and {*t.events} & {*u.events} and not apart:
+                one, other = sorted((t.name, u.name))
+                out.append(
+                    f"{one} and {other} wait for one event, and their waits were interrupted: "
+                    "the simulated net lets it come for each of them by itself"
+                )
+        if memory is EventMemory.LATCHED and reads_variables(t):
+            out.append(
+                f"{t.name} waits for a latched event and reads variables, which the simulated net "
+                "does not know"
+            )
+    return list(dict.fromkeys(out))
 
 
 def doubts(residual: Sequence[Mapping[str, Any]], played: Played, trials: int) -> list[str]:

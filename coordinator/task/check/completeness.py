@@ -3,7 +3,7 @@ conditions cover all cases."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from petrobot.coordinator.task import (
@@ -23,6 +23,8 @@ from petrobot.coordinator.task.conditions.regions import Certainty, Domain, cove
 from petrobot.coordinator.task.validation import condition_domains
 from petrobot.coordinator.task.wording import Severity, listed, nearest
 
+EXTERNAL_WAIT = "external-wait"
+"""Code of the findings of `external_waits`."""
 _EXIT_OF = {Status.SUCCESS: End.NORMAL, Status.FAILURE: End.NORMAL, Status.ERROR: End.ERROR}
 
 
@@ -93,9 +95,15 @@ def event_faults(task: Task) -> Iterator[Finding]:
                 yield _unheard(task, t, event)
 
 
-def external_waits(task: Task) -> Iterator[Finding]:
+def external_waits(
+    task: Task, raised: Collection[str] = (), source: str | None = None
+) -> Iterator[Finding]:
     """Places whose tokens only an external event can free, with no `after` beside it. One that
-    listens may wait for ever."""
+    listens may wait for ever.
+
+    `raised`: the events that the cell is known to raise; they are awaited as designed. `source`:
+    the location file, if it is known that the cell raises no others.
+    """
     for place in task.places.values():
         if place.listen:
             continue
@@ -105,21 +113,24 @@ def external_waits(task: Task) -> Iterator[Finding]:
                 if arc.place == place.name and arc.end not in (End.PREEMPT, End.GOING):
                     takers.setdefault(arc.end, []).append(t)
         for end, ways in takers.items():
-            waits = {e for t in ways for e in t.events if task.events[e].scope is Scope.EXTERNAL}
-            if all(_is_external(task, t) for t in ways):
-                after = f" after its {end} end" if end else ""
-                text = (
-                    f"only {listed(waits)} can free its token{after}: if it never comes, "
-                    "the task hangs"
-                )
-                remedy = "put a transition with `after` beside it"
-                yield Finding(
-                    Severity.WARNING, "external-wait", f"places.{place.name}", text, remedy
-                )
+            missing = [_external(task, t) - {*raised} for t in ways]
+            if not all(missing):
+                continue
+            waits = set[str]().union(*missing)
+            after = f" after its {end} end" if end else ""
+            text = f"only {listed(waits)} can free its token{after}"
+            remedy = "put a transition with `after` beside it"
+            if source is None:
+                text += ": if it never comes, the task hangs"
+            else:
+                text += f", and no driver, action, service or timer of {source} raises it"
+                remedy += ", or raise it by hand: petrobot raise EVENT"
+            yield Finding(Severity.WARNING, EXTERNAL_WAIT, f"places.{place.name}", text, remedy)
 
 
-def _is_external(task: Task, t: Transition) -> bool:
-    return any(task.events[e].scope is Scope.EXTERNAL for e in t.events)
+def _external(task: Task, t: Transition) -> set[str]:
+    """Return the external events for which a transition waits."""
+    return {e for e in t.events if task.events[e].scope is Scope.EXTERNAL}
 
 
 def _holds_raiser(task: Task, t: Transition, event: Event) -> bool:

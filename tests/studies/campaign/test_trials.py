@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from petrobot.coordinator.cli.loading import load_task
 from petrobot.coordinator.engine.instructions import Corrected
 from petrobot.coordinator.launch import Setting, lockstep_cell
+from petrobot.coordinator.learning.records import Waited, WaitEnd
 from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.studies.campaign.block import scores
 from petrobot.coordinator.studies.campaign.plan import CampaignPlan, identity
@@ -144,7 +145,7 @@ TRIALS = st.builds(
     status=st.sampled_from(["success", "failure", "error"]),
     cause=TEXT,
     runs=st.lists(RUNS, max_size=3),
-    waits=st.lists(st.tuples(TEXT, FINITE), max_size=2),
+    waits=st.lists(st.builds(Waited, TEXT, FINITE, st.sampled_from(WaitEnd)), max_size=2),
     fired=st.dictionaries(TEXT, st.integers(1, 3), max_size=2),
 )
 SCORES = st.dictionaries(

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from petrobot.coordinator.learning.records import Waited, WaitEnd
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import loads
@@ -135,7 +136,7 @@ def make_trials() -> Make:
                 else max((r.status for r in runs), key=("success", "failure", "error").index)
             )
             goals = int(runs[-1].taken == "done")
-            wait = [("begin", float(random.uniform(0, 0.2)))]
+            wait = [Waited("begin", float(random.uniform(0, 0.2)), WaitEnd.FIRED)]
             out.append(Trial(k % 5 + 1, 0.0, round(time, 6), True, goals, worst, "", runs, wait))
         return out
 

@@ -18,6 +18,7 @@ from petrobot.coordinator.engine import (
     Stimulus,
     TimerFired,
 )
+from petrobot.coordinator.learning.records import Waited
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial, TrialLog
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.distributions import Drawer, RunDistributions
@@ -229,7 +230,7 @@ b_done: b:normal -> end
 b_lost: b:error -> end
 """
     trials = [
-        Trial(1, 0.0, runs=[entry("a", 4.0, taken="done")], waits=[("rung", wait)])
+        Trial(1, 0.0, runs=[entry("a", 4.0, taken="done")], waits=[Waited("rung", wait)])
         for wait in (1.0, 3.0)
     ]
     played = play(text, trials, task='final = "end == 1"')

@@ -1,0 +1,320 @@
+"""Waits for an event while another branch takes and returns a resource: the rate that is recorded,
+the rate in the stochastic view, and trials that the forecast plays, against missions that the
+engine plays by a clock."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import count
+from math import sqrt
+
+import numpy as np
+import pytest
+
+from petrobot.coordinator.analysis.may_run import BUDGET, may_run
+from petrobot.coordinator.analysis.time.stochastic import stochastic_view
+from petrobot.coordinator.analysis.time.task_forecast import forecast
+from petrobot.coordinator.engine import Begin, Choose, Chosen, Engine, EventOccurred, RunEnded
+from petrobot.coordinator.engine.instructions import Finished, StartRun
+from petrobot.coordinator.engine.stimuli import Pause, RaiseEvent, Resume, Stimulus
+from petrobot.coordinator.learning.estimate import Firings
+from petrobot.coordinator.learning.learner import LearningSelector
+from petrobot.coordinator.learning.learning import Estimates, Learning
+from petrobot.coordinator.learning.propagation import measured_from
+from petrobot.coordinator.learning.records import Passage, Waited, WaitEnd, of_plain, to_plain
+from petrobot.coordinator.learning.waits import EventWaits
+from petrobot.coordinator.studies.campaign.observed import estimates_of
+from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.campaign.trials import Trial, TrialLog, waits_of
+from petrobot.coordinator.studies.forecast.choices import choices_of
+from petrobot.coordinator.studies.forecast.distributions import Drawer, RunDistributions
+from petrobot.coordinator.studies.forecast.history import Training, trainings_of
+from petrobot.coordinator.studies.forecast.net_arrays import Structure
+from petrobot.coordinator.studies.forecast.play import Play
+from petrobot.coordinator.studies.forecast.residual import event_doubts
+from petrobot.coordinator.task import Status, Task
+from petrobot.coordinator.task.file import loads
+
+LOST = "lost-pulse"
+MEAN = 5.0
+"""Mean time between two events (s)."""
+SECONDS = {"work": 1.0, "rest": 1.0, "tidy": 0.5}
+MEMORIES = {
+    "pulse": 'memory = "pulse"',
+    "latched": 'memory = "latched"',
+    "kept": 'memory = "latched"\nearly = "keep"',
+}
+
+
+def shared(memory: str, parts: int = 1) -> Task:
+    """Return a task in which two branches share an arm; the second one waits for an event."""
+    text = f"""
+schema = 1
+[task]
+name = "shared"
+runs_place = "parts"
+final = "parts == 0 and ready == 1 and arm == 1 and watching == 1"
+[errors]
+to = "broken"
+[events.alarm]
+scope = "external"
+{MEMORIES[memory]}
+"""
+    for name in SECONDS:
+        text += f'[primitive_tasks.{name}]\ngoal = "{name}"\nalternatives = ["{name}"]\n'
+        text += "deadline = 9.0\n"
+    text += """
+[places]
+parts = { kind = "control", tokens = PARTS }
+ready = { tokens = 1 }
+arm = { kind = "resource", tokens = 1 }
+want = {}
+work = { kind = "action", task = "work", holds = "arm" }
+rest = { kind = "action", task = "rest" }
+watching = { tokens = 1 }
+tidy = { kind = "action", task = "tidy", holds = "arm" }
+broken = { kind = "control" }
+[transitions]
+take = { in = ["parts", "ready"], out = ["want"] }
+grab = { in = ["want"], out = ["work"] }
+worked = { in = ["work:normal"], out = ["rest"] }
+rested = { in = ["rest:normal"], out = ["ready"] }
+low = { in = ["watching"], out = ["tidy"], event = "alarm" }
+tidied = { in = ["tidy:normal"], out = ["watching"] }
+"""
+    return loads(text.replace("PARTS", str(parts)), "shared.toml")
+
+
+@dataclass
+class Played:
+    """What missions of the engine came to."""
+
+    trials: list[Trial] = field(default_factory=list)
+    records: list[Passage] = field(default_factory=list)
+    estimates: Estimates = field(default_factory=Estimates)
+    seconds: float = 0.0
+
+    @property
+    def firings(self) -> int:
+        return sum(trial.fired.get("low", 0) for trial in self.trials)
+
+
+def missions(task: Task, n: int) -> Played:
+    """Play missions by a clock; the event comes at random, at a known rate."""
+    out, random = Played(), np.random.default_rng(7)
+    engine = Engine(task)
+    selector = LearningSelector(Learning(task, "fixed"))
+    for _ in range(n):
+        log = TrialLog(task, lambda record, values: record.seconds)
+        queue: list[tuple[float, int, Stimulus]] = [(0.0, 0, Begin())]
+        numbers, state, over = count(1), engine.initial(), False
+        heapq.heappush(queue, (random.exponential(MEAN), next(numbers), EventOccurred("alarm")))
+        own = LearningSelector(selector.learning)
+        for _step in range(10_000):
+            now, _, stimulus = heapq.heappop(queue)
+            for observer in (log, own):
+                observer.stimulus(now, stimulus)
+            state, said = engine.handle(state, stimulus)
+            if isinstance(stimulus, EventOccurred):
+                later = now + random.exponential(MEAN)
+                heapq.heappush(queue, (later, next(numbers), EventOccurred("alarm")))
+            for instruction in said:
+                for observer in (log, own):
+                    observer.instruction(now, instruction)
+                if isinstance(instruction, Choose):
+                    chosen = Chosen(instruction.key, instruction.alternatives[0])
+                    heapq.heappush(queue, (now, -next(numbers), chosen))
+                elif isinstance(instruction, StartRun):
+                    took = SECONDS[instruction.action]
+                    ended = RunEnded(instruction.run, Status.SUCCESS, seconds=took)
+                    heapq.heappush(queue, (now + took, next(numbers), ended))
+                over |= isinstance(instruction, Finished)
+            for observer in (log, own):
+                observer.settled(now, state)
+            if over:
+                break
+        assert over
+        out.trials += log.trials
+        out.seconds += now
+        out.records += [r for r in own.records if isinstance(r, Passage)]
+    out.estimates = selector.learning.gained
+    return out
+
+
+def rows_of(trials: list[Trial]) -> list[TrialRow]:
+    """Return the trials as rows of a campaign's table."""
+    return [TrialRow(i, "", 1, 1, 1, 0.0, trial) for i, trial in enumerate(trials, 1)]
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_the_recorded_rate_is_that_of_the_event(memory: str) -> None:
+    """The table of a campaign, the learner of `run --learn`, the stochastic view and the simulated
+    net agree with the measured missions within three standard errors."""
+    task = shared(memory)
+    played = missions(task, 400)
+    rate, error = played.firings / played.seconds, sqrt(played.firings) / played.seconds
+    time = np.array([trial.time for trial in played.trials])
+    bound = 3 * time.std() / sqrt(len(time))
+    table = estimates_of(task, rows_of(played.trials), "")
+    for estimates in (table, played.estimates):
+        measured = measured_from(task, estimates)
+        n = sum(flow.occurrences for flow in estimates.flows.values())
+        assert measured.waits["alarm"] == pytest.approx(MEAN, abs=3 * MEAN / sqrt(n))
+        found = forecast(stochastic_view(task, measured))
+        assert found.throughput["low"] == pytest.approx(rate, abs=3 * error)
+    for training in (Training.of(task, played.trials), trainings_of(task, table)[""]):
+        random = np.random.default_rng(1)
+        ones = np.ones((1, len(training.trials)))
+        drawer = Drawer(RunDistributions(training), training.waits, ones, random)
+        play = Play(
+            Structure.of(task), drawer, choices_of(training), np.zeros(4_000, np.int64)
+        ).run()
+        assert play.time.mean() == pytest.approx(time.mean(), abs=bound)
+        assert event_doubts(training) == []
+
+
+def waits(memory: str, script: list[tuple[float, Stimulus]]) -> list[Waited]:
+    """Return the waits of `low` in a mission with these stimuli after its begin."""
+    task = shared(memory, parts=3)
+    engine, observer, out = Engine(task), EventWaits(task), list[Waited]()
+    state = engine.initial()
+    line: list[tuple[float, Stimulus]] = [(0.0, Begin()), *script]
+    for now, stimulus in line:
+        pending = [stimulus]
+        for stimulus in pending:  # grows by the draws
+            observer.stimulus(now, stimulus)
+            state, said = engine.handle(state, stimulus)
+            for one in said:
+                if isinstance(one, Choose):
+                    pending.append(Chosen(one.key, one.alternatives[0]))
+                elif not isinstance(one, StartRun):
+                    wait = observer.fired(now, getattr(one, "transition", ""))
+                    out += [] if wait is None else [wait]
+            out += observer.settled(now, state)
+    return [wait for wait in out if wait.transition == "low"]
+
+
+ALARM = EventOccurred("alarm")
+
+
+def ends(run: str) -> Stimulus:
+    """Return the stimulus that a run ended."""
+    return RunEnded(run, Status.SUCCESS)
+
+
+CUT, CAME, FIRED = WaitEnd.CUT, WaitEnd.CAME, WaitEnd.FIRED
+# The arm is taken at 0 and given back when work#1 ends.
+WHILE_TAKEN = [(0.5, ALARM), (1.0, ends("work#1")), (1.75, ALARM)]
+CASES: dict[str, tuple[str, list[tuple[float, Stimulus]], list[tuple[float, WaitEnd]]]] = {
+    "a pulse while the arm is taken is lost": ("pulse", WHILE_TAKEN, [(0.75, FIRED)]),
+    "a latched event is dropped then": ("latched", WHILE_TAKEN, [(0.75, FIRED)]),
+    "a kept event sets its flag, and low fires when the arm is free": (
+        "kept",
+        [*WHILE_TAKEN[:2], (2.0, ALARM)],
+        [(0.5, CAME), (1.0, CAME)],  # the second one while it still tidies up
+    ),
+    "a wait that another branch ends is cut, and the next one begins when the arm is back": (
+        "pulse",
+        [(1.0, ends("work#1")), (1.5, ends("rest#1")), (2.5, ends("work#2")), (2.75, ALARM)],
+        [(0.5, CUT), (0.25, FIRED)],
+    ),
+    "the operator raises it by hand": (
+        "pulse",
+        [(1.0, ends("work#1")), (1.5, RaiseEvent("alarm"))],
+        [(0.5, FIRED)],
+    ),
+    "an event that was counted before changes nothing": (
+        "kept",
+        [
+            (0.5, EventOccurred("alarm", "a", 1)),
+            (1.0, ends("work#1")),
+            (1.5, EventOccurred("alarm", "a", 1)),
+            (2.0, EventOccurred("alarm", "a", 2)),
+        ],
+        [(0.5, CAME), (1.0, CAME)],
+    ),
+    "nothing waits during a pause": (
+        "pulse",
+        [(1.0, ends("work#1")), (1.25, Pause()), (5.0, Resume()), (5.5, ALARM)],
+        [(0.25, CUT), (0.5, FIRED)],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_how_each_wait_ends(case: str) -> None:
+    memory, script, expected = CASES[case]
+    assert [(wait.seconds, wait.end) for wait in waits(memory, script)] == expected
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_table_and_learner_record_the_same_waits(memory: str) -> None:
+    """But for those that the end of a trial cuts: the learner's waits go on."""
+    task = shared(memory, parts=3)
+    played = missions(task, 20)
+    key: Callable[[Estimates], Firings] = lambda e: next(  # noqa: E731
+        flow for where, flow in e.flows.items() if where.transition == "low"
+    )
+    one, other = key(estimates_of(task, rows_of(played.trials), "")), key(played.estimates)
+    assert (one.fired, one.occurrences) == (other.fired, other.occurrences)
+    assert one.exposure == pytest.approx(other.exposure, abs=1e-3)
+    assert all(of_plain(to_plain(record)) == record for record in played.records)
+
+
+def test_older_tables_and_files_mean_what_they_meant() -> None:
+    """A wait without its end was measured since the tokens came last, and is drawn as it was."""
+    task = shared("pulse")
+    old = Trial(1, 0.0, 2.0, True, waits=waits_of([["low", 1.5]]), fired={"low": 1})
+    assert old.waits == [Waited("low", 1.5, WaitEnd.LATEST)]
+    flow = next(iter(estimates_of(task, rows_of([old]), "").flows.values()))
+    assert Firings.of_plain(flow.to_plain()[:2]) == flow
+    assert (flow.exposure, flow.occurrences, flow.changes) == (1.5, 1, 1)
+    known = Training.of(task, [old]).waits["low"]
+    assert known.came is None and known.seconds.tolist() == [1.5]
+
+
+def test_an_event_for_two_interrupted_transitions_makes_the_forecast_doubtful() -> None:
+    """The simulated net would let it come for each of them by itself."""
+    text = """
+schema = 1
+[task]
+name = "two"
+final = "end == 2"
+[events.bell]
+scope = "external"
+memory = "MEMORY"
+[places]
+one = { kind = "control", tokens = 1 }
+other = { kind = "control", tokens = 1 }
+end = { kind = "control" }
+[transitions]
+first = { in = ["one"], out = ["end"], event = "bell" }
+second = { in = ["other"], out = ["end"], event = "bell" }
+"""
+    ended = [Waited("first", 1.0, WaitEnd.FIRED), Waited("second", 1.0, WaitEnd.CUT)]
+    for memory in ("pulse", "latched"):
+        task = loads(text.replace("MEMORY", memory), "two.toml")
+        told = event_doubts(Training.of(task, [Trial(1, 0.0, waits=ended)]))
+        assert told == []
+        cut = [*ended, Waited("first", 1.0, WaitEnd.CUT)]
+        (told,) = [event_doubts(Training.of(task, [Trial(1, 0.0, waits=cut)]))]
+        assert ["first and second wait for one event" in doubt for doubt in told] == [True]
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_check_notes_a_pulse_that_another_branch_makes_the_task_lose(memory: str) -> None:
+    """The arm may be taken when it comes; a latched event is meant to be dropped or kept."""
+    notes = [f for f in may_run(shared(memory), None, BUDGET).report.findings if f.code == LOST]
+    assert [(f.key, f.text) for f in notes] == (
+        []
+        if memory != "pulse"
+        else [
+            (
+                "events.alarm",
+                "alarm is a pulse: if it comes while arm is taken (by grab), low does not fire and "
+                "the event is lost",
+            )
+        ]
+    )
