@@ -20,12 +20,12 @@ from petrobot.coordinator.run.supervisor import is_local
 from petrobot.services.comm.calls.caller import Caller, Notice, PeerLost
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.location_file import Directory
-from petrobot.services.comm.protocol.messages import Answer, Command, Hello
+from petrobot.services.comm.protocol.messages import EMERGENCY_STOP, Answer, Command, Hello
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 from petrobot.services.comm.tls.credentials import Credentials
 from petrobot.services.host.emergency_latch import ALL, LatchError, latch_of
 
-STOP = "emergency_stop"
+STOP = EMERGENCY_STOP
 CLEAR = "clear_emergency"
 _DONE = {STOP: ("stopped",), CLEAR: ("cleared", "not ready")}
 """By order: the answers of a device that has carried it out. One that is not ready is not known to

@@ -49,6 +49,8 @@ from petrobot.services.comm.calls.caller import Caller, LateResult, Notice
 from petrobot.services.comm.calls.events import VERDICT_EVENTS, RunVerdict, verdict_event
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import (
+    EMERGENCY_STOP,
+    LATCHED,
     Accept,
     Answer,
     Event,
@@ -57,8 +59,6 @@ from petrobot.services.comm.protocol.messages import (
     Welcome,
 )
 
-EMERGENCY_STOP: Final = "emergency_stop"
-"""Cause of a run that its node ended, or refused, because of an emergency stop."""
 MEMORY_EVENTS: Final = "memory:"
 SYNC_WITHIN: Final = 0.5
 """Time after which records are synced even if no effect needs that (s), so that nodes may forget
@@ -253,7 +253,8 @@ class Executor:
 
     def _ended(self, now: float, node: str, outcome: Outcome) -> None:
         self._acks.append(lambda: self.callers[node].acknowledge(now, outcome.id))
-        if outcome.cause == EMERGENCY_STOP and self.finished is None:
+        latched = outcome.cause == EMERGENCY_STOP and outcome.values.get(LATCHED) is True
+        if latched and self.finished is None:
             # Before the end of the run, so that no transition answers it. Who gave the stop also
             # tells the coordinator, but it may have been frozen, or not have been resumed yet: then
             # clearing the stop would let it move the devices on.

@@ -31,6 +31,7 @@ from petrobot.services.comm.location_file import (
 )
 from petrobot.services.comm.protocol.messages import (
     COORDINATOR,
+    LATCHED,
     SEED,
     Answer,
     Call,
@@ -383,8 +384,8 @@ class Node:
             self._stop_places(now, self._stops.look(now))
             if key in self._stops:
                 _log.info("run %s of %s refused: %s", call.id, call.service, EMERGENCY_STOP)
-                refused = (EMERGENCY_STOP, IN_EMERGENCY, Executed.NO)
-                self.callee.finish(now, Outcome(call.id, Status.ERROR, {}, *refused))
+                refused = ({LATCHED: True}, EMERGENCY_STOP, IN_EMERGENCY, Executed.NO)
+                self.callee.finish(now, Outcome(call.id, Status.ERROR, *refused))
                 return
         _log.info("run %s of %s started", call.id, call.service)
         self.places[key].take(now, call)
@@ -483,8 +484,12 @@ class Node:
             self.callee.feedback(now, report.id, report.fraction, report.data)
 
     def _end(self, now: float, end: Outcome) -> None:
-        if self.callee.service_of(end.id) is None:
+        if (service := self.callee.service_of(end.id)) is None:
             return
+        if end.cause == EMERGENCY_STOP:
+            self._stop_places(now, self._stops.look(now))  # this process may have been frozen
+            if self._host_of(service) in self._stops:
+                end = replace(end, values={LATCHED: True})
         for caller in self.callers.values():
             caller.cancel_children(now, end.id, "its run is over")
         _log.info("run %s ended: %s %s %s", end.id, end.status, end.cause, end.text)

@@ -126,8 +126,15 @@ def test_an_emergency_stop_that_only_its_node_reports_aborts_the_run(
         bench = bench.resumed(2.0, runs=[WORK])
     bench.fired.clear()
     bench.sent()
-    bench.say(2.1, m.Outcome(WORK, "error", {}, "emergency_stop", "", executed))
+    bench.say(2.1, m.Outcome(WORK, "error", {m.LATCHED: True}, m.EMERGENCY_STOP, "", executed))
     finished = bench.executor.finished
     assert finished is not None and finished.status is Status.ERROR
     assert "emergency stop" in finished.reason
     assert bench.fired == [] and bench.calls() == []
+
+
+def test_a_stop_that_a_driver_reports_is_an_error_that_the_task_may_answer() -> None:
+    """The node is not stopped, or not any more: drives must be reset before they move again."""
+    bench = Bench().begin()
+    bench.say(2.1, m.Outcome(WORK, "error", {}, m.EMERGENCY_STOP, "the drives have no power"))
+    assert bench.fired[-1] == "failed" and bench.calls() == [TIDY]

@@ -17,6 +17,11 @@ from typing import Any, ClassVar, Final
 
 COORDINATOR: Final = "coordinator"
 """Name of the coordinator: its role in HELLO, its table in services.toml, its certificate."""
+EMERGENCY_STOP: Final = "emergency_stop"
+"""Cause of a run that its node ended or refused because of an emergency stop. A driver may give it,
+too, for a stop of its own device."""
+LATCHED: Final = "latched"
+"""Value of such a result while the node's stop is not cleared."""
 SEED: Final = "seed"
 """Verb and key of the COMMAND that tells the mission's seed to devices that no action uses."""
 
