@@ -325,14 +325,14 @@ final = "done == 2"
 
 [primitive_tasks.look]
 goal = "done"
-deadline = 9.0
+deadline = 1000.0
 alternatives = ["look"]
 [primitive_tasks.look.estimates]
 success = { share = 1.0, mean = 2.0, cv = 1.0 }
 
 [primitive_tasks.point]
 goal = "done"
-deadline = 9.0
+deadline = 1000.0
 alternatives = ["point"]
 [primitive_tasks.point.estimates]
 success = { share = 1.0, mean = 3.0, cv = 1.0 }
@@ -361,11 +361,11 @@ driver = "here:Camera"
 [actions.look]
 run = "here:look"
 device = "camera"
-deadline = 5.0
+deadline = 1000.0
 [actions.point]
 run = "here:point"
 device = "camera"
-deadline = 5.0
+deadline = 1000.0
 """
 
 
