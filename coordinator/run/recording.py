@@ -42,7 +42,7 @@ STAGE = "stage"
 """The mission run was prepared or scored, with the result: not repeated after a resume."""
 PREPARED, SCORED = "prepared", "scored"
 EPOCH = "epoch"
-"""A coordinator took over the run."""
+"""Another coordinator continues the run."""
 REMARK = "remark"
 """What an operator remarked."""
 _ASIDE = frozenset((EPOCH, REMARK))
@@ -67,6 +67,21 @@ class Remark:
     def told(self) -> str:
         """The remark with its author."""
         return f"{self.author} remarked: {self.text}"
+
+
+@dataclass(frozen=True, slots=True)
+class TakeOver:
+    """Another coordinator continues the run: number of the record, time since the journal's origin
+    (s), epoch."""
+
+    number: int
+    time: float
+    epoch: int
+
+    @property
+    def told(self) -> str:
+        """What happened, for people."""
+        return f"another coordinator continues the run (epoch {self.epoch})"
 
 
 def digest(instructions: Sequence[Instruction]) -> int:
@@ -313,11 +328,21 @@ def remarks(journal: Journal) -> list[Remark]:
     ]
 
 
-def with_remarks(
+def take_overs(journal: Journal) -> Iterator[TakeOver]:
+    """Yield where another coordinator continued the run. An older journal has no time of it: it is
+    that of the record before."""
+    time = 0.0
+    for r in journal.records:
+        time = r.data.get("t", time)
+        if r.kind == EPOCH:
+            yield TakeOver(r.number, time, int(r.data["epoch"]))
+
+
+def with_asides(
     journal: Journal, steps: Iterable[RecordedStep]
-) -> Iterator[RecordedStep | Remark]:
-    """Return the steps of a replay with the operators' remarks between them."""
-    return heapq.merge(steps, remarks(journal), key=lambda one: one.number)
+) -> Iterator[RecordedStep | Remark | TakeOver]:
+    """Return the steps of a replay with what else happened between them."""
+    return heapq.merge(steps, remarks(journal), take_overs(journal), key=lambda one: one.number)
 
 
 def stages(journal: Journal) -> dict[str, Mapping[str, Any]]:
@@ -327,7 +352,7 @@ def stages(journal: Journal) -> dict[str, Mapping[str, Any]]:
 
 def last_epoch(journal: Journal) -> int:
     """Return the newest epoch in which the run was coordinated."""
-    return max([1, *(int(r.data["epoch"]) for r in journal.records if r.kind == EPOCH)])
+    return max([1, *(one.epoch for one in take_overs(journal))])
 
 
 def clock_reading(now: float) -> dict[str, Any]:
