@@ -313,6 +313,19 @@ def _holding(t: Transition, holds: Mapping[str, tuple[str, ...]]) -> Transition:
 # ------------------------------------------------------------------------------------------- tries
 
 
+_COUNTERS = ("left", "used")
+
+
+def counters(flat: Places) -> frozenset[str]:
+    """Return the places of a flat task that count tries."""
+    owned = ((name, *name.rpartition(".")[::2]) for name in flat)
+    return frozenset(
+        name
+        for name, owner, suffix in owned
+        if suffix in _COUNTERS and owner in flat and flat[owner].kind is Kind.ACTION
+    )
+
+
 def _with_tries(
     places: Places, transitions: Transitions
 ) -> tuple[Places, Transitions, dict[str, tuple[str, ...]]]:
@@ -327,7 +340,7 @@ def _with_tries(
     new_places: dict[str, Place] = {}
     retries: dict[str, Transition] = {}
     for p in again.values():
-        for suffix, tokens in (("left", p.tries - 1), ("used", 0)):
+        for suffix, tokens in zip(_COUNTERS, (p.tries - 1, 0), strict=True):
             new_places[f"{p.name}.{suffix}"] = Place(
                 f"{p.name}.{suffix}",
                 Kind.RESOURCE,

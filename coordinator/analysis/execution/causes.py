@@ -31,15 +31,13 @@ def settled(x: ExecutionGraph, state: int) -> int:
 def describe(x: ExecutionGraph, state: int) -> str:
     """Return the marked places of a state, with how the runs in them ended."""
     at, net = x.states[state], x.engine.compiled.net
-    told = []
+    told = {}
     for place, tokens in zip(net.places, at.marking, strict=True):
         ended = [_ended(at, place, i) for i in range(tokens)] if place in at.tokens else []
         if any(ended):
-            told.append(f"{place} ({', '.join(one or 'active' for one in ended)})")
-        elif tokens:
-            told.append(f"{place}:{tokens}" if tokens > 1 else place)
-    told += [f"{run.place} (stopping)" for run in at.stopping.values()]
-    return " ".join(told) or "nothing marked"
+            told[place] = f"{place} ({', '.join(one or 'active' for one in ended)})"
+    stopping = (f"{run.place} (stopping)" for run in at.stopping.values())
+    return " ".join((net.describe(at.marking, told), *stopping))
 
 
 def _ended(at: State, place: str, i: int) -> str:
