@@ -90,6 +90,12 @@ def expand(task: Task) -> Task:
 # ------------------------------------------------------------------------- default error branches
 
 
+def with_error_branches(task: Task) -> Task:
+    """Return a task that writes the error branches that its `errors_to` adds."""
+    added = _with_error_branches(task.places, task.transitions, task.subnets, task.errors_to)
+    return task if added is task.transitions else replace(task, transitions=added)
+
+
 def _with_error_branches(
     places: Places, transitions: Transitions, subnets: Mapping[str, Subnet], to: str
 ) -> Transitions:
