@@ -101,7 +101,7 @@ class JournalStore:
         `durable`, no effect at all leaves before its cause is synced."""
         self.writer = writer
         self.durable = durable
-        self._origin = origin
+        self.origin = origin
 
     def append(
         self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State
@@ -109,7 +109,7 @@ class JournalStore:
         """Write a stimulus and its effects with the next sync; `t` is the time since the journal's
         origin (s)."""
         data = {
-            "t": round(now - self._origin, 6),
+            "t": round(now - self.origin, 6),
             "stimulus": to_plain(stimulus),
             "marking": list(state.marking),
             "instructions": digest(instructions),
@@ -128,7 +128,7 @@ class JournalStore:
         if len(text) > LONGEST_REMARK:
             found = f"found {len(text):,}"
             raise ValueError(f"text: expected at most {LONGEST_REMARK:,} characters, {found}")
-        remark = Remark(self.writer.next_number, round(now - self._origin, 6), author, text.strip())
+        remark = Remark(self.writer.next_number, round(now - self.origin, 6), author, text.strip())
         self.record(REMARK, {"t": remark.time, "author": author, "text": remark.text})
         return remark
 

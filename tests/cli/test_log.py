@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import closing
 from pathlib import Path
 
@@ -87,7 +88,7 @@ STORY: tuple[tuple[Stimulus, str], ...] = (
 )  # fmt: skip
 
 
-def recorded(folder: Path) -> Path:
+def recorded(folder: Path, begun: float = 0.0) -> Path:
     """Write the journal of the story; another coordinator continues it after its first half."""
     engine = Engine(loads(TASK, "desk.toml"))
     header = {
@@ -102,7 +103,7 @@ def recorded(folder: Path) -> Path:
             if i == len(STORY) // 2:
                 store.record(EPOCH, {"t": i - 0.5, "epoch": 2})
             state, instructions = engine.handle(state, stimulus)
-            store.append(float(i), stimulus, instructions, state)
+            store.append(begun + i, stimulus, instructions, state)
     return path
 
 
@@ -119,6 +120,19 @@ def test_the_log_shows_all_that_moves_or_explains_a_token(
     assert resumed[5:] == (
         f"{7.5:11.3f} s  resumed   {'':20} another coordinator continues the run (epoch 2)"
     )
+
+
+def test_a_report_has_the_times_of_the_log(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The journal's clock begins before the run: the nodes connect, and the cell is prepared."""
+    path, page = recorded(tmp_path, begun=2.0), tmp_path / "page.html"
+    assert main(["log", str(path)]) == 0
+    [fired] = [one for one in capsys.readouterr().out.splitlines() if " fired " in one]
+    assert main(["report", str(path), "--out", str(page)]) == 0
+    cell = re.search(r"<td>([\d.]*) s</td><td>carried<", page.read_text(encoding="utf-8"))
+    assert cell is not None
+    assert float(cell[1]) == float(fired[5:16]) == 16.0
 
 
 def test_the_page_tells_the_same_of_events_and_resumes(tmp_path: Path) -> None:
