@@ -263,12 +263,12 @@ def resumed_mission(
     epoch = last_epoch(journal) + 1
     try:
         steps = list(replay(journal, engine))
-        writer.append(EPOCH, {"epoch": epoch})
+        origin = origin_of(header, now, steps[-1].time if steps else 0.0)
+        writer.append(EPOCH, {"t": round(now - origin, 6), "epoch": epoch})
         writer.sync()
     except BaseException:
         writer.close()
         raise
-    origin = origin_of(header, now, steps[-1].time if steps else 0.0)
     name = NAME if header["mode"] == "lockstep" else header["mission"]
     callers = make_callers(directory, secrets.token_hex(8), epoch, name)
     store, chosen = (

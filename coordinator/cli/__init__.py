@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import errno
 import importlib
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -123,13 +124,19 @@ PLAIN = (
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
     try:
-        return _main(list(sys.argv[1:] if argv is None else argv))
+        code = _main(list(sys.argv[1:] if argv is None else argv))
+        sys.stdout.flush()
+        return code
     except KeyboardInterrupt:  # also while modules are imported: that takes longest
         print("interrupted", file=sys.stderr)
         return 130
-    except BrokenPipeError:
-        # The program that reads our output has closed it; Python would report that again at exit.
-        sys.stderr.close()
+    except (BrokenPipeError, CommandError, SystemExit) as fault:
+        # A command may have made bad input of it, and rich ends the process with 1.
+        if not isinstance(fault.__context__ or fault, BrokenPipeError):
+            raise
+        # The program that reads our output has closed it. Python would try again at exit to write
+        # what is left, and report it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return PIPE_CLOSED
 
 
@@ -189,6 +196,8 @@ def _dispatch(command: Subcommand, arguments: Sequence[str]) -> int:
     try:
         return _run(module.run, options)
     except CommandError as fault:
+        if isinstance(fault.__cause__, BrokenPipeError):
+            raise
         print(f"petrobot {command.name}: {fault}", file=sys.stderr)
         return fault.code
 

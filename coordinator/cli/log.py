@@ -16,8 +16,9 @@ from petrobot.coordinator.run.folder import NODE_LOGS
 from petrobot.services.host.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.engine import RunRecorded
+    from petrobot.coordinator.engine import Engine, RunRecorded
     from petrobot.coordinator.operator.start_from import Recorded
+    from petrobot.coordinator.run.recording import RecordedStep
 
 EXAMPLE = "petrobot log last --format xes --out run.xes"
 
@@ -140,39 +141,86 @@ def _ended(run: RunRecorded) -> str:
 
 
 def _text(found: Recorded) -> Iterator[str]:
+    from petrobot.coordinator.run.recording import Remark, TakeOver, with_asides
+
+    header = found.journal.header
+    yield f"{header['mission']}  {header['date']}  {header['mode']}  seed {header['seed']}"
+    if found.journal.torn_bytes:
+        yield f"(a torn tail of {found.journal.torn_bytes} bytes was dropped)"
+    for step in with_asides(found.journal, found.steps()):
+        when = f"{step.number:5} {step.time:10.3f} s  "
+        if isinstance(step, Remark):
+            yield f"{when}remarked  {step.author:20} {step.text}"
+        elif isinstance(step, TakeOver):
+            yield f"{when}resumed   {'':20} {step.told}"
+        else:
+            for word, of, text in _lines(step, found.engine):
+                yield f"{when}{word:9} {of:20} {text}".rstrip()
+
+
+def _lines(step: RecordedStep, engine: Engine) -> Iterator[tuple[str, str, str]]:
+    """Yield a word, the element concerned and a text for all that happened in a step."""
     from petrobot.coordinator.engine import (
         Corrected,
         Finished,
         Fired,
+        Marked,
+        Paused,
         Report,
+        Resumed,
         RunRecorded,
         StartRun,
     )
-    from petrobot.coordinator.run.recording import Remark, with_remarks
+    from petrobot.coordinator.operator.event_texts import told
 
-    header, net = found.journal.header, found.engine.compiled.net
-    yield f"{header['mission']}  {header['date']}  {header['mode']}  seed {header['seed']}"
-    if found.journal.torn_bytes:
-        yield f"(a torn tail of {found.journal.torn_bytes} bytes was dropped)"
-    for step in with_remarks(found.journal, found.steps()):
-        when = f"{step.number:5} {step.time:10.3f} s  "
-        if isinstance(step, Remark):
-            yield f"{when}remarked {step.author:20} {step.text}"
-            continue
-        for one in step.instructions:
-            if isinstance(one, Fired):
-                yield f"{when}fired    {one.transition:20} {net.describe(one.after)}"
-            elif isinstance(one, StartRun):
-                yield f"{when}started  {one.run:20} {one.action}"
-            elif isinstance(one, RunRecorded):
-                yield f"{when}ended    {one.run:20} {_ended(one)}"
-            elif isinstance(one, Corrected):
-                why = f"  {one.cause}: {one.text}".rstrip(": ") if one.cause else ""
-                yield (
-                    f"{when}judged   {one.run:20} {one.status.value.upper()}, was "
-                    f"{one.was.value.upper()}{why}"
-                )
-            elif isinstance(one, Report):
-                yield f"{when}{one.severity.value:8} {one.of:20} {one.text}"
-            elif isinstance(one, Finished):
-                yield f"{when}finished {one.status.value.upper()}: {one.reason}"
+    net = engine.compiled.net
+    yield from _cause(step, engine)
+    for one in step.instructions:
+        if isinstance(one, Fired):
+            yield "fired", one.transition, net.describe(one.after)
+        elif isinstance(one, Marked):
+            yield "marked", one.place, f"{told(step.stimulus)}  {net.describe(one.after)}"
+        elif isinstance(one, StartRun):
+            yield "started", one.run, one.action
+        elif isinstance(one, RunRecorded):
+            yield "ended", one.run, _ended(one)
+        elif isinstance(one, Corrected):
+            why = f"  {one.cause}: {one.text}".rstrip(": ") if one.cause else ""
+            was = f"{one.status.value.upper()}, was {one.was.value.upper()}"
+            yield "judged", one.run, was + why
+        elif isinstance(one, Paused):
+            yield "paused", "", one.reason
+        elif isinstance(one, Resumed):
+            yield "continued", "", "for one firing" if one.steps else ""
+        elif isinstance(one, Report):
+            yield one.severity.value, one.of, one.text
+        elif isinstance(one, Finished):
+            yield "finished", "", f"{one.status.value.upper()}: {one.reason}"
+
+
+def _cause(step: RecordedStep, engine: Engine) -> Iterator[tuple[str, str, str]]:
+    """Yield what came from outside; not what a line about its effect says."""
+    from petrobot.coordinator.engine import (
+        Abort,
+        EventOccurred,
+        ForceExit,
+        Override,
+        RaiseEvent,
+        RunRaised,
+        SetBreakpoints,
+    )
+    from petrobot.coordinator.operator.event_texts import told, unserved
+
+    text = told(step.stimulus)
+    match step.stimulus:
+        case EventOccurred(event, source):
+            of = f"from {source}" if source else ""
+            yield "event", event, ": ".join(filter(None, (of, unserved(step, engine))))
+        case RaiseEvent(event):
+            yield "event", event, ": ".join(filter(None, (text, unserved(step, engine))))
+        case RunRaised(run, event):
+            yield "event", event, f"raised by {run}"
+        case ForceExit(of) | Override(of):
+            yield "operator", of, text
+        case SetBreakpoints() | Abort():
+            yield "operator", "", text

@@ -194,7 +194,7 @@ def _run(name: str) -> tuple[str, dict[str, str], Path]:
     from petrobot.coordinator.studies.report.run_page import gantt_svg, own_pictures, report_html
 
     found = recorded(name)
-    timeline, observed = Timeline(), _observer(found)
+    timeline, observed = Timeline(origin=0.0), _observer(found)  # the journal's clock
     for step in _steps(found):
         timeline.stimulus(step.time, step.stimulus)
         for instruction in step.instructions:

@@ -307,7 +307,7 @@ def conduct(
     from petrobot.coordinator.run.journal import JournalError
     from petrobot.coordinator.run.mission import MissionError
     from petrobot.coordinator.run.realtime import UnreachableError
-    from petrobot.coordinator.run.recording import ReplayError
+    from petrobot.coordinator.run.recording import JournalStore, ReplayError
     from petrobot.coordinator.run.supervisor import LaunchError
     from petrobot.coordinator.run.timeline import Timeline
     from petrobot.services.comm.location_file import DirectoryError
@@ -319,6 +319,9 @@ def conduct(
     async def lead() -> None:
         with interruptible():  # importing a simulated cell may take seconds
             made.append(make([] if timeline is None else [timeline]))
+            store = made[0].mission.executor.store
+            if timeline is not None and isinstance(store, JournalStore):
+                timeline.origin = store.origin  # its times are those of `petrobot log`
         await (_lead_lockstep if mode == "lockstep" else _lead_realtime)(made[0], options)
 
     try:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from petrobot.coordinator.drawing.layout import Edge, Point, lay_out
 from petrobot.coordinator.task import End, Kind, Place, Scope, Task, Transition
+from petrobot.coordinator.task.expansion import with_error_branches
 from petrobot.coordinator.task.macros import macros_around
 from petrobot.coordinator.task.net import Marking, Net
 from petrobot.coordinator.task.wording import listed
@@ -82,11 +83,12 @@ def expanded(task: Task) -> Task:
 
 
 def _opened(task: Task, inside: str) -> tuple[Task, str, str]:
-    """Return the net of a macro place, the prefix of its names in the flat task, and its group.
+    """Return the net of a macro place, the prefix of its names in the flat task, and its group. It
+    has the error branches that `[errors]` adds.
 
     The group is "" if the whole net is shown. Raises ValueError.
     """
-    net, prefix, group = task, "", ""
+    net, prefix, group = with_error_branches(task), "", ""
     for part in inside.split(".") if inside else ():
         place = net.places.get(part)
         if place is None or place.kind is not Kind.MACRO or group:
@@ -96,10 +98,15 @@ def _opened(task: Task, inside: str) -> tuple[Task, str, str]:
             )
         if place.subnet:
             subnet = task.subnets[place.subnet]
-            net, prefix = (
-                replace(task, places=subnet.places, transitions=subnet.transitions),
-                f"{prefix}{part}.",
+            net = with_error_branches(
+                replace(
+                    task,
+                    places=subnet.places,
+                    transitions=subnet.transitions,
+                    errors_to=subnet.errors_to,
+                )
             )
+            prefix = f"{prefix}{part}."
         else:
             group = part
     return net, prefix, group
@@ -148,6 +155,8 @@ def _tokens(
     tokens: dict[str, int] = {}
     for name, n in zip(task.net.places, marking or task.net.initial, strict=True):
         own = name.removeprefix(prefix) if name.startswith(prefix) else ""
+        if name in task.net.counters and own not in net.places:
+            continue
         head = own if own in net.places else own.partition(".")[0]
         here = shown.get(head)
         if here is not None and (head == own or net.places[head].kind is Kind.MACRO):

@@ -20,6 +20,7 @@ from petrobot.coordinator.engine import (
     ForceExit,
     HoldRun,
     Instruction,
+    Mode,
     Override,
     Pause,
     RaiseEvent,
@@ -184,7 +185,8 @@ class Operation:
     # --- commands that are stimuli ------------------------------------------------------------
 
     async def _do_pause(self, who: str, data: Mapping[str, Any]) -> Answer:
-        answer = self._order(Pause(f"by {who}"))
+        paused = self.executor.state.mode is Mode.PAUSED  # then only ask again who holds
+        answer = {"ok": True} if paused else self._order(Pause(f"by {who}"))
         if answer["ok"]:
             with suppress(TimeoutError):
                 async with asyncio.timeout(ANSWERS):
@@ -200,12 +202,8 @@ class Operation:
             return
         directory, late = self.executor.directory, set(self._holding.values())
         owners = {device.node for device in directory.devices.values() if device.driver}
-        nodes = {
-            node: "lost" if node in self.mission.lost else "idle"
-            for node in directory.nodes
-            if node in owners
-        }
-        nodes |= paused["nodes"] | dict.fromkeys(late, "lost")
+        nodes = {node: "idle" for node in directory.nodes if node in owners} | paused["nodes"]
+        nodes |= dict.fromkeys((*late, *(n for n in self.mission.lost if n in nodes)), "lost")
         if nodes != paused["nodes"]:
             self.feed.emit("paused", paused={**paused, "nodes": nodes})
 

@@ -9,7 +9,9 @@ from petrobot.coordinator.engine import (
     Abort,
     AddTokens,
     Begin,
+    Choose,
     Chosen,
+    Engine,
     EventOccurred,
     Fired,
     ForceExit,
@@ -17,6 +19,7 @@ from petrobot.coordinator.engine import (
     Pause,
     RaiseEvent,
     RemoveTokens,
+    Report,
     Resume,
     RunEnded,
     RunHeld,
@@ -32,6 +35,7 @@ from petrobot.coordinator.engine import (
     VariableChanged,
     Verdict,
 )
+from petrobot.coordinator.run.recording import RecordedStep
 from petrobot.coordinator.task import Executed, Status
 
 LONGEST_TEXT = 400
@@ -88,20 +92,33 @@ def told(stimulus: Stimulus | None, cause: str = "") -> str:
             return "continued by the operator"
         case Step():
             return "operator's step"
-        case SetBreakpoints():
-            return "breakpoints set"
+        case SetBreakpoints(names):
+            return f"breakpoints: {', '.join(names) or 'none'}"
         case Override(primitive_task, action):
             return (
                 f"operator chose {action} for {primitive_task}"
                 if action
                 else f"{primitive_task} is chosen freely again"
             )
-        case Abort():
-            return "aborted by the operator"
+        case Abort(reason):
+            return f"aborted: {reason}" if reason else "aborted by the operator"
         case Begin():
             return "the run began"
         case None:
             return cause
+
+
+def unserved(step: RecordedStep, engine: Engine) -> str:
+    """Return why an external event fired nothing when it came; empty if it did, if a report says
+    why, or if a choice has to be made first."""
+    if not isinstance(step.stimulus, EventOccurred | RaiseEvent) or step.state.suspended:
+        return ""
+    if any(isinstance(one, Fired | Choose | Report) for one in step.instructions):
+        return ""
+    event = step.stimulus.event
+    if event in step.state.flags:
+        return "kept until a transition takes it"
+    return "nothing could fire" if engine.awaits(step.state, event) else "nothing waited for it"
 
 
 def reason_of(status: Status | None, cause: str, text: str, executed: Executed) -> dict[str, Any]:

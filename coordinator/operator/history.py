@@ -11,7 +11,7 @@ from typing import Any
 
 from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.engine import Engine, Fired, Phase, Report, RunRecorded, StartRun
-from petrobot.coordinator.operator.event_texts import firing_of, reason_recorded, told
+from petrobot.coordinator.operator.event_texts import firing_of, reason_recorded, told, unserved
 from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.run.folder import JOURNAL, RESULT
 from petrobot.coordinator.run.journal import Journal, JournalError, read_journal
@@ -19,8 +19,9 @@ from petrobot.coordinator.run.recording import (
     RecordedStep,
     Remark,
     ReplayError,
+    TakeOver,
     replay,
-    with_remarks,
+    with_asides,
 )
 from petrobot.coordinator.task import End, Task
 from petrobot.coordinator.task.file import TaskFileError, loads
@@ -83,14 +84,16 @@ def opened(path: Path, run: str) -> dict[str, Any]:
     except (JournalError, TaskFileError, KeyError) as fault:
         return {"id": run, "fault": f"{fault}", "task": None, "initial": {}, "records": []}
     engine = Engine(task, journal.header.get("devices") or _devices(journal))
-    teller = _StepDescriber(task)
+    teller = _StepDescriber(engine)
     records: list[dict[str, Any]] = []
     fault_text = (
         f"a torn tail of {journal.torn_bytes} bytes was dropped" if journal.torn_bytes else ""
     )
     try:
-        for step in with_remarks(journal, replay(journal, engine)):
-            records.append(teller.remark(step) if isinstance(step, Remark) else teller.record(step))
+        for step in with_asides(journal, replay(journal, engine)):
+            records.append(
+                teller.record(step) if isinstance(step, RecordedStep) else teller.aside(step)
+            )
             if len(records) >= RECORDS_AT_MOST:
                 fault_text = f"only the first {RECORDS_AT_MOST} records are shown"
                 break
@@ -151,7 +154,8 @@ def _devices(journal: Journal) -> dict[str, str]:
 class _StepDescriber:
     """Converts steps to records; keeps the action of each run, for the reasons of firings."""
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, engine: Engine) -> None:
+        self._engine, task = engine, engine.task
         self._places = task.net.places
         self._marking = task.net.initial
         self._going: list[str] = []
@@ -167,6 +171,8 @@ class _StepDescriber:
         """Return {number, t, text, firings, marking (changed places), notes, error, going (places
         with active runs)}."""
         firings, notes, text = [], [], told(step.stimulus)
+        if why := unserved(step, self._engine):
+            text = f"{text}: {why}"
         for instruction in step.instructions:
             if isinstance(instruction, StartRun):
                 self._actions[instruction.run] = instruction.action
@@ -197,12 +203,12 @@ class _StepDescriber:
             "going": self._going,
         }
 
-    def remark(self, remark: Remark) -> dict[str, Any]:
-        """Return a remark as a record that changes nothing."""
+    def aside(self, aside: Remark | TakeOver) -> dict[str, Any]:
+        """Return what changes nothing as a record."""
         return {
-            "number": remark.number,
-            "t": round(remark.time, 4),
-            "text": remark.told,
+            "number": aside.number,
+            "t": round(aside.time, 4),
+            "text": aside.told,
             "firings": [],
             "marking": {},
             "notes": [],

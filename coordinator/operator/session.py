@@ -156,7 +156,13 @@ class RunSession(ABC):
     def result(self) -> dict[str, Any]:
         """Return the result after `lead`; also of a run that failed."""
         origin = {"from": dict(self.origin)} if self.origin else {}
-        return {**self.mission.result(self.mode, self._seconds), **self._learned, **origin}
+        resumed = {"resumed": "wall_s counts from the last resume"} if self._resumed else {}
+        return {
+            **self.mission.result(self.mode, self._seconds),
+            **resumed,
+            **self._learned,
+            **origin,
+        }
 
     def keep_result(self) -> None:
         """Write the result next to the journal. Raises OSError."""

@@ -413,10 +413,11 @@ class Dispatch:
         return stimuli
 
     def answered(self, now: float, answer: Answer) -> list[Stimulus]:
-        """Handle the answer to a hold."""
+        """Handle the answer to a hold. A node that does not answer has not said that its device
+        cannot hold."""
         run = self._commands.pop(answer.id, None)
         flight = self.flights.get(run) if run is not None else None
-        if run is None or flight is None:
+        if run is None or flight is None or (not answer.ok and "cause" in answer.data):
             return []
         said = str(answer.data.get("answers", {}).get(flight.device or flight.node, "")).replace(
             " ", "_"

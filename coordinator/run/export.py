@@ -21,21 +21,24 @@ from petrobot.coordinator.engine import (
     to_plain,
 )
 from petrobot.coordinator.run.journal import Journal
-from petrobot.coordinator.run.recording import RecordedStep, Remark, with_remarks
+from petrobot.coordinator.run.recording import RecordedStep, Remark, TakeOver, with_asides
 from petrobot.coordinator.task.net import Net
 from petrobot.services.host.json_text import json_text
 from petrobot.services.host.whole_file import write_whole
 
 
 def jsonl(journal: Journal, steps: Iterator[RecordedStep]) -> Iterator[str]:
-    """One line for the header, then one for each stimulus with the instructions that followed, or
-    for a remark."""
+    """One line for the header, then one for each stimulus with the instructions that followed, for
+    a remark, or for a resume by another coordinator."""
     yield json_text({"kind": "header", **journal.header}, ensure_ascii=False)
-    for step in with_remarks(journal, steps):
+    for step in with_asides(journal, steps):
         line: dict[str, Any] = {"number": step.number, "t": step.time}
         if isinstance(step, Remark):
             remark = {"author": step.author, "text": step.text}
             yield json_text({**line, "remark": remark}, ensure_ascii=False)
+            continue
+        if isinstance(step, TakeOver):
+            yield json_text({**line, "epoch": step.epoch}, ensure_ascii=False)
             continue
         line |= {
             "stimulus": to_plain(step.stimulus),

@@ -136,6 +136,9 @@ class MissionTally:
     is stuck may never have a result."""
 
     runs_place: int | None
+    goal_transitions: frozenset[str] = frozenset()
+    goals: int = 0
+    """Firings of goal transitions."""
     firings: int = 0
     ended: int = 0
     """Runs that ended and were not cancelled."""
@@ -151,6 +154,7 @@ class MissionTally:
         """Count."""
         if isinstance(instruction, Fired):
             self.firings += 1
+            self.goals += instruction.transition in self.goal_transitions
             self._cycle(now, instruction.before, instruction.after)
         elif isinstance(instruction, RunRecorded):
             _forget_oldest(self.runs)
@@ -200,15 +204,16 @@ class MissionTally:
             for record in failed
         ]
 
-    def happened(self, reached_end: bool) -> str:
+    def happened(self, recovered: bool) -> str:
         """Return what happened on the way, in words: number of runs, errors by primitive task and
-        cause, and values that a result lacked."""
+        cause, and values that a result lacked. `recovered`: the task reached its end and met each
+        goal, so its errors cost none."""
         failed = +self.failed  # a verdict may have taken the last error of a cause away
         parts = [_count(self.ended, "run")]
         if failed:
             causes = ", ".join(f"{name} ({n})" if n > 1 else name for name, n in failed.items())
-            recovered = ", all recovered" if reached_end else ""
-            parts.append(f"{_count(failed.total(), 'error')}{recovered} [{causes}]")
+            told = ", all recovered" if recovered else ""
+            parts.append(f"{_count(failed.total(), 'error')}{told} [{causes}]")
         if self.missing:
             parts.append(f"{_count(self.missing, 'value')} missing [{self.first_missing}]")
         return "; ".join(parts)
@@ -271,7 +276,7 @@ class Mission:
         """Whether an earlier process may have asked for the preparation or the score."""
         task = executor.task.flat
         index = task.net.place_index.get(task.runs_place) if task.runs_place else None
-        self.tally = MissionTally(index)
+        self.tally = MissionTally(index, frozenset(task.goal_transitions))
         executor.observers.append(self.tally)
 
     @property
@@ -350,6 +355,8 @@ class Mission:
         finished = self.executor.finished
         failed = finished is None or finished.status is Status.ERROR
         errors = self.tally.last_errors(self.executor.directory) if failed else []
+        has_goal, met = bool(self.tally.goal_transitions), self.tally.goals
+        recovered = not failed and (not has_goal or met >= self.runs)
         general = {
             "task": self.executor.task.name,
             "mode": mode,
@@ -358,7 +365,8 @@ class Mission:
             "runs": self.runs,
             "status": finished.status.value if finished else Status.ERROR.value,
             "reason": finished.reason if finished else "not finished",
-            "happened": self.tally.happened(reached_end=not failed),
+            **({"goals": f"{met} of {self.runs}"} if has_goal else {}),
+            "happened": self.tally.happened(recovered),
             **({"last_errors": errors} if errors else {}),
             **self.remarks,
         }

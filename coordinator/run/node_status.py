@@ -68,7 +68,8 @@ async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any
                 "status": _status(status, node, directory),
             }
         else:
-            answer["why"] = refused[-1] if refused else client.trouble
+            silent = "connected, but does not answer" if client.answered else "does not answer"
+            answer["why"] = refused[-1] if refused else client.trouble or silent
     except TimeoutError:
         answer |= {
             "up": False,

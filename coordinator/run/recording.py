@@ -42,7 +42,7 @@ STAGE = "stage"
 """The mission run was prepared or scored, with the result: not repeated after a resume."""
 PREPARED, SCORED = "prepared", "scored"
 EPOCH = "epoch"
-"""A coordinator took over the run."""
+"""Another coordinator continues the run."""
 REMARK = "remark"
 """What an operator remarked."""
 _ASIDE = frozenset((EPOCH, REMARK))
@@ -69,6 +69,21 @@ class Remark:
         return f"{self.author} remarked: {self.text}"
 
 
+@dataclass(frozen=True, slots=True)
+class TakeOver:
+    """Another coordinator continues the run: number of the record, time since the journal's origin
+    (s), epoch."""
+
+    number: int
+    time: float
+    epoch: int
+
+    @property
+    def told(self) -> str:
+        """What happened, for people."""
+        return f"another coordinator continues the run (epoch {self.epoch})"
+
+
 def digest(instructions: Sequence[Instruction]) -> int:
     """Return the CRC-32 of the instructions as plain data, which replay compares."""
     packed: bytes = msgpack.packb(
@@ -86,7 +101,7 @@ class JournalStore:
         `durable`, no effect at all leaves before its cause is synced."""
         self.writer = writer
         self.durable = durable
-        self._origin = origin
+        self.origin = origin
 
     def append(
         self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State
@@ -94,7 +109,7 @@ class JournalStore:
         """Write a stimulus and its effects with the next sync; `t` is the time since the journal's
         origin (s)."""
         data = {
-            "t": round(now - self._origin, 6),
+            "t": round(now - self.origin, 6),
             "stimulus": to_plain(stimulus),
             "marking": list(state.marking),
             "instructions": digest(instructions),
@@ -113,7 +128,7 @@ class JournalStore:
         if len(text) > LONGEST_REMARK:
             found = f"found {len(text):,}"
             raise ValueError(f"text: expected at most {LONGEST_REMARK:,} characters, {found}")
-        remark = Remark(self.writer.next_number, round(now - self._origin, 6), author, text.strip())
+        remark = Remark(self.writer.next_number, round(now - self.origin, 6), author, text.strip())
         self.record(REMARK, {"t": remark.time, "author": author, "text": remark.text})
         return remark
 
@@ -313,11 +328,21 @@ def remarks(journal: Journal) -> list[Remark]:
     ]
 
 
-def with_remarks(
+def take_overs(journal: Journal) -> Iterator[TakeOver]:
+    """Yield where another coordinator continued the run. An older journal has no time of it: it is
+    that of the record before."""
+    time = 0.0
+    for r in journal.records:
+        time = r.data.get("t", time)
+        if r.kind == EPOCH:
+            yield TakeOver(r.number, time, int(r.data["epoch"]))
+
+
+def with_asides(
     journal: Journal, steps: Iterable[RecordedStep]
-) -> Iterator[RecordedStep | Remark]:
-    """Return the steps of a replay with the operators' remarks between them."""
-    return heapq.merge(steps, remarks(journal), key=lambda one: one.number)
+) -> Iterator[RecordedStep | Remark | TakeOver]:
+    """Return the steps of a replay with what else happened between them."""
+    return heapq.merge(steps, remarks(journal), take_overs(journal), key=lambda one: one.number)
 
 
 def stages(journal: Journal) -> dict[str, Mapping[str, Any]]:
@@ -327,7 +352,7 @@ def stages(journal: Journal) -> dict[str, Mapping[str, Any]]:
 
 def last_epoch(journal: Journal) -> int:
     """Return the newest epoch in which the run was coordinated."""
-    return max([1, *(int(r.data["epoch"]) for r in journal.records if r.kind == EPOCH)])
+    return max([1, *(one.epoch for one in take_overs(journal))])
 
 
 def clock_reading(now: float) -> dict[str, Any]:

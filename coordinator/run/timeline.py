@@ -20,7 +20,7 @@ from petrobot.services.comm.protocol.messages import Feedback
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """A run on the time axis (s since the mission began)."""
+    """A run on the time axis (s since the timeline's origin)."""
 
     run: str
     place: str
@@ -35,7 +35,7 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Firing:
-    """A transition that fired at a time (s since the mission began)."""
+    """A transition that fired at a time (s since the timeline's origin)."""
 
     time: float
     number: int
@@ -52,6 +52,7 @@ class Timeline:
     firings: list[Firing] = field(default_factory=list)
     reports: list[tuple[float, Report]] = field(default_factory=list)
     origin: float | None = None
+    """When its time axis begins: as that of the journal, else at the first stimulus."""
 
     def instruction(self, now: float, instruction: Instruction) -> None:
         """Keep starts, ends and firings."""
@@ -91,7 +92,7 @@ class Timeline:
             self.reports.append((time, instruction))
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
-        """The first stimulus begins the time axis."""
+        """The first stimulus begins the time axis, unless it has begun."""
         self._since(now)
 
     def progress(self, now: float, run: str, notice: Feedback) -> None:

@@ -90,6 +90,12 @@ def expand(task: Task) -> Task:
 # ------------------------------------------------------------------------- default error branches
 
 
+def with_error_branches(task: Task) -> Task:
+    """Return a task that writes the error branches that its `errors_to` adds."""
+    added = _with_error_branches(task.places, task.transitions, task.subnets, task.errors_to)
+    return task if added is task.transitions else replace(task, transitions=added)
+
+
 def _with_error_branches(
     places: Places, transitions: Transitions, subnets: Mapping[str, Subnet], to: str
 ) -> Transitions:
@@ -332,6 +338,19 @@ def _places_of(arc: Input | Output, entered: Mapping[str, Subnet]) -> Iterator[s
 # ------------------------------------------------------------------------------------------- tries
 
 
+_COUNTERS = ("left", "used")
+
+
+def counters(flat: Places) -> frozenset[str]:
+    """Return the places of a flat task that count tries."""
+    owned = ((name, *name.rpartition(".")[::2]) for name in flat)
+    return frozenset(
+        name
+        for name, owner, suffix in owned
+        if suffix in _COUNTERS and owner in flat and flat[owner].kind is Kind.ACTION
+    )
+
+
 def _with_tries(
     places: Places, transitions: Transitions
 ) -> tuple[Places, Transitions, dict[str, tuple[str, ...]]]:
@@ -346,7 +365,7 @@ def _with_tries(
     new_places: dict[str, Place] = {}
     retries: dict[str, Transition] = {}
     for p in again.values():
-        for suffix, tokens in (("left", p.tries - 1), ("used", 0)):
+        for suffix, tokens in zip(_COUNTERS, (p.tries - 1, 0), strict=True):
             new_places[f"{p.name}.{suffix}"] = Place(
                 f"{p.name}.{suffix}",
                 Kind.RESOURCE,

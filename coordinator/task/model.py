@@ -24,7 +24,7 @@ from petrobot.coordinator.task.elements import (
     Value,
     Variable,
 )
-from petrobot.coordinator.task.expansion import expand
+from petrobot.coordinator.task.expansion import counters, expand
 from petrobot.coordinator.task.net import Net
 
 
@@ -92,6 +92,7 @@ class Task:
                 for t in flat.transitions.values()
             },
             capacity={p.name: p.capacity for p in flat.places.values() if p.capacity is not None},
+            counters=counters(flat.places),
         )
 
     @cached_property

@@ -14,6 +14,9 @@ class NotEnabled(Exception):  # noqa: N818 - a fact about a marking that callers
     """A transition was to fire in a marking that does not enable it."""
 
 
+EMPTY = "(empty)"
+"""A marking without tokens, in words."""
+
 @dataclass(frozen=True, slots=True)
 class Net:
     """An immutable net (P, T, Pre, Post, Inhibit, M0, capacities, priorities).
@@ -32,6 +35,9 @@ class Net:
     initial: Marking
     capacity: tuple[int | None, ...]
     priority: tuple[int, ...]
+    counters: frozenset[str] = field(default=frozenset(), compare=False)
+    """Places that a short form adds to count (`grip.left`): a text shows them only while their
+    tokens differ from the initial ones."""
     compiled: CompiledNet = field(init=False, repr=False, compare=False)
     place_index: Mapping[str, int] = field(init=False, repr=False, compare=False)
     transition_index: Mapping[str, int] = field(init=False, repr=False, compare=False)
@@ -76,6 +82,7 @@ class Net:
         inhibitors: Mapping[str, Mapping[str, int]] | None = None,
         capacity: Mapping[str, int] | None = None,
         priority: Mapping[str, int] | None = None,
+        counters: frozenset[str] = frozenset(),
     ) -> Net:
         """Return a net from names: initial tokens of each place, and for each transition the
         weights (consumed, produced) by place."""
@@ -97,6 +104,7 @@ class Net:
             tuple(places.values()),
             tuple(capacity.get(p) for p in places),
             tuple(priority.get(t, 0) for t in transitions),
+            counters,
         )
 
     def has_concession(self, marking: Marking, t: int) -> bool:
@@ -127,11 +135,11 @@ class Net:
             current = self.fire(current, self.transition_index[name])
             yield current
 
-    def describe(self, marking: Marking) -> str:
-        """Return the marking as text: the marked places with their tokens."""
-        return (
-            " ".join(
-                f"{p}:{n}" if n != 1 else p for p, n in zip(self.places, marking, strict=True) if n
-            )
-            or "(empty)"
-        )
+    def describe(self, marking: Marking, told: Mapping[str, str] | None = None) -> str:
+        """Return the marking as text: the marked places with their tokens, and of counters those
+        that have counted. `told` are the texts of places of which more is known."""
+        words = dict(told or {})
+        for p, n, initial in zip(self.places, marking, self.initial, strict=True):
+            if (n != initial) if p in self.counters else n:
+                words.setdefault(p, f"{p}:{n}" if n != 1 else p)
+        return " ".join(words[p] for p in self.places if p in words) or EMPTY

@@ -239,9 +239,55 @@ def test_an_interrupt_during_the_imports_is_an_interrupt(
     assert (code, said) == (130, "interrupted\n")
 
 
+GOLDEN = Path(__file__).parents[1] / "run" / "golden"
+JOURNAL = str(GOLDEN / "catch_ball-missed-and-recovered.journal")
+
+
 @pytest.mark.processes
-def test_a_reader_that_leaves_is_no_answer() -> None:
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--help",),
+        ("log", "--help"),
+        ("log", JOURNAL),
+        ("log", JOURNAL, "--format", "jsonl"),
+        ("log", JOURNAL, "--format", "xes"),
+        ("replay", JOURNAL),
+        ("check", "work.toml"),
+        ("analyse", "work.toml"),
+        ("show", "work.toml"),
+        ("convert", "work.toml", "work.pnml", "--json", "-"),
+        ("simulate", "work.pnml", "--rates", "unit", "--horizon", "9"),
+        ("run", "work.toml", "--mode", "lockstep"),
+        ("learned", "show", "kept.estimates"),
+        ("forecast", "work.toml", "--estimates", "kept.estimates"),
+        ("new", "robot", "carrier"),
+    ],
+    ids=" ".join,
+)
+def test_a_reader_that_leaves_is_no_answer(
+    words: tuple[str, ...],
+    petrobot: Petrobot,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """`petrobot check TASK | head -1` must not end as if the task might not run."""
+    if "kept.estimates" in words:
+        learnt = ("--learn", "kept.estimates", "--selector", "fixed", "--quiet")
+        ran = ("run", "work.toml", "--mode", "lockstep", *learnt)
+        petrobot(*ran)
+    petrobot("convert", "work.toml", "work.pnml", "--view", "ordinary")
+    reading, writing = os.pipe()
+    os.close(reading)
+    closed = os.fdopen(writing, "w", encoding="utf-8")
+    with closed, monkeypatch.context() as patched:
+        patched.setattr("sys.stdout", closed)
+        code = main(words)
+    assert code == 141 and f"petrobot {words[0]}:" not in capsys.readouterr().err
+
+
+@pytest.mark.processes
+def test_python_says_nothing_more_of_a_closed_pipe_at_its_exit() -> None:
     reading, writing = os.pipe()
     os.close(reading)
     command = [sys.executable, "-m", "petrobot.coordinator", "check", "catch_ball"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -99,6 +100,24 @@ def test_the_stop_of_a_node_that_does_not_run_is_shown_too(
     assert main(["nodes", "--services", services, "--timeout", "0.2"]) == 3
     shown = capsys.readouterr().out
     assert "away" in shown and STOPPED in shown
+
+
+@pytest.mark.parametrize(
+    ("listens", "why"), [(True, "connected, but does not answer"), (False, "refused")]
+)
+def test_a_node_that_is_away_has_a_reason(
+    listens: bool, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A frozen process still accepts connections."""
+    directory = directory_in(tmp_path)
+    with socket.socket() as frozen:
+        frozen.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        frozen.bind(directory.address("robot"))
+        if listens:
+            frozen.listen()
+        command = ["nodes", "--services", str(directory.source), "--timeout", "0.3", "--json", "-"]
+        assert main(command) == 3
+    assert why in json.loads(capsys.readouterr().out)["robot"]["why"]
 
 
 def test_the_log_of_a_node_is_printed_by_its_name(

@@ -147,3 +147,71 @@ def test_the_command_opens_a_macro_place(tmp_path: Path) -> None:
     ) as caught:
         show.run(parser.parse_args([str(task), "--inside", "nowhere", "--out", str(out)]))
     assert caught.value.code == 2
+
+
+SHORT = """
+schema = 1
+[task]
+name = "short"
+final = "done == 1"
+final_error = "lost > 0"
+[errors]
+to = "lost"
+[primitive_tasks.dock]
+goal = "It is there"
+alternatives = ["dock"]
+deadline = 1.0
+[places]
+begin = { kind = "control", tokens = 1 }
+go = { kind = "macro", subnet = "go" }
+own = { kind = "action", task = "dock", tries = 2 }
+done = { kind = "control" }
+lost = { kind = "control" }
+[transitions]
+start = { in = ["begin"], out = ["go"] }
+there = { in = ["go:normal"], out = ["own"] }
+good = { in = ["own:normal"], out = ["done"] }
+[subnets.go]
+entry = "dock"
+normal = "docked"
+error = "failed"
+[subnets.go.errors]
+to = "failed"
+[subnets.go.places]
+dock = { kind = "action", task = "dock", tries = 3 }
+docked = { kind = "control" }
+failed = { kind = "control" }
+[subnets.go.transitions]
+end = { in = ["dock:normal"], out = ["docked"] }
+"""
+
+
+@pytest.mark.parametrize(
+    ("inside", "branches", "tokens"),
+    [
+        ("", {("go", "lost"), ("own", "lost")}, {"begin": 1}),
+        ("go", {("dock", "failed")}, {}),
+    ],
+)
+def test_short_forms_add_branches_to_the_drawing_and_no_tokens(
+    inside: str, branches: set[tuple[str, str]], tokens: dict[str, int]
+) -> None:
+    """`[errors]` adds error branches, which are drawn as those of the file; `tries` adds tokens,
+    which only count and are not drawn."""
+    task = loads(SHORT)
+    drawn = scene_of_task(task, True, None, None, inside)
+    assert {n: node.tokens for n, node in drawn.nodes.items() if node.tokens} == tokens
+    came = {arc.target: arc.source for arc in drawn.arcs if arc.kind == "error"}
+    assert {(came[a.source], a.target) for a in drawn.arcs if a.source in came} == branches
+    folded = scene_of_task(task, False, None, None, inside)
+    assert {a.kind for a in folded.arcs}.isdisjoint({"error"})
+    assert "lost" not in folded.nodes and "failed" not in folded.nodes
+    assert all(folded.nodes[place].hidden == 1 for place, _ in branches)
+
+
+def test_a_marking_in_words_shows_tries_only_when_they_have_counted() -> None:
+    net = loads(SHORT).net
+    assert net.describe(net.initial) == "begin"
+    used = list(net.initial)
+    used[net.place_index["own.left"]], used[net.place_index["own.used"]] = 0, 1
+    assert net.describe(tuple(used)) == "begin own.left:0 own.used"

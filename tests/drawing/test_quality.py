@@ -209,7 +209,7 @@ def test_tokens_that_a_short_form_adds_are_no_runs() -> None:
 
 
 def test_what_follows_without_a_branch_is_level() -> None:
-    """From the scanned part to the grip."""
-    nodes = scene_of_task(load(SORTER), True, None, None).nodes
+    """From the scanned part to the grip; `[errors]` adds branches on the way."""
+    nodes = scene_of_task(load(SORTER), False, None, None).nodes
     row = {nodes[name].at[1] for name in ("scanned", "pick", "fetch", "there", "grip")}
     assert len(row) == 1

@@ -49,7 +49,7 @@ def test_an_error_of_the_net_is_logged_when_it_occurs(caplog: pytest.LogCaptureF
     tally.instruction(1.5, Report(Severity.ERROR, "nowhere_to_go", "scan#1 has nowhere to go"))
     tally.instruction(2.0, Report(Severity.WARNING, "bad_value", "scan#1 gave nothing"))
     assert [r.getMessage() for r in caplog.records] == ["1.500 s: scan#1 has nowhere to go"]
-    assert tally.happened(reached_end=False) == "0 runs; 1 value missing [scan#1 gave nothing]"
+    assert tally.happened(recovered=False) == "0 runs; 1 value missing [scan#1 gave nothing]"
 
 
 def test_a_long_mission_run_needs_no_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,6 +153,20 @@ def test_every_error_branch_returns_to_the_normal_flow(
     assert [c.status for c in mission.tally.cycles] == [Status.ERROR, *[Status.SUCCESS] * 3]
     assert mission.tally.cycles[0].cause == cause
     assert [bar.cause for bar in timeline.bars.values() if bar.status is Status.ERROR] == [cause]
+
+
+@pytest.mark.parametrize(("primitive", "met"), [("move_to_point", 3), ("return_home", 4)])
+def test_an_error_that_cost_a_goal_is_not_called_recovered(
+    catch_ball: Task, primitive: str, met: int
+) -> None:
+    """In this script each trial whose arm arrives meets its goal, `missed`."""
+    goal = ("missed",)
+    flat = replace(catch_ball.flat, goal_transitions=goal)
+    task = replace(catch_ball, goal_transitions=goal, expansion=flat)
+    mission, _ = run(task, {primitive: [failing("drive_fault"), *[GOOD] * 3]})
+    told = mission.result("lockstep", 0.0)
+    assert (told["status"], told["goals"]) == ("success", f"{met} of 4")
+    assert ("all recovered" in told["happened"]) == (met == 4)
 
 
 def test_an_arm_that_cannot_be_recovered_ends_the_task_in_error(catch_ball: Task) -> None:

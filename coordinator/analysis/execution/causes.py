@@ -16,7 +16,7 @@ from petrobot.coordinator.task import Kind
 from petrobot.coordinator.task.compiled_task import CompiledTransition
 from petrobot.coordinator.task.conditions import And, Compare, Expression, Literal, Name
 from petrobot.coordinator.task.conditions.language import Node
-from petrobot.coordinator.task.net import Net
+from petrobot.coordinator.task.net import EMPTY, Net
 
 MOST = 4
 """The most waiting transitions that are explained one by one."""
@@ -64,17 +64,16 @@ def left_over(x: ExecutionGraph, state: int) -> str:
 
 
 def _told(x: ExecutionGraph, at: State, matters: Callable[[str], bool]) -> str:
-    told = []
-    for place, tokens in zip(x.engine.compiled.net.places, at.marking, strict=True):
-        if not tokens or not matters(place):
-            continue
+    net, told, shown = x.engine.compiled.net, dict[str, str](), []
+    for place, tokens, initial in zip(net.places, at.marking, net.initial, strict=True):
+        hidden = not matters(place)
+        shown.append((initial if place in net.counters else 0) if hidden else tokens)
         ended = [_ended(at, place, i) for i in range(tokens)] if place in at.tokens else []
-        if any(ended):
-            told.append(f"{place} ({', '.join(one or 'active' for one in ended)})")
-        else:
-            told.append(f"{place}:{tokens}" if tokens > 1 else place)
-    told += [f"{run.place} (stopping)" for run in at.stopping.values()]
-    return " ".join(told)
+        if any(ended) and not hidden:
+            told[place] = f"{place} ({', '.join(one or 'active' for one in ended)})"
+    stopping = (f"{run.place} (stopping)" for run in at.stopping.values())
+    words = (net.describe(tuple(shown), told), *stopping)
+    return " ".join(word for word in words if word != EMPTY)
 
 
 def _ended(at: State, place: str, i: int) -> str:

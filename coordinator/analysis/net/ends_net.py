@@ -194,7 +194,13 @@ class _Builder:
             for p, c in zip(self.task.net.places, self.task.net.capacity, strict=True)
             if c is not None and p in self.places
         }
-        net = Net.build(self.places, self.arcs, inhibitors=self.inhibit, capacity=capacity)
+        net = Net.build(
+            self.places,
+            self.arcs,
+            inhibitors=self.inhibit,
+            capacity=capacity,
+            counters=self.task.net.counters,
+        )
         parts = tuple(tuple(net.place_index[name] for name in part) for part in self.parts)
         left_out = tuple(dict.fromkeys(self.left_out))
         values = {

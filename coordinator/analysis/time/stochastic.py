@@ -391,6 +391,7 @@ class _Derivation:
             inhibitors=self.inhibit,
             capacity=capacity,
             priority=self.priority,
+            counters=self.task.net.counters,
         )
         gspn = Gspn.of(net, self.rates, weights=self.weights, servers=self.servers)
         assumed = tuple(dict.fromkeys(self.assumptions))

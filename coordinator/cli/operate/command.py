@@ -70,13 +70,14 @@ def give(
     verb: str,
     data: Callable[[OperatorClient], dict[str, Any]] | None = None,
     told: Callable[[OperatorClient, Answer], Awaitable[str]] | None = None,
+    code: Callable[[Answer], int] = lambda _: 0,
 ) -> int:
-    """Give one command and print its answer. Return 0, or 1 if it was refused.
+    """Give one command and print its answer. Return 1 if it was refused, else `code(answer)`.
 
     `data(client)` makes the command's data once the snapshot has arrived; `told(client, answer)`
     makes the text that is printed when the command was accepted.
     """
-    return asyncio.run(_give(options, verb, data, told))
+    return asyncio.run(_give(options, verb, data, told, code))
 
 
 async def _give(
@@ -84,6 +85,7 @@ async def _give(
     verb: str,
     data: Callable[[OperatorClient], dict[str, Any]] | None,
     told: Callable[[OperatorClient, Answer], Awaitable[str]] | None,
+    code: Callable[[Answer], int],
 ) -> int:
     from petrobot.coordinator.operator.client import OperatorError
     from petrobot.coordinator.operator.port import FREE
@@ -104,7 +106,7 @@ async def _give(
     except OperatorError as fault:
         raise CommandError(3, f"{address.run}: {fault}") from fault
     show(options, {"run": address.run, "verb": verb, **answer}, text)
-    return 0
+    return code(answer)
 
 
 def show(options: argparse.Namespace, answer: Mapping[str, Any], text: str) -> None:

@@ -26,8 +26,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Give the command, and print what each node reports."""
-    return command.give(options, "pause", told=_told)
+    """Give the command, and print what each node reports. Return 3 if one did not answer: it could
+    not be paused."""
+    return command.give(options, "pause", told=_told, code=_code)
+
+
+def _code(answer: command.Answer) -> int:
+    return 3 if "lost" in answer.get("nodes", {}).values() else 0
 
 
 async def _told(client: OperatorClient, answer: command.Answer) -> str:

@@ -8,7 +8,7 @@ table. So choices depend neither on the number of workers nor on their speed.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -213,10 +213,11 @@ class LearnedActions:
     def _measure(self, primitive_task: str) -> str:
         return self._learning.question(primitive_task).measure
 
-    def state(self) -> dict[str, Any]:
+    def state(self, regimes: Iterable[str] = ()) -> dict[str, Any]:
         """Return, by regime and primitive task: learned probabilities, J from the learner's sums,
-        and the best action."""
-        contexts = sorted({c for s in self._learning.selectors.values() for c in s.learners})
+        and the best action; of `regimes` also before their first trial."""
+        met = {c for s in self._learning.selectors.values() for c in s.learners}
+        contexts = sorted(met | set(map(context_of, regimes)))
         return {
             regime_of(c): {n: self._of(n, c) for n in self._learning.selectors} for c in contexts
         }

@@ -24,16 +24,18 @@ from petrobot.coordinator.task import Status, Task
 
 Curve = list[tuple[float, float]]
 Curves = dict[str, Curve]
+_Seen = tuple[int, str, bool, float | None]
+"""A run: number of its trial, action, whether it succeeded, cost."""
 POINTS = 300
 """Largest number of points of a curve."""
 WINDOW = 50
-"""Trials over which shares of choices are averaged."""
+"""Runs over which shares of choices are averaged."""
 
 
 @dataclass
 class LearningCurves:
-    """Curves of one primitive task in one regime, by action; x is the trial (a run of the primitive
-    task in that regime)."""
+    """Curves of one primitive task in one regime, by action; x is the number of the trial in that
+    regime, in a single run that of the run of the primitive task."""
 
     primitive_task: str
     regime: str
@@ -41,7 +43,7 @@ class LearningCurves:
     """For a single run: the context from which `regime` was derived."""
     probability: Curves = field(default_factory=dict)
     """Learned p; for campaigns that do not learn, the share of choices over the last `WINDOW`
-    trials."""
+    runs."""
     objective: Curves = field(default_factory=dict)
     """J computed from the sums so far, with the rho so far."""
 
@@ -63,16 +65,14 @@ def objective_curves(task: Task, rows: Sequence[TrialRow]) -> list[LearningCurve
 
 def recorded_curves(task: Task, records: Iterable[Record]) -> list[LearningCurves]:
     """Return the same curves for a single mission run, from its records of learning."""
-    runs: dict[tuple[str, str], list[tuple[str, bool, float | None]]] = {}
+    runs: dict[tuple[str, str], list[_Seen]] = {}
     for record in records:
         if isinstance(record, RunEnd) and record.outcome.status is not None:
             cost = cost_of(record.outcome, task.primitive_tasks[record.primitive_task].cost)
-            seen = (
-                record.action,
-                record.outcome.status is Status.SUCCESS,
-                None if math.isnan(cost) else cost,
-            )
-            runs.setdefault((record.primitive_task, record.context), []).append(seen)
+            seen = runs.setdefault((record.primitive_task, record.context), [])
+            success = record.outcome.status is Status.SUCCESS
+            known = None if math.isnan(cost) else cost
+            seen.append((len(seen) + 1, record.action, success, known))
     out = []
     for (name, context), seen_runs in runs.items():
         alternatives = task.primitive_tasks[name].alternatives
@@ -83,21 +83,17 @@ def recorded_curves(task: Task, records: Iterable[Record]) -> list[LearningCurve
     return out
 
 
-def _runs(
-    task: Task, primitive: str, rows: Sequence[TrialRow]
-) -> Iterator[tuple[str, bool, float | None]]:
-    for row in rows:
+def _runs(task: Task, primitive: str, rows: Sequence[TrialRow]) -> Iterator[_Seen]:
+    for k, row in enumerate(rows, 1):
         for run in row.trial.runs if row.trial is not None else ():
             if run.status and task.primitive_task_of(run.place).name == primitive:
-                yield run.action, run.status == Status.SUCCESS.value, run.cost
+                yield k, run.action, run.status == Status.SUCCESS.value, run.cost
 
 
-def _fill(
-    made: LearningCurves, runs: Sequence[tuple[str, bool, float | None]], actions: Sequence[str]
-) -> None:
+def _fill(made: LearningCurves, runs: Sequence[_Seen], actions: Sequence[str]) -> None:
     sums = {action: [0, 0, 0.0, 0] for action in actions}
     step = max(1, len(runs) // POINTS)
-    for i, (action, success, cost) in enumerate(runs, 1):
+    for i, (k, action, success, cost) in enumerate(runs, 1):
         own = sums.setdefault(action, [0, 0, 0.0, 0])
         own[0], own[1], own[2], own[3] = (
             own[0] + 1,
@@ -105,15 +101,15 @@ def _fill(
             own[2] + (cost or 0.0),
             own[3] + (cost is not None),
         )
-        if i % step and i != len(runs):
+        if i > 1 and i % step and i != len(runs):
             continue
-        recent = [a for a, *_ in runs[max(0, i - WINDOW) : i]]
+        recent = [a for _, a, *_ in runs[max(0, i - WINDOW) : i]]
         costs = {a: s[2] / s[3] if s[3] else 0.0 for a, s in sums.items()}
         rho = 1.0 / max(costs.values()) if max(costs.values()) > 0 else 0.0
         for a, s in sums.items():
-            made.probability.setdefault(a, []).append((i, recent.count(a) / len(recent)))
+            made.probability.setdefault(a, []).append((k, recent.count(a) / len(recent)))
             if s[0]:
-                made.objective.setdefault(a, []).append((i, 1.0 - s[1] / s[0] + rho * costs[a]))
+                made.objective.setdefault(a, []).append((k, 1.0 - s[1] / s[0] + rho * costs[a]))
 
 
 def learned_curves(
@@ -127,27 +123,24 @@ def learned_curves(
     policy = policy_of(plan, bench.task, bench.directory)
     if not isinstance(policy, LearnedActions):
         return
+    counts = dict.fromkeys((one.regime for one in trials), 0)
     for one in trials:
-        one.probability = {}
+        p = policy.state(counts)[one.regime][one.primitive_task]["p"]
+        one.probability = {action: [(1, chance)] for action, chance in p.items()}
     given = iter(rows)
-    counts = {(t.primitive_task, t.regime): 0 for t in trials}
     for batch in plan.batches:
         taken = list(islice(given, sum(block.count for block in batch)))
         if len(taken) < sum(block.count for block in batch):
             return
         for block in batch:
             policy.weights(block)
+            counts[block.regime] = counts.get(block.regime, 0) + block.count
         policy.update(taken)
         state = policy.state()
         for one in trials:
-            key = (one.primitive_task, one.regime)
-            counts[key] += sum(
-                1 for _ in _runs(bench.task, key[0], [row for row in taken if row.regime == key[1]])
-            )
-            for action, p in (
-                state.get(one.regime, {}).get(one.primitive_task, {}).get("p", {}).items()
-            ):
-                one.probability.setdefault(action, []).append((counts[key], p))
+            p = state.get(one.regime, {}).get(one.primitive_task, {}).get("p", {})
+            for action, chance in p.items():
+                one.probability.setdefault(action, []).append((counts[one.regime], chance))
 
 
 # --- pictures ---

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,9 +14,14 @@ import pytest
 from scipy.stats import binomtest
 
 from petrobot.coordinator.cli import main
+from petrobot.coordinator.studies.campaign.conduct import Campaign
+from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest
 from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
-from petrobot.coordinator.studies.report.action_pictures import objective_curves
+from petrobot.coordinator.studies.report.action_pictures import (
+    learned_curves,
+    objective_curves,
+)
 from petrobot.coordinator.studies.report.campaign_page import CampaignReport, story, timeline_of
 from petrobot.coordinator.studies.report.comparing import (
     Weighting,
@@ -26,7 +33,7 @@ from petrobot.coordinator.studies.report.comparing import (
 from petrobot.coordinator.studies.report.plots import declared, finished
 from petrobot.coordinator.studies.report.run_page import own_pictures
 from petrobot.coordinator.task.file import load
-from tests.studies.campaign.conftest import HERE, SERVICES, TASK
+from tests.studies.campaign.conftest import HERE, SERVICES, TASK, InlinePool
 
 TOY = load(TASK)
 
@@ -476,3 +483,31 @@ def test_report_of_a_run_that_learned(
     assert "no learned probabilities" in capsys.readouterr().err
     assert not (tmp_path / "later_pictures" / "probability_look__rough.svg").exists()
     assert (tmp_path / "later_pictures" / "reliability_look.svg").exists()
+
+
+@pytest.mark.parametrize(("selector", "batch"), [("nikolic_fu", 6), ("random", 0)])
+def test_a_learning_picture_has_the_first_trial_and_the_last(
+    selector: str, batch: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Trials whose run was repeated are no more trials; the choice is still open at the first."""
+    monkeypatch.syspath_prepend(str(HERE))
+    digests = {"task": digest(TASK), "services": digest(SERVICES)}
+    plan = CampaignPlan(
+        *(str(TASK), str(SERVICES), 12, ("easy",)), selector=selector, block=3, batch=batch,
+        digests=digests,
+    )  # fmt: skip
+    campaign = Campaign(tmp_path / "c", plan)
+    asyncio.run(campaign.run(InlinePool(plan)))
+    rows = [
+        replace(row, trial=replace(row.trial, runs=[*row.trial.runs, *row.trial.runs]))
+        for row in campaign.table.rows()
+        if row.trial is not None
+    ]
+    trials = objective_curves(TOY, rows)
+    learned_curves(plan, rows, trials)
+    assert [one.primitive_task for one in trials] == ["look", "grip"]
+    for one in trials:
+        for points in one.probability.values():
+            assert (points[0][0], points[-1][0]) == (1, 12)
+            even = pytest.approx(1 / len(one.probability), abs=1e-6)
+            assert selector == "random" or points[0][1] == even
