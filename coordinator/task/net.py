@@ -17,6 +17,7 @@ class NotEnabled(Exception):  # noqa: N818 - a fact about a marking that callers
 EMPTY = "(empty)"
 """A marking without tokens, in words."""
 
+
 @dataclass(frozen=True, slots=True)
 class Net:
     """An immutable net (P, T, Pre, Post, Inhibit, M0, capacities, priorities).
