@@ -156,7 +156,9 @@ class RunSession(ABC):
     def result(self) -> dict[str, Any]:
         """Return the result after `lead`; also of a run that failed."""
         origin = {"from": dict(self.origin)} if self.origin else {}
-        resumed = {"resumed": "wall_s counts from the last resume"} if self._resumed else {}
+        # In lock step a resumed run is derived again from its beginning: it is the undisturbed one.
+        later = self._resumed and self.mode == REALTIME
+        resumed = {"resumed": "wall_s counts from the last resume"} if later else {}
         return {
             **self.mission.result(self.mode, self._seconds),
             **resumed,
