@@ -520,9 +520,9 @@ def test_a_wait_for_an_event_is_reported_unless_the_cell_raises_it(
     damaged(sound, mistakes, tmp_path)
     monkeypatch.chdir(tmp_path)
     code, words = said(*CHECK)
-    alarms = [line for line in words.splitlines() if "can free its token" in line]
-    assert code == 0 and bool(alarms) == bool(told)
-    assert all(told in line for line in alarms)
+    found = " ".join(words.split())
+    assert code == 0 and ("can free its token" in found) == bool(told)
+    assert told in found
 
 
 @pytest.mark.processes

@@ -282,4 +282,4 @@ def test_a_run_does_not_notice_that_the_time_of_day_jumps(tmp_path: Path) -> Non
     assert result["status"] == "success" and 3.0 < result["sim_s"] < 600.0
     journal = read_journal(next((folder / "runs").glob(f"*/{JOURNAL}")))
     times = [r.data["t"] for r in journal.records if "t" in r.data]
-    assert len(times) > 20 and times == sorted(times)
+    assert len(times) > 10 and times == sorted(times)
