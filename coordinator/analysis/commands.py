@@ -162,11 +162,14 @@ def analyse_command(
                     f"  {name:28}" + " -> ".join(f"{value:.6g}" for value in values)
                     for name, values in rows.items()
                 ]
-    except (NetFileError, ValueError, OverflowError, OutOfTime) as error:
+    except (NetFileError, ValueError, OverflowError) as error:
         return CommandResult(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
+    except OutOfTime as late:  # the input is good, and the answer is not known
+        told = f"{_named(path, late)}; give more --seconds, or fewer --states"
+        return CommandResult(FAULT, told, {"error": told})
     except MemoryError:
         told = f"{path}: the memory was used up; give more --memory, or fewer --states"
-        return CommandResult(BAD_INPUT, told, {"error": told})
+        return CommandResult(FAULT, told, {"error": told})
     said += [wrapped(f"note: {note}", 4) for note in notes]
     return CommandResult(
         OK if then.ok else FAULT,

@@ -10,6 +10,7 @@ import resource
 import signal
 import subprocess
 import sys
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,14 @@ def ring(places: int, tokens: int) -> Net:
     names = [f"p{i}" for i in range(places)]
     arcs = {f"t{i}": ({names[i]: 1}, {names[(i + 1) % places]: 1}) for i in range(places)}
     return Net.build({**dict.fromkeys(names, 0), names[0]: tokens}, arcs)
+
+
+def test_what_is_not_known_in_time_is_no_bad_input() -> None:
+    """The file is good: the exit code is that of an answer that is not yes."""
+    limits = SearchLimits(seconds=100, clock=count().__next__)
+    outcome = analyse_command(CATCH.with_name("pick_and_place.toml"), load, limits=limits)
+    assert outcome.code == 1
+    assert "verdicts: unknown within the time limit; give more --seconds" in outcome.text
 
 
 def started(net: Net, folder: Path, *arguments: str) -> subprocess.Popen[str]:
