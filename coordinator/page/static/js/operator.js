@@ -90,11 +90,14 @@ export class Operator {
   async startWith() {
     if (this.asking) return; // a second press, while the server is asked for the options
     this.asking = true;
-    await this.loading; // of the task that was picked just now
-    const { file, revision } = this.link.state.mission;
-    const about = file ? await startForm(file) : null;
-    this.asking = false;
-    if (about) startDialog(about, file, (data) => this.give("start", { ...data, revision }, false, true));
+    try {
+      await this.loading; // of the task that was picked just now
+      const { file, revision } = this.link.state.mission;
+      const about = file ? await startForm(file) : null;
+      if (about) startDialog(about, file, (data) => this.give("start", { ...data, revision }, false, true));
+    } finally {
+      this.asking = false; // also when an answer fails: the button must work again
+    }
   }
 
   clearStop() {
