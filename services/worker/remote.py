@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
+from petrobot.services.comm.protocol.messages import EMERGENCY_STOP as EMERGENCY_STOP
 from petrobot.services.comm.protocol.messages import SEED
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import Driver, stop_at_once
@@ -17,9 +18,9 @@ from petrobot.services.worker.callables import describe, words_of
 _log = logging.getLogger(__name__)
 
 COMMAND, STOP = "command", "stop"
-EMERGENCY_STOP, CLEAR_EMERGENCY = "emergency_stop", "clear_emergency"
-"""Verbs of the operator: stop at once and refuse all commands; accept commands again (which moves
-nothing by itself)."""
+CLEAR_EMERGENCY = "clear_emergency"
+"""Verb of the operator: accept commands again after `EMERGENCY_STOP` (which moves nothing by
+itself)."""
 IN_EMERGENCY = "emergency stop: clear it with `petrobot estop --clear` when the cell is safe"
 NODE_SILENT = "node_silent"
 NODE_IS_SILENT = (

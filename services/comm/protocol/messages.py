@@ -18,8 +18,8 @@ from typing import Any, ClassVar, Final
 COORDINATOR: Final = "coordinator"
 """Name of the coordinator: its role in HELLO, its table in services.toml, its certificate."""
 EMERGENCY_STOP: Final = "emergency_stop"
-"""Cause of a run that its node ended or refused because of an emergency stop. A driver may give it,
-too, for a stop of its own device."""
+"""Verb of the operator: stop at once and refuse all commands. Also the cause of a run that its node
+ended or refused because of it; a driver may give this cause, too, for a stop of its own device."""
 LATCHED: Final = "latched"
 """Value of such a result while the node's stop is not cleared."""
 SEED: Final = "seed"
