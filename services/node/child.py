@@ -14,25 +14,99 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 from petrobot.services.comm.protocol.messages import Call
 from petrobot.services.host.parent_death import STOP_ROUTINE, state_of, until_ended
-from petrobot.services.worker.keeper import KILL_ORDER
+from petrobot.services.worker.keeper import KEPT, KILL_ORDER
 from petrobot.services.worker.pipe import Item, Permits, permit_counter, pipe_pair
 from petrobot.services.worker.process import BORN, SETUP, Setup
 
 _log = logging.getLogger(__name__)
 
-NONE = -1
 LEAVE_LIMIT = 4.0
 """Time in which a process must end by itself (s)."""
+FORK_LIMIT = 20.0
+"""Time in which its keeper must have been forked (s)."""
 PIPE_LIMIT = 0.5
 """Time after the end of its pipe at which a process is killed (s): the node can reach it no
 more."""
 TURN = 1 << 14
 """Most bytes that are read of a process in one turn of the loop. A process that writes without end
 would otherwise keep the node from all else: from heartbeats, devices and an emergency stop."""
+
+
+class Forge:
+    """The process that forks the keepers of this process's children (`services/worker/keeper.py`).
+    It has the working directory, environment and output of its start, so another one takes its
+    place when one of these has changed, and also when it has ended or does not read."""
+
+    _current: ClassVar[Forge | None] = None
+    _former: ClassVar[list[Forge]] = []
+    """Those that take no more orders and have perhaps not ended."""
+
+    def __init__(self, surroundings: object) -> None:
+        """Start it. Raises OSError."""
+        self._surroundings = surroundings
+        self._orders, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._orders.setblocking(False)
+        with there:
+            self._process = subprocess.Popen(
+                [
+                    sys.executable,
+                    "-m",
+                    "petrobot.services.worker.keeper",
+                    *map(str, (os.getpid(), there.fileno())),
+                ],
+                pass_fds=[there.fileno()],
+                stdin=subprocess.DEVNULL,
+                # a Ctrl-C in the node's terminal is for the node: it ends its children in order
+                start_new_session=True,
+            )
+
+    @classmethod
+    def order(cls, patience: int, passed: Sequence[int]) -> Forge:
+        """Order a keeper and its worker, and return the forge that forks them. Raises OSError."""
+        cls._former = [one for one in cls._former if one._process.poll() is None]
+        surroundings = _surroundings()
+        if cls._current is not None and cls._current._surroundings != surroundings:
+            cls._current.close()
+        while True:
+            known, cls._current = cls._current, cls._current or cls(surroundings)
+            try:
+                socket.send_fds(cls._current._orders, [bytes([patience])], passed)
+            except OSError:
+                cls._current.kill()
+                if known is None:
+                    raise
+            else:
+                return cls._current
+
+    def close(self) -> None:
+        """Give it no more orders; it exits after it has forked for the last one."""
+        self._orders.close()
+        if Forge._current is self:
+            Forge._current = None
+            Forge._former.append(self)
+
+    def kill(self) -> None:
+        """Kill it, as it does not fork. What it has forked lives on."""
+        self.close()
+        self._process.kill()
+
+
+def _surroundings() -> object:
+    """Return what a process inherits at its start and may differ at a later one."""
+    outputs = []
+    for number in (1, 2):
+        with contextlib.suppress(OSError):
+            found = os.fstat(number)
+            outputs.append((found.st_dev, found.st_ino))
+    folder = ""
+    with contextlib.suppress(OSError):
+        folder = os.getcwd()  # noqa: PTH109 - a Path of a removed folder raises the same
+    return folder, dict(os.environ), outputs
 
 
 class Child:
@@ -55,50 +129,39 @@ class Child:
         self._logs = _log.isEnabledFor(logging.DEBUG)
         self.pipe, pipe_end = pipe_pair()
         self._descriptors, descriptors_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        passed = [pipe_end, descriptors_end, *([link] if link else [])]
         counter = permit_counter()
-        numbers = [
-            pipe_end.fileno(),
-            descriptors_end.fileno(),
-            link.fileno() if link else NONE,
-            counter,
-        ]
         # Only what owns a device has something to do after the node's end: its stop routine.
         patience = int(STOP_ROUTINE) if setup.device and link is None else 0
+        ends = [pipe_end, descriptors_end, *([link] if link else [])]
+        numbers = [end.fileno() for end in ends]
         try:
-            self.process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-m",
-                    "petrobot.services.worker.keeper",
-                    *map(str, (os.getpid(), patience, *numbers)),
-                ],
-                pass_fds=[number for number in numbers if number != NONE],
-                stdin=subprocess.DEVNULL,
-                # a Ctrl-C in the node's terminal is for the node: it ends its children in order
-                start_new_session=True,
-            )
+            self._forge = Forge.order(patience, [*numbers[:2], counter, *numbers[2:]])
         except OSError:
             self.pipe.close()
             self._descriptors.close()
             os.close(counter)
             raise
         finally:
-            for end in passed:
+            for end in ends:
                 end.close()
         self._permits = Permits(counter)
-        self._worker = 0
+        self._keeper = self._worker = 0
+        self._code: int | None = None
+        self._forked = asyncio.Event()
+        """Set once the keeper has told its process id, or has ended before that."""
         self._killed = ""
-        self._let_go = False
+        self._leaves = self._let_go = False
         self._limits: list[asyncio.TimerHandle] = []
+        self._limit(FORK_LIMIT, self._require_keeper)
         self.pipe.post([SETUP, dict(setup.items())])
         self._loop.add_reader(self.pipe.socket, self._read)
         self._watch = self._loop.create_task(self._wait_for_end())
 
     @property
     def pid(self) -> int:
-        """Process id of the worker; until the worker has reported it, that of its keeper."""
-        return self._worker or self.process.pid
+        """Process id of the worker; until the worker has reported it, that of its keeper; 0 before
+        that."""
+        return self._worker or self._keeper
 
     @property
     def closed(self) -> bool:
@@ -108,7 +171,11 @@ class Child:
     @property
     def code(self) -> int | None:
         """Its exit code; minus the signal number if a signal ended it; None while it runs."""
-        return self.process.poll()
+        if self._code is None and self._keeper:
+            ended, status = os.waitpid(self._keeper, os.WNOHANG)
+            if ended:
+                self._code = os.waitstatus_to_exitcode(status)
+        return self._code
 
     def give(self, call: Call) -> None:
         """Send a call, with the permit to begin it."""
@@ -159,16 +226,25 @@ class Child:
     def kill(self, why: str = "") -> None:
         """Kill it at once, with everything that it started. One that hangs in the kernel does not
         end, and neither does its keeper: its device must not get a second driver."""
-        if self.process.poll() is None:
+        if self.code is None:
             self._killed = self._killed or why
-            self.process.send_signal(KILL_ORDER)
-            self.process.send_signal(signal.SIGCONT)  # a keeper may be frozen
+            if self._keeper:
+                os.kill(self._keeper, KILL_ORDER)
+                os.kill(self._keeper, signal.SIGCONT)  # it may be frozen
+            else:
+                self._forge.kill()
+
+    def _require_keeper(self) -> None:
+        if not self._keeper:
+            self.kill(f"it was not forked within {FORK_LIMIT:g} s")
 
     def leave(self) -> None:
         """Close its pipe, so that it stops its device and exits. It is killed after
         `LEAVE_LIMIT`."""
         if not self._let_go:
-            self._close_pipe()
+            self._leaves = True
+            if self._keeper:
+                self._close_pipe()
             self._limit(LEAVE_LIMIT, self.kill)
 
     async def wait(self) -> None:
@@ -177,7 +253,7 @@ class Child:
 
     def describe(self) -> str:
         """Return how it ended, in words."""
-        code = self.process.poll()
+        code = self.code
         if code is None or (self._killed and code == -signal.SIGKILL):
             return self._killed or "it closed its pipe"
         # Otherwise it had ended by itself before it could be killed.
@@ -196,11 +272,19 @@ class Child:
             received = []
             self._close_pipe()
             self.kill("it wrote data into its pipe that is not a message, and was killed")
-        first = received[0] if received and not self._worker else None
-        if isinstance(first, list) and first[0] == BORN:
-            self._worker = first[1]
+        while not self._worker and received and isinstance(received[0], list):
+            word, number = received[0][:2]
+            if word == KEPT and not self._keeper:
+                self._keeper = number
+                self._forked.set()
+            elif word == BORN:
+                self._worker = number
+            else:
+                break
             del received[0]
-        if received:
+        if self._leaves and self._keeper and not self._let_go:
+            self._close_pipe()
+        elif received:
             if self._logs:
                 named = ", ".join(map(_named, received))
                 _log.debug("from %d: %s", self._worker, named)
@@ -209,11 +293,16 @@ class Child:
         # process sent before its end still waits to be read.
         if self.pipe.ended and not self._let_go:
             self._close_pipe()
+            self._forked.set()
             self._limit(PIPE_LIMIT, lambda: self.kill("it closed its pipe, and was killed"))
 
     async def _wait_for_end(self) -> None:
-        await until_ended(self.process.pid)
-        self.process.wait()
+        await self._forked.wait()
+        if self._keeper:
+            await until_ended(self._keeper)
+        else:
+            self._code = -signal.SIGKILL
+            self._killed = self._killed or "its forge ended, or could not fork it"
         for limit in self._limits:
             limit.cancel()
         if not self._let_go:

@@ -288,9 +288,9 @@ class WorkerHost:
     def pids(self) -> dict[str, int]:
         """Return the process ids: `actions`, and `driver` if that has a process of its own."""
         found = {}
-        if self._worker is not None:
+        if self._worker is not None and self._worker.pid:
             found["actions"] = self._worker.pid
-        if self._owner is not None and self._owner is not self._worker:
+        if self._owner is not None and self._owner is not self._worker and self._owner.pid:
             found["driver"] = self._owner.pid
         return found
 

@@ -1,13 +1,16 @@
-"""The process between a node and one of its workers: it ends everything that user code
-left running when the worker ends.
+"""The processes between a node and its workers.
 
 An action or a driver may fork, start daemons or leave programs running. A worker that dies cannot
 clean up after itself, and its node is not the parent of what it started. So each worker has a
 keeper: the subreaper (prctl(2)) that becomes the parent of every orphan of the worker, even of one
-with a session or process group of its own. The keeper runs no user code and imports next to
-nothing. It kills its worker when the node orders it or dies, kills what is left once the worker has
-ended, and then ends as the worker did. So the end of this process says that nothing of the worker
-runs any more.
+with a session or process group of its own. The keeper runs no user code. It kills its worker when
+the node orders it or dies, kills what is left once the worker has ended, and then ends as the
+worker did. So the end of this process says that nothing of the worker runs any more.
+
+To start Python and to import what a worker needs takes some twenty times as long as a fork. So a
+node starts one process that does both once, the forge, and that forks a keeper for each order of
+its node; the keeper forks the worker. The forge runs no user code and holds nothing of a run. If it
+ends, the keepers and workers live on, and the node starts another one.
 
 What escapes: a process that user code starts as another user (set-user-ID programs cannot be
 signalled), one that hangs in the kernel, and all of them if user code kills the keeper itself.
@@ -16,12 +19,19 @@ signalled), one that hangs in the kernel, and all of them if user code kills the
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import gc
 import os
 import resource
 import signal
+import socket
 import sys
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NoReturn
+
+import msgpack
 
 from petrobot.services.host.parent_death import adopt_orphans, die_with, notify_of_end
 
@@ -36,6 +46,16 @@ CLEAN_UP = 1.0
 """Time in which the processes that the worker left must die (s): one that hangs in the kernel must
 not hide that the worker has ended."""
 LOOK_AGAIN = 0.01
+KEPT = "kept"
+"""First word in the pipe of a worker, from its keeper: the keeper's process id."""
+MOST_PASSED = 4
+"""Most descriptors of an order to the forge: PIPE, DESCRIPTORS, PERMITS, LINK."""
+CLONE_PARENT = 0x8000
+_CLONE = {"x86_64": 56, "ppc64le": 120}.get(os.uname().machine, 220)
+"""Number of the system call clone (syscalls(2)): most 64-bit machines share one table."""
+if sys.maxsize < 1 << 32:
+    _CLONE = 120
+_PYTHON = ctypes.PyDLL(None, use_errno=True)
 
 
 def keep(worker: int, patience: float) -> int:
@@ -92,7 +112,7 @@ def _children(parent: int) -> list[int]:
     return found
 
 
-def end_as(status: int) -> None:
+def end_as(status: int) -> NoReturn:
     """End this process as the worker ended: by the same signal or with the same exit code."""
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
@@ -104,33 +124,76 @@ def end_as(status: int) -> None:
     os._exit(os.waitstatus_to_exitcode(status) & 0xFF)
 
 
-def main(arguments: list[str]) -> None:
-    """Entry point of the process: `NODE PATIENCE PIPE DESCRIPTORS LINK PERMITS`, the last four as
-    `services.worker` takes them."""
-    node, patience, sockets = int(arguments[0]), float(arguments[1]), arguments[2:]
-    for ignored in _IGNORED:
-        signal.signal(ignored, signal.SIG_IGN)
+def fork_sibling() -> int:
+    """Fork this process, which must have one thread. The child is a child of this process's own
+    parent (CLONE_PARENT, clone(2)): so the node, not the forge, is notified of the end of a keeper
+    and reaps it, and the kernel notifies the keeper of the node's end. Return 0 in the child.
+
+    The C library does not know of this fork: the child must not run user code before it has forked
+    in the usual way.
+    """
+    _PYTHON.PyOS_BeforeFork()
+    found = int(_PYTHON.syscall(_CLONE, CLONE_PARENT | int(signal.SIGCHLD), 0, 0, 0, 0))
+    if found == 0:
+        _PYTHON.PyOS_AfterFork_Child()
+        return 0
+    _PYTHON.PyOS_AfterFork_Parent()
+    if found < 0:
+        raise OSError(ctypes.get_errno(), "clone")
+    return found
+
+
+def forge(node: int, orders: socket.socket) -> None:
+    """Fork a keeper for each order, until the node closes the socket. An order is one byte, the
+    patience (s), and the descriptors PIPE, DESCRIPTORS, PERMITS and, for some, LINK."""
+    # Imported here, once for all workers. None of it starts a thread.
+    from petrobot.services.worker import process as program
+
+    gc.freeze()  # otherwise the collector of each child writes to all these pages, and copies them
+    while True:
+        order, passed, _, _ = socket.recv_fds(orders, 1, MOST_PASSED, socket.MSG_CMSG_CLOEXEC)
+        if not order:
+            return
+        # If it cannot fork, the node sees that the pipe has no other end.
+        with contextlib.suppress(OSError):
+            if not fork_sibling():
+                orders.close()
+                keep_worker(node, order[0], passed, program.main)
+        for descriptor in passed:
+            os.close(descriptor)
+
+
+def keep_worker(
+    node: int, patience: float, passed: Sequence[int], program: Callable[[Sequence[int]], None]
+) -> NoReturn:
+    """Fork the worker, keep it, and end as it did."""
+    keeper = os.getpid()
+    os.write(passed[0], msgpack.packb([KEPT, keeper]))
+    os.setsid()
     signal.pthread_sigmask(signal.SIG_BLOCK, _WATCHED)
     adopt_orphans()
     notify_of_end(node, NODE_ENDED)
-    keeper = os.getpid()
     worker = os.fork()
     if worker == 0:
         die_with(keeper)
         os.setsid()  # a signal to the worker's whole process group does not reach its keeper
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _WATCHED)
-        # Imported in the worker alone: here it would start threads of libraries before the fork,
-        # and take memory.
-        from petrobot.services.worker import process as program
-
-        program.main(sockets)
-        return
-    for number in map(int, sockets):
-        if number >= 0:
-            os.close(number)
+        program(passed)
+        sys.exit()
+    for descriptor in passed:
+        os.close(descriptor)
     status = keep(worker, patience)
     clean_up()
     end_as(status)
+
+
+def main(arguments: list[str]) -> None:
+    """Entry point of the forge: `NODE ORDERS`, a process id and an inherited socket."""
+    node, orders = map(int, arguments)
+    die_with(node)
+    for ignored in _IGNORED:
+        signal.signal(ignored, signal.SIG_IGN)
+    forge(node, socket.socket(fileno=orders))
 
 
 if __name__ == "__main__":

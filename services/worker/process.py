@@ -1,9 +1,9 @@
 """A process of a node: the warm worker that runs the actions of a device (or of none), or the
 process of a cyclic driver.
 
-Its keeper (`services/worker/keeper.py`) forks it with the numbers of the inherited sockets PIPE,
-DESCRIPTORS and LINK (-1: none) and of the counter PERMITS, from which it takes the permit of each
-call before it begins it. The node sends over the pipe what the process is for. A process that makes
+Its keeper (`services/worker/keeper.py`) forks it with the sockets PIPE and DESCRIPTORS, the counter
+PERMITS, from which it takes the permit of each call before it begins it, and perhaps a LINK to its
+device. The node sends over the pipe what the process is for. A process that makes
 its device's driver and finds it cyclic serves only the driver.
 """
 
@@ -18,7 +18,7 @@ import socket
 import sys
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -348,7 +348,7 @@ def _first(node: Pipe) -> Setup:
 
 
 def serve(
-    node: Pipe, descriptors: socket.socket | None, link: NewestLink | None, permits: Permits
+    node: Pipe, descriptors: socket.socket, link: NewestLink | None, permits: Permits
 ) -> None:
     """Serve what the node's first message asks for. Errors of the driver are reported to it as
     text."""
@@ -368,7 +368,7 @@ def serve(
             driver = make_driver(directory, directory.devices[setup.device], ports)
             ports.draws.reseed(0)
             guard = Guard(setup.device, latch_of(directory.source, setup.node))
-            if driver.period and descriptors is not None:
+            if driver.period:
                 node.post(
                     [
                         READY,
@@ -395,23 +395,21 @@ def serve(
         sys.exit(1)
 
 
-def main(arguments: list[str]) -> None:
-    """Run the process, after the fork."""
+def main(passed: Sequence[int]) -> None:
+    """Run the process, after the fork, with the descriptors PIPE, DESCRIPTORS, PERMITS and perhaps
+    LINK."""
     for number in _IGNORED:
         # The node decides when its children end. Programs that user code starts do not inherit a
         # handler, as they would inherit SIG_IGN.
         signal.signal(number, lambda *_: None)
     os.register_at_fork(after_in_child=_take_signals)
     log_to_stderr()
-    pipe, descriptors, link = (
-        socket.socket(fileno=int(a)) if int(a) >= 0 else None for a in arguments[:3]
-    )
-    permits = Permits(int(arguments[3]))
-    assert pipe is not None
-    node, driver_link = Pipe(pipe), NewestLink(link) if link is not None else None
-    keep_from_copies(*([descriptors] if descriptors is not None else []))
+    pipe, descriptors = (socket.socket(fileno=number) for number in passed[:2])
+    node, permits = Pipe(pipe), Permits(passed[2])
+    link = NewestLink(socket.socket(fileno=passed[3])) if len(passed) > 3 else None
+    keep_from_copies(descriptors)
     try:
-        serve(node, descriptors, driver_link, permits)
+        serve(node, descriptors, link, permits)
     except MemoryError:
         os._exit(NO_MEMORY)
 

@@ -274,7 +274,7 @@ async def test_messages_sent_before_a_process_ended_are_read(
                 )
             child.give(Call("3", "segfault", {}))
             limit = Limit("the end of the process")
-            while child.process.poll() is None and limit.left():
+            while child.code is None and limit.left():
                 time.sleep(0.01)
             child.give(Call("4", "write_down", {}))
             assert child.closed and not results
@@ -331,8 +331,10 @@ async def test_a_run_beyond_the_limit_is_refused_with_the_reason(operator: Opera
 async def test_too_much_memory_ends_only_its_run(own_nodes: Nodes) -> None:
     async with operator_of(own_nodes.directory, "left", "right") as operator:
         nap = asyncio.create_task(operator.call("nap", 20.0, seconds=4.0))
-        assert (await operator.call("pid")).status == "success"
+        other = await operator.call("nap", 20.0, seconds=0.1)
+        assert other.status == "success"
         before = await pids(operator, "left", "")
+        assert len(before) >= 2, "one for each nap"
         end = await operator.call("eat", 20.0, megabytes=4000)
         assert (end.status, end.cause, end.executed) == ("error", "out_of_memory", "yes"), end
         kept = await operator.call("keep_memory", 20.0)

@@ -252,8 +252,8 @@ def nodes_command(file: Path) -> dict[str, Any]:
 
 @pytest.mark.parametrize("how", ["SIGKILL", "SIGSTOP"])
 async def test_a_killed_or_frozen_keeper_costs_only_its_worker(tmp_path: Path, how: str) -> None:
-    """The keepers are the processes directly below the node, so a tool that kills the node's
-    children kills them."""
+    """The keepers are directly below the node, and beside them only the forge, so a tool that kills
+    the node's children kills these."""
     running = Nodes(tmp_path, "left")
     try:
         async with operator_of(running.directory, "left") as operator:
@@ -263,7 +263,8 @@ async def test_a_killed_or_frozen_keeper_costs_only_its_worker(tmp_path: Path, h
                 *(await pids(operator, "left", "")).values(),
             }
             keepers = processes.children(node)
-            assert len(keepers) == len(workers) == 3 and workers.isdisjoint(keepers)
+            assert len(keepers) == len(workers) + 1 == 4 and workers.isdisjoint(keepers)
+            assert set(map(processes.parent, workers)) < keepers
             processes.kill(keepers, getattr(signal, how))
             if how == "SIGSTOP":
                 hanging = [operator.call("hang", 1.0), operator.call("hang_moving", 1.0)]

@@ -75,7 +75,7 @@ class FakeChild:
         self.link = link
         self.linked = link is not None
         self._drop(link)
-        self.pid = id(self) % 10_000
+        self.pid = 1 + id(self) % 10_000
         self.got: list[Any] = []
         self.passed: list[socket.socket] = []
         self.killed = self.left = self.unsent = self.frozen = False

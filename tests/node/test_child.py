@@ -1,0 +1,153 @@
+"""The processes of a node are forked by its forge, which may die, hang, or be out of date."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+
+from petrobot.services.comm.protocol.messages import Call, Outcome
+from petrobot.services.node import child as children
+from petrobot.services.node.child import Child, Forge
+from petrobot.services.worker.pipe import Item
+from petrobot.services.worker.process import READY, Setup
+from tests.node.test_processes import PATIENCE, ROOT
+from tests.processes import alive, parent
+from tests.waiting import until
+
+pytestmark = pytest.mark.processes
+TEXT = """\
+schema = 1
+nodes.left = { host = "127.0.0.1", port = 7001 }
+actions.ask = { run = "asked:ask", task = "ask", node = "left" }
+"""
+CODE = """\
+import os
+from pathlib import Path
+from petrobot import success
+
+def ask(ctx):
+    return success(setting=os.environ.get("SETTING", ""), folder=str(Path.cwd()))
+"""
+
+
+class Started:
+    """A process of a node, and what it reports."""
+
+    def __init__(self, folder: Path) -> None:
+        self.ready, self.over = asyncio.Event(), asyncio.Event()
+        self.results: list[Outcome] = []
+        setup = Setup(str(folder / "services.toml"), TEXT, "left", "")
+        self.child = Child(setup, self._hear, lambda child: self.over.set())
+
+    def _hear(self, child: Child, items: list[Item]) -> None:
+        self.results += [item for item in items if isinstance(item, Outcome)]
+        if any(isinstance(item, list) and item[0] == READY for item in items):
+            self.ready.set()
+
+    async def ask(self) -> dict[str, object]:
+        """Wait until it is ready, call its action, and end it; return the values."""
+        async with asyncio.timeout(PATIENCE):
+            await self.ready.wait()
+            self.child.give(Call("1", "ask", {}))
+            await until(lambda: self.results, "the result")
+            assert self.results[0].status == "success", self.results
+            self.child.leave()
+            await self.over.wait()
+        assert self.child.code == 0
+        return dict(self.results[0].values)
+
+
+def forge() -> Forge:
+    """The forge of this process."""
+    assert Forge._current is not None
+    return Forge._current
+
+
+@pytest.fixture
+async def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Path]:
+    """A location file and the module of its action, and a forge of their own."""
+    (tmp_path / "services.toml").write_text(TEXT)
+    (tmp_path / "asked.py").write_text(CODE)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    yield tmp_path
+    if Forge._current is not None:
+        forge().kill()
+
+
+async def test_a_worker_and_its_keeper(folder: Path) -> None:
+    """The keeper is a child of this process, so that this process may reap it."""
+    started = Started(folder)
+    async with asyncio.timeout(PATIENCE):
+        await started.ready.wait()
+    worker = started.child.pid
+    keeper = parent(worker)
+    assert parent(keeper) == os.getpid() and keeper != forge()._process.pid
+    assert (await started.ask())["setting"] == ""
+    assert not alive(worker) and not Path(f"/proc/{keeper}").exists()
+
+
+async def test_a_process_has_the_environment_of_its_start(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the forge was started before the environment or the folder changed."""
+    assert (await Started(folder).ask())["setting"] == ""
+    first = forge()
+    (there := folder / "there").mkdir()
+    late = Started(folder)
+    monkeypatch.setenv("SETTING", "other")
+    monkeypatch.chdir(there)
+    values = await Started(folder).ask()
+    assert values == {"setting": "other", "folder": str(there)} and forge() is not first
+    assert (await late.ask())["setting"] == "", "the former forge has an order left"
+    await until(lambda: first._process.poll() == 0, "the end of the former forge")
+
+
+async def test_another_forge_takes_the_place_of_one_that_was_killed(folder: Path) -> None:
+    former = Started(folder)
+    async with asyncio.timeout(PATIENCE):
+        await former.ready.wait()
+    os.kill(forge()._process.pid, signal.SIGKILL)
+    forge()._process.wait(PATIENCE)
+    assert await Started(folder).ask()
+    assert await former.ask(), "what it has forked lives on"
+
+
+@pytest.mark.parametrize("how", [Child.kill, Child.leave], ids=["kill", "leave"])
+async def test_a_child_that_is_not_forked_yet_can_be_ended(
+    folder: Path, how: Callable[[Child], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(children, "LEAVE_LIMIT", 0.5)
+    assert await Started(folder).ask()
+    os.kill(forge()._process.pid, signal.SIGSTOP)
+    started = Started(folder)
+    assert started.child.pid == 0 and started.child.code is None
+    how(started.child)
+    async with asyncio.timeout(PATIENCE):
+        await started.over.wait()
+    assert started.child.code == -signal.SIGKILL
+    assert await Started(folder).ask()
+
+
+async def test_a_frozen_forge_is_replaced(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert await Started(folder).ask()
+    frozen = forge()
+    os.kill(frozen._process.pid, signal.SIGSTOP)
+    monkeypatch.setattr(children, "FORK_LIMIT", 0.5)
+    started = Started(folder)
+    async with asyncio.timeout(PATIENCE):
+        await started.over.wait()
+    assert started.child.describe() == "it was not forked within 0.5 s"
+    monkeypatch.undo()
+    assert await Started(folder).ask() and forge() is not frozen
+
+
+async def test_a_forge_ends_with_its_node(folder: Path) -> None:
+    assert await Started(folder).ask()
+    process = forge()._process
+    forge().close()
+    await until(lambda: process.poll() == 0, "the end of the forge")
