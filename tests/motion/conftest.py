@@ -17,7 +17,7 @@ from petrobot.services.action import Cancelled, Result, Status, Wait
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.motion.arm import PERIOD, Arm
 from petrobot.services.motion.model import nominal_arm
-from petrobot.sim.catching.drives import DriveBus, ratings
+from petrobot.sim.catching.drives import ArmBus, ratings
 
 TABLE = tomllib.loads(
     files("petrobot.services.motion").joinpath("puma560.toml").read_text(encoding="utf-8")
@@ -148,7 +148,7 @@ class Rig:
         self.plant = (
             plant if plant is not None else SimplePlant(start if start is not None else home)
         )
-        self.drives = drives if drives is not None else DriveBus(self.plant, ratings(TABLE))
+        self.drives = drives if drives is not None else ArmBus(self.plant, ratings(TABLE))
         self.commanded: list[list[float]] = []
         self.on_step: Callable[[float], None] | None = None
         self.thinking = 0.0
