@@ -23,9 +23,6 @@ from petrobot.coordinator.learning.estimate import (
     TallyKey,
     TrialsKey,
     TrialSums,
-    merge_firings,
-    merge_tallies,
-    merge_trials,
 )
 from petrobot.coordinator.learning.objective import Comparison, Question, compare
 from petrobot.coordinator.learning.records import (
@@ -39,6 +36,7 @@ from petrobot.coordinator.learning.records import (
     WaitEnd,
 )
 from petrobot.coordinator.learning.selectors import ACTION, DEFAULT, TASK, RuleSelector, make
+from petrobot.coordinator.learning.statistics import merged
 from petrobot.coordinator.task import Task
 
 NOTHING = Tally()
@@ -61,21 +59,10 @@ class Estimates:
 
     def merged(self, other: Estimates) -> Estimates:
         """Return the estimates of both sets of runs."""
-        tallies = {
-            k: merge_tallies(self.tally(k), other.tally(k))
-            for k in sorted({*self.tallies, *other.tallies})
-        }
-        keys = sorted({*self.flows, *other.flows})
         return Estimates(
-            tallies,
-            {
-                k: merge_firings(self.flows.get(k, Firings()), other.flows.get(k, Firings()))
-                for k in keys
-            },
-            {
-                k: merge_trials(self.trials.get(k, TrialSums()), other.trials.get(k, TrialSums()))
-                for k in sorted({*self.trials, *other.trials})
-            },
+            merged(self.tallies, other.tallies),
+            merged(self.flows, other.flows),
+            merged(self.trials, other.trials),
         )
 
     def trials_of(self, task: str, context: str | None = None) -> dict[str, TrialSums]:
@@ -257,7 +244,7 @@ class Learning:
         for name in self.task.primitive_tasks:
             measure = self.question(name).measure
             for action, by_context in self.gained.of(name).items():
-                whole = reduce(merge_tallies, by_context.values(), NOTHING)
+                whole = reduce(Tally.merged, by_context.values(), NOTHING)
                 if whole.runs and not whole.cost(measure).n:
                     found.append((name, action, measure))
         return found

@@ -19,7 +19,7 @@ from functools import reduce
 from math import inf, isfinite, isnan, nan, sqrt
 from typing import Any
 
-from petrobot.coordinator.learning.estimate import Tally, TrialSums, merge_tallies
+from petrobot.coordinator.learning.estimate import Tally, TrialSums
 from petrobot.coordinator.learning.statistics import (
     joined,
     lowest_share,
@@ -226,7 +226,7 @@ def compare(
     unmet = not any(inside.values())
     rows = []
     for action, by_scenario in over.items():
-        whole = reduce(merge_tallies, actions[action].values(), Tally())
+        whole = reduce(Tally.merged, actions[action].values(), Tally())
         rows.append(_row(action, whole, by_scenario, inside[action], question, unmet))
     rho = cost_weight(f.cost for f in rows) if question.rho is None else question.rho
     known = any(f.runs for f in rows)
