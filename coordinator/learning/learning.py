@@ -1,9 +1,8 @@
 """Everything that a task has learned: tallies by action and context, waits of transitions, and one
 selector for each primitive task.
 
-The state changes only by records (`Choice`, `RunEnd`, `Correction`, `Passage`), all of them plain
-data. A journal or a campaign table that stores the records yields the same state again when they
-are applied in the same order.
+The state changes only by records (`Choice`, `RunEnd`, `Correction`, `Passage`): the same records in
+the same order yield the same state.
 """
 
 from __future__ import annotations
@@ -129,8 +128,6 @@ class Learning:
     ) -> None:
         self.task, self.salt, self.credit = task, salt, credit
         self.known, self.gained = known or Estimates(), Estimates()
-        self.applied = 0
-        """Number of records applied in this session."""
         self.given = question
         self.selectors: dict[str, RuleSelector] = {}
         for p in task.primitive_tasks.values():
@@ -167,7 +164,6 @@ class Learning:
 
     def apply(self, record: Record) -> None:
         """Apply a record to the estimates and the selectors."""
-        self.applied += 1
         self.gained.apply(record, self.task.name, self.salt)
         self._select(record)
 

@@ -34,7 +34,6 @@ FLIGHT = 0.4
 """s of a token's way to a transition and on to the next place."""
 SAME = 1e-3
 """s by which the times of two firings may differ: a journal rounds them."""
-PAPER = 255
 
 
 class NoFilmError(ValueError):
