@@ -31,14 +31,13 @@ class SimplePlant:
     GRAVITY = (0.0, 37.0, 9.0, 0.0, 0.3, 0.0)
 
     def __init__(self, q: Sequence[float]) -> None:
-        model = nominal_arm()
         self.q = [float(angle) for angle in q]
         self.qd = [0.0] * 6
         self.braked = [True] * 6
         self.tau = [0.0] * 6
         self._inertia = [float(joint["inertia"]) for joint in TABLE["joint"]]
-        self._viscous = (model.viscous * model.gear**2).tolist()
-        self._dry = (model.coulomb * model.gear).tolist()
+        self._viscous = [joint["viscous"] * joint["gear"] ** 2 for joint in TABLE["joint"]]
+        self._dry = [joint["coulomb"] * joint["gear"] for joint in TABLE["joint"]]
         self.factor = 1.0
 
     def brake(self, joint: int) -> None:
