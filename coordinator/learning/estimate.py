@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 from petrobot.coordinator.learning.statistics import (
     EMPTY,
     Moments,
-    added,
     clopper_pearson,
     merged,
     whole,
@@ -204,11 +203,6 @@ class Tally:
     def censored(self) -> int:
         """Number of preempted runs that count none."""
         return sum(m.n for exit_, m in self.durations.items() if not is_counted(exit_))
-
-    @property
-    def exposure(self) -> float:
-        """Total seconds of all executed runs, including censored ones."""
-        return added(m.total for m in self.durations.values())
 
     @property
     def reliability(self) -> float:

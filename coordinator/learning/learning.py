@@ -23,7 +23,7 @@ from petrobot.coordinator.learning.estimate import (
     TrialsKey,
     TrialSums,
 )
-from petrobot.coordinator.learning.objective import Comparison, Question, compare
+from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.records import (
     Choice,
     Correction,
@@ -206,22 +206,6 @@ class Learning:
     def estimates(self) -> Estimates:
         """Everything that is known, including the runs of this session."""
         return self.known.merged(self.gained)
-
-    def comparison(self, primitive_task: str, context: str | None = None) -> Comparison:
-        """Compare the alternatives of a primitive task: in one context, or over all of them as
-        scenarios (None).
-
-        Over scenarios the target reliability is the given one, otherwise the one that the task file
-        declares.
-        """
-        tallies, primitive = (
-            self.estimates.of(primitive_task, context),
-            self.task.primitive_tasks[primitive_task],
-        )
-        question = (
-            self.question(primitive_task) if context is not None else self.asked()[primitive_task]
-        )
-        return compare({a: tallies.get(a, {}) for a in primitive.alternatives}, question)
 
     def asked(self) -> dict[str, Question]:
         """Return by what the actions of each primitive task are judged over scenarios: with the

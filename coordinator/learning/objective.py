@@ -75,8 +75,6 @@ class Figures:
     """All scenarios that meet the target."""
     largest_cost: float
     """The largest mean cost over the scenarios that meet the target."""
-    declared_cost: float
-    """The cost that the task file declares, beside the measured one; nan if there is none."""
     j: float
     """J with the common rho of the comparison; inf for an inadmissible action, nan if nothing is
     known."""
@@ -274,7 +272,6 @@ def _row(
         scenario if inside else None,
         inside,
         largest,
-        declared,
         nan,
         nan,
         nan,
@@ -343,16 +340,9 @@ def pareto(figures: Iterable[Figures]) -> tuple[Figures, ...]:
     return tuple(front)
 
 
-def cost_to_reach(
-    figures: Iterable[Figures], target: float, *, surely: bool = False
-) -> Figures | None:
-    """Return the cheapest action whose reliability (`surely`: its lower confidence bound) reaches
-    the target; None if none does."""
-    enough = [
-        f
-        for f in figures
-        if f.availability * (f.lower if surely else f.reliability) >= target and f.cost < inf
-    ]
+def cost_to_reach(figures: Iterable[Figures], target: float) -> Figures | None:
+    """Return the cheapest action whose reliability reaches the target; None if none does."""
+    enough = [f for f in figures if f.effective >= target and f.cost < inf]
     return min(enough, key=lambda f: (f.cost, -f.effective, f.action), default=None)
 
 

@@ -100,7 +100,6 @@ def test_the_numbers_that_each_result_changes(
     assert tally.availability == availability
     assert tally.censored == censored
     assert tally.unknown == (seen.executed is Executed.UNKNOWN)
-    assert tally.exposure == (0.0 if seen.executed is Executed.NO else seen.seconds)
 
 
 @given(OBSERVATIONS, OBSERVATIONS, OBSERVATIONS)

@@ -24,6 +24,7 @@ from petrobot.coordinator.learning.learner import (
     usual_contexts,
 )
 from petrobot.coordinator.learning.learning import Learning
+from petrobot.coordinator.learning.objective import Comparison, Question, compare
 from petrobot.coordinator.learning.records import (
     Choice,
     Correction,
@@ -276,10 +277,16 @@ def test_alternatives_are_judged_in_a_context_or_over_scenarios(task: Task) -> N
     selector = learner(task, "round_robin", seed=1)
     for regime in ("A", "B"):
         run(task, selector, runs=120, parameters={"regime": regime})
-    judged = selector.learning.comparison("pick", "regime=A")
+
+    def compared(question: Question, context: str | None = None) -> Comparison:
+        known = selector.learning.estimates.of("pick", context)
+        alternatives = task.primitive_tasks["pick"].alternatives
+        return compare({action: known.get(action, {}) for action in alternatives}, question)
+
+    judged = compared(selector.learning.question("pick"), "regime=A")
     assert judged.of("pick_blind").scenarios == ("regime=A",)
     assert judged.best == "pick_fast"  # R 1/3, but at a quarter of the cost
-    over = selector.learning.comparison("pick")
+    over = compared(selector.learning.asked()["pick"])
     assert over.best == "pick_slow"
     assert over.of("pick_slow").scenarios == ("regime=A", "regime=B")
     assert over.of("pick_slow").runs == 2 * judged.of("pick_slow").runs
