@@ -4,10 +4,6 @@ their own."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
-from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.sim.bus.feetech import FeetechBus, so101
@@ -30,7 +26,6 @@ class Arms(LaboratoryParty):
         self._controllers: dict[str, UrController] = {}
 
     def tick(self, now: float) -> None:
-        """Let the arms move."""
         for bus in self._servos.values():
             bus.advance(TICK)
         for controller in self._controllers.values():
@@ -38,32 +33,13 @@ class Arms(LaboratoryParty):
         self.now = now + TICK
 
     def take_on_serial(self, now: float, device: str, data: bytes) -> bytes:
-        """Answer as the servos of this device."""
         if device not in self._servos:
             self._servos[device] = so101([0.0] * 5 + [1.0])
             self._servos[device].servos[6].low = HELD
         return self._servos[device].receive(data)
 
     def connect(self, device: str, port: int) -> ControllerSession:
-        """Connect to the controller of this device."""
         return self._controllers.setdefault(device, UrController()).connect(port)
-
-    def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
-        """It has no CAN bus."""
-
-    def take_frames(self) -> Sequence[Frame]:
-        """It has no CAN bus."""
-        return ()
-
-    def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """It has no services."""
-        raise ValueError(f"no service {service!r}")
-
-    def make_ready(self, arguments: Mapping[str, Any]) -> None:
-        """Nothing takes long."""
-
-    def close(self) -> None:
-        """Nothing is held."""
 
 
 def make_laboratory(directory: Directory, name: str) -> Arms:

@@ -46,13 +46,14 @@ class FaultKinds:
     keys: Mapping[str, tuple[str, ...]]
     drives: int
 
-    def read(self, now: float, kind: str, arguments: Mapping[str, Any]) -> InjectedFault:
-        """Return the fault that a caller asks for. Raises ValueError that says what is wrong and
-        what is expected."""
+    def read(self, now: float, arguments: Mapping[str, Any]) -> InjectedFault:
+        """Return the fault that a caller asks for: its `kind` and keys. Raises ValueError that says
+        what is wrong and what is expected."""
+        kind = str(arguments.get("kind", ""))
         if kind not in self.keys:
             raise ValueError(f"unknown fault {kind!r}; the faults are {', '.join(self.keys)}")
         keys = self.keys[kind]
-        unknown = sorted(set(arguments) - {*keys, "after"})
+        unknown = sorted(set(arguments) - {*keys, "kind", "after"})
         if unknown:
             raise ValueError(
                 f"{kind}: unknown key {unknown[0]!r}; the keys are {', '.join((*keys, 'after'))}"
@@ -73,19 +74,16 @@ class FaultKinds:
         return InjectedFault(kind, now + after, now + after + duration, value, "duration" in keys)
 
 
-ARM_FAULTS: Final = FaultKinds(
-    keys={
-        "drop_images": ("share", "duration"),
-        "dead_camera": ("duration",),
-        "can_errors": ("share", "duration"),
-        "bus_off": ("duration",),
-        "drive_fault": ("joint",),
-        "slow_arm": ("factor",),
-        "arm_power": ("duration",),
-        "clear": (),
-    },
-    drives=6,
-)
+CAMERA_FAULTS: Final[Mapping[str, tuple[str, ...]]] = {
+    "drop_images": ("share", "duration"),
+    "dead_camera": ("duration",),
+    "clear": (),
+}
+BUS_FAULTS: Final[Mapping[str, tuple[str, ...]]] = {
+    "can_errors": ("share", "duration"),
+    "bus_off": ("duration",),
+    "drive_fault": ("joint",),
+}
 
 
 def _number(

@@ -25,8 +25,12 @@ from petrobot.services.comm.lockstep.channels import (
 from petrobot.services.comm.lockstep.party import TICK, Envelope
 from petrobot.services.comm.protocol.messages import Call, Command, Executed, Outcome
 from petrobot.sim.exposures import Exposures
+from petrobot.sim.faults import FaultKinds, FaultPlan
 
 PREPARE, SCORE, FAULT = SERVICES = ("laboratory_prepare", "laboratory_score", "laboratory_fault")
+"""laboratory_prepare(...): begin a new experiment, return nothing; parameters of the task that do
+not concern the laboratory are ignored. laboratory_score(...): see each laboratory's referee.
+laboratory_fault(kind, after=0, ...): see sim.faults."""
 
 
 def answer_command(now: float, callee: Callee, order: Order) -> None:
@@ -60,6 +64,10 @@ class LaboratoryParty(ABC):
     callers."""
     tcp_ports: Sequence[int] = ()
     """Ports at which its robots accept TCP connections."""
+    fault_kinds: ClassVar[FaultKinds]
+    """The faults that it can inject."""
+    faults: FaultPlan
+    """Those of the present experiment."""
 
     def __init__(self, name: str, where: Callable[[str], str], boot: str, directory: str) -> None:
         """`boot`, `directory`: as in services.comm.calls.callee."""
@@ -87,38 +95,48 @@ class LaboratoryParty(ABC):
     def tick(self, now: float) -> None:
         """Expose the world as it is at `now`, then advance it to `now` + TICK."""
 
-    @abstractmethod
-    def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
+    # The defaults of these are for a world without such devices or services.
+    def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:  # noqa: B027
         """Process frames of the master."""
 
-    @abstractmethod
     def take_frames(self) -> Sequence[Frame]:
         """Return the frames of the simulated devices since the last call."""
-
-    @abstractmethod
-    def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Answer one of `services`. Raises ValueError for bad arguments."""
-
-    @abstractmethod
-    def make_ready(self, arguments: Mapping[str, Any]) -> None:
-        """Do in advance, in any thread, what takes long in a preparation with these arguments.
-        Raises ValueError."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Release what the world holds."""
+        return ()
 
     def take_on_serial(self, now: float, device: str, data: bytes) -> bytes:
-        """Process what a device's driver sent on its serial line; return the answer. A world with
-        such devices overrides this."""
+        """Process what a device's driver sent on its serial line; return the answer."""
         return b""
 
     def connect(self, device: str, port: int) -> TcpSession:
-        """Accept a connection of a device's driver to one of `tcp_ports`. A world with such devices
-        overrides this."""
+        """Accept a connection of a device's driver to one of `tcp_ports`."""
         raise ValueError(f"nothing listens at port {port}")
 
+    def prepare(self, arguments: Mapping[str, Any]) -> None:
+        """Begin a new experiment. Raises ValueError for bad arguments."""
+        raise ValueError("nothing to prepare")
+
+    def make_ready(self, arguments: Mapping[str, Any]) -> None:  # noqa: B027
+        """Do in advance, in any thread, what takes long in a preparation with these arguments.
+        Raises ValueError."""
+
+    def score(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the score of the experiment so far."""
+        raise ValueError("no score")
+
+    def close(self) -> None:  # noqa: B027
+        """Release what the world holds."""
+
     # The party
+
+    def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Answer one of `services`. Raises ValueError for bad arguments."""
+        if service == SCORE:
+            return self.score(arguments)
+        if service == FAULT:
+            self.faults.add(self.fault_kinds.read(self.now, arguments))
+        else:
+            self.prepare(arguments)
+        return {}
 
     def receive(self, now: float, envelope: Envelope) -> None:
         """Process frames, requests for images, and calls."""

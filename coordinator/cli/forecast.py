@@ -274,7 +274,7 @@ def _refuse_other_runs(task: Task, rows: Iterable[TrialRow], path: Path) -> None
 
     actions: dict[str, dict[str, None]] = {}
     for row in rows:
-        for run in row.trial.runs if row.trial is not None else ():
+        for run in row.runs:
             actions.setdefault(run.place, {})[run.action] = None
     for place, found in actions.items():
         known = task.flat.places.get(place)

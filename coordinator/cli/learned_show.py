@@ -193,9 +193,9 @@ def _plain(
 
 
 def _row(by_context: Mapping[str, Tally], asked: Question, f: Figures) -> dict[str, Any]:
-    from petrobot.coordinator.learning.estimate import Tally, merge_tallies
+    from petrobot.coordinator.learning.estimate import Tally
 
-    whole = reduce(merge_tallies, by_context.values(), Tally())
+    whole = reduce(Tally.merged, by_context.values(), Tally())
     cost = whole.cost(asked.measure)
     return {
         "action": f.action,

@@ -370,7 +370,6 @@ async def _page(session: RunSession, options: argparse.Namespace) -> AsyncIterat
     """Serve the operator's page, or with --no-page the operator's protocol alone, while the run is
     active."""
     from petrobot.coordinator.cli.loading import SHIPPED, own_tasks
-    from petrobot.coordinator.operator.history import JournalHistory
     from petrobot.coordinator.operator.run_address import RunAddress
     from petrobot.coordinator.operator.station import offered
     from petrobot.coordinator.page.server import start_page
@@ -387,7 +386,7 @@ async def _page(session: RunSession, options: argparse.Namespace) -> AsyncIterat
             offers=lambda: offered(
                 directory, lambda action, node: callers[node].up and action in callers[node].offers
             ),
-            history=JournalHistory(session.folder.parent),
+            runs=session.folder.parent,
             page=not options.no_page,
         )
     if not options.no_page:

@@ -114,7 +114,6 @@ async def _page(
     station: Station, runs: Path, options: argparse.Namespace, stop: asyncio.Event
 ) -> None:
     """Serve the page until `stop` is set; then abort the active run and close the page."""
-    from petrobot.coordinator.operator.history import JournalHistory
     from petrobot.coordinator.page.server import start_page
 
     with named_port(options.page_port):
@@ -124,7 +123,7 @@ async def _page(
             shipped=SHIPPED,
             port=options.page_port,
             offers=station.offers,
-            history=JournalHistory(runs),
+            runs=runs,
             starts=station.form,
         )
     station.address = _addresses(station.directory, page)

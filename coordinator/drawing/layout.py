@@ -20,6 +20,7 @@ from bisect import bisect_left, insort
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from graphlib import TopologicalSorter
 from itertools import pairwise
 
 Point = tuple[float, float]
@@ -227,7 +228,7 @@ def _columns(names: Sequence[str], edges: Sequence[Edge]) -> dict[str, int]:
     for a, b in edges:
         before[b].append(a)
         after[a].append(b)
-    column = _longest_paths(names, before, after)
+    column = _longest_paths(before)
     for _ in range(_TIGHTENINGS):
         moved = False
         for name in names:
@@ -242,20 +243,17 @@ def _columns(names: Sequence[str], edges: Sequence[Edge]) -> dict[str, int]:
     return column
 
 
-def _longest_paths(
-    names: Sequence[str], before: Mapping[str, Sequence[str]], after: Mapping[str, Sequence[str]]
-) -> dict[str, int]:
-    column = dict.fromkeys(names, 0)
-    waiting = {n: len(before[n]) for n in names}
-    ready = [n for n in names if not waiting[n]]
-    while ready:
-        node = ready.pop()
-        for child in after[node]:
-            column[child] = max(column[child], column[node] + 1)
-            waiting[child] -= 1
-            if not waiting[child]:
-                ready.append(child)
-    return column
+def _longest_paths(before: Mapping[str, Sequence[str]]) -> dict[str, int]:
+    """Return the layer of each node: the length of the longest path that leads to it."""
+    layers, layer = dict[str, int](), 0
+    sorter = TopologicalSorter(before)
+    sorter.prepare()
+    while sorter.is_active():
+        ready = sorter.get_ready()
+        layers |= dict.fromkeys(ready, layer)
+        sorter.done(*ready)
+        layer += 1
+    return layers
 
 
 @dataclass(frozen=True, slots=True)

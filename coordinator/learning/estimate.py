@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 from petrobot.coordinator.learning.statistics import (
     EMPTY,
     Moments,
-    added,
     clopper_pearson,
     merged,
     whole,
@@ -206,11 +205,6 @@ class Tally:
         return sum(m.n for exit_, m in self.durations.items() if not is_counted(exit_))
 
     @property
-    def exposure(self) -> float:
-        """Total seconds of all executed runs, including censored ones."""
-        return added(m.total for m in self.durations.values())
-
-    @property
     def reliability(self) -> float:
         """R; nan if no run counts."""
         return self.count(Status.SUCCESS) / self.runs if self.runs else float("nan")
@@ -353,6 +347,24 @@ class Tally:
             changes=self.changes + 1,
         )
 
+    def merged(self, other: Tally) -> Tally:
+        """Return the tally of both sets of runs."""
+        if not self.changes or not other.changes:
+            return self if self.changes else other
+        return Tally(
+            _summed(self.counts, other.counts),
+            merged(self.durations, other.durations),
+            self.cpu.merged(other.cpu),
+            merged(self.values, other.values),
+            self.waited.merged(other.waited),
+            _summed(self.not_executed, other.not_executed),
+            self.unknown + other.unknown,
+            self.corrected + other.corrected,
+            self.changes + other.changes,
+            self.sample.merged(other.sample),
+            _summed(self.unknown_ends, other.unknown_ends),
+        )
+
     # --- plain data ---------------------------------------------------------------------------
 
     def to_plain(self) -> dict[str, Any]:
@@ -436,25 +448,6 @@ class Tally:
             raise ValueError(f"{self.changes} changes cannot have counted {least} runs")
         if any(m.low < 0 for m in (*self.durations.values(), self.cpu, self.waited) if m.n):
             raise ValueError("expected seconds from 0, got negative ones")
-
-
-def merge_tallies(one: Tally, other: Tally) -> Tally:
-    """Return the tally of both sets of runs."""
-    if not one.changes or not other.changes:
-        return one if one.changes else other
-    return Tally(
-        _summed(one.counts, other.counts),
-        merged(one.durations, other.durations),
-        one.cpu.merged(other.cpu),
-        merged(one.values, other.values),
-        one.waited.merged(other.waited),
-        _summed(one.not_executed, other.not_executed),
-        one.unknown + other.unknown,
-        one.corrected + other.corrected,
-        one.changes + other.changes,
-        one.sample.merged(other.sample),
-        _summed(one.unknown_ends, other.unknown_ends),
-    )
 
 
 def _more(counts: Mapping[Any, int], key: Any, by: int = 1) -> dict[Any, int]:
@@ -546,15 +539,14 @@ class Firings:
         """Return the firings with one more wait that ended without one. `came`: by the event."""
         return replace(self, unfired=self.unfired.adding(waited), came=self.came + came)
 
-
-def merge_firings(one: Firings, other: Firings) -> Firings:
-    """Return the firings of both sets of runs."""
-    return Firings(
-        one.fired + other.fired,
-        one.waits.merged(other.waits),
-        one.unfired.merged(other.unfired),
-        one.came + other.came,
-    )
+    def merged(self, other: Firings) -> Firings:
+        """Return the firings of both sets of runs."""
+        return Firings(
+            self.fired + other.fired,
+            self.waits.merged(other.waits),
+            self.unfired.merged(other.unfired),
+            self.came + other.came,
+        )
 
 
 @dataclass(frozen=True, order=True, slots=True)
@@ -583,6 +575,11 @@ class TrialSums:
     runs: Mapping[str, int] = field(default_factory=dict)
     """Number of runs of each primitive task."""
 
+    @property
+    def changes(self) -> int:
+        """Number of trials, the version in estimates files."""
+        return self.n
+
     def adding(
         self, success: bool, goal: bool, cost: float | None, runs: Iterable[str]
     ) -> TrialSums:
@@ -596,6 +593,17 @@ class TrialSums:
             self.cost if cost is None else self.cost.adding(cost),
             self.good_cost if cost is None or not success else self.good_cost.adding(cost),
             dict(sorted(counts.items())),
+        )
+
+    def merged(self, other: TrialSums) -> TrialSums:
+        """Return the sums of both sets of trials."""
+        return TrialSums(
+            self.n + other.n,
+            self.success + other.success,
+            self.goals + other.goals,
+            self.cost.merged(other.cost),
+            self.good_cost.merged(other.good_cost),
+            dict(sorted((Counter(self.runs) + Counter(other.runs)).items())),
         )
 
     def to_plain(self) -> list[Any]:
@@ -613,15 +621,3 @@ class TrialSums:
         whole(good.n, "costs of successes", success)
         runs = {str(name): whole(k, f"runs of {name}") for name, k in data[5].items()}
         return cls(n, success, goals, cost, good, dict(sorted(runs.items())))
-
-
-def merge_trials(one: TrialSums, other: TrialSums) -> TrialSums:
-    """Return the sums of both sets of trials."""
-    return TrialSums(
-        one.n + other.n,
-        one.success + other.success,
-        one.goals + other.goals,
-        one.cost.merged(other.cost),
-        one.good_cost.merged(other.good_cost),
-        dict(sorted((Counter(one.runs) + Counter(other.runs)).items())),
-    )

@@ -22,34 +22,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from petrobot.coordinator.learning.estimate import (
-    Firings,
-    FiringsKey,
-    TallyKey,
-    TrialsKey,
-    TrialSums,
-    merge_firings,
-    merge_tallies,
-    merge_trials,
-)
 from petrobot.coordinator.learning.estimates_tables import (
     APPLICATION,
     CAMPAIGN,
     CHOICE,
     COUNTED,
+    FLOWS,
     IN,
     PLANT,
     SCHEMA,
+    SUMS,
     TABLES,
+    TALLIES,
     TRIAL,
-    add_flow,
-    add_tally,
-    add_trials,
+    TRIALS,
+    SumsTable,
     correct_tally,
     count_session,
     fact,
-    flow_of,
-    flow_row,
     forget,
     is_empty,
     migrate,
@@ -65,11 +55,6 @@ from petrobot.coordinator.learning.estimates_tables import (
     state_of,
     take_later,
     take_selector,
-    tally_of,
-    tally_row,
-    trial_rows,
-    trials_of,
-    trials_row,
     use_plant,
 )
 from petrobot.coordinator.learning.learning import Estimates
@@ -173,21 +158,16 @@ class EstimatesFile:
         kept = FileContents(about["origin"], int(about["generation"]), about.get(PHYSICS, ""))
         places = plants(db)
         kinds: dict[str, dict[tuple[str, str], dict[str, int]]] = {}
-        for row in db.execute("SELECT * FROM tally"):
-            where, key, tally = places.get(row[0], ""), TallyKey(*row[1:4]), tally_of(row)
-            into = kept.plants.setdefault(where, Estimates())
-            into.tallies[key] = merge_tallies(into.tally(key), tally)
-            by_kind = kinds.setdefault(where, {}).setdefault((key.primitive_task, key.action), {})
-            kind = _kind(where, campaign=row[0].startswith(CAMPAIGN))
-            by_kind[kind] = by_kind.get(kind, 0) + tally.runs + tally.censored
-        for row in db.execute("SELECT * FROM flow"):
-            into = kept.plants.setdefault(places.get(row[0], ""), Estimates())
-            at = FiringsKey(*row[1:4])
-            into.flows[at] = merge_firings(into.flows.get(at, Firings()), flow_of(row))
-        for row in trial_rows(db):
-            into = kept.plants.setdefault(places.get(row[0], ""), Estimates())
-            of = TrialsKey(*row[1:3])
-            into.trials[of] = merge_trials(into.trials.get(of, TrialSums()), trials_of(row))
+        for table in SUMS:
+            for row in table.rows(db):
+                where, (key, sums) = places.get(row[0], ""), table.read(row)
+                into = table.of(kept.plants.setdefault(where, Estimates()))
+                into[key] = into[key].merged(sums) if key in into else sums
+                if table is TALLIES:
+                    by_action = kinds.setdefault(where, {})
+                    by_kind = by_action.setdefault((key.primitive_task, key.action), {})
+                    kind = _kind(where, campaign=row[0].startswith(CAMPAIGN))
+                    by_kind[kind] = by_kind.get(kind, 0) + sums.runs + sums.censored
         for task, name, state in db.execute("SELECT primitive_task, name, state FROM selector"):
             kept.selectors[task, name] = json.loads(state)
             kept.plants.setdefault(name.partition(IN)[2], Estimates())
@@ -257,12 +237,9 @@ class EstimatesFile:
             if fact(db, COUNTED + mission) == origin:
                 for correction in late:
                     correct_tally(db, origin, correction)
-            for key, tally in gained.tallies.items():
-                add_tally(db, origin, key, tally)
-            for where, flow in gained.flows.items():
-                add_flow(db, origin, where, flow)
-            for of, sums in gained.trials.items():
-                add_trials(db, origin, of, sums)
+            for table in SUMS:
+                for key, sums in table.of(gained).items():
+                    table.add(db, origin, key, sums)
             for task, state in selectors.items():
                 put_selector(db, task, state, selector_name(state["selector"], plant))
             for task, question in (asked or {}).items():
@@ -304,19 +281,20 @@ class EstimatesFile:
                     "SELECT primitive_task FROM forgotten WHERE origin = ?", (origin,)
                 )
             }
-            tallies = [
-                tally_row(origin, k, t)
-                for k, t in estimates.tallies.items()
-                if k.primitive_task not in gone
-            ]
-            flows = (
-                [] if "" in gone else [flow_row(origin, k, f) for k, f in estimates.flows.items()]
-            )
-            whole = [trials_row(origin, k, t) for k, t in estimates.trials.items()]
-            take_later(db, "trial", [] if "" in gone else whole)
+
+            def take(table: SumsTable) -> None:
+                # what is kept of whole tasks is forgotten under the name ""
+                rows = [
+                    table.row(origin, key, sums)
+                    for key, sums in table.of(estimates).items()
+                    if getattr(key, "primitive_task", "") not in gone
+                ]
+                take_later(db, table.name, rows)
+
+            take(TRIALS)
             before = db.total_changes
-            take_later(db, "tally", tallies)
-            take_later(db, "flow", flows)
+            take(TALLIES)
+            take(FLOWS)
             if db.total_changes > before:
                 count_session(db)
             for task, state in selectors.items():
@@ -390,29 +368,24 @@ class EstimatesFile:
             if is_empty(db):
                 return
             origin, physics = fact(db, "origin"), fact(db, PHYSICS)
-            rows = {
-                name: db.execute(f"SELECT * FROM {name}").fetchall()
-                for name in ("tally", "flow", "selector")
-            }
-            rows["question"], rows["trial"] = questions(db), trial_rows(db)
+            rows = {table.name: table.rows(db) for table in SUMS}
+            rows["question"] = questions(db)
+            selectors = db.execute("SELECT primitive_task, name, state FROM selector").fetchall()
             gone = db.execute("SELECT * FROM forgotten").fetchall()
             places, simulated = plants(db), _simulated(db)
-            for row in rows["tally"]:
-                tally_of(row)
-            for row in rows["flow"]:
-                flow_of(row)
-            for row in rows["trial"]:
-                trials_of(row)
+            for table in SUMS:
+                for row in rows[table.name]:
+                    table.read(row)
             for _, _, _, *asked in rows["question"]:
                 question_of(asked)
-            states = [(task, name, state_of(body)) for task, name, _, body in rows["selector"]]
+            states = [(task, name, state_of(body)) for task, name, body in selectors]
         with self._writing() as mine:
             if simulated:
                 self._note_physics(mine, physics)
             for own, place in places.items():
                 put_fact(mine, PLANT + own, place)
-            for table in ("tally", "flow", "question", "trial"):
-                take_later(mine, table, rows[table])
+            for name, learned in rows.items():
+                take_later(mine, name, learned)
             for task, name, state in states:
                 take_selector(mine, task, name, state, origin)
             mine.executemany("INSERT OR IGNORE INTO forgotten VALUES (?, ?)", gone)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import secrets
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import astuple, dataclass
 from math import inf
-from typing import Any
+from typing import Any, Protocol
 
 from petrobot.coordinator.learning.combinations import TOGETHER
 from petrobot.coordinator.learning.estimate import (
@@ -18,11 +19,8 @@ from petrobot.coordinator.learning.estimate import (
     TallyKey,
     TrialsKey,
     TrialSums,
-    merge_firings,
-    merge_tallies,
-    merge_trials,
 )
-from petrobot.coordinator.learning.learning import corrected
+from petrobot.coordinator.learning.learning import Estimates, corrected
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.records import Correction
 
@@ -181,87 +179,118 @@ def put_fact(db: sqlite3.Connection, name: str, value: str) -> None:
     db.execute("INSERT OR REPLACE INTO about VALUES (?, ?)", (name, value))
 
 
-def add_tally(db: sqlite3.Connection, origin: str, key: TallyKey, gained: Tally) -> None:
-    """Add runs to the sums of an origin."""
-    _put_tally(db, origin, key, merge_tallies(_own_tally(db, origin, key), gained))
+class Sums(Protocol):
+    """Sums over runs, firings or trials; `changes` is their version."""
+
+    @property
+    def changes(self) -> int: ...
+
+    def merged(self, other: Any) -> Any: ...
+
+    def to_plain(self) -> Any: ...
+
+
+@dataclass(frozen=True, slots=True)
+class SumsTable:
+    """A table of sums: a row holds an origin, the parts of a key, the version, and the sums as
+    JSON."""
+
+    name: str
+    columns: tuple[str, ...]
+    """Those of the primary key."""
+    key: Callable[..., Any]
+    read_plain: Callable[[Any], Sums]
+    of: Callable[[Estimates], dict[Any, Any]]
+    """Returns what the table keeps of estimates."""
+    title: str
+    """Format of a key in messages."""
+    added_later: bool = False
+    """Old files are without the table until something is written to them."""
+
+    def rows(self, db: sqlite3.Connection) -> list[tuple[Any, ...]]:
+        """Return all rows."""
+        if self.added_later:
+            known = "SELECT 1 FROM sqlite_master WHERE name = ?"
+            if not db.execute(known, (self.name,)).fetchone():
+                return []
+        return db.execute(f"SELECT * FROM {self.name}").fetchall()
+
+    def row(self, origin: str, key: Any, sums: Sums) -> tuple[Any, ...]:
+        """Return a row."""
+        body = json.dumps(sums.to_plain(), separators=(",", ":"))
+        return origin, *astuple(key), sums.changes, body
+
+    def read(self, row: Sequence[Any]) -> tuple[Any, Any]:
+        """Return key and sums of a row. Raises ValueError naming it."""
+        _, *parts, version, body = row
+        key = self.key(*parts)
+        try:
+            sums = self.read_plain(json.loads(body))
+            if sums.changes != version:
+                # a version that is too high would win every merge, whatever the contents
+                raise ValueError(
+                    f"expected version {sums.changes}, the number of changes, got {version}"
+                )
+        except (ValueError, KeyError, TypeError, IndexError, AttributeError) as fault:
+            said = f"{fault} is missing" if isinstance(fault, KeyError) else str(fault)
+            context = f" ({key.context})" if key.context else ""
+            raise ValueError(f"{self.title.format(key=key)}{context}: {said}") from fault
+        return key, sums
+
+    def own(self, db: sqlite3.Connection, origin: str, key: Any) -> Any:
+        """Return the sums of an origin; None if it has none."""
+        where = " AND ".join(f"{column} = ?" for column in self.columns)
+        row = db.execute(
+            f"SELECT * FROM {self.name} WHERE {where}", (origin, *astuple(key))
+        ).fetchone()
+        return row and self.read(row)[1]
+
+    def put(self, db: sqlite3.Connection, origin: str, key: Any, sums: Sums) -> None:
+        """Replace the sums of an origin."""
+        row = self.row(origin, key, sums)
+        marks = ", ".join("?" for _ in row)
+        db.execute(f"INSERT OR REPLACE INTO {self.name} VALUES ({marks})", row)
+
+    def add(self, db: sqlite3.Connection, origin: str, key: Any, gained: Sums) -> None:
+        """Add to the sums of an origin."""
+        own: Sums | None = self.own(db, origin, key)
+        self.put(db, origin, key, gained if own is None else own.merged(gained))
+
+
+TALLIES = SumsTable(
+    "tally",
+    ("origin", "primitive_task", "action", "context"),
+    TallyKey,
+    Tally.of_plain,
+    lambda estimates: estimates.tallies,
+    "{key.primitive_task}, {key.action}",
+)
+FLOWS = SumsTable(
+    "flow",
+    ("origin", "task", "transition_name", "context"),
+    FiringsKey,
+    Firings.of_plain,
+    lambda estimates: estimates.flows,
+    "transition {key.transition}",
+)
+TRIALS = SumsTable(
+    "trial",
+    ("origin", "task", "context"),
+    TrialsKey,
+    TrialSums.of_plain,
+    lambda estimates: estimates.trials,
+    "trials of {key.task}",
+    added_later=True,
+)
+SUMS = (TALLIES, FLOWS, TRIALS)
 
 
 def correct_tally(db: sqlite3.Connection, origin: str, correction: Correction) -> None:
     """Apply a verdict to a run that an origin's sums have counted; do nothing if they have not."""
     key = TallyKey(correction.primitive_task, correction.action, correction.context)
     with suppress(KeyError):  # the origin no longer contains the run
-        _put_tally(db, origin, key, corrected(_own_tally(db, origin, key), correction))
-
-
-def _own_tally(db: sqlite3.Connection, origin: str, key: TallyKey) -> Tally:
-    where = (origin, key.primitive_task, key.action, key.context)
-    row = db.execute(
-        "SELECT * FROM tally WHERE origin = ? AND primitive_task = ? AND action = ? AND "
-        "context = ?",
-        where,
-    ).fetchone()
-    return tally_of(row) if row else Tally()
-
-
-def _put_tally(db: sqlite3.Connection, origin: str, key: TallyKey, tally: Tally) -> None:
-    db.execute(
-        "INSERT OR REPLACE INTO tally VALUES (?, ?, ?, ?, ?, ?)", tally_row(origin, key, tally)
-    )
-
-
-def tally_row(origin: str, key: TallyKey, tally: Tally) -> tuple[Any, ...]:
-    """Return a row of the table `tally`."""
-    body = json.dumps(tally.to_plain(), separators=(",", ":"))
-    return origin, key.primitive_task, key.action, key.context, tally.changes, body
-
-
-def add_flow(db: sqlite3.Connection, origin: str, key: FiringsKey, gained: Firings) -> None:
-    """Add firings to the sums of an origin."""
-    where = (origin, key.task, key.transition, key.context)
-    row = db.execute(
-        "SELECT * FROM flow WHERE origin = ? AND task = ? AND transition_name = ? AND context = ?",
-        where,
-    ).fetchone()
-    flow = merge_firings(flow_of(row) if row else Firings(), gained)
-    db.execute("INSERT OR REPLACE INTO flow VALUES (?, ?, ?, ?, ?, ?)", flow_row(origin, key, flow))
-
-
-def flow_row(origin: str, key: FiringsKey, flow: Firings) -> tuple[Any, ...]:
-    """Return a row of the table `flow`."""
-    return origin, key.task, key.transition, key.context, flow.changes, json.dumps(flow.to_plain())
-
-
-def add_trials(db: sqlite3.Connection, origin: str, key: TrialsKey, gained: TrialSums) -> None:
-    """Add trials to the sums of an origin."""
-    row = db.execute(
-        "SELECT * FROM trial WHERE origin = ? AND task = ? AND context = ?",
-        (origin, key.task, key.context),
-    ).fetchone()
-    sums = merge_trials(trials_of(row) if row else TrialSums(), gained)
-    db.execute("INSERT OR REPLACE INTO trial VALUES (?, ?, ?, ?, ?)", trials_row(origin, key, sums))
-
-
-def trials_row(origin: str, key: TrialsKey, sums: TrialSums) -> tuple[Any, ...]:
-    """Return a row of the table `trial`."""
-    body = json.dumps(sums.to_plain(), separators=(",", ":"))
-    return origin, key.task, key.context, sums.n, body
-
-
-def trial_rows(db: sqlite3.Connection) -> list[tuple[Any, ...]]:
-    """Return the rows of the table `trial`; none in a file that is older than it."""
-    there = db.execute("SELECT 1 FROM sqlite_master WHERE name = 'trial'").fetchone()
-    return db.execute("SELECT * FROM trial").fetchall() if there else []
-
-
-def trials_of(row: Sequence[Any]) -> TrialSums:
-    """Read a row of the table `trial`. Raises ValueError naming the row."""
-    _, task, context, version, body = row
-    try:
-        sums = TrialSums.of_plain(json.loads(body))
-        _agree(sums.n, version)
-    except (ValueError, KeyError, TypeError, IndexError, AttributeError) as fault:
-        raise ValueError(f"trials of {task}{_in(context)}: {_said(fault)}") from fault
-    return sums
+        own = TALLIES.own(db, origin, key) or Tally()
+        TALLIES.put(db, origin, key, corrected(own, correction))
 
 
 def put_question(
@@ -322,23 +351,16 @@ def take_selector(
 def forget(db: sqlite3.Connection) -> None:
     """Delete what any of the merged files has reset. If that includes this file's own origin, start
     a new one."""
-    db.execute(
-        "DELETE FROM tally WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = tally.origin "
-        "AND f.primitive_task = tally.primitive_task)"
-    )
-    db.execute(
-        "DELETE FROM question WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = "
-        "question.origin "
-        "AND f.primitive_task = question.primitive_task)"
-    )
-    db.execute(
-        "DELETE FROM flow WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = flow.origin "
-        "AND f.primitive_task = '')"
-    )
-    db.execute(
-        "DELETE FROM trial WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = trial.origin "
-        "AND f.primitive_task = '')"
-    )
+    for table, forgotten in (
+        ("tally", "tally.primitive_task"),
+        ("question", "question.primitive_task"),
+        ("flow", "''"),
+        ("trial", "''"),
+    ):
+        db.execute(
+            f"DELETE FROM {table} WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = "
+            f"{table}.origin AND f.primitive_task = {forgotten})"
+        )
     gone = {origin for (origin,) in db.execute("SELECT DISTINCT origin FROM forgotten")}
     others = db.execute(
         "SELECT name, value FROM about WHERE substr(name, 1, ?) = ?", (len(ORIGIN_OF), ORIGIN_OF)
@@ -350,53 +372,17 @@ def forget(db: sqlite3.Connection) -> None:
         renew_origin(db)
 
 
-KEYS = {
-    "tally": "origin, primitive_task, action, context",
-    "flow": "origin, task, transition_name, context",
-    "question": "origin, primitive_task",
-    "trial": "origin, task, context",
-}
-"""Primary keys of the tables whose rows have a version."""
-
-
 def take_later(db: sqlite3.Connection, table: str, rows: Sequence[Sequence[Any]]) -> None:
     """Insert rows that are not there yet or that have a later version than those that are."""
-    names = [name for _, name, *_ in db.execute(f"PRAGMA table_info({table})")]
-    body = ", ".join(
-        f"{name} = excluded.{name}" for name in names if name not in KEYS[table].split(", ")
-    )
+    columns = [(name, key) for _, name, _, _, _, key in db.execute(f"PRAGMA table_info({table})")]
+    keys = ", ".join(name for name, key in columns if key)
+    body = ", ".join(f"{name} = excluded.{name}" for name, key in columns if not key)
+    marks = ", ".join("?" for _ in columns)
     db.executemany(
-        f"INSERT INTO {table} VALUES ({', '.join('?' for _ in names)}) ON "
-        f"CONFLICT({KEYS[table]}) DO UPDATE SET {body} "
+        f"INSERT INTO {table} VALUES ({marks}) ON CONFLICT({keys}) DO UPDATE SET {body} "
         "WHERE excluded.version > version",
         rows,
     )
-
-
-def tally_of(row: Sequence[Any]) -> Tally:
-    """Read a row of the table `tally`. Raises ValueError naming the row."""
-    _, task, action, context, version, body = row
-    try:
-        tally = Tally.of_plain(json.loads(body))
-        _agree(tally.changes, version)
-    except (ValueError, KeyError, TypeError) as fault:
-        raise ValueError(f"{task}, {action}{_in(context)}: {_said(fault)}") from fault
-    return tally
-
-
-def _agree(changes: int, version: int) -> None:
-    """Check the version: a version that is too high would win every merge, whatever the
-    contents."""
-    if changes != version:
-        raise ValueError(f"expected version {changes}, the number of changes, got {version}")
-
-
-def _in(context: str) -> str:
-    return f" ({context})" if context else ""
-
-
-def _said(fault: Exception) -> str:
-    return f"{fault} is missing" if isinstance(fault, KeyError) else str(fault)
 
 
 def state_of(body: str) -> dict[str, Any]:
@@ -405,14 +391,3 @@ def state_of(body: str) -> dict[str, Any]:
     if not 0 <= trials(state) < inf:  # otherwise it would win, or lose, every merge
         raise ValueError(f"selector: expected a number of trials from 0, got {trials(state):g}")
     return state
-
-
-def flow_of(row: Sequence[Any]) -> Firings:
-    """Read a row of the table `flow`. Raises ValueError naming the row."""
-    _, _, transition, context, version, body = row
-    try:
-        flow = Firings.of_plain(json.loads(body))
-        _agree(flow.changes, version)
-    except (ValueError, KeyError, TypeError, IndexError) as fault:
-        raise ValueError(f"transition {transition}{_in(context)}: {_said(fault)}") from fault
-    return flow

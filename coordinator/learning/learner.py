@@ -140,11 +140,10 @@ class LearningSelector(FirstAlternative):
     """Implements `Selector` and `Observer` with a `Learning`.
 
     `chosen`: actions that the user fixed; their runs are learned from, too. `live`: apply each
-    record at once; False for a worker of a campaign, whose records are applied later, in order, to
-    one common state. `generation`: number of mission runs that were learned from before, so that a
-    second run with the same seed draws other actions. `declared`: in lock step, the compute time
-    (s) of each action as services.toml declares it, so that measured CPU time never influences a
-    choice there.
+    record at once; False for a frozen run, which learns nothing. `generation`: number of mission
+    runs that were learned from before, so that a second run with the same seed draws other actions.
+    `declared`: in lock step, the compute time (s) of each action as services.toml declares it, so
+    that measured CPU time never influences a choice there.
     """
 
     def __init__(

@@ -1,9 +1,8 @@
 """Everything that a task has learned: tallies by action and context, waits of transitions, and one
 selector for each primitive task.
 
-The state changes only by records (`Choice`, `RunEnd`, `Correction`, `Passage`), all of them plain
-data. A journal or a campaign table that stores the records yields the same state again when they
-are applied in the same order.
+The state changes only by records (`Choice`, `RunEnd`, `Correction`, `Passage`): the same records in
+the same order yield the same state.
 """
 
 from __future__ import annotations
@@ -23,11 +22,8 @@ from petrobot.coordinator.learning.estimate import (
     TallyKey,
     TrialsKey,
     TrialSums,
-    merge_firings,
-    merge_tallies,
-    merge_trials,
 )
-from petrobot.coordinator.learning.objective import Comparison, Question, compare
+from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.records import (
     Choice,
     Correction,
@@ -39,6 +35,7 @@ from petrobot.coordinator.learning.records import (
     WaitEnd,
 )
 from petrobot.coordinator.learning.selectors import ACTION, DEFAULT, TASK, RuleSelector, make
+from petrobot.coordinator.learning.statistics import merged
 from petrobot.coordinator.task import Task
 
 NOTHING = Tally()
@@ -61,21 +58,10 @@ class Estimates:
 
     def merged(self, other: Estimates) -> Estimates:
         """Return the estimates of both sets of runs."""
-        tallies = {
-            k: merge_tallies(self.tally(k), other.tally(k))
-            for k in sorted({*self.tallies, *other.tallies})
-        }
-        keys = sorted({*self.flows, *other.flows})
         return Estimates(
-            tallies,
-            {
-                k: merge_firings(self.flows.get(k, Firings()), other.flows.get(k, Firings()))
-                for k in keys
-            },
-            {
-                k: merge_trials(self.trials.get(k, TrialSums()), other.trials.get(k, TrialSums()))
-                for k in sorted({*self.trials, *other.trials})
-            },
+            merged(self.tallies, other.tallies),
+            merged(self.flows, other.flows),
+            merged(self.trials, other.trials),
         )
 
     def trials_of(self, task: str, context: str | None = None) -> dict[str, TrialSums]:
@@ -142,8 +128,6 @@ class Learning:
     ) -> None:
         self.task, self.salt, self.credit = task, salt, credit
         self.known, self.gained = known or Estimates(), Estimates()
-        self.applied = 0
-        """Number of records applied in this session."""
         self.given = question
         self.selectors: dict[str, RuleSelector] = {}
         for p in task.primitive_tasks.values():
@@ -180,7 +164,6 @@ class Learning:
 
     def apply(self, record: Record) -> None:
         """Apply a record to the estimates and the selectors."""
-        self.applied += 1
         self.gained.apply(record, self.task.name, self.salt)
         self._select(record)
 
@@ -224,22 +207,6 @@ class Learning:
         """Everything that is known, including the runs of this session."""
         return self.known.merged(self.gained)
 
-    def comparison(self, primitive_task: str, context: str | None = None) -> Comparison:
-        """Compare the alternatives of a primitive task: in one context, or over all of them as
-        scenarios (None).
-
-        Over scenarios the target reliability is the given one, otherwise the one that the task file
-        declares.
-        """
-        tallies, primitive = (
-            self.estimates.of(primitive_task, context),
-            self.task.primitive_tasks[primitive_task],
-        )
-        question = (
-            self.question(primitive_task) if context is not None else self.asked()[primitive_task]
-        )
-        return compare({a: tallies.get(a, {}) for a in primitive.alternatives}, question)
-
     def asked(self) -> dict[str, Question]:
         """Return by what the actions of each primitive task are judged over scenarios: with the
         given target, otherwise the declared one."""
@@ -257,7 +224,7 @@ class Learning:
         for name in self.task.primitive_tasks:
             measure = self.question(name).measure
             for action, by_context in self.gained.of(name).items():
-                whole = reduce(merge_tallies, by_context.values(), NOTHING)
+                whole = reduce(Tally.merged, by_context.values(), NOTHING)
                 if whole.runs and not whole.cost(measure).n:
                     found.append((name, action, measure))
         return found

@@ -19,7 +19,7 @@ from functools import reduce
 from math import inf, isfinite, isnan, nan, sqrt
 from typing import Any
 
-from petrobot.coordinator.learning.estimate import Tally, TrialSums, merge_tallies
+from petrobot.coordinator.learning.estimate import Tally, TrialSums
 from petrobot.coordinator.learning.statistics import (
     joined,
     lowest_share,
@@ -75,8 +75,6 @@ class Figures:
     """All scenarios that meet the target."""
     largest_cost: float
     """The largest mean cost over the scenarios that meet the target."""
-    declared_cost: float
-    """The cost that the task file declares, beside the measured one; nan if there is none."""
     j: float
     """J with the common rho of the comparison; inf for an inadmissible action, nan if nothing is
     known."""
@@ -226,7 +224,7 @@ def compare(
     unmet = not any(inside.values())
     rows = []
     for action, by_scenario in over.items():
-        whole = reduce(merge_tallies, actions[action].values(), Tally())
+        whole = reduce(Tally.merged, actions[action].values(), Tally())
         rows.append(_row(action, whole, by_scenario, inside[action], question, unmet))
     rho = cost_weight(f.cost for f in rows) if question.rho is None else question.rho
     known = any(f.runs for f in rows)
@@ -274,7 +272,6 @@ def _row(
         scenario if inside else None,
         inside,
         largest,
-        declared,
         nan,
         nan,
         nan,
@@ -343,16 +340,9 @@ def pareto(figures: Iterable[Figures]) -> tuple[Figures, ...]:
     return tuple(front)
 
 
-def cost_to_reach(
-    figures: Iterable[Figures], target: float, *, surely: bool = False
-) -> Figures | None:
-    """Return the cheapest action whose reliability (`surely`: its lower confidence bound) reaches
-    the target; None if none does."""
-    enough = [
-        f
-        for f in figures
-        if f.availability * (f.lower if surely else f.reliability) >= target and f.cost < inf
-    ]
+def cost_to_reach(figures: Iterable[Figures], target: float) -> Figures | None:
+    """Return the cheapest action whose reliability reaches the target; None if none does."""
+    enough = [f for f in figures if f.effective >= target and f.cost < inf]
     return min(enough, key=lambda f: (f.cost, -f.effective, f.action), default=None)
 
 

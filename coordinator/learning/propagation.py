@@ -22,7 +22,7 @@ from petrobot.coordinator.analysis.time.measured import Ending, Measured, is_cau
 from petrobot.coordinator.analysis.time.stochastic import contended, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.learning.batch import Array
-from petrobot.coordinator.learning.estimate import CENSORED, Tally, merge_tallies
+from petrobot.coordinator.learning.estimate import CENSORED, Tally
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import (
     Comparison,
@@ -131,7 +131,7 @@ def measured_from(
             continue
         takers = _preempting(task, place.name)
         for action, by_context in estimates.of(place.task, context).items():
-            tally = reduce(merge_tallies, by_context.values(), Tally())
+            tally = reduce(Tally.merged, by_context.values(), Tally())
             causes[place.task, action], pooled = _causes(tally)
             if pooled:
                 mixed.add((place.task, action))
@@ -615,7 +615,7 @@ def _moves(
     for (place, action), known in found.measured.runs.items():
         primitive = task.primitive_task_of(place).name
         tally = reduce(
-            merge_tallies, estimates.of(primitive, scenario).get(action, {}).values(), Tally()
+            Tally.merged, estimates.of(primitive, scenario).get(action, {}).values(), Tally()
         )
         if not tally.runs or not known or found.visits.get((place, action), 0.0) <= 0:
             continue

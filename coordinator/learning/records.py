@@ -1,15 +1,14 @@
 """The records that a task learns from: choices, ends of runs, corrected verdicts, verdicts of the
-task on choices, firings, and ends of trials; as plain data and back."""
+task on choices, firings, and ends of trials."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from petrobot.coordinator.learning.estimate import Observation
-from petrobot.coordinator.task import Executed, Status
+from petrobot.coordinator.task import Status
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,89 +113,3 @@ class TrialEnd:
 
 
 Record = Choice | RunEnd | Correction | Credit | Passage | TrialEnd
-
-
-def to_plain(record: Record) -> dict[str, Any]:
-    """Return a record as plain data for journals and tables."""
-    if isinstance(record, Passage):
-        return {
-            "kind": "Passage",
-            "transition": record.transition,
-            "context": record.context,
-            "waited": record.waited,
-            **({} if record.end is WaitEnd.FIRED else {"end": record.end.value}),
-        }
-    if isinstance(record, TrialEnd):
-        return {
-            "kind": "Trial",
-            "context": record.context,
-            "success": record.success,
-            "goal": record.goal,
-            "cost": record.cost,
-            "runs": list(record.runs),
-        }
-    about = {
-        "primitive_task": record.primitive_task,
-        "action": record.action,
-        "context": record.context,
-    }
-    if isinstance(record, RunEnd):
-        return {"kind": "End", **about, "outcome": _observation(record.outcome)}
-    if isinstance(record, Credit):
-        beside = {"beside": [list(one) for one in record.beside]} if record.beside else {}
-        return {"kind": "Credit", **about, "outcome": _observation(record.outcome), **beside}
-    if isinstance(record, Correction):
-        verdict = {"status": record.status.value, "cause": record.cause, "age": record.age}
-        return {"kind": "Correction", **about, "was": _observation(record.was), **verdict}
-    return {"kind": "Choice", **about}
-
-
-def of_plain(data: Mapping[str, Any]) -> Record:
-    """Read what `to_plain` returned. Raises ValueError or KeyError."""
-    kind = data["kind"]
-    if kind == "Passage":
-        end = WaitEnd(data.get("end", WaitEnd.FIRED))
-        return Passage(str(data["transition"]), str(data["context"]), data["waited"], end)
-    if kind == "Trial":
-        runs = tuple(map(str, data["runs"]))
-        told = bool(data["success"]), bool(data["goal"]), data["cost"]
-        return TrialEnd(str(data["context"]), *told, runs)
-    about = (str(data["primitive_task"]), str(data["action"]), str(data["context"]))
-    if kind == "Choice":
-        return Choice(*about)
-    if kind == "End":
-        return RunEnd(*about, _observed(data["outcome"]))
-    if kind == "Credit":
-        beside = tuple((str(task), str(action)) for task, action in data.get("beside", ()))
-        return Credit(*about, _observed(data["outcome"]), beside)
-    if kind == "Correction":
-        verdict = (Status(data["status"]), str(data["cause"]), int(data.get("age", 0)))
-        return Correction(*about, _observed(data["was"]), *verdict)
-    known = "Choice, End, Correction, Credit, Passage or Trial"
-    raise ValueError(f"kind: expected {known}, got {kind!r}")
-
-
-def _observation(seen: Observation) -> dict[str, Any]:
-    return {
-        "status": None if seen.status is None else seen.status.value,
-        "seconds": seen.seconds,
-        "cause": seen.cause,
-        "executed": seen.executed.value,
-        "cpu_seconds": seen.cpu_seconds,
-        "values": dict(seen.values),
-        "preempted_by": seen.preempted_by,
-        "waited": seen.waited,
-    }
-
-
-def _observed(data: Mapping[str, Any]) -> Observation:
-    return Observation(
-        None if data["status"] is None else Status(data["status"]),
-        float(data["seconds"]),
-        str(data["cause"]),
-        Executed(data["executed"]),
-        data["cpu_seconds"],
-        {str(name): float(value) for name, value in data["values"].items()},
-        data["preempted_by"],
-        data["waited"],
-    )

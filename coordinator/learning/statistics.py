@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import reduce
 from math import ceil, inf, isfinite, nan, sqrt
 from operator import add
-from typing import Any
+from typing import Any, Protocol, Self, TypeVar
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,10 +107,19 @@ def whole(n: Any, what: str, most: float = inf) -> int:
     return n
 
 
-def merged(one: Mapping[Any, Moments], other: Mapping[Any, Moments]) -> dict[Any, Moments]:
-    """Merge two families of moments by key; the keys of the result are sorted."""
-    keys = sorted({*one, *other})
-    return {key: one.get(key, EMPTY).merged(other.get(key, EMPTY)) for key in keys}
+class Mergeable(Protocol):
+    """Sums that can be merged with others of their kind."""
+
+    def merged(self, other: Self) -> Self: ...
+
+
+S = TypeVar("S", bound=Mergeable)
+
+
+def merged(one: Mapping[Any, S], other: Mapping[Any, S]) -> dict[Any, S]:
+    """Merge two families of sums by key; the keys of the result are sorted."""
+    both = {key: sums.merged(other[key]) for key, sums in one.items() if key in other}
+    return dict(sorted({**one, **other, **both}.items()))
 
 
 # --- confidence intervals of a probability estimated by a relative frequency ---

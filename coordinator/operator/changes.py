@@ -89,18 +89,27 @@ def _setpoint(state: State, change: Change) -> None:
     }
 
 
-def _entry(table: str, field: str) -> Callable[[State, Change], None]:
-    def put(state: State, change: Change) -> None:
-        state[table][change["name"]] = change[field]
-
-    return put
+def _entry(state: State, change: Change) -> None:
+    kind = change["kind"]
+    state[_TABLES[kind]][change["name"]] = change["value" if kind == "variable" else kind]
 
 
-def _whole(key: str) -> Callable[[State, Change], None]:
-    def put(state: State, change: Change) -> None:
-        state[key] = change[key]
+def _whole(state: State, change: Change) -> None:
+    state[change["kind"]] = change[change["kind"]]
 
-    return put
+
+_TABLES: Mapping[str, str] = {
+    "node": "nodes",
+    "event": "events",
+    "variable": "variables",
+    "device": "devices",
+    "image": "images",
+    "report": "reports",
+    "selector": "selectors",
+}
+"""By kind of a change of one named entry: the table that has it."""
+_WHOLE = ("breakpoints", "paused", "controls", "result")
+"""Kinds that replace a part of the state, with its name."""
 
 
 _RULES: dict[str, Callable[[State, Change], None]] = {
@@ -111,28 +120,14 @@ _RULES: dict[str, Callable[[State, Change], None]] = {
     "run_progress": _progress,
     "run_ended": _ended,
     "run_judged": _judged,
-    "node": _entry("nodes", "node"),
-    "event": _entry("events", "event"),
-    "variable": _entry("variables", "value"),
-    "device": _entry("devices", "device"),
-    "image": _entry("images", "image"),
-    "report": _entry("reports", "report"),
-    "selector": _entry("selectors", "selector"),
     "setpoint": _setpoint,
     "notice": lambda s, c: _append(s, "notices", c["notice"], NOTICES_KEPT),
-    "breakpoints": _whole("breakpoints"),
-    "paused": _whole("paused"),
-    "controls": _whole("controls"),
-    "result": _whole("result"),
+    **dict.fromkeys(_TABLES, _entry),
+    **dict.fromkeys(_WHOLE, _whole),
 }
-SNAPSHOT_KEYS = tuple(key for key in empty_state() if key != "sequence")
-"""The parts of a snapshot, apart from its number."""
 KINDS = frozenset(_RULES) | {"reset"}
 """Kinds of change. `reset` means that so much is new (another mission) that clients get a snapshot
 instead."""
-
-_NAMED = frozenset({"node", "event", "variable", "device", "image", "report", "selector"})
-_WHOLE = frozenset({"breakpoints", "paused", "controls", "result"})
 
 
 def apply(state: State, change: Change) -> None:
@@ -215,7 +210,7 @@ class Pending:
 
 
 def _key(kind: str, change: Change) -> tuple[str, Any]:
-    if kind in _NAMED:
+    if kind in _TABLES:
         return kind, change["name"]
     if kind == "run_progress":
         return kind, change["id"]

@@ -11,7 +11,7 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import Any
 
 from petrobot.coordinator.engine import (
     Abort,
@@ -38,11 +38,11 @@ from petrobot.coordinator.engine import (
 from petrobot.coordinator.operator.controls import Answer, Controls, refusal
 from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
 from petrobot.coordinator.operator.feed import Feed
-from petrobot.coordinator.operator.observation import TrialWatch, Watching, shown_selectors
+from petrobot.coordinator.operator.observation import Shell, TrialWatch, Watching, shown_selectors
 from petrobot.coordinator.operator.run_state import ChangePublisher
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.journal import JournalError
-from petrobot.coordinator.run.mission import Mission, Stage
+from petrobot.coordinator.run.mission import Stage
 from petrobot.coordinator.run.realtime import credentials_of
 from petrobot.coordinator.run.recording import JournalStore
 from petrobot.services.comm.protocol.messages import Feedback
@@ -54,24 +54,6 @@ ANSWERS = 1.5
 _BEFORE = (Stage.CONNECTING, Stage.PREPARING)
 _MAY_COME_EARLY = (SetBreakpoints, Override)
 """Commands that only configure the run and move nothing."""
-
-
-class Shell(Protocol):
-    """Interface to the driver of a mission run, in real time or in lock step."""
-
-    mission: Mission
-
-    def now(self) -> float:
-        """Return the mission's clock (s)."""
-
-    def settle(self) -> None:
-        """Send new messages and continue."""
-
-    def flush(self, node: str) -> None:
-        """Send the messages to a node."""
-
-    def fail(self, fault: Exception) -> None:
-        """End the run with this fault; nothing more is sent."""
 
 
 class Operation:

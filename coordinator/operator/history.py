@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +28,6 @@ from petrobot.coordinator.task.file import TaskFileError, loads
 
 RECORDS_AT_MOST = 20_000
 RUNS_AT_MOST = 300
-
-
-@dataclass(frozen=True, slots=True)
-class JournalHistory:
-    """The runs of one folder (`coordinator.run.folder`). Fits
-    `coordinator.operator.port.HistoryPort`."""
-
-    folder: Path
 
 
 def _runs(folder: str) -> list[dict[str, Any]]:

@@ -103,32 +103,17 @@ def _event_words(name: str, task: Task) -> dict[str, str]:
 
 
 def _arcs(transition: Transition) -> Iterator[dict[str, Any]]:
-    for arc in transition.inputs:
-        ends = {
-            "end": arc.end.value if arc.end else None,
-            "counts": arc.counts.value if arc.counts else None,
-        }
-        yield {
-            "place": arc.place,
-            "transition": transition.name,
-            "direction": "in",
-            "weight": arc.weight,
-            **ends,
-        }
+    def arc(direction: str, place: str, weight: int, **more: Any) -> dict[str, Any]:
+        ends = {"place": place, "transition": transition.name}
+        return {**ends, "direction": direction, "weight": weight, **more}
+
+    for one in transition.inputs:
+        end, counts = one.end and one.end.value, one.counts and one.counts.value
+        yield arc("in", one.place, one.weight, end=end, counts=counts)
     for out in transition.outputs:
-        yield {
-            "place": out.place,
-            "transition": transition.name,
-            "direction": "out",
-            "weight": out.weight,
-        }
+        yield arc("out", out.place, out.weight)
     for stop in transition.inhibitors:
-        yield {
-            "place": stop.place,
-            "transition": transition.name,
-            "direction": "inhibit",
-            "weight": stop.threshold,
-        }
+        yield arc("inhibit", stop.place, stop.threshold)
 
 
 def _primitive_task(task: PrimitiveTask) -> dict[str, Any]:

@@ -92,16 +92,22 @@ def task_text(found: Summary) -> str:
     return f"{counts.runs} trial{'s' * (counts.runs != 1)}: {', '.join(parts)}"
 
 
-class WatchedShell(Protocol):
-    """Interface to the driver of a mission run: its clock, and sending to nodes."""
+class Shell(Protocol):
+    """Interface to the driver of a mission run, in real time or in lock step."""
 
     mission: Mission
 
     def now(self) -> float:
         """Return the mission's clock (s)."""
 
+    def settle(self) -> None:
+        """Send new messages and continue."""
+
     def flush(self, node: str) -> None:
         """Send the messages to a node."""
+
+    def fail(self, fault: Exception) -> None:
+        """End the run with this fault; nothing more is sent."""
 
 
 class Watching:
@@ -110,7 +116,7 @@ class Watching:
 
     def __init__(
         self,
-        shell: WatchedShell,
+        shell: Shell,
         feed: Feed,
         selector: FirstAlternative,
         origin: float,

@@ -7,7 +7,6 @@ docs/operator-protocol.md defines the format, which browsers and the command lin
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Protocol
 
 PROTOCOL = 1
@@ -54,26 +53,10 @@ class MissionPort(Protocol):
         "code", "text"}."""
 
 
-class HistoryPort(Protocol):
-    """Journals of finished and active runs for the page."""
-
-    @property
-    def folder(self) -> Path:
-        """The folder that has a folder for each run."""
-
-
-class StartsPort(Protocol):
-    """Options of the start of a task."""
-
-    def __call__(self, name: str, /) -> Awaitable[Mapping[str, Any]]:
-        """Return {task, runs ({default, place} or None), seed, modes, parameters: [{name, type,
-        default, text}], learn: {selectors, selector, credits, contexts, estimates}} of a task
-        file. Raises StoreError, TaskFileError."""
-
-
-class OffersPort(Protocol):
-    """Current offers of the nodes, for the designer."""
-
-    def __call__(self) -> Sequence[Mapping[str, Any]]:
-        """Return one entry for each action: {action, primitive_task, node, device, args ({name:
-        default}), up}."""
+StartForm = Callable[[str], Awaitable[Mapping[str, Any]]]
+"""Returns the options of a task file's start: {task, runs ({default, place} or None), seed, modes,
+parameters: [{name, type, default, text}], learn: {selectors, selector, credits, contexts,
+estimates}}. Raises RefusedError."""
+Offers = Callable[[], Sequence[Mapping[str, Any]]]
+"""Returns the current offers of the nodes, for the designer, one entry for each action: {action,
+primitive_task, node, device, args ({name: default}), up}."""

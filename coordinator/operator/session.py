@@ -29,6 +29,7 @@ from petrobot.coordinator.learning.session import LearningSession
 from petrobot.coordinator.operator.commands import Operation
 from petrobot.coordinator.operator.controls import Controls
 from petrobot.coordinator.operator.feed import Feed
+from petrobot.coordinator.operator.observation import Shell
 from petrobot.coordinator.operator.run_address import RunAddress, published
 from petrobot.coordinator.operator.sliced_cell import TELL, SlicedCell
 from petrobot.coordinator.run.folder import RESULT
@@ -88,7 +89,6 @@ class RunSession(ABC):
         self._begun = time.perf_counter()
         self._seconds = 0.0
 
-    @abstractmethod
     def operate(
         self,
         feed: Feed | None = None,
@@ -98,17 +98,19 @@ class RunSession(ABC):
         stops: Collection[str] = (),
         choices: Mapping[str, str] | None = None,
     ) -> Operation:
-        """Let operators see and control it. `feed`, `controls` and `starts` as for `Operation`;
-        `stops` are breakpoints, `choices` the alternatives that the operator fixed by primitive
-        task, both from the start."""
-
-    def _operated(
-        self, operation: Operation, stops: Collection[str], choices: Mapping[str, str] | None
-    ) -> Operation:
+        """Let operators see and control it; in lock step only a cell in this process. `feed`,
+        `controls` and `starts` as for `Operation`; `stops` are breakpoints, `choices` the
+        alternatives that the operator fixed by primitive task, both from the start."""
         fixed = (Override(primitive, action) for primitive, action in (choices or {}).items())
         self._first = (*((SetBreakpoints(tuple(sorted(stops))),) if stops else ()), *fixed)
-        self.operation = operation
-        return operation
+        self.operation = Operation(
+            self._attended(), self.selector, feed, controls, starts=starts, mode=self.mode
+        )
+        return self.operation
+
+    @abstractmethod
+    def _attended(self) -> Shell:
+        """Return the driver of the run, which operators control from now on."""
 
     @abstractmethod
     async def connect(self) -> None:
@@ -235,21 +237,10 @@ class RealtimeSession(RunSession):
         self.shell = RealtimeMission(mission, directory, credentials_of(directory))
         self._begin = begin or mission.start
 
-    def operate(
-        self,
-        feed: Feed | None = None,
-        controls: Controls | None = None,
-        *,
-        starts: bool = False,
-        stops: Collection[str] = (),
-        choices: Mapping[str, str] | None = None,
-    ) -> Operation:
-        """Let operators see and control it."""
-        operation = Operation(self.shell, self.selector, feed, controls, starts=starts)
-        return self._operated(operation, stops, choices)
+    def _attended(self) -> Shell:
+        return self.shell
 
     async def connect(self) -> None:
-        """Connect to every node. Raises UnreachableError."""
         await self.shell.connect()
 
     async def _lead(self, watch: Watch | None) -> None:
@@ -299,22 +290,10 @@ class LockstepSession(RunSession):
         self._launched = launched
         self._mock = mock
 
-    def operate(
-        self,
-        feed: Feed | None = None,
-        controls: Controls | None = None,
-        *,
-        starts: bool = False,
-        stops: Collection[str] = (),
-        choices: Mapping[str, str] | None = None,
-    ) -> Operation:
-        """Let operators see and control it, which is possible only for a cell in this process."""
+    def _attended(self) -> Shell:
         assert self.shell is not None
         self._party.attended = True
-        operation = Operation(
-            self.shell, self.selector, feed, controls, starts=starts, mode=LOCKSTEP
-        )
-        return self._operated(operation, stops, choices)
+        return self.shell
 
     async def _lead(self, watch: Watch | None) -> None:
         if watch is not None:

@@ -24,7 +24,7 @@ class SlicedCell:
     operators see and control the run as in real time.
 
     Nothing in lock step depends on the slices, the pace or the clients. While the net is paused and
-    every node has answered, simulated time does not advance. Implements `commands.Shell`.
+    every node has answered, simulated time does not advance. Implements `observation.Shell`.
     """
 
     def __init__(self, cell: LockStepCell, party: CoordinatorParty, pace: float) -> None:

@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import ipaddress
-import re
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 
 from aiohttp import web
@@ -34,17 +32,10 @@ HEADERS = {
     "X-Frame-Options": "DENY",
 }
 READING = frozenset({"GET", "HEAD"})
-_PORT = re.compile(r":\d{1,5}$")
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether an address can be reached only from this machine."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
+HOST = "127.0.0.1"
+"""The page is served on this computer only; from another one it is reached through a tunnel."""
+NAMES = (HOST, "localhost", "[::1]")
+"""Names under which browsers of this computer reach it."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +44,6 @@ class AccessRules:
 
     token: str
     port: int
-    names: frozenset[str]
-    """Names and addresses of the server, without port."""
-    secure: bool = False
     cookie: str = field(init=False)
     pass_value: str = field(init=False)
     """Value of the cookie: derived from the token, so that a leaked cookie does not reveal the
@@ -69,13 +57,12 @@ class AccessRules:
     @property
     def hosts(self) -> frozenset[str]:
         """Accepted values of the Host header."""
-        return frozenset(f"{name}:{self.port}" for name in self.names)
+        return frozenset(f"{name}:{self.port}" for name in NAMES)
 
     @property
     def origins(self) -> frozenset[str]:
         """Accepted values of the Origin header."""
-        scheme = "https" if self.secure else "http"
-        return frozenset(f"{scheme}://{host}" for host in self.hosts)
+        return frozenset(f"http://{host}" for host in self.hosts)
 
     def fault(self, request: web.Request) -> web.HTTPException | None:
         """Return why a request is refused, or None. The front page with `?token=` passes here; the
@@ -131,24 +118,8 @@ class AccessRules:
         """Set the browser's cookie. It has no age: it is worthless when this server ends, and a
         page that is open for longer than any age must still connect, and stop, again."""
         response.set_cookie(
-            self.cookie,
-            self.pass_value,
-            httponly=True,
-            samesite="Strict",
-            secure=self.secure,
-            path="/",
+            self.cookie, self.pass_value, httponly=True, samesite="Strict", path="/"
         )
-
-
-def names_for(host: str, extra: Sequence[str]) -> frozenset[str]:
-    """Return the names of a server bound to `host`: the address, this machine's own names for
-    loopback, and `extra`."""
-    named = {"[" + host.strip("[]") + "]" if ":" in host else host, *extra}
-    if is_loopback(host) or host in ("0.0.0.0", "::"):
-        named |= {"127.0.0.1", "localhost", "[::1]"}
-    return frozenset(
-        _PORT.sub("", name.lower()) if not name.startswith("[") else name.lower() for name in named
-    )
 
 
 def middleware(access: AccessRules) -> Middleware:

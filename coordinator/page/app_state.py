@@ -7,12 +7,13 @@ import asyncio
 from collections import OrderedDict
 from collections.abc import Coroutine
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from aiohttp import web
 
 from petrobot.coordinator.background import BackgroundProcess
-from petrobot.coordinator.operator.port import HistoryPort, MissionPort, OffersPort, StartsPort
+from petrobot.coordinator.operator.port import MissionPort, Offers, StartForm
 from petrobot.coordinator.page.access import AccessRules
 from petrobot.coordinator.page.connection_limits import ConnectionLimit
 from petrobot.coordinator.page.sessions import Session, carry_out, encode
@@ -32,9 +33,10 @@ class PageState:
     port: MissionPort
     store: TaskStore
     access: AccessRules
-    offers: OffersPort | None = None
-    history: HistoryPort | None = None
-    starts: StartsPort | None = None
+    offers: Offers | None = None
+    runs: Path | None = None
+    """The folder that has a folder for each run."""
+    starts: StartForm | None = None
     limit: ConnectionLimit | None = None
     sessions: set[Session] = field(default_factory=set)
     commands: set[asyncio.Task[None]] = field(default_factory=set)

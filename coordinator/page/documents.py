@@ -42,13 +42,7 @@ async def _list(request: web.Request) -> web.Response:
 
 
 async def _open(request: web.Request) -> web.StreamResponse:
-    page_state = request.app[PAGE_STATE]
-    given = {
-        **page_state.store.folders,
-        "name": request.match_info["name"],
-        "cell": _cell(page_state),
-    }
-    return await _done(request, "opening", given)
+    return await _done(request, "opening", _file(request))
 
 
 async def _revision(request: web.Request) -> web.Response:
@@ -65,21 +59,14 @@ async def _revision(request: web.Request) -> web.Response:
 async def _save(request: web.Request) -> web.StreamResponse:
     """{base, document, renames} or, to resolve a conflict, {base, text}; 409 returns both
     versions."""
-    page_state = request.app[PAGE_STATE]
     body = await read_object(request)
     content = (
         {"text": body["text"]}
         if isinstance(body.get("text"), str)
         else {"document": _document(body)}
     )
-    about = {
-        **page_state.store.folders,
-        "name": request.match_info["name"],
-        "cell": _cell(page_state),
-    }
-    return await _done(
-        request, "saving", {**about, "base": body.get("base"), "content": content} | _renames(body)
-    )
+    given = {**_file(request), "base": body.get("base"), "content": content, **_renames(body)}
+    return await _done(request, "saving", given)
 
 
 async def _check(request: web.Request) -> web.StreamResponse:
@@ -91,7 +78,7 @@ async def _check(request: web.Request) -> web.StreamResponse:
     """
     page_state = request.app[PAGE_STATE]
     body = await read_object(request)
-    desk = str(body.get("desk") or "")[:DESK_AT_MOST]
+    desk = _desk(body)
     page_state.analyses.give_up(desk)
     return await _done(
         request, "check", {**_drawing(page_state, body), "cell": _cell(page_state)}, desk
@@ -103,29 +90,21 @@ async def _analyse(request: web.Request) -> web.StreamResponse:
     analysis at a time."""
     page_state = request.app[PAGE_STATE]
     body = await read_object(request)
-    desk = str(body.get("desk") or "")[:DESK_AT_MOST]
     drawing = _drawing(page_state, body)
     try:
         text = json.loads(await page_state.apart.do("drawing", drawing))["text"]
-        said = await page_state.analyses.do(
-            "analysis",
-            {"text": text, "filename": f"{drawing['name']}.toml", "cell": _cell(page_state)},
-            desk,
-        )
+        given = {"text": text, "filename": f"{drawing['name']}.toml", "cell": _cell(page_state)}
+        said = await page_state.analyses.do("analysis", given, _desk(body))
     except RefusedError as refusal:
         return _refusal(refusal)
     return await send_json(request, said)
 
 
 async def _export(request: web.Request) -> web.Response:
-    page_state, name, form = (
-        request.app[PAGE_STATE],
-        request.match_info["name"],
-        request.match_info["form"],
-    )
+    name, form = request.match_info["name"], request.match_info["form"]
+    given = {**_file(request), "form": form}
     try:
-        given = {**page_state.store.folders, "name": name, "form": form, "cell": _cell(page_state)}
-        made = json.loads(await page_state.apart.do("export", given))
+        made = json.loads(await request.app[PAGE_STATE].apart.do("export", given))
     except RefusedError as refusal:
         raise refused(refusal) from refusal
     return web.Response(
@@ -152,19 +131,15 @@ async def _offers(request: web.Request) -> web.Response:
 
 
 async def _runs(request: web.Request) -> web.StreamResponse:
-    history = request.app[PAGE_STATE].history
-    if history is None:
-        return json_answer([])
-    return await _done(request, "runs", {"folder": str(history.folder)})
+    runs = request.app[PAGE_STATE].runs
+    return json_answer([]) if runs is None else await _done(request, "runs", {"folder": str(runs)})
 
 
 async def _run(request: web.Request) -> web.StreamResponse:
-    history = request.app[PAGE_STATE].history
-    if history is None:
+    runs = request.app[PAGE_STATE].runs
+    if runs is None:
         raise web.HTTPNotFound(text="no such run")
-    return await _done(
-        request, "run", {"folder": str(history.folder), "run": request.match_info["run"]}
-    )
+    return await _done(request, "run", {"folder": str(runs), "run": request.match_info["run"]})
 
 
 async def _done(
@@ -183,6 +158,17 @@ def _refusal(refusal: RefusedError) -> web.Response:
     if refusal.more:
         return json_answer(refusal.more, refusal.status)
     raise refused(refusal) from refusal
+
+
+def _file(request: web.Request) -> dict[str, Any]:
+    """Return the task file that a request names, and the cell."""
+    page_state = request.app[PAGE_STATE]
+    named = {"name": request.match_info["name"], "cell": _cell(page_state)}
+    return {**page_state.store.folders, **named}
+
+
+def _desk(body: Mapping[str, Any]) -> str:
+    return str(body.get("desk") or "")[:DESK_AT_MOST]
 
 
 def _cell(page_state: PageState) -> dict[str, Any] | None:

@@ -38,14 +38,14 @@ async def read_object(request: web.Request) -> dict[str, Any]:
     return value
 
 
-async def send_json(request: web.Request, text: bytes, status: int = 200) -> web.StreamResponse:
+async def send_json(request: web.Request, text: bytes) -> web.StreamResponse:
     """Answer with JSON text in pieces, so that a long answer does not delay other clients."""
     headers = {
         **HEADERS,
         "Cache-Control": "no-store",
         "Content-Type": "application/json; charset=utf-8",
     }
-    response = web.StreamResponse(status=status, headers=headers)
+    response = web.StreamResponse(headers=headers)
     response.content_length = len(text)
     with contextlib.suppress(ConnectionError):  # The client has left meanwhile.
         await response.prepare(request)

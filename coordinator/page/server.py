@@ -7,23 +7,14 @@ import asyncio
 import contextlib
 import secrets
 import socket as sockets
-import ssl
-from collections.abc import Sequence
 from pathlib import Path
 
 from aiohttp import web
 
 from petrobot.coordinator.background import RefusedError
-from petrobot.coordinator.operator.port import (
-    PROTOCOL,
-    HistoryPort,
-    MissionPort,
-    OffersPort,
-    StartsPort,
-)
+from petrobot.coordinator.operator.port import PROTOCOL, MissionPort, Offers, StartForm
 from petrobot.coordinator.page import documents
-from petrobot.coordinator.page import server as feeds
-from petrobot.coordinator.page.access import AccessRules, Handler, middleware, names_for
+from petrobot.coordinator.page.access import HOST, AccessRules, Handler, middleware
 from petrobot.coordinator.page.app_state import PAGE_STATE, PageState
 from petrobot.coordinator.page.connection_limits import ConnectionLimit
 from petrobot.coordinator.page.requests import LARGEST_BODY, json_answer, read_object, refused
@@ -86,30 +77,24 @@ async def start_page(
     *,
     tasks_folder: Path,
     shipped: Path | None = None,
-    host: str = "127.0.0.1",
     port: int = 0,
     token: str | None = None,
-    offers: OffersPort | None = None,
-    history: HistoryPort | None = None,
-    starts: StartsPort | None = None,
-    names: Sequence[str] = (),
-    tls: ssl.SSLContext | None = None,
+    offers: Offers | None = None,
+    runs: Path | None = None,
+    starts: StartForm | None = None,
     page: bool = True,
 ) -> Page:
     """Serve the page of a mission; without `page`, only the operator protocol: WebSocket, snapshot
     and commands.
 
     Tasks are saved in `tasks_folder`; those of `shipped` are offered, too, and saving one makes a
-    copy there. `port` 0 selects a free one. `names` are further names of this server in browsers
-    (needed if `host` is not loopback). `token` is random unless given. Raises OSError if the
-    address cannot be bound."""
-    listener = _listen(host, port)
+    copy there. `runs` has a folder for each recorded run. `port` 0 selects a free one. `token` is
+    random unless given. Raises OSError if the port cannot be used."""
+    listener = _listen(port)
     number = listener.getsockname()[1]
-    access = AccessRules(
-        token or secrets.token_hex(24), number, names_for(host, names), tls is not None
-    )
+    access = AccessRules(token or secrets.token_hex(24), number)
     page_state = PageState(
-        port_object, TaskStore(tasks_folder, shipped), access, offers, history, starts
+        port_object, TaskStore(tasks_folder, shipped), access, offers, runs, starts
     )
     runner = web.AppRunner(
         _application(page_state, page),
@@ -121,31 +106,17 @@ async def start_page(
     assert runner.server is not None
     page_state.limit = ConnectionLimit(runner.server)
     listening = await asyncio.get_running_loop().create_server(
-        page_state.limit, sock=listener, ssl=tls, backlog=128
+        page_state.limit, sock=listener, backlog=128
     )
-    shown = (
-        "127.0.0.1"
-        if host in ("0.0.0.0", "::", "localhost")
-        else f"[{host}]"
-        if ":" in host
-        else host
-    )
-    return Page(
-        runner,
-        listening,
-        page_state,
-        f"{'https' if tls else 'http'}://{shown}:{number}/?token={access.token}",
-    )
+    url = f"http://{HOST}:{number}/?token={access.token}"
+    return Page(runner, listening, page_state, url)
 
 
-def _listen(host: str, port: int) -> sockets.socket:
-    family, kind, protocol, _, address = sockets.getaddrinfo(
-        host, port, type=sockets.SOCK_STREAM, flags=sockets.AI_PASSIVE
-    )[0]
-    listener = sockets.socket(family, kind, protocol)
+def _listen(port: int) -> sockets.socket:
+    listener = sockets.socket()
     try:
         listener.setsockopt(sockets.SOL_SOCKET, sockets.SO_REUSEADDR, 1)
-        listener.bind(address)
+        listener.bind((HOST, port))
         listener.setblocking(False)
     except OSError:
         listener.close()
@@ -164,7 +135,7 @@ def _application(page_state: PageState, page: bool) -> web.Application:
         middlewares=[count, middleware(page_state.access)], client_max_size=LARGEST_BODY
     )
     app[PAGE_STATE] = page_state
-    feeds.add_routes(app)
+    add_routes(app)
     if page:
         app.router.add_get("/", _index)
         app.router.add_static("/page", PAGE_FILES, follow_symlinks=False)

@@ -78,7 +78,6 @@ class FloorCamera(Driver):
     # For the node
 
     def state(self) -> Mapping[str, Any]:
-        """Return plain data for operator and report."""
         return {
             "rate": self.rate,
             "source": self._images.condition,
@@ -86,7 +85,6 @@ class FloorCamera(Driver):
         }
 
     def stop(self, now: float) -> None:
-        """Stop taking images."""
         self.end()
 
     def stopped(self) -> bool:
@@ -98,5 +96,4 @@ class FloorCamera(Driver):
         return "held"
 
     def close(self) -> None:
-        """Stop the images and close the source."""
         self._images.close()

@@ -54,11 +54,6 @@ class FloorView:
         x, _ = self.points(np.zeros(self.height), np.where(under, rows, self._cy))
         return np.where(under, x, np.inf)
 
-    def half_width(self, x: float) -> float:
-        """Return how far to each side (m) the image shows the floor at a distance `x` (m)."""
-        depth = (x - self._forward) * self._cos + self._above * self._sin
-        return min(self._cx, self.width - 1 - self._cx) * depth / self._focal
-
     def sample(self, image: NDArray[np.uint8], x: Vector, y: Vector) -> Grey:
         """Return grey levels at floor points, bilinear, in the shape of x and y; NaN outside the
         image."""

@@ -113,8 +113,6 @@ class Rover(Driver):
     # Driver contract
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Accept a command. Raises ValueError if it is unknown, malformed, or cannot be obeyed
-        now."""
         act = self._commands.get(str(body.get("do")))
         if act is None:
             raise ValueError(
@@ -123,7 +121,6 @@ class Rover(Driver):
         act(now, body)
 
     def step(self, now: float) -> None:
-        """Run one cycle."""
         self._cycles += 1
         self._now = now
         self._fits.clear()
@@ -188,7 +185,6 @@ class Rover(Driver):
         return "held"
 
     def release(self, now: float) -> None:
-        """End the pause."""
         self._paused = False
         self._leased_until = max(self._leased_until, now + LEASE)
 

@@ -83,7 +83,6 @@ class Sight:
         steep = 1.0 + along.slope * along.slope
         offset = float(y[0]) + along.offset / max(0.2, math.cos(chord))
         return Shape(
-            float(x[0]),
             offset,
             chord + math.atan(along.slope),
             along.bend / (steep * math.sqrt(steep)),
@@ -101,10 +100,9 @@ UNSEEN = Sight(np.empty(0), np.empty(0))
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """The line at its nearest point, `near` m ahead: offset (m) and heading (rad) to the left,
-    curvature (1/m, positive to the left)."""
+    """The line at its nearest point: offset (m) and heading (rad) to the left, curvature (1/m,
+    positive to the left)."""
 
-    near: float
     offset: float
     heading: float
     curvature: float

@@ -21,14 +21,14 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import sub
 from typing import Any, Final
 
 import numpy as np
 
 from petrobot.services.comm.canopen.master import MasterPhase
-from petrobot.services.device import LIMITS, Driver, Ports, Setpoint, refuse_unknown_keys
+from petrobot.services.device import LIMITS, Driver, Ports, Setpoint, key
 from petrobot.services.motion.drive_master import DriveMaster, DriveSettings
 from petrobot.services.motion.following import Follower
 from petrobot.services.motion.interception import STRATEGIES, Interceptor, Strategy
@@ -36,78 +36,12 @@ from petrobot.services.motion.kinematics import Puma, branch_of
 from petrobot.services.motion.limits import CollisionGuard
 from petrobot.services.motion.model import (
     JOINTS,
-    ArmModel,
-    CatchingCell,
     nominal_arm,
     nominal_cell,
     read_arm,
     read_cell,
 )
 from petrobot.services.motion.steering import Steering
-
-# --- Settings ------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Configuration of the driver in services.toml.
-
-    `stream` and `stream_period` (s) name the stream of catch points; `enable` says whether to
-    enable the drives at the start; `model` and `cell` name files to read instead of the package's
-    own.
-    """
-
-    stream: str = "catch_point"
-    stream_period: float = 0.02
-    enable: bool = True
-    model: str = ""
-    cell: str = ""
-
-    @classmethod
-    def parse(cls, config: Mapping[str, Any]) -> Settings:
-        """Read the device's table; ignore the keys of its ports (interface, channel, ...). Raises
-        ValueError."""
-        refuse_unknown_keys(config, cls.__slots__)
-        fields = {name: config[name] for name in cls.__slots__ if name in config}
-        for name, value in fields.items():
-            kind = type(getattr(_DEFAULTS, name))
-            fits = (
-                isinstance(value, int | float) and not isinstance(value, bool)
-                if kind is float
-                else type(value) is kind
-            )
-            if not fits:
-                raise ValueError(
-                    f"services.toml: arm: {name}: expected a {kind.__name__}, got {value!r}"
-                )
-        settings = cls(**fields)
-        if not settings.stream_period > 0.0:
-            raise ValueError(
-                "services.toml: arm: stream_period: expected seconds above 0, got "
-                f"{settings.stream_period}"
-            )
-        return settings
-
-
-_DEFAULTS: Final = Settings()
-
-
-def numbers(settings: Settings, ports: Ports) -> tuple[ArmModel, CatchingCell]:
-    """Return the arm and the cell: the package's own, or those in the files that the settings
-    name."""
-    model = read_arm(ports.file(settings.model).decode()) if settings.model else nominal_arm()
-    return model, (
-        read_cell(ports.file(settings.cell).decode()) if settings.cell else nominal_cell()
-    )
-
-
-def drive_settings(model: ArmModel) -> list[DriveSettings]:
-    """Return the configuration of each drive, base to flange."""
-    limits = zip(
-        model.lower.tolist(), model.upper.tolist(), model.acceleration.tolist(), strict=True
-    )
-    return [DriveSettings(lower, upper, acceleration) for lower, upper, acceleration in limits]
-
 
 # --- The light barrier in the cup ----------------------------------------------------------------
 
@@ -182,30 +116,37 @@ class Arm(Driver):
 
     period: float | None = PERIOD
     obeys = LIMITS
+    stream: str = key("catch_point", "stream of catch points")
+    stream_period: float = key(0.02, "s")
+    enable: bool = key(True, "enable the drives at the start")
+    model: str = key("", "file of the arm, instead of the shipped one")
+    cell: str = key("", "file of the cell, instead of the shipped one")
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
-        settings = Settings.parse(config)
-        self.limit(config)
-        self._ports = ports
-        self.model, cell = numbers(settings, ports)
-        self._puma = Puma.of(self.model)
-        self._guard = CollisionGuard(self._puma, self.model, cell, workspace=self.workspace)
-        home = self.model.poses["home"]
+        super().__init__(config, ports)
+        if not self.stream_period > 0.0:
+            raise ValueError(f"stream_period: expected seconds above 0, found {self.stream_period}")
+        model = read_arm(ports.file(self.model).decode()) if self.model else nominal_arm()
+        cell = read_cell(ports.file(self.cell).decode()) if self.cell else nominal_cell()
+        self._poses = model.poses
+        self._puma = Puma.of(model)
+        self._guard = CollisionGuard(self._puma, model, cell, workspace=self.workspace)
+        home = model.poses["home"]
         self._interceptor = Interceptor(
             self._puma, cell, self._guard, home, branch_of(self._puma, np.asarray(home))
         )
-        self._full_speed = (self.model.speed * (self.speed * SPEED_SHARE)).tolist()
-        self._full_acceleration = self.model.acceleration.tolist()
+        self._full_speed = (model.speed * (self.speed * SPEED_SHARE)).tolist()
+        self._full_acceleration = model.acceleration.tolist()
         self._steering = Steering(
-            self._guard, self._interceptor.retreat, home, PERIOD, self.model.acceleration
+            self._guard, self._interceptor.retreat, home, PERIOD, model.acceleration
         )
         self._trajectory = self._steering.trajectory
-        self._master = DriveMaster(
-            drive_settings(self.model), PERIOD, enable=settings.enable, dry_run=self.dry_run
-        )
-        self._setpoint: Setpoint = ports.stream(settings.stream)
+        limits = model.lower.tolist(), model.upper.tolist(), self._full_acceleration
+        drives = [DriveSettings(*each) for each in zip(*limits, strict=True)]
+        self._master = DriveMaster(drives, PERIOD, enable=self.enable, dry_run=self.dry_run)
+        self._setpoint: Setpoint = ports.stream(self.stream)
         self._bus = ports.can()
-        self._follower = Follower(settings.stream_period)
+        self._follower = Follower(self.stream_period)
         self._ball = CupBarrier()
         self._mode = "off"
         self._reason = ""
@@ -229,8 +170,6 @@ class Arm(Driver):
 
     # What the node calls (`services.device.Driver`).
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Accept a command. Raises ValueError if it is unknown, malformed, or cannot be obeyed
-        now."""
         act = self._commands.get(str(body.get("do")))
         if act is None:
             raise ValueError(
@@ -239,7 +178,6 @@ class Arm(Driver):
         act(now, body)
 
     def step(self, now: float) -> None:
-        """Run one cycle."""
         self._cycles += 1
         self._now = now
         try:
@@ -320,7 +258,6 @@ class Arm(Driver):
         return "held"
 
     def release(self, now: float) -> None:
-        """End the pause."""
         self._paused = False
         self._leased_until = max(self._leased_until, now + LEASE)
 
@@ -364,9 +301,9 @@ class Arm(Driver):
 
     def _pose(self, pose: Any) -> list[float]:
         if isinstance(pose, str):
-            if pose not in self.model.poses:
-                raise ValueError(f"unknown pose {pose!r}: know {', '.join(self.model.poses)}")
-            return list(self.model.poses[pose])
+            if pose not in self._poses:
+                raise ValueError(f"unknown pose {pose!r}: know {', '.join(self._poses)}")
+            return list(self._poses[pose])
         if (
             not isinstance(pose, Sequence)
             or len(pose) != JOINTS
@@ -396,7 +333,7 @@ class Arm(Driver):
         """Read the light barrier."""
         inputs = self._master.inputs
         if inputs is not None and self._ball.look(now, bool(inputs & BALL)):
-            self._ports.raise_event("ball_caught")
+            self.ports.raise_event("ball_caught")
 
     def _drive(self, now: float) -> None:
         """Advance the commanded trajectory by one cycle."""
@@ -430,9 +367,7 @@ class Arm(Driver):
         self._commanded.append(self._trajectory.q)
         # Receiving and planning took time. A set point must be fresh at the moment at which it is
         # executed, so read the clock again.
-        late = (
-            self._ports.now
-        )  # receiving and planning took time: what counts is the clock at the last moment
+        late = self.ports.now
         if self._follows() and not self._follower.fresh(late):
             self._let_go()
         self._steering.cycle(self._paused)

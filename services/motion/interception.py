@@ -109,10 +109,6 @@ DEPTH_COST: Final = 2.0
 """s per m from the preferred depth."""
 CLOSED_COST: Final = 4.0
 """s per unit of cosine by which the mouth is less open to the ball than it should be."""
-ROOM: Final = 0.075
-"""m from the table's edge to the cup's mouth at which the arm has room to move sideways."""
-EDGE_COST: Final = 8.0
-"""s per m closer to the edge than `ROOM`."""
 RETREAT: Final = 0.08
 """m back from a catching pose to the pose from which it is approached where the straight path is
 not clear."""

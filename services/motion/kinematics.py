@@ -33,12 +33,6 @@ class ArmBranch(NamedTuple):
     wrist: int
     """Sign of q5: +1 not flipped, -1 flipped."""
 
-    @property
-    def label(self) -> str:
-        """The branch in words, such as "fore up noflip"."""
-        words = (("over", "fore"), ("down", "up"), ("flip", "noflip"))
-        return " ".join(pair[(sign + 1) // 2] for pair, sign in zip(words, self, strict=True))
-
 
 BRANCHES = tuple(ArmBranch(s, e, w) for s in (1, -1) for e in (1, -1) for w in (1, -1))
 
@@ -185,35 +179,6 @@ class Puma:
         good = ((q >= self.lower - LIMIT_SLACK) & (q <= self.upper + LIMIT_SLACK)).all(axis=-1)
         q[~good] = np.nan
         return q
-
-    def jacobian(self, q: Vector) -> Vector:
-        """Return the geometric Jacobian (6, 6) of frame 6's origin in the base frame for one joint
-        pose (6,): rows v (m/s), omega (rad/s)."""
-        axes, origins = self._axes(np.asarray(q, dtype=float))
-        return np.vstack([np.cross(axes, origins[6] - origins[:6]).T, axes.T])
-
-    def _axes(self, q: Vector) -> tuple[Vector, Vector]:
-        """Return the axes of the joints (6, 3) and the origins of frames 0 to 6 (7, 3) in the base
-        frame."""
-        c1, s1 = math.cos(q[0]), math.sin(q[0])
-        c2, s2 = math.cos(q[1]), math.sin(q[1])
-        c23, s23 = math.cos(q[1] + q[2]), math.sin(q[1] + q[2])
-        c4, s4, c5, s5 = math.cos(q[3]), math.sin(q[3]), math.cos(q[4]), math.sin(q[4])
-        ahead, side, up = (
-            np.array([c1, s1, 0.0]),
-            np.array([s1, -c1, 0.0]),
-            np.array([0.0, 0.0, 1.0]),
-        )
-        x3, z3 = c23 * ahead + s23 * up, -s23 * ahead + c23 * up
-        z4 = s4 * x3 + c4 * side
-        z5 = -c4 * s5 * x3 + s4 * s5 * side + c5 * z3
-        shoulder = self.d1 * up
-        elbow = shoulder + self.a2 * (c2 * ahead + s2 * up)
-        bend = elbow + self.d3 * side + self.a3 * x3
-        wrist = bend + self.d4 * z3
-        return np.array([up, side, side, z3, z4, z5]), np.array(
-            [0.0 * up, shoulder, elbow, bend, wrist, wrist, wrist]
-        )
 
 
 LIMIT_SLACK = 1e-9

@@ -48,7 +48,6 @@ floor, height of the pedestal, and its radius for the wrist and for the cup.
 """
 Radii = tuple[float, float]
 """Radii of forearm and wrist."""
-Pose = tuple[Links, Radii, Cup, Solids]
 
 
 @kernel

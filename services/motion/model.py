@@ -1,5 +1,6 @@
 """The PUMA 560 and its cup as numbers, read from `puma560.toml` and `cell.toml`; SI units and
-radians."""
+radians. Of the arm's file, motion needs neither masses nor friction nor gears: these are for the
+drives and the laboratory."""
 
 from __future__ import annotations
 
@@ -25,21 +26,10 @@ class ArmFileError(ValueError):
 
 
 @dataclass(frozen=True)
-class LinkInertia:
-    """The link moved by the joint of the same number: mass (kg), centre of mass (m) and inertia
-    about it (kg m^2) in its DH frame."""
-
-    mass: float
-    centre: tuple[float, float, float]
-    inertia: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
 class Body:
     """Radii (m) of the capsules that stand for the solid parts of the arm."""
 
     base: float
-    upper_arm: float
     forearm: float
     wrist: float
 
@@ -56,14 +46,7 @@ class ArmModel:
     upper: Vector
     speed: Vector
     acceleration: Vector
-    torque: Vector
-    gear: Vector
-    rotor_inertia: Vector
-    viscous: Vector
-    coulomb: Vector
-    links: tuple[LinkInertia, ...]
     body: Body
-    flange: float
     poses: Mapping[str, tuple[float, ...]]
 
 
@@ -89,7 +72,6 @@ class CatchingCell:
     cup: Cup
     table_top: float
     near_edge: float
-    table_width: float
     ball_radius: float
     gravity: float
 
@@ -125,13 +107,9 @@ def read_arm(text: str) -> ArmModel:
     """Read an arm from a text in the format that the head of `puma560.toml` describes. Raises
     ArmFileError."""
     table = tomllib.loads(text)
-    joints, links = table.get("joint", []), table.get("link", [])
-    if len(joints) != JOINTS or len(links) != JOINTS:
-        raise ArmFileError(
-            f"puma560.toml: expected {JOINTS} tables [[joint]] and [[link]] each, got "
-            f"{len(joints)} "
-            f"and {len(links)}"
-        )
+    joints = table.get("joint", [])
+    if len(joints) != JOINTS:
+        raise ArmFileError(f"puma560.toml: expected {JOINTS} tables [[joint]], got {len(joints)}")
     limits = np.radians(
         [
             _numbers(joint, "limits", f"puma560.toml: joint {i + 1}", 2)
@@ -148,29 +126,10 @@ def read_arm(text: str) -> ArmModel:
         upper=limits[:, 1],
         speed=_column(joints, "speed", degree),
         acceleration=_column(joints, "acceleration"),
-        torque=_column(joints, "torque"),
-        gear=_column(joints, "gear"),
-        rotor_inertia=_column(joints, "rotor_inertia"),
-        viscous=_column(joints, "viscous"),
-        coulomb=_column(joints, "coulomb"),
-        links=tuple(_link(link, f"puma560.toml: link {i + 1}") for i, link in enumerate(links)),
         body=Body(
-            *(
-                _number(body, key, "puma560.toml: body")
-                for key in ("base", "upper_arm", "forearm", "wrist")
-            )
+            *(_number(body, key, "puma560.toml: body") for key in ("base", "forearm", "wrist"))
         ),
-        flange=_number(table.get("frame", {}), "flange", "puma560.toml: frame"),
         poses=_poses(table.get("poses", {}), limits),
-    )
-
-
-def _link(table: Mapping[str, Any], where: str) -> LinkInertia:
-    centre, inertia = _numbers(table, "centre", where, 3), _numbers(table, "inertia", where, 3)
-    return LinkInertia(
-        _number(table, "mass", where),
-        (centre[0], centre[1], centre[2]),
-        (inertia[0], inertia[1], inertia[2]),
     )
 
 
@@ -214,7 +173,6 @@ def read_cell(text: str) -> CatchingCell:
         ),
         table_top=_number(desk, "top", "cell.toml: table"),
         near_edge=_number(desk, "near_edge", "cell.toml: table"),
-        table_width=_number(desk, "width", "cell.toml: table"),
         ball_radius=_number(ball, "radius", "cell.toml: ball"),
         gravity=_number(ball, "gravity", "cell.toml: ball"),
     )

@@ -54,11 +54,9 @@ class TableCamera(Driver):
         return taken
 
     def state(self) -> Mapping[str, Any]:
-        """Return plain data for operator and report."""
         return {"source": self._images.condition, "images": self._count}
 
     def stop(self, now: float) -> None:
-        """Stop taking images."""
         self._images.end()
 
     def stopped(self) -> bool:
@@ -70,5 +68,4 @@ class TableCamera(Driver):
         return "held"
 
     def close(self) -> None:
-        """Stop the images and close the source."""
         self._images.close()

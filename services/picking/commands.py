@@ -60,7 +60,6 @@ class So101(Commands):
     """`petrobot.services.adapters.so101`: the gripper is a joint, and closes until it squeezes."""
 
     def open(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
-        """See `Commands`."""
         return {"do": "open", "angle": gap / gripper.numbers["gap_per_rad"]}
 
     def close(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
@@ -70,7 +69,6 @@ class So101(Commands):
     def fingers(
         self, gripper: Gripper, state: Mapping[str, Any]
     ) -> tuple[float | None, bool, bool]:
-        """See `Commands`."""
         jaw = state["gripper"]
         grip = max(0.0, jaw["angle"] * gripper.numbers["gap_per_rad"])
         held = jaw["holding"] and grip > CLOSED
@@ -86,13 +84,11 @@ class Ur(Commands):
         return {"do": "output", "bit": 0, "value": False}
 
     def close(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
-        """See `Commands`."""
         return {"do": "output", "bit": 0, "value": True}
 
     def fingers(
         self, gripper: Gripper, state: Mapping[str, Any]
     ) -> tuple[float | None, bool, bool]:
-        """See `Commands`."""
         inputs = state["inputs"]
         return None, bool(inputs & 1) and bool(state["outputs"] & 1), bool(inputs & 2)
 

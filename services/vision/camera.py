@@ -132,7 +132,6 @@ class Camera(Driver):
     # For the node
 
     def state(self) -> Mapping[str, Any]:
-        """Return plain data for operator and report."""
         return {
             "rate": self.rate,
             "source": self._images.condition,
@@ -192,7 +191,6 @@ class Camera(Driver):
         return shapes
 
     def stop(self, now: float) -> None:
-        """Stop taking images."""
         self.end()
 
     def stopped(self) -> bool:
@@ -200,7 +198,6 @@ class Camera(Driver):
         return self.rate == 0.0
 
     def close(self) -> None:
-        """Stop the images and close the source."""
         self._images.close()
 
 

@@ -38,13 +38,12 @@ Array = NDArray[np.float64]
 class BallTrack:
     """A ball that was seen to roll.
 
-    `times` (n,) s, `places` (n, 2) m, `velocity` (2,) m/s, and the `residual` (m, rms) of the
-    places about the straight line of constant speed through them.
+    `times` (n,) s, `places` (n, 2) m, and the `residual` (m, rms) of the places about the straight
+    line of constant speed through them.
     """
 
     times: Array
     places: Array
-    velocity: Array
     residual: float
 
 
@@ -145,7 +144,7 @@ class Confirmation:
         way = float(np.hypot(*(rows[-1, 1:] - rows[0, 1:])))
         if residual > self._rolling.spread or way < self._rolling.shortest:
             return None
-        return BallTrack(rows[:, 0], rows[:, 1:], velocity, residual)
+        return BallTrack(rows[:, 0], rows[:, 1:], residual)
 
 
 def _line(rows: Array) -> tuple[Array, Array]:

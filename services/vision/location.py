@@ -9,7 +9,6 @@ in pixels. Each keeps its own state. Time, cameras, and the question which candi
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import cv2
@@ -159,7 +158,7 @@ class BackgroundSubtraction(_WholeTable):
                 pixels, picture, centre, streak=self.view.streak_px(FASTEST)
             )
             if seen is not None:
-                found.append(seen.centre)
+                found.append(seen)
         return np.array(found) if found else NOTHING
 
     def _mask(self, half: Pixels, empty: Pixels) -> Pixels:
@@ -261,15 +260,6 @@ class FixedThreshold(_WholeTable):
         return self.blobs(np.asarray(mask, np.uint8))
 
 
-@dataclass(frozen=True, slots=True)
-class MeasuredBall:
-    """A ball measured in a window: `centre` (2,) px; `cover`: measured area relative to the
-    expected one."""
-
-    centre: Array
-    cover: float
-
-
 class BallWindow:
     """Measures a ball whose position is roughly known.
 
@@ -295,9 +285,9 @@ class BallWindow:
         expected: Array,
         streak: float = 0.0,
         spread: float = 4.0,
-    ) -> MeasuredBall | None:
-        """Return the ball nearest to `expected` (2,) px, at most `spread` px away; `streak`: its
-        longest path during the exposure (px).
+    ) -> Array | None:
+        """Return the centre (2,) px of the ball nearest to `expected` (2,) px, at most `spread` px
+        away; `streak`: its longest path during the exposure (px).
 
         None where no whole ball is in view.
         """
@@ -376,8 +366,8 @@ class BallWindow:
         mine: NDArray[np.bool_],
         stats: NDArray[Any],
         box: tuple[slice, slice],
-    ) -> MeasuredBall | None:
-        left, top, wide, high, area = (int(value) for value in stats)
+    ) -> Array | None:
+        left, top, wide, high = (int(value) for value in stats[:4])
         if left == 0 or top == 0 or left + wide == cover.shape[1] or top + high == cover.shape[0]:
             return None  # Cut off by the border of the window or the image.
         part = slice(top - 1, top + high + 1), slice(left - 1, left + wide + 1)
@@ -388,8 +378,7 @@ class BallWindow:
         total = float(weight.sum())
         u = float(weight.sum(axis=0) @ np.arange(left - 1, left + wide + 1)) / total
         v = float(weight.sum(axis=1) @ np.arange(top - 1, top + high + 1)) / total
-        centre = np.array([u + box[1].start, v + box[0].start])
-        return MeasuredBall(centre, area / (np.pi * self.view.radius_px**2))
+        return np.array([u + box[1].start, v + box[0].start])
 
 
 def _median(region: Pixels) -> float:

@@ -8,9 +8,8 @@ pixel centres.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,27 +35,6 @@ class Optics:
     distortion: tuple[float, float, float, float]
     rotation: Array
     position: Array
-
-    @classmethod
-    def nominal(cls, cell: Mapping[str, Any]) -> Optics:
-        """Return the camera as designed: `[camera]` of cell.toml."""
-        camera = cell["camera"]
-        right, down = np.asarray(camera["image_x"], float), np.array([0.0, 0.0, -1.0])
-        focal = float(camera["focal_px"])
-        k1, k2, p1, p2 = (float(k) for k in camera["distortion"])
-        return cls(
-            (focal, focal),
-            ((camera["width"] - 1) / 2, (camera["height"] - 1) / 2),
-            (k1, k2, p1, p2),
-            np.array([right, np.cross(down, right), down]),
-            np.asarray(camera["position"], float),
-        )
-
-    @property
-    def matrix(self) -> Array:
-        """The intrinsic matrix (3, 3)."""
-        (fx, fy), (cx, cy) = self.focal, self.centre
-        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def project(self, points: ArrayLike) -> Array:
         """Return pixels (..., 2) of points (..., 3) in front of the camera."""

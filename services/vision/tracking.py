@@ -222,12 +222,12 @@ class _Chase:
         seen = self._window.measure(image.pixels, picture, view.to_pixels(expected), streak, spread)
         if seen is None:
             return self._missed(image.time, expected)
-        x, y = view.to_table(seen.centre)
+        x, y = view.to_table(seen)
         self._predictor.add(image.time, float(x), float(y))
         self._sights.append((image.time, float(x), float(y)))
         self._seen, self._misses, self._seen_at = self._seen + 1, 0, image.time
         ended = self._predicted(image.time)
-        self._mark((seen.centre,), (float(x), float(y)))
+        self._mark((seen,), (float(x), float(y)))
         return ended
 
     def _mark(self, centres: tuple[Any, ...], place: tuple[float, float]) -> None:

@@ -6,9 +6,10 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Generic, TypeVar
 
-from petrobot.services.comm.canopen.cia301 import AbortCode, NmtState, SdoAbortError
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import SYNC_ID, AbortCode, NmtState, SdoAbortError
 from petrobot.services.comm.canopen.cia402 import (
     DriveCommand,
     DriveFault,
@@ -133,6 +134,12 @@ class PowerDrive(CanopenNode, ABC):
             self._patient_periods * self.values[ObjectIndex.SYNC_PERIOD, 0] * 1e-6 or math.inf
         )
 
+    def before_reading(self) -> None:
+        """Also update what only an SDO reads."""
+        self.before_sending()
+        self.values[ObjectIndex.ERROR_CODE, 0] = self.fault
+        self.values[ObjectIndex.MODE_DISPLAY, 0] = self.values[ObjectIndex.MODE, 0]
+
     def check_write(self, index: int, sub: int, value: int) -> None:
         """Refuse any other mode, and any change of configuration while the motor has torque."""
         if index == ObjectIndex.MODE and value not in (OperationMode.NONE, self.mode):
@@ -215,3 +222,60 @@ class PowerDrive(CanopenNode, ABC):
         self.cut_power()
         self.state = state
         self.stir()
+
+
+AnyDrive = TypeVar("AnyDrive", bound=PowerDrive)
+
+
+class DriveBus(Generic[AnyDrive]):
+    """The devices on a bus, except the master: drives, and one other device."""
+
+    def __init__(self, drives: tuple[AnyDrive, ...], other: CanopenNode) -> None:
+        self.drives = drives
+        self._nodes: tuple[CanopenNode, ...] = (*drives, other)
+        self._own = {node.node: node for node in self._nodes}
+        self._due = -math.inf
+        """When a device has something to do next (s)."""
+        for node in self._nodes:
+            node.boot(0.0)
+
+    def receive(self, now: float, frame: Frame) -> None:
+        """Process one frame of the master."""
+        cob_id = frame.id
+        target = self._own.get(cob_id & 0x7F)
+        if target is not None and target.rpdo.cob_id == cob_id and target.rpdo.on:
+            target.take_rpdo(now, frame.data)
+        elif cob_id == SYNC_ID:
+            self._sync(now)
+        else:
+            self._spread(now, frame)
+
+    def _sync(self, now: float) -> None:
+        for node in self._nodes:
+            node.sync(now)
+
+    def _spread(self, now: float, frame: Frame) -> None:
+        """Let all devices process a frame."""
+        self._due = -math.inf  # It may set any timer.
+        for node in self._nodes:
+            node.receive(now, frame)
+
+    def drain(self) -> list[Frame]:
+        """Return the frames to the master, oldest first."""
+        frames: list[Frame] = []
+        for node in self._nodes:
+            if node.outbox:
+                frames += node.drain()
+        return frames
+
+    def power(self, closed: bool) -> None:
+        """Close or open the power chain (emergency stop). Open: the drives lose power and the
+        brakes engage."""
+        for drive in self.drives:
+            drive.powered = closed
+            if not closed:
+                drive.trip(DriveFault.UNDERVOLTAGE)
+
+    def trip(self, number: int, fault: DriveFault = DriveFault.OVERCURRENT) -> None:
+        """Make a drive (from 0) fail."""
+        self.drives[number].trip(fault)

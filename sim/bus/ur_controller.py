@@ -89,12 +89,11 @@ class ControllerSession:
 
 
 class UrController:
-    """The arm and its controller. `place(q)` gives the tool's pose for `actual_TCP_pose`."""
+    """The arm and its controller; its `actual_TCP_pose` is always zero."""
 
     def __init__(
         self,
         q: Sequence[float] = (0.0, -1.57, 1.57, -1.57, -1.57, 0.0),
-        place: Callable[[Sequence[float]], Sequence[float]] = lambda q: [0.0] * 6,
         robot_mode: int = POWER_OFF,
     ) -> None:
         self.q, self.qd = list(q), [0.0] * 6
@@ -108,7 +107,7 @@ class UrController:
         self.outputs: dict[str, Any] = {}
         """Registers that the program writes, by name."""
         self.now = 0.0
-        self._place, self._target = place, list(q)
+        self._target = list(q)
         self._silent, self._beat, self._patience = 0.0, -1, 0.1
         self._clients: list[_Rtde] = []
         self._due_mode: tuple[float, int] | None = None
@@ -123,10 +122,6 @@ class UrController:
         """Press the mushroom button: power off."""
         self._stop(EMERGENCY)
         self.robot_mode = POWER_OFF
-
-    def release_emergency(self) -> None:
-        """Turn the mushroom button back."""
-        self.safety_mode = NORMAL
 
     def _stop(self, safety: int) -> None:
         self.safety_mode, self.program, self.qd = safety, "", [0.0] * 6
@@ -200,7 +195,7 @@ class UrController:
             "target_qd": self.qd,
             "actual_q": self.q,
             "actual_qd": self.qd,
-            "actual_TCP_pose": list(self._place(self.q)),
+            "actual_TCP_pose": [0.0] * 6,
             "robot_mode": self.robot_mode,
             "safety_mode": self.safety_mode,
             "runtime_state": 2 if playing else 1,

@@ -350,14 +350,11 @@ class OwnArmDynamics:
         self._numbers = packed(puma_bias, numbers)
 
     def bias(self, q: Six, qd: Six) -> Six:
-        """Return six torques (N m) that hold the arm against gravity, Coriolis and centrifugal
-        forces."""
         if self._puma:
             return puma_bias(q, qd, self._gravity, self._numbers)
         return general_torques(q, qd, _REST, self._gravity, self._numbers)
 
     def mass_matrix(self, q: Six) -> Vector:
-        """Return the mass matrix (6, 6) kg m^2."""
         upper = mass_numbers(q, self._numbers)
         mass = np.empty((JOINTS, JOINTS))
         mass[_UPPER] = upper

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Protocol
 
 from petrobot.services.comm.canopen.bus import Frame
-from petrobot.services.comm.canopen.cia301 import SYNC_ID, NmtState
+from petrobot.services.comm.canopen.cia301 import NmtState
 from petrobot.services.comm.canopen.cia402 import (
     RECEIVED,
     SENT,
@@ -18,11 +18,17 @@ from petrobot.services.comm.canopen.cia402 import (
     ObjectIndex,
     OperationMode,
     StatusBit,
-    fault_text,
     to_units,
 )
 from petrobot.sim.bus.canopen_node import CanopenNode
-from petrobot.sim.bus.power_drive import ENABLE, ENABLE_MASK, POWERED, RUNNING, PowerDrive
+from petrobot.sim.bus.power_drive import (
+    ENABLE,
+    ENABLE_MASK,
+    POWERED,
+    RUNNING,
+    DriveBus,
+    PowerDrive,
+)
 from petrobot.sim.catching.servo import DriveRating, JointServo
 
 # The digital-input node on the arm's bus (CiA 401): light barrier in the cup and arm-power chain.
@@ -181,14 +187,10 @@ class ServoDrive(PowerDrive):
         self.changed()
 
     def before_reading(self) -> None:
-        """Also update what only an SDO reads."""
-        self.before_sending()
+        super().before_reading()
         self.values[ObjectIndex.FOLLOWING_ERROR, 0] = to_units(self.servo.error)
-        self.values[ObjectIndex.ERROR_CODE, 0] = self.fault
-        self.values[ObjectIndex.MODE_DISPLAY, 0] = self.values[ObjectIndex.MODE, 0]
 
     def changed(self) -> None:
-        """Note that the content of a TPDO may have changed."""
         self._said = None
         super().changed()
 
@@ -260,7 +262,6 @@ class ServoDrive(PowerDrive):
         return frame if frame is not None and self.outbox and self.outbox[-1] is frame else None
 
     def after_configuring(self) -> None:
-        """Store how the drive monitors itself."""
         super().after_configuring()
         values, rpdo, tpdo = self.values, self.rpdo, self.tpdo
         self._usual = rpdo.synchronous and tpdo.on and tpdo.synchronous
@@ -286,11 +287,9 @@ class ServoDrive(PowerDrive):
         self.plant.release(self.joint)
 
     def ramp_down(self, deceleration: float) -> None:
-        """Bring the joint to rest."""
         self.servo.ramp_down(deceleration)
 
     def cut_power(self) -> None:
-        """Let the brake hold."""
         self._torque = 0.0
         self.plant.brake(self.joint)
 
@@ -360,7 +359,7 @@ class ServoDrive(PowerDrive):
         return (low if target < low else high if target > high else target) / UNITS
 
 
-class DriveBus:
+class ArmBus(DriveBus[ServoDrive]):
     """Everything on the arm's bus except the master: six drives (nodes 1 to 6) and the digital
     inputs (node 7).
 
@@ -370,25 +369,21 @@ class DriveBus:
     would change nothing and is skipped.
     """
 
-    def __init__(self, plant: Plant, drives: Sequence[DriveRating], now: float = 0.0) -> None:
+    def __init__(self, plant: Plant, drives: Sequence[DriveRating]) -> None:
         self.plant = plant
         self._resting, self._stirred = False, True
-        self._rests_until = self._due = -math.inf
+        self._rests_until = -math.inf
         self._tau: list[float] = []
         self._odd = False
         self._heard: Sequence[Frame] = ()
         self._echoes: Sequence[Frame] = ()
         """Set points of the newest cycle that found and left the arm at rest, and the answers, one
         per drive."""
-        self.drives = tuple(
-            ServoDrive(joint, rating, plant, self._stir) for joint, rating in enumerate(drives)
-        )
         self.inputs = DigitalInputs(INPUTS_NODE)
-        self._nodes: tuple[CanopenNode, ...] = (*self.drives, self.inputs)
-        self._own = {node.node: node for node in self._nodes}
-        self.errors = 0
-        for node in self._nodes:
-            node.boot(now)
+        super().__init__(
+            tuple(ServoDrive(joint, each, plant, self._stir) for joint, each in enumerate(drives)),
+            self.inputs,
+        )
 
     def receive_cycle(self, now: float, frames: Sequence[Frame]) -> None:
         """Process the frames of one cycle of the master. Drives at rest that receive the same
@@ -409,21 +404,13 @@ class DriveBus:
         sent = [drive.tpdo_sent for drive in self.drives]
         return [frame for frame in sent if frame is not None] if None not in sent else ()
 
-    def receive(self, now: float, frame: Frame) -> None:
-        """Process one frame of the master."""
-        cob_id = frame.id
-        target = self._own.get(cob_id & 0x7F)
-        if target is not None and target.rpdo.cob_id == cob_id and target.rpdo.on:
-            target.take_rpdo(now, frame.data)
-        elif cob_id == SYNC_ID:
-            for node in self._nodes:
-                node.sync(now)
-            self._rests_until = min([drive.waits_until for drive in self.drives])
-        else:
-            self._odd = True
-            self._due = -math.inf  # It may set any timer.
-            for node in self._nodes:
-                node.receive(now, frame)
+    def _sync(self, now: float) -> None:
+        super()._sync(now)
+        self._rests_until = min([drive.waits_until for drive in self.drives])
+
+    def _spread(self, now: float, frame: Frame) -> None:
+        self._odd = True
+        super()._spread(now, frame)
 
     def step(self, now: float, dt: float) -> None:
         """Compute torques for `dt` seconds, move the plant, and run what the devices do on time."""
@@ -447,37 +434,19 @@ class DriveBus:
         self._resting, self._stirred = False, True
         self._echoes = ()
 
-    def drain(self) -> list[Frame]:
-        """Return the frames to the master, oldest first."""
-        frames: list[Frame] = []
-        for node in self._nodes:
-            if node.outbox:
-                frames += node.drain()
-        return frames
-
     def ball(self, present: bool) -> None:
         """Set the light barrier in the cup: interrupted or free."""
         self._put(DigitalInputs.BALL, present)
 
     def power(self, closed: bool) -> None:
-        """Close or open the arm-power chain (emergency stop). Open: the drives lose power and the
-        brakes engage."""
         self._put(DigitalInputs.POWER, closed)
         self._echoes = ()
-        for drive in self.drives:
-            drive.powered = closed
-            if not closed:
-                drive.trip(DriveFault.UNDERVOLTAGE)
+        super().power(closed)
 
     def _put(self, mask: int, on: bool) -> None:
         if bool(self.inputs.inputs & mask) is not on:
             self.inputs.put(mask, on)
             self._due = -math.inf
-
-    def trip(self, joint: int, fault: DriveFault = DriveFault.OVERCURRENT) -> str:
-        """Make a drive (0 to 5) fail; return the fault in words."""
-        self.drives[joint].trip(fault)
-        return fault_text(fault)
 
     def slow_down(self, factor: float) -> None:
         """Limit drives and plant to this share (0 to 1] of their speeds."""

@@ -17,7 +17,7 @@ from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.sim.catching.camera import Picture, PinholeCamera
-from petrobot.sim.catching.drives import DriveBus
+from petrobot.sim.catching.drives import ArmBus
 from petrobot.sim.catching.oracle import Oracle
 from petrobot.sim.catching.physics import choose, version
 from petrobot.sim.catching.puma import ArmPlant
@@ -29,8 +29,8 @@ from petrobot.sim.catching.thrower import Thrower, draw_throw
 from petrobot.sim.catching.truth import LaboratoryError, Truth, read_toml
 from petrobot.sim.catching.world import BallWorld, SecondBall
 from petrobot.sim.exposures import camera_of
-from petrobot.sim.faults import ARM_FAULTS, FaultPlan, InjectedFault
-from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
+from petrobot.sim.faults import BUS_FAULTS, CAMERA_FAULTS, FaultKinds, FaultPlan
+from petrobot.sim.laboratory_party import LaboratoryParty, whole_number
 
 _NOISE, _FAULTS, _SCATTER, _SECOND = 0x6361, 0x6661, 0x7363, 0x7362
 """Keep the draws of camera noise, of faults, of scatter and of second balls separate from other
@@ -42,6 +42,16 @@ _SECOND_AFTER = 0.6
 class CatchingLaboratory(LaboratoryParty):
     """The party of the simulated node `name`. `where` returns the party of an endpoint
     (`Directory.party`)."""
+
+    fault_kinds = FaultKinds(
+        keys={
+            **CAMERA_FAULTS,
+            **BUS_FAULTS,
+            "slow_arm": ("factor",),
+            "arm_power": ("duration",),
+        },
+        drives=6,
+    )
 
     def __init__(
         self,
@@ -74,7 +84,7 @@ class CatchingLaboratory(LaboratoryParty):
             physics=self._physics,
         )
         self._home: list[float] = site.arm.poses["home"].tolist()
-        self.bus = DriveBus(self.plant, site.drives)
+        self.bus = ArmBus(self.plant, site.drives)
         self._world: BallWorld | None = None
         self._prepare(self.now, seed, truth, throws)
 
@@ -91,7 +101,7 @@ class CatchingLaboratory(LaboratoryParty):
         self.referee = CatchReferee(
             seed, truth.regime, Oracle(self._site.arm, truth, self._site.cell), now
         )
-        self._faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
+        self.faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
         self._noise = np.random.default_rng((seed, _NOISE))
         self._scatter = np.random.default_rng((seed, _SCATTER))
         self._seed = seed
@@ -106,7 +116,6 @@ class CatchingLaboratory(LaboratoryParty):
     # The world, as lock step and real time drive it
 
     def tick(self, now: float) -> None:
-        """Expose the world as it is at `now`, then advance it to `now` + TICK."""
         self._begin_faults(now)
         self._expose(now)
         self._throw(now)
@@ -116,11 +125,9 @@ class CatchingLaboratory(LaboratoryParty):
     # Bus
 
     def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
-        """Process frames of the master."""
         self.bus.receive_cycle(now, self._passed(frames))
 
     def take_frames(self) -> Sequence[Frame]:
-        """Return the frames of drives and inputs since the last call."""
         return self._passed(self.bus.drain())
 
     def _passed(self, frames: Sequence[Frame]) -> Sequence[Frame]:
@@ -129,12 +136,12 @@ class CatchingLaboratory(LaboratoryParty):
         if share > 0.0 and frames:
             kept = self._scatter.random(len(frames)) >= share
             frames = [frame for frame, keep in zip(frames, kept, strict=True) if keep]
-        return self._faults.passed(frames)
+        return self.faults.passed(frames)
 
     # Camera
 
     def _expose(self, now: float) -> None:
-        if not self.exposures.due(now) or self._faults.image_lost():
+        if not self.exposures.due(now) or self.faults.image_lost():
             return
         scatter, readout = self.truth.scatter, self.truth.settings["camera"]["readout"]
         if scatter.images_lost > 0.0 and self._scatter.random() < scatter.images_lost:
@@ -258,44 +265,29 @@ class CatchingLaboratory(LaboratoryParty):
     # Faults and services
 
     def _begin_faults(self, now: float) -> None:
-        if self._faults.none:
+        if self.faults.none:
             return
-        powerless = self._faults.active("arm_power")
-        for fault in self._faults.begin(now):
-            self._strike(fault)
-        if self._faults.active("arm_power") is not powerless:
+        powerless = self.faults.active("arm_power")
+        for fault in self.faults.begin(now):
+            if fault.kind == "drive_fault":
+                self.bus.trip(int(fault.value) - 1)
+            elif fault.kind == "slow_arm":
+                self.bus.slow_down(fault.value)
+        if self.faults.active("arm_power") is not powerless:
             self.bus.power(powerless)
 
-    def _strike(self, fault: InjectedFault) -> None:
-        if fault.kind == "drive_fault":
-            self.bus.trip(int(fault.value) - 1)
-        elif fault.kind == "slow_arm":
-            self.bus.slow_down(fault.value)
+    def prepare(self, arguments: Mapping[str, Any]) -> None:
+        """Begin a new experiment: seed=0, regime="A", throws=None. Raises ValueError."""
+        seed, throws = whole_number(arguments, "seed", 0), whole_number(arguments, "throws", None)
+        truth = self._site.truth(str(arguments.get("regime", "A")))
+        self._prepare(self.now, seed or 0, truth, throws)
 
-    def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Answer one of `SERVICES`. Raises ValueError (LaboratoryError among them) for bad
-        arguments.
-
-        laboratory_prepare(seed=0, regime="A", throws=None): begin a new experiment, return nothing;
-        other parameters of the task do not concern the laboratory; laboratory_score(cycles=[]): see
-        `CatchReferee.score`; laboratory_fault(kind, after=0, ...): see sim.faults.
-        """
-        if service == SCORE:
-            score = self.referee.score(self.now, arguments.get("cycles", ()))
-            return {**score, "physics": self.physics}
-        if service == FAULT:
-            rest = {key: value for key, value in arguments.items() if key != "kind"}
-            self._faults.add(ARM_FAULTS.read(self.now, str(arguments.get("kind", "")), rest))
-            return {}
-        seed, throws = (
-            whole_number(arguments, "seed", 0) or 0,
-            whole_number(arguments, "throws", None),
-        )
-        self._prepare(self.now, seed, self._site.truth(str(arguments.get("regime", "A"))), throws)
-        return {}
+    def score(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Return `CatchReferee.score` of the trials in `cycles`."""
+        score = self.referee.score(self.now, arguments.get("cycles", ()))
+        return {**score, "physics": self.physics}
 
     def close(self) -> None:
-        """Release what the back end of the mechanics holds."""
         self.world.close()
         self.plant.close()
 

@@ -51,12 +51,10 @@ class ArmPlant:
         model: PumaModel,
         gravity: float,
         start: Sequence[float],
-        speed_factor: float = 1.0,
         load: PrincipalInertia | None = None,
         physics: str = "",
     ) -> None:
-        """`speed_factor`: share of its joint speeds that the arm reaches (a slow arm); `load`: what
-        the flange carries; `physics`: as for `physics.choose`."""
+        """`load`: what the flange carries; `physics`: as for `physics.choose`."""
         self.model = model
         self.q: Six = _six(start)
         self.qd: Six = _REST
@@ -80,7 +78,7 @@ class ArmPlant:
             self.brake(joint)
         self._friction = _REST
         self._bias = self._body.bias(self.q, self.qd)
-        self.slow_down(speed_factor)
+        self.slow_down(1.0)
         self._refresh()
         self._warm_up()
 

@@ -137,13 +137,8 @@ class PumaModel:
 
     def frames(self, q: Sequence[float]) -> tuple[Frame3, ...]:
         """Return frames 0 to 6 at joint angles `q` (six, rad)."""
+        # plain floats: 8 us a pose
         frames = [Frame3((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), self.base)]
-        self._chain(q, frames)
-        return tuple(frames)
-
-    def _chain(self, q: Sequence[float], frames: list[Frame3] | None) -> Frame3:
-        """Return frame 6, and append all frames on the way to `frames` if it is given. Plain
-        floats: 8 us a pose."""
         xx, xy, xz, yx, yy, yz, zx, zy, zz = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
         ox, oy, oz = self.base
         for angle, d, a, (ca, sa) in zip(q, self.d, self.a, self.twists, strict=True):
@@ -153,13 +148,8 @@ class PumaModel:
             ox, oy, oz = ox + d * zx + a * xx, oy + d * zy + a * xy, oz + d * zz + a * xz
             yx, yy, yz = ca * nx + sa * zx, ca * ny + sa * zy, ca * nz + sa * zz
             zx, zy, zz = ca * zx - sa * nx, ca * zy - sa * ny, ca * zz - sa * nz
-            if frames is not None:
-                frames.append(Frame3((xx, xy, xz), (yx, yy, yz), (zx, zy, zz), (ox, oy, oz)))
-        return Frame3((xx, xy, xz), (yx, yy, yz), (zx, zy, zz), (ox, oy, oz))
-
-    def flange_frame(self, q: Sequence[float]) -> Frame3:
-        """Return frame 6 at joint angles `q` (six, rad)."""
-        return self._chain(q, None)
+            frames.append(Frame3((xx, xy, xz), (yx, yy, yz), (zx, zy, zz), (ox, oy, oz)))
+        return tuple(frames)
 
     def solid_parts(
         self, q: Sequence[float], cup_bottom: tuple[float, float, float]

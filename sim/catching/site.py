@@ -33,7 +33,7 @@ def carried(q: Six, numbers: Sequence[float]) -> tuple[Triple, Triple, Triple, T
 
     `numbers` (see `numbers_of`): five per joint (zero of its encoder in rad, d and a in m, cosine
     and sine of alpha), the base (m), then the frame's axes and origin in the flange's frame. The
-    same sums in the same order as `PumaModel.flange_frame` and `Frame3.point`, which explain them.
+    same sums in the same order as `PumaModel.frames` and `Frame3.point`, which explain them.
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
     ox, oy, oz = numbers[30], numbers[31], numbers[32]

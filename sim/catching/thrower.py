@@ -78,11 +78,6 @@ class Thrower:
             return None
         return draw_throw(self._seed, n, self._cell, self._truth)
 
-    @property
-    def exhausted(self) -> bool:
-        """Whether the last throw has been released."""
-        return self._next is None
-
     def advance(self, now: float, ready: bool) -> Throw | None:
         """Return the throw to release at `now` (s), None if there is none. `ready`: images are
         taken, the last ball is gone, the cup is empty and the arm stands still at home."""

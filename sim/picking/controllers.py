@@ -4,43 +4,48 @@ angles, gap and force of the fingers."""
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from petrobot.sim.bus.feetech import STEPS, so101
 from petrobot.sim.bus.ur_controller import ControllerSession, UrController
 from petrobot.sim.catching.truth import LaboratoryError
 
 
-class Controller(Protocol):
+class Controller(ABC):
     """An arm with its gripper: its interface to the driver, and to the laboratory."""
 
-    def receive(self, now: float, data: bytes) -> bytes:
-        """Take bytes of the driver; return the answer."""
-
+    @abstractmethod
     def advance(self, now: float, dt: float) -> None:
         """Let `dt` s pass."""
 
+    @abstractmethod
     def joints(self) -> Sequence[float]:
         """Return the joint angles (rad)."""
 
+    @abstractmethod
     def gap(self) -> float:
         """Return the gap between the fingers by the motor's position (m)."""
 
+    @abstractmethod
     def force(self) -> float:
         """Return the force of the fingers on what stops them (N)."""
 
+    @abstractmethod
     def block(self, gap: float | None) -> None:
         """Let a part stop the fingers at a gap (m); None: no part."""
 
+    def receive(self, now: float, data: bytes) -> bytes:
+        """Take bytes of the driver's serial line; return the answer."""
+        return b""
+
     def connect(self, port: int) -> ControllerSession:
-        """Accept a connection of the driver."""
-
-    def close(self) -> None:
-        """Release its resources."""
+        """Accept a connection of the driver. Raises LaboratoryError."""
+        raise LaboratoryError("this arm has a serial line, and no TCP port")
 
 
-class FeetechArm:
+class FeetechArm(Controller):
     """Bus servos: the last one turns the gripper's jaw, `gap_per_rad` m for each rad."""
 
     def __init__(self, numbers: Mapping[str, Any]) -> None:
@@ -52,19 +57,15 @@ class FeetechArm:
         *self._arm, self._jaw = self.bus.servos.values()
 
     def receive(self, now: float, data: bytes) -> bytes:
-        """Take packets; return the servos' answers."""
         return self.bus.receive(data)
 
     def advance(self, now: float, dt: float) -> None:
-        """Let the servos move for `dt` s."""
         self.bus.advance(dt)
 
     def joints(self) -> Sequence[float]:
-        """Return the joint angles (rad)."""
         return [servo.angle for servo in self._arm]
 
     def gap(self) -> float:
-        """Return how far the jaw is open (m)."""
         return self._jaw.angle * self._lever
 
     def force(self) -> float:
@@ -76,15 +77,8 @@ class FeetechArm:
         angle = max(0.0, gap or 0.0) / self._lever
         self._jaw.low = 2048.0 + angle / (2 * math.pi) * STEPS
 
-    def connect(self, port: int) -> ControllerSession:
-        """Refuse: it has a serial line. Raises LaboratoryError."""
-        raise LaboratoryError("the servos of this arm have a serial line, and no TCP port")
 
-    def close(self) -> None:
-        """Do nothing: all is in memory."""
-
-
-class UrArm:
+class UrArm(Controller):
     """A UR controller, and a gripper on its digital outputs and inputs: output 0 closes it, input 0
     says that it holds something, input 1 that its fingers stand."""
 
@@ -96,16 +90,10 @@ class UrArm:
         self.ur = UrController([float(q) for q in numbers["poses"]["rest"]])
         self._stop: float | None = None
 
-    def receive(self, now: float, data: bytes) -> bytes:
-        """Answer nothing: it has no serial line."""
-        return b""
-
     def connect(self, port: int) -> ControllerSession:
-        """Connect to the controller."""
         return self.ur.connect(port)
 
     def advance(self, now: float, dt: float) -> None:
-        """Let arm and fingers move for `dt` s."""
         self.ur.advance(now + dt)
         wish = 0.0 if self.ur.digital_out & 1 else self._opening
         step = self._speed * dt
@@ -117,11 +105,9 @@ class UrArm:
         self.ur.digital_in = int(holds) | (self._gap == before) << 1
 
     def joints(self) -> Sequence[float]:
-        """Return the joint angles (rad)."""
         return self.ur.q
 
     def gap(self) -> float:
-        """Return the gap between the fingers (m)."""
         return self._gap
 
     def force(self) -> float:
@@ -129,11 +115,7 @@ class UrArm:
         return self._force if self._stop is not None and self.ur.digital_out & 1 else 0.0
 
     def block(self, gap: float | None) -> None:
-        """Stop the fingers at a part."""
         self._stop = gap
-
-    def close(self) -> None:
-        """Do nothing: all is in memory."""
 
 
 CONTROLLERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Controller]]] = {

@@ -4,33 +4,24 @@ hardware of the arm that the location file names."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import cv2
 import numpy as np
 
-from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.sim.bus.ur_controller import PORTS, ControllerSession
 from petrobot.sim.catching.truth import LaboratoryError
-from petrobot.sim.faults import FaultKinds, FaultPlan
-from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
+from petrobot.sim.faults import CAMERA_FAULTS, FaultKinds, FaultPlan
+from petrobot.sim.laboratory_party import LaboratoryParty, whole_number
 from petrobot.sim.picking.camera import Picture, SceneCamera
 from petrobot.sim.picking.controllers import controller
 from petrobot.sim.picking.referee import Referee
 from petrobot.sim.picking.truth import PickingSite, picking_site_of
 from petrobot.sim.picking.world import PickingWorld
 
-PICKING_FAULTS: Final = FaultKinds(
-    keys={
-        "drop_images": ("share", "duration"),
-        "dead_camera": ("duration",),
-        "clear": (),
-    },
-    drives=1,
-)
 REGIME: Final = "plain"
 """The default regime."""
 _PARTS, _IMAGE, _WORLD, _FAULTS = 0x7061, 0x696D, 0x776F, 0x6661
@@ -42,6 +33,7 @@ class PickingLaboratory(LaboratoryParty):
     (`Directory.party`)."""
 
     tcp_ports = PORTS
+    fault_kinds = FaultKinds(CAMERA_FAULTS, drives=1)
 
     def __init__(
         self,
@@ -73,17 +65,16 @@ class PickingLaboratory(LaboratoryParty):
         self._image_draws = np.random.default_rng((seed, _IMAGE))
         direction = float(np.random.default_rng((seed, _PARTS, 1)).uniform(-math.pi, math.pi))
         self.light = self.truth.light(direction)
-        self._faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
+        self.faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
         self.referee = Referee(self.world, self._site.trays, self._site.belongs, self.now)
         self.controller.block(None)
 
     # The world, for lock step and real time
 
     def tick(self, now: float) -> None:
-        """Expose the world as it is at `now`, then advance it to `now` + TICK."""
-        if not self._faults.none:
-            self._faults.begin(now)
-        if self.exposures.due(now) and not self._faults.image_lost():
+        if not self.faults.none:
+            self.faults.begin(now)
+        if self.exposures.due(now) and not self.faults.image_lost():
             self.exposures.put(now, now + self._site.readout, self.picture())
         controller = self.controller
         controller.advance(now, TICK)
@@ -102,51 +93,29 @@ class PickingLaboratory(LaboratoryParty):
         )
 
     def take_on_serial(self, now: float, device: str, data: bytes) -> bytes:
-        """Process bytes that the arm's driver sent; return the answer."""
         return self.controller.receive(now, data)
 
     def connect(self, device: str, port: int) -> ControllerSession:
-        """Accept a connection of the arm's driver."""
         return self.controller.connect(port)
-
-    def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
-        """Ignore frames: nothing here is on a CAN bus."""
-
-    def take_frames(self) -> Sequence[Frame]:
-        """Return no frames."""
-        return ()
 
     # Services
 
-    def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Answer one of `services`. Raises ValueError (LaboratoryError among them) for bad
-        arguments.
+    def score(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Return `Referee.score` of the trials in `cycles`."""
+        return self.referee.score(self.now, arguments.get("cycles") or [])
 
-        laboratory_prepare(seed=0, regime="plain", parts=None): lay out new parts;
-        laboratory_score(cycles=[]): see `Referee.score`; laboratory_fault(kind, after=0, ...): see
-        PICKING_FAULTS.
-        """
-        if service == SCORE:
-            return self.referee.score(self.now, arguments.get("cycles") or [])
-        if service == FAULT:
-            rest = {key: value for key, value in arguments.items() if key != "kind"}
-            kind = str(arguments.get("kind", ""))
-            self._faults.add(PICKING_FAULTS.read(self.now, kind, rest))
-            return {}
+    def prepare(self, arguments: Mapping[str, Any]) -> None:
+        """Lay out new parts: seed=0, regime="plain", parts=None. Raises ValueError (LaboratoryError
+        among them)."""
         self._prepare(
             whole_number(arguments, "seed", 0) or 0,
             str(arguments.get("regime", REGIME)),
             whole_number(arguments, "parts", None),
         )
-        return {}
 
     def make_ready(self, arguments: Mapping[str, Any]) -> None:
         """Check the regime. Raises LaboratoryError."""
         self._site.truth(str(arguments.get("regime", REGIME)))
-
-    def close(self) -> None:
-        """Release the controller."""
-        self.controller.close()
 
 
 def make_laboratory(directory: Directory, name: str) -> PickingLaboratory:

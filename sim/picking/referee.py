@@ -26,7 +26,6 @@ class _Delivery:
     """A part that was put into a tray: when (s), and whether the tray was the right one."""
 
     time: float
-    part: int
     right: bool
 
 
@@ -60,7 +59,7 @@ class Referee:
             for part in inside:
                 if self._lies.get(part.number) != name:
                     right = self._belongs[part.kind] == name
-                    self._deliveries.append(_Delivery(now, part.number, right))
+                    self._deliveries.append(_Delivery(now, right))
                 self._lies[part.number] = name
             for part in self._world.parts:
                 if self._lies.get(part.number) == name and part not in inside:

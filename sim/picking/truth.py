@@ -32,7 +32,6 @@ _DRAWS: Final = 1500
 class PickingTruth:
     """The values of one regime, as `[nominal]` of the laboratory file names them."""
 
-    regime: str
     parts: int
     values: Mapping[str, float]
 
@@ -104,7 +103,7 @@ class PickingSite:
     def truth(self, regime: str) -> PickingTruth:
         """Return the truth of a regime. Raises LaboratoryError for an unknown one."""
         base, values = disturbed(self.settings, regime)
-        return PickingTruth(regime, int(base["parts"]), values)
+        return PickingTruth(int(base["parts"]), values)
 
     def parts(
         self, truth: PickingTruth, rng: np.random.Generator, count: int | None = None

@@ -7,7 +7,6 @@ import math
 from typing import Final
 
 from petrobot.services.comm.canopen.bus import Frame
-from petrobot.services.comm.canopen.cia301 import SYNC_ID
 from petrobot.services.comm.canopen.cia402 import (
     UNITS,
     DriveFault,
@@ -15,11 +14,9 @@ from petrobot.services.comm.canopen.cia402 import (
     ObjectIndex,
     OperationMode,
     StatusBit,
-    fault_text,
     to_units,
 )
-from petrobot.sim.bus.canopen_node import CanopenNode
-from petrobot.sim.bus.power_drive import POWERED, PowerDrive
+from petrobot.sim.bus.power_drive import POWERED, DriveBus, PowerDrive
 from petrobot.sim.track.rover import SLOT, RoverBody
 from petrobot.sim.track.sensor import ReflectorSensor
 
@@ -79,12 +76,6 @@ class WheelDrive(PowerDrive):
         values[_MAX_SPEED] = to_units(rover.top_speed)
         self.changed()
 
-    def before_reading(self) -> None:
-        """Also update what only an SDO reads."""
-        self.before_sending()
-        self.values[ObjectIndex.ERROR_CODE, 0] = self.fault
-        self.values[ObjectIndex.MODE_DISPLAY, 0] = self.values[ObjectIndex.MODE, 0]
-
     def on_sync(self, now: float) -> None:
         """Read the encoder and take the next set point."""
         since, self._synced = now - self._synced, now
@@ -115,11 +106,9 @@ class WheelDrive(PowerDrive):
         self._wheel.braked = False
 
     def ramp_down(self, deceleration: float) -> None:
-        """Bring the wheel to rest."""
         self._ramp = deceleration
 
     def cut_power(self) -> None:
-        """Let the brake hold."""
         self._reference = self._wheel.target = 0.0
         self._wheel.braked = True
 
@@ -146,37 +135,21 @@ class WheelDrive(PowerDrive):
             self.ramp_ended()
 
 
-class RoverBus:
+class RoverBus(DriveBus[WheelDrive]):
     """Everything on the rover's bus except the master: drives 1 (left) and 2 (right), sensor 3.
 
     In each tick: `receive` the frames, then `step(now)`, then send what `drain` returns. Times are
     seconds on the caller's clock.
     """
 
-    def __init__(self, rover: RoverBody, sensor: ReflectorSensor, now: float = 0.0) -> None:
-        self.rover = rover
-        self.drives = (WheelDrive(0, rover), WheelDrive(1, rover))
-        self.sensor = sensor
-        self._nodes: tuple[CanopenNode, ...] = (*self.drives, sensor)
-        self._own = {node.node: node for node in self._nodes}
-        self._due, self._watch_due = -math.inf, now
-        for node in self._nodes:
-            node.boot(now)
+    def __init__(self, rover: RoverBody, sensor: ReflectorSensor) -> None:
+        super().__init__((WheelDrive(0, rover), WheelDrive(1, rover)), sensor)
+        self.rover, self.sensor = rover, sensor
+        self._watch_due = 0.0
 
     def receive(self, now: float, frame: Frame) -> None:
-        """Process one frame of the master."""
-        cob_id = frame.id
-        target = self._own.get(cob_id & 0x7F)
         self.rover.move_to(now)
-        if target is not None and target.rpdo.cob_id == cob_id and target.rpdo.on:
-            target.take_rpdo(now, frame.data)
-        elif cob_id == SYNC_ID:
-            for node in self._nodes:
-                node.sync(now)
-        else:
-            self._due = -math.inf  # It may set any timer.
-            for node in self._nodes:
-                node.receive(now, frame)
+        super().receive(now, frame)
 
     def step(self, now: float) -> None:
         """Run what rover and devices do on time."""
@@ -190,24 +163,3 @@ class RoverBus:
         for node in self._nodes:
             node.advance(now)
         self._due = min(self._watch_due, *[node.due() for node in self._nodes])
-
-    def drain(self) -> list[Frame]:
-        """Return the frames to the master, oldest first."""
-        frames: list[Frame] = []
-        for node in self._nodes:
-            if node.outbox:
-                frames += node.drain()
-        return frames
-
-    def power(self, closed: bool) -> None:
-        """Close or open the power chain (emergency stop). Open: the drives lose power and the
-        brakes engage."""
-        for drive in self.drives:
-            drive.powered = closed
-            if not closed:
-                drive.trip(DriveFault.UNDERVOLTAGE)
-
-    def trip(self, side: int, fault: DriveFault = DriveFault.OVERCURRENT) -> str:
-        """Make a drive (0 left, 1 right) fail; return the fault in words."""
-        self.drives[side].trip(fault)
-        return fault_text(fault)

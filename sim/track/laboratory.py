@@ -18,8 +18,8 @@ from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.sim.catching.truth import LaboratoryError
-from petrobot.sim.faults import FaultKinds, FaultPlan, InjectedFault
-from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
+from petrobot.sim.faults import BUS_FAULTS, CAMERA_FAULTS, FaultKinds, FaultPlan
+from petrobot.sim.laboratory_party import LaboratoryParty, whole_number
 from petrobot.sim.track.camera import Motion, RoverCamera
 from petrobot.sim.track.course import Track
 from petrobot.sim.track.drives import RoverBus
@@ -29,23 +29,6 @@ from petrobot.sim.track.referee import TrackReferee
 from petrobot.sim.track.rover import RoverBody
 from petrobot.sim.track.sensor import Echo, ReflectorSensor, look
 from petrobot.sim.track.truth import LightTruth, RoverTruth, TrackSite, TrackTruth, track_site_of
-
-# Faults that the rover's laboratory can inject.
-
-ROVER_FAULTS: Final = FaultKinds(
-    keys={
-        "drop_images": ("share", "duration"),
-        "dead_camera": ("duration",),
-        "can_errors": ("share", "duration"),
-        "bus_off": ("duration",),
-        "drive_fault": ("joint",),
-        "dead_sensor": ("duration",),
-        "power": ("duration",),
-        "clear": (),
-    },
-    drives=2,
-)
-
 
 # Light over the floor: a slow drift, and the flashes of spectators' cameras.
 
@@ -99,6 +82,16 @@ class TrackLaboratory(LaboratoryParty):
     """The party of the simulated node `name`. `where` returns the party of an endpoint
     (`Directory.party`)."""
 
+    fault_kinds = FaultKinds(
+        keys={
+            **CAMERA_FAULTS,
+            **BUS_FAULTS,
+            "dead_sensor": ("duration",),
+            "power": ("duration",),
+        },
+        drives=2,
+    )
+
     def __init__(
         self,
         name: str,
@@ -139,7 +132,7 @@ class TrackLaboratory(LaboratoryParty):
         self._reflectors = [
             (gap.x, gap.y) for gap, there in zip(track.gaps, hangs, strict=True) if there
         ]
-        self._faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
+        self.faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
         self.bus.power(True)
         self.bus.sensor.dead = False
         self.rover.move_to(self.now)
@@ -166,8 +159,7 @@ class TrackLaboratory(LaboratoryParty):
     # The world, as lock step and real time drive it
 
     def tick(self, now: float) -> None:
-        """Expose the world as it is at `now`, then advance it to `now` + TICK."""
-        if not self._faults.none:
+        if not self.faults.none:
             self._begin_faults(now)
         if self.exposures.due(now):
             self._expose(now)
@@ -180,16 +172,14 @@ class TrackLaboratory(LaboratoryParty):
         self.now = now + TICK
 
     def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
-        """Process frames of the master."""
-        for frame in self._faults.passed(frames):
+        for frame in self.faults.passed(frames):
             self.bus.receive(now, frame)
 
     def take_frames(self) -> Sequence[Frame]:
-        """Return the frames of drives and sensor since the last call."""
-        return self._faults.passed(self.bus.drain())
+        return self.faults.passed(self.bus.drain())
 
     def _expose(self, now: float) -> None:
-        if self._faults.image_lost():
+        if self.faults.image_lost():
             return
         self.exposures.put(now, now + self._site.settings["camera"]["readout"], self.picture(now))
 
@@ -211,32 +201,22 @@ class TrackLaboratory(LaboratoryParty):
     # Faults and services
 
     def _begin_faults(self, now: float) -> None:
-        powerless = self._faults.active("power")
-        for fault in self._faults.begin(now):
-            self._strike(fault)
-        if self._faults.active("power") is not powerless:
+        powerless = self.faults.active("power")
+        for fault in self.faults.begin(now):
+            if fault.kind == "drive_fault":
+                self.bus.trip(int(fault.value) - 1)
+        if self.faults.active("power") is not powerless:
             self.bus.power(powerless)
-        self.bus.sensor.dead = self._faults.active("dead_sensor")
+        self.bus.sensor.dead = self.faults.active("dead_sensor")
 
-    def _strike(self, fault: InjectedFault) -> None:
-        if fault.kind == "drive_fault":
-            self.bus.trip(int(fault.value) - 1)
+    def score(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Return `TrackReferee.score`."""
+        return self.referee.score(self.now)
 
-    def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Answer one of `services`. Raises ValueError (LaboratoryError, TrackError among them) for
-        bad arguments.
-
-        laboratory_prepare(seed=0, regime="straight", elements=None, interruptions=None,
-        speed=None): begin a new experiment, return nothing; a `speed` (m/s) that no wheel reaches
-        is refused; other parameters of the task do not concern the laboratory; laboratory_score():
-        see `TrackReferee.score`; laboratory_fault(kind, after=0, ...): see `ROVER_FAULTS`.
-        """
-        if service == SCORE:
-            return self.referee.score(self.now)
-        if service == FAULT:
-            rest = {key: value for key, value in arguments.items() if key != "kind"}
-            self._faults.add(ROVER_FAULTS.read(self.now, str(arguments.get("kind", "")), rest))
-            return {}
+    def prepare(self, arguments: Mapping[str, Any]) -> None:
+        """Begin a new experiment: seed=0, regime="straight", elements=None, interruptions=None,
+        speed=None; a `speed` (m/s) that no wheel reaches is refused. Raises ValueError
+        (LaboratoryError, TrackError among them)."""
         seed = whole_number(arguments, "seed", 0) or 0
         truth = self._site.truth(str(arguments.get("regime", REGIME)))
         _check_speed(arguments.get("speed"), truth.rover)
@@ -244,14 +224,10 @@ class TrackLaboratory(LaboratoryParty):
             whole_number(arguments, key, None) for key in ("elements", "interruptions")
         )
         self._prepare(seed, truth, truth.course.track(seed, elements, interruptions))
-        return {}
 
     def make_ready(self, arguments: Mapping[str, Any]) -> None:
         """Make the camera of a regime. Raises LaboratoryError."""
         self._camera_of(self._site.truth(str(arguments.get("regime", REGIME))))
-
-    def close(self) -> None:
-        """Do nothing: all is in memory."""
 
 
 def _put_down(start: FloorPose, rover: RoverTruth, draws: np.random.Generator) -> FloorPose:

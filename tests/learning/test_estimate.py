@@ -19,7 +19,6 @@ from petrobot.coordinator.learning.estimate import (
     Observation,
     Sample,
     Tally,
-    merge_tallies,
     quantile,
 )
 from petrobot.coordinator.learning.selectors import cost_of
@@ -101,7 +100,6 @@ def test_the_numbers_that_each_result_changes(
     assert tally.availability == availability
     assert tally.censored == censored
     assert tally.unknown == (seen.executed is Executed.UNKNOWN)
-    assert tally.exposure == (0.0 if seen.executed is Executed.NO else seen.seconds)
 
 
 @given(OBSERVATIONS, OBSERVATIONS, OBSERVATIONS)
@@ -111,9 +109,9 @@ def test_tallies_merge_like_sets_of_runs(
     """Merging is commutative and associative, and gives what a single counter would have counted
     (up to rounding of the sums)."""
     x, y, z = tally_of(a, "a"), tally_of(b, "b"), tally_of(c, "c")
-    assert merge_tallies(x, y).counts == merge_tallies(y, x).counts
-    assert merge_tallies(x, y).sample == merge_tallies(y, x).sample
-    left, right = merge_tallies(merge_tallies(x, y), z), merge_tallies(x, merge_tallies(y, z))
+    assert x.merged(y).counts == y.merged(x).counts
+    assert x.merged(y).sample == y.merged(x).sample
+    left, right = x.merged(y).merged(z), x.merged(y.merged(z))
     whole = tally_of(a + b + c)
     for one in (left, right):
         assert one.counts == whole.counts
@@ -312,10 +310,8 @@ def test_every_tally_of_real_runs_is_accepted(
     seen: list[Observation], deferred: Observation, status: Status, others: list[Observation]
 ) -> None:
     """This includes corrected and merged tallies: the check refuses no valid tally."""
-    tally = merge_tallies(
-        tally_of([*seen, deferred]).correcting(deferred, status, "seen later"),
-        tally_of(others, "other"),
-    )
+    corrected = tally_of([*seen, deferred]).correcting(deferred, status, "seen later")
+    tally = corrected.merged(tally_of(others, "other"))
     assert Tally.of_plain(json.loads(json.dumps(tally.to_plain()))) == tally
 
 

@@ -398,7 +398,7 @@ def test_a_bad_file_gives_one_clear_error(tmp_path: Path, spoil: Any, said: str)
         ("tally", '"unknown"', '"unheard"', 2, "'unknown' is missing"),
         ("tally", "{", "{", 999, "expected version 2, the number of changes, got 999"),
         ("flow", "[2,", "[-2,", 999, "transition begin (regime=A): -2 firings"),
-        ("flow", "[2, [2,", "[1, [2,", 1, "2 waits: expected a whole number from 0 to 1"),
+        ("flow", "[2,[2,", "[1,[2,", 1, "2 waits: expected a whole number from 0 to 1"),
         ("flow", "[2,", "[2,", 999, "expected version 2"),
     ],
 )

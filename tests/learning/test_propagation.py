@@ -18,7 +18,7 @@ from petrobot.coordinator.analysis.time.measured import Measured
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.launch import with_runs
-from petrobot.coordinator.learning.estimate import Observation, Tally, TallyKey, merge_tallies
+from petrobot.coordinator.learning.estimate import Observation, Tally, TallyKey
 from petrobot.coordinator.learning.learner import LearningSelector
 from petrobot.coordinator.learning.learning import Estimates, Learning
 from petrobot.coordinator.learning.objective import Question, compare
@@ -264,7 +264,7 @@ def test_executed_unknown_is_kept_by_cause() -> None:
     plain = known.to_plain()
     assert Tally.of_plain(plain) == known
     older = Tally.of_plain({k: v for k, v in plain.items() if k != "unknown_ends"})
-    for kept, goal in ((known, 0.2), (older, 0.2 * 2 / 3), (merge_tallies(known, known), 0.2)):
+    for kept, goal in ((known, 0.2), (older, 0.2 * 2 / 3), (known.merged(known), 0.2)):
         found = propagate(task, Estimates({TallyKey("a", "do_a"): kept})).forecast
         assert found.goal_reliability == pytest.approx(goal, rel=1e-4)
 
@@ -430,7 +430,8 @@ def test_uniformly_censored_exponential_has_the_classic_rate() -> None:
             else Observation(None, 1.0, preempted_by="jammed")
         )
         out = out.adding(seen)
-    assert out.exposure / out.runs == pytest.approx(2.0, rel=0.06)
+    exposure = sum(moments.total for moments in out.durations.values())
+    assert exposure / out.runs == pytest.approx(2.0, rel=0.06)
     assert out.runs / (out.runs + out.censored) == pytest.approx(1 - exp(-0.5), abs=0.03)
 
 

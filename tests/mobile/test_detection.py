@@ -77,7 +77,7 @@ def test_offset_and_heading_of_a_straight_line_are_recovered(
     sight = look(name, floor, floor.at(s, aside, turn), seed)
     line = sight.describe()
     assert line.heading == pytest.approx(-turn, abs=0.06)
-    expected = -aside / math.cos(turn) - line.near * math.tan(turn)
+    expected = -aside / math.cos(turn) - float(sight.x[0]) * math.tan(turn)
     assert line.offset == pytest.approx(expected, abs=0.008)
     assert abs(line.curvature) < 0.25 and sight.confidence > 0.8
 

@@ -17,7 +17,7 @@ from petrobot.services.action import Cancelled, Result, Status, Wait
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.motion.arm import PERIOD, Arm
 from petrobot.services.motion.model import nominal_arm
-from petrobot.sim.catching.drives import DriveBus, ratings
+from petrobot.sim.catching.drives import ArmBus, ratings
 
 TABLE = tomllib.loads(
     files("petrobot.services.motion").joinpath("puma560.toml").read_text(encoding="utf-8")
@@ -31,14 +31,13 @@ class SimplePlant:
     GRAVITY = (0.0, 37.0, 9.0, 0.0, 0.3, 0.0)
 
     def __init__(self, q: Sequence[float]) -> None:
-        model = nominal_arm()
         self.q = [float(angle) for angle in q]
         self.qd = [0.0] * 6
         self.braked = [True] * 6
         self.tau = [0.0] * 6
         self._inertia = [float(joint["inertia"]) for joint in TABLE["joint"]]
-        self._viscous = (model.viscous * model.gear**2).tolist()
-        self._dry = (model.coulomb * model.gear).tolist()
+        self._viscous = [joint["viscous"] * joint["gear"] ** 2 for joint in TABLE["joint"]]
+        self._dry = [joint["coulomb"] * joint["gear"] for joint in TABLE["joint"]]
         self.factor = 1.0
 
     def brake(self, joint: int) -> None:
@@ -148,7 +147,7 @@ class Rig:
         self.plant = (
             plant if plant is not None else SimplePlant(start if start is not None else home)
         )
-        self.drives = drives if drives is not None else DriveBus(self.plant, ratings(TABLE))
+        self.drives = drives if drives is not None else ArmBus(self.plant, ratings(TABLE))
         self.commanded: list[list[float]] = []
         self.on_step: Callable[[float], None] | None = None
         self.thinking = 0.0

@@ -32,7 +32,7 @@ from petrobot.services.comm.canopen.cia402 import (
     to_units,
 )
 from petrobot.services.motion.drive_master import DriveSettings, JointDriveLink
-from petrobot.sim.catching.drives import DriveBus, ratings
+from petrobot.sim.catching.drives import ArmBus, ratings
 from tests.waiting import Limit
 
 TPDO, RPDO = canopen.pdo_struct(SENT), canopen.pdo_struct(RECEIVED)
@@ -44,7 +44,7 @@ class ArmDriveBench:
 
     def __init__(self, plant: Any, table: Any) -> None:
         self.plant = plant
-        self.bus = DriveBus(plant, ratings(table))
+        self.bus = ArmBus(plant, ratings(table))
         self.now = 0.0
         self.frames: list[Frame] = []
         self.target = plant.q[0]

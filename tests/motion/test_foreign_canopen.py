@@ -26,7 +26,7 @@ from petrobot.services.comm.canopen.cia402 import (
 from petrobot.services.comm.canopen.hub import CanHub
 from petrobot.services.comm.canopen.master import MasterPhase
 from petrobot.services.motion.drive_master import DriveMaster, DriveSettings
-from petrobot.sim.catching.drives import DriveBus, ratings
+from petrobot.sim.catching.drives import ArmBus, ratings
 
 canopen: Any = importlib.import_module("canopen")  # It has hardly any annotations.
 BaseNode402: Any = importlib.import_module("canopen.profiles.p402").BaseNode402
@@ -41,7 +41,7 @@ class LiveDrives:
     def __init__(self, plant: Any, table: Any) -> None:
         self.hub = CanHub()
         self.channel = self.hub.channel
-        self.drives = DriveBus(plant, ratings(table))
+        self.drives = ArmBus(plant, ratings(table))
         self._port = self.hub.port()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._live)

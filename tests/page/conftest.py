@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import pytest_asyncio
 
-from petrobot.coordinator.operator.history import JournalHistory
 from petrobot.coordinator.page.server import Page, start_page
 from petrobot.coordinator.task import Executed, Status
 from petrobot.coordinator.task.file import load
@@ -88,9 +87,8 @@ async def staged(tasks: Path, runs: Path) -> AsyncIterator[Stage]:
 @asynccontextmanager
 async def served(stage: Stage, tasks: Path, runs: Path) -> AsyncIterator[Page]:
     """Serve the page of a mission on loopback."""
-    history = JournalHistory(runs)
     made = await start_page(
-        stage, tasks_folder=tasks, token="open sesame", offers=stage.offers, history=history
+        stage, tasks_folder=tasks, token="open sesame", offers=stage.offers, runs=runs
     )
     yield made
     await made.close()

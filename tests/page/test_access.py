@@ -15,7 +15,7 @@ import pytest
 
 from petrobot.coordinator.operator.port import PROTOCOL
 from petrobot.coordinator.page import requests
-from petrobot.coordinator.page.access import HEADERS, is_loopback, names_for
+from petrobot.coordinator.page.access import HEADERS
 from petrobot.coordinator.page.connection_limits import CONNECTIONS, ConnectionLimit
 from petrobot.coordinator.page.server import CLIENTS, Page, start_page
 from petrobot.coordinator.page.sessions import LARGEST_MESSAGE
@@ -275,24 +275,6 @@ async def test_scripts_use_the_token(page: Page, stage: Stage) -> None:
         page, "/api/command", "POST", headers=bearer(page), json={"verb": "step", "name": "other"}
     )
     assert refused.status == 409
-
-
-INSIDE = ("127.0.0.1", "localhost", "::1", "127.3.4.5")
-OUTSIDE = ("0.0.0.0", "10.0.0.7", "robot.lab")
-
-
-@pytest.mark.parametrize(
-    ("host", "loopback"), [*((h, True) for h in INSIDE), *((h, False) for h in OUTSIDE)]
-)
-def test_loopback(host: str, loopback: bool) -> None:
-    """Which addresses can be reached only from this machine."""
-    assert is_loopback(host) is loopback
-
-
-def test_a_server_on_all_addresses_needs_its_names() -> None:
-    """Bound to all addresses, it answers to a name of the network only if configured."""
-    assert names_for("0.0.0.0", ()) == {"0.0.0.0", "127.0.0.1", "localhost", "[::1]"}
-    assert "cell.lab" in names_for("0.0.0.0", ("Cell.lab",))
 
 
 async def test_each_server_draws_its_own_token(stage: Stage, tasks: Any) -> None:

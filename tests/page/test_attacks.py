@@ -15,7 +15,6 @@ import aiohttp
 import pytest
 import pytest_asyncio
 
-from petrobot.coordinator.operator.history import JournalHistory
 from petrobot.coordinator.operator.port import VERBS
 from petrobot.coordinator.page.access import HEADERS
 from petrobot.coordinator.page.server import Page, start_page
@@ -65,7 +64,7 @@ async def cell(tmp_path: Path) -> AsyncIterator[tuple[Simulated, Page]]:
     page = await start_page(
         made.station,
         tasks_folder=tmp_path / "tasks",
-        history=JournalHistory(made.runs),
+        runs=made.runs,
         starts=made.station.form,
     )
     yield made, page

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 import pytest_asyncio
 
-from petrobot.coordinator.operator.history import JournalHistory
 from petrobot.coordinator.page.server import Page, start_page
 from petrobot.coordinator.run.folder import JOURNAL
 from petrobot.coordinator.run.journal import read_journal
@@ -42,12 +41,12 @@ async def cell(tmp_path: Path) -> AsyncIterator[Simulated]:
 @pytest_asyncio.fixture(loop_scope="session")
 async def page(cell: Simulated) -> AsyncIterator[Page]:
     """Its page."""
-    history, offers, form = JournalHistory(cell.runs), cell.station.offers, cell.station.form
+    offers, form = cell.station.offers, cell.station.form
     made = await start_page(
         cell.station,
         tasks_folder=cell.folder / "tasks",
         offers=offers,
-        history=history,
+        runs=cell.runs,
         starts=form,
     )
     yield made

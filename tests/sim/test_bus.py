@@ -13,7 +13,7 @@ from petrobot.services.comm.canopen import cia301 as canopen
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.canopen.cia301 import NmtCommand, NmtState
 from petrobot.services.comm.canopen.cia402 import RECEIVED, DriveCommand, to_units
-from petrobot.sim.catching.drives import DriveBus
+from petrobot.sim.catching.drives import ArmBus
 from petrobot.sim.catching.puma import ArmPlant
 from petrobot.sim.catching.site import Site
 
@@ -43,7 +43,7 @@ class Twin:
     def __init__(self, site: Site) -> None:
         self.home = site.arm.poses["home"].tolist()
         self.plant = ArmPlant(site.arm, 9.81, self.home)
-        self.bus = DriveBus(self.plant, site.drives)
+        self.bus = ArmBus(self.plant, site.drives)
         self.bus.receive(0.0, canopen.nmt(NmtCommand.START))
 
     def cycle(self, now: float, frames: tuple[Frame, ...], at_once: bool) -> list[Frame]:

@@ -27,7 +27,7 @@ from petrobot.services.comm.canopen.cia402 import (
     to_units,
 )
 from petrobot.sim.catching import drives
-from petrobot.sim.catching.drives import DriveBus, ServoDrive
+from petrobot.sim.catching.drives import ArmBus, ServoDrive
 from petrobot.sim.catching.servo import DriveRating
 from tests.waiting import Limit
 
@@ -76,7 +76,7 @@ class CycleBench:
     def __init__(self, kind: type[ServoDrive], monkeypatch: pytest.MonkeyPatch) -> None:
         with monkeypatch.context() as patch:
             patch.setattr(drives, "ServoDrive", kind)
-            self.bus = DriveBus(Joints(), [DriveRating(40.0, 2.0, 1.0)] * 6)
+            self.bus = ArmBus(Joints(), [DriveRating(40.0, 2.0, 1.0)] * 6)
         self.now, self.sent, self.targets = 0.0, list[Frame](), [0.0] * 6
         for node in range(1, 7):
             self.configure(node)

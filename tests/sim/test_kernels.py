@@ -206,7 +206,7 @@ def test_the_pose_of_the_load_equals_that_of_the_arms_frames_to_the_bit(
     arm: PumaModel, q: Six, zero: Six, axes: tuple[Triple, Triple, Triple], origin: Triple
 ) -> None:
     numbers = numbers_of(arm, zero, axes, origin)
-    flange = arm.flange_frame([angle + off for angle, off in zip(q, zero, strict=True)])
+    flange = arm.frames([angle + off for angle, off in zip(q, zero, strict=True)])[6]
     turned = [
         tuple(a - b for a, b in zip(flange.point(axis), flange.origin, strict=True))
         for axis in axes

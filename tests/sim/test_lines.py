@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import pytest
 
-from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.location_file import load
 from petrobot.services.comm.lockstep.party import Envelope
 from petrobot.services.comm.streams.line import ByteLine, SerialPort, TcpConnection
@@ -72,23 +70,8 @@ class Echo(LaboratoryParty):
     def tick(self, now: float) -> None:
         self.now = now + 0.004
 
-    def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
-        """It has no bus."""
-
-    def take_frames(self) -> Sequence[Frame]:
-        return ()
-
     def take_on_serial(self, now: float, device: str, data: bytes) -> bytes:
         return device.encode() + b" " + data.upper()
-
-    def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        return {}
-
-    def make_ready(self, arguments: Mapping[str, Any]) -> None:
-        """Nothing takes long."""
-
-    def close(self) -> None:
-        """Nothing is held."""
 
 
 def echo() -> Echo:

@@ -96,7 +96,7 @@ def test_the_mass_matrix_equals_the_published_one(arm: PumaModel, body: ArmDynam
 
 
 def test_the_zero_pose_equals_the_published_one(arm: PumaModel) -> None:
-    assert arm.flange_frame(QZ).origin == pytest.approx((0.4521, -0.15005, 0.4318 + 0.67183))
+    assert arm.frames(QZ)[6].origin == pytest.approx((0.4521, -0.15005, 0.4318 + 0.67183))
 
 
 @needs_bullet
@@ -106,7 +106,7 @@ def test_forward_kinematics_agrees_with_bullet(arm: PumaModel, shares: list[floa
     from petrobot.sim.catching.bullet import BulletArmDynamics
 
     q, body = angles(arm, shares), BulletArmDynamics(arm, GRAVITY)
-    flange = arm.flange_frame(q)
+    flange = arm.frames(q)[6]
     origin, rotation = body.link_frame(
         q, 5
     )  # frame 6 coincides with its URDF link: d6, a6 and alpha6 are zero

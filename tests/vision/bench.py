@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from petrobot.services.action import Cancelled, Result, Status, Wait
 from petrobot.services.comm.streams.camera import MemoryImages
 from petrobot.services.comm.streams.image import Image
+from petrobot.services.vision.optics import Optics
 from petrobot.sim.catching.camera import PinholeCamera
 from petrobot.sim.catching.truth import read_truth
 
@@ -27,6 +28,21 @@ REGIMES = {"A": (0.7, 1.5), "B": (1.5, 2.0), "C": (2.0, 2.5)}
 def read_cell() -> dict[str, Any]:
     """The shipped cell."""
     return tomllib.loads((ROOT / "services" / "cell.toml").read_text(encoding="utf-8"))
+
+
+def nominal_optics(cell: Mapping[str, Any]) -> Optics:
+    """Return the camera as designed: `[camera]` of cell.toml."""
+    camera = cell["camera"]
+    right, down = np.asarray(camera["image_x"], float), np.array([0.0, 0.0, -1.0])
+    focal = float(camera["focal_px"])
+    k1, k2, p1, p2 = (float(k) for k in camera["distortion"])
+    return Optics(
+        (focal, focal),
+        ((camera["width"] - 1) / 2, (camera["height"] - 1) / 2),
+        (k1, k2, p1, p2),
+        np.array([right, np.cross(down, right), down]),
+        np.asarray(camera["position"], float),
+    )
 
 
 def true_view(cell: Mapping[str, Any], **changes: Any) -> dict[str, Any]:

@@ -272,7 +272,7 @@ def window_sees(bench: CameraBench, camera: Camera) -> Array:
         bench.picture(), camera.background.picture, near, spread=6.0
     )
     assert seen is not None
-    return seen.centre
+    return seen
 
 
 def scale(pixel: Array) -> tuple[int, int]:

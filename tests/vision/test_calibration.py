@@ -33,6 +33,7 @@ from petrobot.services.vision.calibration_file import (
 from petrobot.services.vision.optics import Array, Optics
 from petrobot.sim.catching.board import HELD, LAID, board_views, save_board_views
 from petrobot.sim.catching.camera import PinholeCamera
+from tests.vision.bench import nominal_optics
 from tests.vision.test_optics import drawn_optics
 
 pytestmark = pytest.mark.once
@@ -76,7 +77,7 @@ def test_rendered_boards_give_the_true_camera(
     error = table_error(found.optics, pinhole)
     assert float(np.sqrt(np.mean(error**2))) < 0.5e-3
     assert error.max() < 1.0e-3
-    nominal = table_error(Optics.nominal(cell), pinhole)
+    nominal = table_error(nominal_optics(cell), pinhole)
     assert float(np.sqrt(np.mean(nominal**2))) > 5e-3, (
         "the truth differs: there was something to find"
     )

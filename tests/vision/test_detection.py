@@ -217,7 +217,7 @@ def test_window_is_accurate_in_any_light(
             image, picture, expected, view.streak_px(float(-velocity[0])), spread=6.0
         )
         if seen is not None:
-            errors.append(np.hypot(*(view.to_table(seen.centre) - place[:2])))
+            errors.append(np.hypot(*(view.to_table(seen) - place[:2])))
     assert len(errors) >= 0.97 * len(sample)
     assert float(np.sqrt(np.mean(np.square(errors)))) < 0.0013
 
@@ -229,7 +229,7 @@ def test_window_scatter_is_a_fraction_of_a_millimetre(
     seen = [
         window.measure(pinhole.render(place), picture, view.to_pixels(place[:2])) for _ in range(30)
     ]
-    places = np.array([view.to_table(s.centre) for s in seen if s is not None])
+    places = np.array([view.to_table(s) for s in seen if s is not None])
     assert len(places) == 30
     assert places.std(axis=0).max() < 0.2e-3
 
@@ -253,7 +253,7 @@ def test_a_half_hidden_ball_is_not_measured_wrongly(
         image = pinhole.render(place, arm_points=arm, arm_radii=[0.05])
         seen = window.measure(image, picture, view.to_pixels(place[:2]), spread=8.0)
         if seen is not None:
-            kept.append(np.hypot(*(view.to_table(seen.centre) - place[:2])))
+            kept.append(np.hypot(*(view.to_table(seen) - place[:2])))
     assert 3 <= len(kept) <= 20, "seen before, not seen when covered"
     assert max(kept) < 0.004
 

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from petrobot.services.vision.optics import Optics
 from petrobot.services.vision.table import TableView
 from petrobot.sim.catching.camera import PinholeCamera
-from tests.vision.bench import true_view
+from tests.vision.bench import nominal_optics, true_view
 
 
 def drawn_optics(cell: dict[str, Any], seed: int) -> Optics:
     """Draw a camera that differs from the nominal one by more than any installation does."""
-    rng, nominal = np.random.default_rng(seed), Optics.nominal(cell)
+    rng, nominal = np.random.default_rng(seed), nominal_optics(cell)
     k1, k2, p1, p2 = (
         float(k) for k in np.array(nominal.distortion) + rng.normal(0, [0.03, 0.01, 5e-4, 5e-4])
     )
@@ -51,7 +51,9 @@ def table_points(rng: np.random.Generator, count: int = 200) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(5))
 def test_projection_is_opencvs(cell: dict[str, Any], seed: int) -> None:
     optics, points = drawn_optics(cell, seed), table_points(np.random.default_rng(seed))
-    expected = by_opencv(points, optics.rotation, optics.position, optics.matrix, optics.distortion)
+    (fx, fy), (cx, cy) = optics.focal, optics.centre
+    matrix = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+    expected = by_opencv(points, optics.rotation, optics.position, matrix, optics.distortion)
     assert np.abs(optics.project(points) - expected).max() < 1e-9
 
 
@@ -85,7 +87,7 @@ def test_rays_of_the_simulated_camera_are_the_inverse(cell: dict[str, Any]) -> N
 
 
 def test_nominal_camera_sees_the_whole_table(cell: dict[str, Any]) -> None:
-    view = TableView.of(cell, Optics.nominal(cell))
+    view = TableView.of(cell, nominal_optics(cell))
     corners = view.to_pixels([(x, y) for x in (0.62, 2.22) for y in (-0.45, 0.45)])
     assert (corners > 5).all() and (corners < [634, 474]).all()
     rows, columns = view.region
@@ -96,21 +98,21 @@ def test_nominal_camera_sees_the_whole_table(cell: dict[str, Any]) -> None:
 def test_the_view_gives_the_balls_centre(cell: dict[str, Any]) -> None:
     """A ball's centre is 20 mm above the table: projecting onto the table top instead would be
     wrong by up to 9 mm at its ends."""
-    view = TableView.of(cell, Optics.nominal(cell))
+    view = TableView.of(cell, nominal_optics(cell))
     pixel = view.optics.project([0.62, 0.0, 0.62])
     assert np.allclose(view.to_table(pixel), [0.62, 0.0], atol=1e-9)
     assert abs(view.optics.to_plane(pixel, 0.60)[0] - 0.62) > 0.008
 
 
 def test_scale_and_streak(cell: dict[str, Any]) -> None:
-    view = TableView.of(cell, Optics.nominal(cell))
+    view = TableView.of(cell, nominal_optics(cell))
     across = view.optics.project([[1.42, 0.02, 0.62], [1.42, -0.02, 0.62]])
     assert view.radius_px == pytest.approx(np.ptp(across[:, 1]) / 2, rel=1e-3)
     assert view.streak_px(2.5) == pytest.approx(2.5 * 0.004 * view.radius_px / 0.02)
 
 
 def test_on_table(cell: dict[str, Any]) -> None:
-    view = TableView.of(cell, Optics.nominal(cell))
+    view = TableView.of(cell, nominal_optics(cell))
     places = [(0.62, 0.45), (0.61, 0.0), (2.23, 0.0), (1.0, -0.46)]
     assert view.on_table(places).tolist() == [True, False, False, False]
     assert view.on_table(places, margin=0.02).all()

@@ -4,7 +4,6 @@ same seed.
 
 from __future__ import annotations
 
-import math
 import statistics
 import subprocess
 import sys
@@ -14,22 +13,14 @@ from typing import Any
 
 from tools.proof.proof import LOCK_STEP, ROOT, FigureProof, Result, digest, run_task
 
+from petrobot.coordinator.learning.statistics import wilson
+
 CHAPTER = "Catching, lock step"
 THROWS = 1000
 DISTURBED_THROWS = 200
 SEED = 20_000
 SAMPLE = 10
 FLOORS = {"A": 0.98, "B": 0.94, "C": 0.89}
-
-
-def wilson_lower(successes: int, trials: int, z: float = 1.959964) -> float:
-    """Return the lower end of Wilson's 95 % interval of a share (Wilson 1927)."""
-    if trials == 0:
-        return 0.0
-    share = successes / trials
-    centre = share + z * z / (2 * trials)
-    margin = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
-    return (centre - margin) / (1 + z * z / trials)
 
 
 def catching(regime: str, throws: int) -> Callable[[], Result]:
@@ -68,7 +59,7 @@ def summary(result: dict[str, Any]) -> Result:
         "reachable": len(reachable),
         "caught of reachable": caught,
         "caught of all": sum(t["caught"] for t in throws),
-        "Wilson lower bound": round(wilson_lower(caught, len(reachable)), 4),
+        "Wilson lower bound": round(wilson(caught, len(reachable))[0], 4),
         "median miss (mm)": round(statistics.median(misses), 1) if misses else None,
         "cycle (s)": round(result["sim_s"] / len(throws), 2),
     }

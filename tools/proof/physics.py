@@ -8,9 +8,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from tools.proof.catching import SAMPLE, wilson_lower
+from tools.proof.catching import SAMPLE
 from tools.proof.proof import KEPT, LOCK_STEP, ROOT, FigureProof, Result, digest, run_task
 
+from petrobot.coordinator.learning.statistics import wilson
 from petrobot.sim.catching.physics import BACK_ENDS, BULLET, PORTABLE, arm_dynamics
 from petrobot.sim.catching.site import CupMount, read_site
 
@@ -115,7 +116,7 @@ def holds(regime: str) -> Callable[[Result], bool]:
 
     def good(result: Result) -> bool:
         caught = (result["caught, bullet"], result["caught, portable"])
-        floor = all(wilson_lower(n, result["throws"]) >= FLOORS[regime] for n in caught)
+        floor = all(wilson(n, result["throws"])[0] >= FLOORS[regime] for n in caught)
         near = -margin <= result["difference from"] and result["difference to"] <= margin
         return bool(result["throws"] > 0 and floor and near)
 

@@ -1,9 +1,9 @@
 """Formats that are only written: Graphviz DOT, the net files of the model checker LoLA, and DRN for
 the model checker Storm.
 
-DOT shows a net or its reachability graph. LoLA (its grammar: `ParserPTNetLoLA.yy` of LoLA 2) has
-places, weighted arcs and tokens alone. DRN ("direct encoding", see Storm's documentation of its
-explicit input) holds the chain of a GSPN over its tangible markings as a CTMC.
+DOT shows a net. LoLA (its grammar: `ParserPTNetLoLA.yy` of LoLA 2) has places, weighted arcs and
+tokens alone. DRN ("direct encoding", see Storm's documentation of its explicit input) holds the
+chain of a GSPN over its tangible markings as a CTMC.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from petrobot.coordinator.analysis.formats.netfile import NetFile, NetFileError, unused
-from petrobot.coordinator.analysis.net.space import Space
 from petrobot.coordinator.analysis.time.gspn import Chain
 from petrobot.coordinator.analysis.time.markov import Generator
 
@@ -58,22 +57,6 @@ def _weight(weight: int, more: str = "") -> str:
     said = [more] if more else []
     said += [f"label={_quoted(str(weight))}"] if weight > 1 else []
     return f" [{', '.join(said)}]" if said else ""
-
-
-def write_space_dot(space: Space) -> str:
-    """Return a reachability graph as DOT: the initial marking bold, dead markings filled."""
-    dead = set(space.dead.tolist())
-    lines = ["digraph markings {"]
-    for i in range(len(space)):
-        style = "bold" if i == 0 else "filled" if i in dead else "solid"
-        lines.append(
-            f"  m{i} [label={_quoted(space.net.describe(space.marking(i)))}, style={style}];"
-        )
-    for i, j, t in zip(
-        space.source.tolist(), space.target.tolist(), space.label.tolist(), strict=True
-    ):
-        lines.append(f"  m{i} -> m{j} [label={_quoted(space.net.transitions[t])}];")
-    return "\n".join([*lines, "}"]) + "\n"
 
 
 LOLA_NAME = re.compile(

@@ -7,7 +7,7 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
@@ -182,7 +182,7 @@ class Campaign:
 
     def _orders(self, blocks: Iterable[Block]) -> Iterator[tuple[Block, dict[str, Any]]]:
         for block in blocks:
-            yield block, {"block": block.to_plain(), "weights": self.policy.weights(block)}
+            yield block, {"block": asdict(block), "weights": self.policy.weights(block)}
 
     def _keep(self, pool: BlockPool, block: Block, result: Mapping[str, Any]) -> list[TrialRow]:
         if "fault" in result:

@@ -134,10 +134,6 @@ class Block:
     count: int
     seed: int
 
-    def to_plain(self) -> dict[str, Any]:
-        """Return plain data."""
-        return asdict(self)
-
 
 def regimes_of(text: str) -> tuple[str, ...]:
     """Return the regimes of a comma-separated list. `C@1-5` stands for C@1, C@2, ..., C@5: one

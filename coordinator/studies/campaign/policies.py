@@ -8,9 +8,10 @@ table. So choices depend neither on the number of workers nor on their speed.
 from __future__ import annotations
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -26,24 +27,27 @@ from petrobot.coordinator.task import Task
 from petrobot.services.comm.location_file import Directory
 
 
-class ChoicePolicy(Protocol):
-    """Chooses before a batch, learns after it."""
+class ChoicePolicy(ABC):
+    """Chooses before a batch, and may learn after it."""
 
-    learns: bool
+    learns = False
     """Whether `update` changes later choices."""
 
+    @abstractmethod
     def weights(self, block: Block) -> list[Weights]:
         """Return, for each trial of a block, the probabilities of the actions of each primitive
         task."""
 
-    def update(self, rows: Sequence[TrialRow]) -> None:
-        """Learn from the rows of a whole batch, in the order of the table."""
-
+    @abstractmethod
     def state(self) -> dict[str, Any]:
         """Return what the policy knows, as plain data for the result."""
 
+    def update(self, rows: Sequence[TrialRow]) -> None:  # noqa: B027 - most learn nothing
+        """Learn from the rows of a whole batch, in the order of the table."""
+
     def selectors(self) -> dict[str, dict[str, Any]]:
         """Return the states of selectors for the estimates file, by primitive task."""
+        return {}
 
 
 def offered(task: Task, directory: Directory) -> dict[str, tuple[str, ...]]:
@@ -55,13 +59,11 @@ def offered(task: Task, directory: Directory) -> dict[str, tuple[str, ...]]:
     }
 
 
-class FixedActions:
+class FixedActions(ChoicePolicy):
     """Always the actions that the user chose; the first alternative for every other primitive task.
 
     `by_regime`: further choices by regime (the result of a learning campaign).
     """
-
-    learns = False
 
     def __init__(
         self,
@@ -81,23 +83,14 @@ class FixedActions:
         """Return the same choice for every trial of a regime."""
         return [self._by_regime.get(block.regime, self._weights)] * block.count
 
-    def update(self, rows: Sequence[TrialRow]) -> None:
-        """Learn nothing."""
-
     def state(self) -> dict[str, Any]:
         """Return the chosen actions."""
         return {task: next(iter(actions)) for task, actions in self._weights.items()}
 
-    def selectors(self) -> dict[str, dict[str, Any]]:
-        """Return no states: nothing is learned."""
-        return {}
 
-
-class AllCombinations:
+class AllCombinations(ChoicePolicy):
     """All combinations of alternatives in turn, from trial to trial of a regime. Actions that the
     user fixed do not change."""
-
-    learns = False
 
     def __init__(
         self, alternatives: Mapping[str, Sequence[str]], chosen: Mapping[str, str]
@@ -120,16 +113,9 @@ class AllCombinations:
         combinations = [self.combination(block.regime_first + k) for k in range(block.count)]
         return [{task: {action: 1.0} for task, action in c.items()} for c in combinations]
 
-    def update(self, rows: Sequence[TrialRow]) -> None:
-        """Learn nothing."""
-
     def state(self) -> dict[str, Any]:
         """Return the alternatives."""
         return dict(self._alternatives)
-
-    def selectors(self) -> dict[str, dict[str, Any]]:
-        """Return no states: nothing is learned."""
-        return {}
 
 
 class RandomActions(AllCombinations):
@@ -145,7 +131,7 @@ class RandomActions(AllCombinations):
         return [even] * block.count
 
 
-class LearnedActions:
+class LearnedActions(ChoicePolicy):
     """One learner for each primitive task with alternatives and each regime (docs/learning.md).
 
     There is one choice per trial and primitive task: a run that is repeated within a trial uses the
@@ -198,7 +184,7 @@ class LearnedActions:
         self._before = None
         for row in rows:
             context, ends = context_of(row.regime), []
-            for run in row.trial.runs if row.trial is not None else ():
+            for run in row.runs:
                 name = self._task.primitive_task_of(run.place).name
                 self._learning.apply(Choice(name, run.action, context))
                 ends.append((name, run.action, context, observation(self._task, run)))

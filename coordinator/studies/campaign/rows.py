@@ -52,6 +52,11 @@ class TrialRow:
     score: dict[str, Any] = field(default_factory=dict)
     """The task's own results, as `table.column`."""
 
+    @property
+    def runs(self) -> Sequence[RunEntry]:
+        """Runs of the trial; none if it did not begin."""
+        return self.trial.runs if self.trial is not None else ()
+
 
 def rows_of(block: Block, result: Mapping[str, Any]) -> list[TrialRow]:
     """Return the rows of a block's result."""
@@ -87,7 +92,7 @@ def columns(task: Task, rows: Sequence[TrialRow]) -> list[str]:
 
 def cells(task: Task, row: TrialRow, names: Sequence[str]) -> list[str]:
     """Return a row as texts, in the order of the columns."""
-    found = {**_general(row), **_runs(task, row.trial), **row.score}
+    found = {**_general(row), **_runs(task, row), **row.score}
     more = {k: v for k, v in row.score.items() if k not in names}
     found["more"] = _json(more) if more else ""
     return [_text(found.get(name)) for name in names]
@@ -98,21 +103,20 @@ def _general(row: TrialRow) -> dict[str, Any]:
     trial = row.trial
     if trial is None:
         return {**base, "begun": False}
-    own = {
+    return {
+        **base,
+        **{n: getattr(trial, n) for n in ("status", "cause", "completed", "goals", "time")},
         "begun": True,
         "at": trial.begun,
         "waits": _json([list(w) for w in trial.waits]),
         "fired": _json(trial.fired),
+        "runs": _json([run.to_plain() for run in trial.runs]),
     }
-    own |= {
-        name: getattr(trial, name) for name in ("status", "cause", "completed", "goals", "time")
-    }
-    return {**base, **own, "runs": _json([run.to_plain() for run in trial.runs])}
 
 
-def _runs(task: Task, trial: Trial | None) -> dict[str, Any]:
+def _runs(task: Task, row: TrialRow) -> dict[str, Any]:
     found: dict[str, Any] = {}
-    for run in trial.runs if trial else ():
+    for run in row.runs:
         primitive = task.primitive_task_of(run.place).name
         found.setdefault(f"chosen.{primitive}", run.action)
         if f"{run.place}.status" not in found:

@@ -160,7 +160,7 @@ class Summary:
         self.by_regime.setdefault(row.regime, TrialCounts()).add(row)
         self.mission_s[row.block] = row.mission_s
         self._see(row)
-        for run in row.trial.runs if row.trial is not None else ():
+        for run in row.runs:
             primitive = self.task.primitive_task_of(run.place).name
             actions = self.chosen.setdefault(primitive, {})
             actions[run.action] = actions.get(run.action, 0) + 1

@@ -135,14 +135,6 @@ class ContextNode:
     durations: dict[int, ContextNode] = field(default_factory=dict)
     """In a leaf of an outcome tree: the tree of the durations of each outcome."""
 
-    def leaves(self) -> list[ContextNode]:
-        """Return all contexts that no test splits further."""
-        return (
-            [leaf for child in self.children for leaf in child.leaves()]
-            if self.children
-            else [self]
-        )
-
 
 class RunDistributions:
     """Outcome probabilities and duration distributions of all actions of one regime:

@@ -4,7 +4,7 @@ its trial."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -124,12 +124,8 @@ class Seen:
 
     def of(self, which: NDArray[np.bool_] | Codes) -> Seen:
         """Select columns."""
-        return Seen(
-            self.outcome[:, which],
-            self.action[:, which],
-            self.took[:, which],
-            self.visits[:, which],
-        )
+        parts = self.outcome[:, which], self.action[:, which]
+        return Seen(*parts, self.took[:, which], self.visits[:, which])
 
     def note(
         self,
@@ -140,11 +136,9 @@ class Seen:
         took: Values | float,
     ) -> None:
         """Record that runs ended in a place."""
-        self.outcome[q, columns], self.action[q, columns], self.took[q, columns] = (
-            outcome,
-            action,
-            took,
-        )
+        self.outcome[q, columns] = outcome
+        self.action[q, columns] = action
+        self.took[q, columns] = took
         self.visits[q, columns] += 1
 
 
@@ -170,17 +164,9 @@ class Runs:
 
     def of(self, which: NDArray[np.bool_] | Codes) -> Runs:
         """Select runs."""
-        return Runs(
-            self.place[which],
-            self.action[which],
-            self.outcome[which],
-            self.preempted[which],
-            self.censored[which],
-            self.took[which],
-            self.trial[which],
-            self.weight[which],
-            self.seen.of(which),
-        )
+        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        seen: Seen = columns.pop("seen")
+        return Runs(**{name: own[which] for name, own in columns.items()}, seen=seen.of(which))
 
     def __len__(self) -> int:
         return len(self.place)

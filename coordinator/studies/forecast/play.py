@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -91,7 +92,7 @@ class Play:
         self._due = np.full((len(self._slow), n), np.inf)
         self._action, self._outcome = np.zeros((q, n), np.int64), np.zeros((q, n), np.int64)
         self._took, self._beyond = np.zeros((q, n)), np.zeros((q, n), np.bool_)
-        self._odd: dict[tuple[str, str], set[int]] = {}
+        self._odd: dict[str, dict[str, set[int]]] = {}
         self._ways: dict[str, dict[str, int]] = {}
         names, actions = sorted(set((devices or {}).values())), structure.vocabulary.actions
         self._device_of = np.array(
@@ -134,31 +135,11 @@ class Play:
                 break
             self._grant()
             self._advance(self._wait())
-        return replace(
-            self._out,
-            endless=len(self._column),
-            beyond={
-                name: len(columns)
-                for (kind, name), columns in self._odd.items()
-                if kind == "beyond"
-            },
-            astray={
-                name: len(columns)
-                for (kind, name), columns in self._odd.items()
-                if kind == "astray"
-            },
-            barred={
-                name: len(columns)
-                for (kind, name), columns in self._odd.items()
-                if kind == "barred"
-            },
-            queued={
-                name: len(columns)
-                for (kind, name), columns in self._odd.items()
-                if kind == "queued"
-            },
-            ways=self._ways,
-        )
+        odd: dict[str, Any] = {
+            kind: {name: len(columns) for name, columns in by_name.items()}
+            for kind, by_name in self._odd.items()
+        }
+        return replace(self._out, endless=len(self._column), ways=self._ways, **odd)
 
     # --- one step -----------------------------------------------------------------------------
 
@@ -259,7 +240,8 @@ class Play:
 
     def _note_odd(self, kind: str, name: str, columns: Codes) -> None:
         if len(columns):
-            self._odd.setdefault((kind, name), set()).update(self._column[columns].tolist())
+            known = self._odd.setdefault(kind, {}).setdefault(name, set())
+            known.update(self._column[columns].tolist())
 
     def _start(self, q: int, columns: Codes) -> None:
         """Choose an action and draw how its run will end."""
@@ -273,21 +255,13 @@ class Play:
         action = codes[np.minimum(which, len(codes) - 1)]
         ends = self._drawer.ends(q, action, self._replicate[columns], self._seen.of(columns))
         status, taken = self._s.vocabulary.parts(ends.outcome)
-        self._phase[q, columns], self._status[q, columns], self._want[q, columns] = (
-            GOING,
-            status,
-            taken,
-        )
-        self._preempted[q, columns], self._end[q, columns] = (
-            ends.preempted,
-            self._now[columns] + ends.took,
-        )
-        self._action[q, columns], self._outcome[q, columns], self._took[q, columns] = (
-            action,
-            ends.outcome,
-            ends.took,
-        )
-        self._came[q, columns], self._beyond[q, columns] = self._now[columns], ends.beyond
+        now = self._now[columns]
+        self._phase[q, columns] = GOING
+        self._status[q, columns], self._want[q, columns] = status, taken
+        self._preempted[q, columns], self._outcome[q, columns] = ends.preempted, ends.outcome
+        self._came[q, columns], self._end[q, columns] = now, now + ends.took
+        self._action[q, columns], self._took[q, columns] = action, ends.took
+        self._beyond[q, columns] = ends.beyond
         device = self._device_of[action]
         self._device[q, columns], self._turn[q, columns] = device, 0
         waits = columns[device >= 0]

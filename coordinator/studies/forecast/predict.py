@@ -25,7 +25,7 @@ from petrobot.coordinator.studies.forecast.distributions import (
     RunDistributions,
     dependences,
 )
-from petrobot.coordinator.studies.forecast.history import Training, Values
+from petrobot.coordinator.studies.forecast.history import Codes, Training, Values
 from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
 from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
 from petrobot.coordinator.studies.forecast.residual import (
@@ -138,7 +138,7 @@ def _refuse_unmeasured(training: Training, choices: Choices, asked: list[str]) -
         ]
         if not any(q in entered for q in own):
             raise ValueError(
-                f"{primitive}: no training run entered {_listed(names.places[q] for q in own)}, "
+                f"{primitive}: no training run entered {', '.join(names.places[q] for q in own)}, "
                 "so nothing can be said about other choices there; leave it out of the choices, "
                 "or train with trials that get there"
             )
@@ -150,10 +150,6 @@ def _refuse_unmeasured(training: Training, choices: Choices, asked: list[str]) -
                         f"{primitive}: {action} was never run in {names.places[q]}, so nothing is "
                         "known of it; train with --selector random"
                     )
-
-
-def _listed(names: Any) -> str:
-    return ", ".join(names)
 
 
 def _never_entered(training: Training) -> list[str]:
@@ -229,7 +225,7 @@ def _law(times: Values, weights: Values, likeness: float = 1.0) -> dict[str, Any
     )
     return {
         "q": list(GRID),
-        "s": _rounded(s),
+        "s": [round(float(v), 6) for v in s],
         "trials": round(effective(weights) / likeness, 3),
         "likeness": round(likeness, 3),
     }
@@ -240,13 +236,11 @@ def _beside(training: Training, request: Request) -> dict[str, Any]:
     if request.net is False:
         return _net_told([], None, 0.0, [])
     try:
-        structure, measured_runs = Structure.of(training.task), RunDistributions(training)
-        played = _replayed(training, structure, measured_runs, request)
+        net = _SimulatedNet(training)
+        played = net.replayed(request.seed)
     except ValueError as fault:
         return _net_told([], None, 0.0, [f"the net was not simulated: {fault}"])
-    return _net_told(
-        residuals(training, played), measured_runs, played.endless / len(played.goals), []
-    )
+    return _net_told(residuals(training, played), net.runs, played.endless / len(played.goals), [])
 
 
 def _net_told(
@@ -268,17 +262,10 @@ def _net_told(
 
 
 def _from_net(training: Training, request: Request, random: np.random.Generator) -> dict[str, Any]:
-    structure, measured_runs = Structure.of(training.task), RunDistributions(training)
-    even = np.ones((1, len(training.trials)))
-    residual = (
-        residuals(training, _replayed(training, structure, measured_runs, request))
-        if training.whole
-        else []
-    )
-    whole = _played(
-        training, structure, measured_runs, request, even, np.zeros(request.point, np.int64), random
-    )
-    samples = _bootstrap(training, structure, measured_runs, request, random)
+    net = _SimulatedNet(training)
+    residual = residuals(training, net.replayed(request.seed)) if training.whole else []
+    whole = net.once(request.choices, request.point, random)
+    samples = net.bootstrap(request, random)
     point, n = figures(whole), len(training.trials)
     times = whole.time[whole.completed]
     law = _law(times, np.ones(len(times)))
@@ -296,9 +283,9 @@ def _from_net(training: Training, request: Request, random: np.random.Generator)
         ],
         **_net_told(
             residual,
-            measured_runs,
+            net.runs,
             whole.endless / request.point,
-            [*structure.assumptions, *([] if training.whole else [NO_TRIALS])],
+            [*net.structure.assumptions, *([] if training.whole else [NO_TRIALS])],
         ),
     }
 
@@ -319,76 +306,69 @@ def _net_time(value: float, samples: Values, runs: int, training: int) -> dict[s
     return time_figure(value, value + sd * SCORES, value + alone * both)
 
 
-def _played(
-    training: Training,
-    structure: Structure,
-    measured_runs: RunDistributions,
-    request: Request,
-    weights: Values,
-    replicate: np.ndarray,
-    random: np.random.Generator,
-) -> Played:
-    drawer = Drawer(measured_runs, training.waits, weights, random)
-    try:
-        longest = longest_of(training)
-        play = Play(structure, drawer, request.choices, replicate, longest, training.devices)
-        return play.run()
-    except KeyError as fault:
-        place, action = fault.args[0]
-        names = training.vocabulary
-        text = (
-            f"{names.places[place]}: no run of {names.actions[action - 1]} was measured; train "
-            "with more trials"
-        )
-        raise ValueError(text) from fault
+class _SimulatedNet:
+    """The task's net with the measured runs of one training."""
 
+    def __init__(self, training: Training) -> None:
+        """Raises ValueError for a net that cannot be simulated."""
+        self.structure, self.runs = Structure.of(training.task), RunDistributions(training)
+        self._training = training
+        # steps after which a simulated trial counts as endless
+        longest = max(len(trial.runs) + len(trial.waits) for trial in training.trials)
+        self._longest = 100 + 20 * longest
 
-def _replayed(
-    training: Training, structure: Structure, measured_runs: RunDistributions, request: Request
-) -> Played:
-    """Simulate four times as many trials as were run, with the choices of the training."""
-    n = len(training.trials)
-    own = Request(request.runs, choices_of(training), request.seed)
-    random = np.random.default_rng([request.seed, 1])
-    return _played(
-        training, structure, measured_runs, own, np.ones((1, n)), np.zeros(4 * n, np.int64), random
-    )
+    def played(
+        self, choices: Choices, weights: Values, replicate: Codes, random: np.random.Generator
+    ) -> Played:
+        """Play one trial for each entry of `replicate`, a row of `weights`. Raises ValueError for
+        what was never measured."""
+        drawer = Drawer(self.runs, self._training.waits, weights, random)
+        devices = self._training.devices
+        try:
+            return Play(self.structure, drawer, choices, replicate, self._longest, devices).run()
+        except KeyError as fault:
+            place, action = fault.args[0]
+            names = self._training.vocabulary
+            raise ValueError(
+                f"{names.places[place]}: no run of {names.actions[action - 1]} was measured; train "
+                "with more trials"
+            ) from fault
 
+    def once(self, choices: Choices, count: int, random: np.random.Generator) -> Played:
+        """Play `count` trials, all training trials counting alike."""
+        even = np.ones((1, len(self._training.trials)))
+        return self.played(choices, even, np.zeros(count, np.int64), random)
 
-def longest_of(training: Training) -> int:
-    """Return the number of steps after which a simulated trial counts as endless: 100 plus twenty
-    times the longest measured trial."""
-    return 100 + 20 * max(len(trial.runs) + len(trial.waits) for trial in training.trials)
+    def replayed(self, seed: int) -> Played:
+        """Play four times as many trials as were run, with the choices of the training."""
+        random = np.random.default_rng([seed, 1])
+        return self.once(choices_of(self._training), 4 * len(self._training.trials), random)
 
+    def bootstrap(self, request: Request, random: np.random.Generator) -> dict[str, Values]:
+        """Return the figures of `runs` new trials for resampled training trials.
 
-def _bootstrap(
-    training: Training,
-    structure: Structure,
-    measured_runs: RunDistributions,
-    request: Request,
-    random: np.random.Generator,
-) -> dict[str, Values]:
-    """Return the figures of `runs` new trials for resampled training trials.
-
-    Trials are resampled as a whole (cluster bootstrap), because the runs of one trial depend on
-    each other.
-    """
-    n = len(training.trials)
-    at_once = max(1, TOGETHER // request.runs)
-    found: dict[str, list[float]] = {name: [] for name in (*SHARES, *TIMES)}
-    for begin in range(0, request.replicates, at_once):
-        count = min(at_once, request.replicates - begin)
-        weights = random.multinomial(n, np.full(n, 1.0 / n), size=count).astype(np.float64)
-        replicate = np.repeat(np.arange(count), request.runs)
-        played = _played(training, structure, measured_runs, request, weights, replicate, random)
-        for b in range(count):
-            own = replicate == b
-            one = Played(
-                played.goals[own], played.completed[own], played.all_success[own], played.time[own]
-            )
-            for name, value in figures(one).items():
-                found[name].append(value)
-    return {name: np.array(values) for name, values in found.items()}
+        Trials are resampled as a whole (cluster bootstrap), because the runs of one trial depend on
+        each other.
+        """
+        n = len(self._training.trials)
+        at_once = max(1, TOGETHER // request.runs)
+        found: dict[str, list[float]] = {name: [] for name in (*SHARES, *TIMES)}
+        for begin in range(0, request.replicates, at_once):
+            count = min(at_once, request.replicates - begin)
+            weights = random.multinomial(n, np.full(n, 1.0 / n), size=count).astype(np.float64)
+            replicate = np.repeat(np.arange(count), request.runs)
+            played = self.played(request.choices, weights, replicate, random)
+            for b in range(count):
+                own = replicate == b
+                one = Played(
+                    played.goals[own],
+                    played.completed[own],
+                    played.all_success[own],
+                    played.time[own],
+                )
+                for name, value in figures(one).items():
+                    found[name].append(value)
+        return {name: np.array(values) for name, values in found.items()}
 
 
 def product_rule(training: Training, choices: Choices) -> dict[str, Any]:
@@ -416,7 +396,3 @@ def product_rule(training: Training, choices: Choices) -> dict[str, Any]:
             factors[names.places[q]] = round(r / whole, 6)
             value *= r / whole
     return {"R_conj": round(value, 6), "factors": factors}
-
-
-def _rounded(values: Values) -> list[float]:
-    return [round(float(v), 6) for v in values]

@@ -11,7 +11,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import beta, betabinom
+from scipy.stats import betabinom
+
+from petrobot.coordinator.learning.statistics import clopper_pearson
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -44,18 +46,15 @@ def _counts(value: float, weight: float) -> tuple[float, float]:
     return round(value * weight, 6), round((1.0 - value) * weight, 6)
 
 
-def confidence_interval(value: float, weight: float, level: float = 0.95) -> list[float]:
-    """Return the interval of the true share (C. J. Clopper and E. S. Pearson, Biometrika 26 (1934)
-    404-413); it holds at least its level."""
-    (yes, no), tail = _counts(value, weight), (1 - level) / 2
-    low = float(beta.ppf(tail, yes, no + 1)) if yes > 0 else 0.0
-    high = float(beta.isf(tail, yes + 1, no)) if no > 0 else 1.0
-    return [round(low, 6), round(high, 6)]
+def confidence_interval(value: float, weight: float) -> list[float]:
+    """Return the interval of the true share; it holds at least its level."""
+    yes, no = _counts(value, weight)
+    return [round(bound, 6) for bound in clopper_pearson(yes, yes + no)]
 
 
-def predictive_interval(value: float, weight: float, n: int, level: float = 0.95) -> list[float]:
+def predictive_interval(value: float, weight: float, n: int) -> list[float]:
     """Return the interval in which a share of n new trials is expected."""
-    (yes, no), tail = _counts(value, weight), (1 - level) / 2
+    (yes, no), tail = _counts(value, weight), 0.025
     low = float(betabinom.ppf(tail, n, yes, no + 1)) if yes > 0 else 0.0
     high = float(betabinom.ppf(1 - tail, n, yes + 1, no)) if no > 0 else float(n)
     return [round(low / n, 6), round(high / n, 6)]

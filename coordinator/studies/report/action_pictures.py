@@ -85,7 +85,7 @@ def recorded_curves(task: Task, records: Iterable[Record]) -> list[LearningCurve
 
 def _runs(task: Task, primitive: str, rows: Sequence[TrialRow]) -> Iterator[_Seen]:
     for k, row in enumerate(rows, 1):
-        for run in row.trial.runs if row.trial is not None else ():
+        for run in row.runs:
             if run.status and task.primitive_task_of(run.place).name == primitive:
                 yield k, run.action, run.status == Status.SUCCESS.value, run.cost
 

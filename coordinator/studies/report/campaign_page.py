@@ -83,7 +83,7 @@ class CombinationFigures:
 def combination_of(task: Task, row: TrialRow, names: Sequence[str]) -> dict[str, str]:
     """Return the actions of a trial's first runs."""
     out: dict[str, str] = {}
-    for run in row.trial.runs if row.trial is not None else ():
+    for run in row.runs:
         name = task.primitive_task_of(run.place).name
         if name in names:
             out.setdefault(name, run.action)
@@ -189,29 +189,18 @@ class CampaignReport:
             self._add("latencies", "Times", latency_svg(latencies))
 
     def _gantt(self) -> None:
-        block = next((row.block for row in self.rows if row.trial is not None), None)
-        chosen = [row for row in self.rows if row.block == block and row.trial is not None]
-        if chosen:
-            self._add(
-                "gantt",
-                f"Runs over time: first cell, seed {chosen[0].seed}",
-                gantt_svg(timeline_of(chosen)),
-            )
-        bad = next(
-            (
-                r
-                for r in self.rows
-                if r.trial and r.trial.status == Status.ERROR.value and r.block != block
-            ),
-            None,
-        )
-        if bad is not None:
-            same = [row for row in self.rows if row.block == bad.block and row.trial is not None]
-            self._add(
-                "gantt error",
-                f"Runs over time: a cell with an error, seed {bad.seed}",
-                gantt_svg(timeline_of(same)),
-            )
+        begun = [row for row in self.rows if row.trial is not None]
+        bad = [
+            row
+            for row in begun
+            if row.trial and row.trial.status == Status.ERROR.value and row.block != begun[0].block
+        ]
+        for name, words, row in (
+            *(("gantt", "first cell", row) for row in begun[:1]),
+            *(("gantt error", "a cell with an error", row) for row in bad[:1]),
+        ):
+            cell = timeline_of([one for one in begun if one.block == row.block])
+            self._add(name, f"Runs over time: {words}, seed {row.seed}", gantt_svg(cell))
 
     # --- page ---------------------------------------------------------------------------------
 
@@ -287,7 +276,7 @@ class CampaignReport:
         counts: dict[tuple[str, str, str, str, str], int] = {}
         first: dict[tuple[str, str, str, str, str], TrialRow] = {}
         for row in self.rows:
-            for run in row.trial.runs if row.trial is not None else ():
+            for run in row.runs:
                 key = (row.regime, run.place, run.action, run.status or "none", run.cause)
                 counts[key] = counts.get(key, 0) + 1
                 first.setdefault(key, row)
@@ -351,7 +340,7 @@ def timeline_of(rows: Sequence[TrialRow]) -> Timeline:
     """Return the runs of a mission run as bars of a timeline."""
     made = Timeline()
     for row in rows:
-        for i, run in enumerate(row.trial.runs if row.trial is not None else ()):
+        for i, run in enumerate(row.runs):
             assert row.trial is not None
             begun = row.trial.begun + run.begun
             key = f"{run.place} of run {row.k}" + (f" ({i})" if i else "")

@@ -278,7 +278,7 @@ def _sums(task: Task, name: str, rows: Sequence[TrialRow]) -> Sums:
     """Return the sums of a primitive task."""
     out = np.zeros((4, len(rows)))
     for i, row in enumerate(rows):
-        for run in row.trial.runs if row.trial is not None else ():
+        for run in row.runs:
             if run.status and task.primitive_task_of(run.place).name == name:
                 known = run.cost is not None
                 out[:, i] += (1.0, run.status == Status.SUCCESS.value, run.cost or 0.0, known)
@@ -301,7 +301,7 @@ def cost_weight(task: Task, name: str, rows: Iterable[TrialRow]) -> float:
     without costs."""
     costs: dict[str, list[float]] = {}
     for row in rows:
-        for run in row.trial.runs if row.trial is not None else ():
+        for run in row.runs:
             if (
                 run.status
                 and run.cost is not None

@@ -34,7 +34,6 @@ FLIGHT = 0.4
 """s of a token's way to a transition and on to the next place."""
 SAME = 1e-3
 """s by which the times of two firings may differ: a journal rounds them."""
-PAPER = 255
 
 
 class NoFilmError(ValueError):
@@ -67,7 +66,7 @@ def images(
     _refuse_other(found, timeline.firings, origin)
     for now, marking, worlds in drawn:
         net = _net(task, marking, now - origin, timeline.firings)
-        yield _stacked([_image(svg, width) for svg in (*worlds, net)])
+        yield np.vstack([_image(svg, width) for svg in (*worlds, net)])
 
 
 def _refuse_other(found: Recorded, firings: Sequence[Firing], origin: float) -> None:
@@ -117,10 +116,6 @@ def _image(svg: str, width: int) -> Picture:
     height = round(whole.shape[0] * width / whole.shape[1])
     size = (width, height)
     return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def _stacked(pictures: Sequence[Picture]) -> Picture:
-    return np.vstack(pictures)
 
 
 def refuse_file(path: Path) -> None:

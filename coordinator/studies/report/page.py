@@ -15,46 +15,27 @@ from petrobot.coordinator.task import Status
 # Series: the palette of M. Okabe and K. Ito (2008), distinguishable with colour blindness, the
 # yellow darkened for white paper.
 
-LIGHT: Mapping[str, str] = {
-    "ink": "#1b1f24",
-    "soft": "#5b6570",
-    "line": "#d7dce1",
-    "paper": "#ffffff",
-    "panel": "#f5f7f9",
-    "success": "#1a7f4b",
-    "failure": "#b7791f",
-    "error": "#c0362c",
-    "none": "#7a8794",
-    "series-1": "#0072b2",
-    "series-2": "#d55e00",
-    "series-3": "#009e73",
-    "series-4": "#cc79a7",
-    "series-5": "#e69f00",
-    "series-6": "#56b4e9",
-    "series-7": "#7a6a00",
-    "series-8": "#555555",
+COLOURS: Mapping[str, tuple[str, str]] = {
+    "ink": ("#1b1f24", "#e8ecf0"),
+    "soft": ("#5b6570", "#9aa6b2"),
+    "line": ("#d7dce1", "#343b43"),
+    "paper": ("#ffffff", "#14181c"),
+    "panel": ("#f5f7f9", "#1d2329"),
+    "success": ("#1a7f4b", "#43b97f"),
+    "failure": ("#b7791f", "#e0a94a"),
+    "error": ("#c0362c", "#ef6f64"),
+    "none": ("#7a8794", "#8794a1"),
+    "series-1": ("#0072b2", "#3fa0dc"),
+    "series-2": ("#d55e00", "#ec7a2c"),
+    "series-3": ("#009e73", "#21b98d"),
+    "series-4": ("#cc79a7", "#d992ba"),
+    "series-5": ("#e69f00", "#e69f00"),
+    "series-6": ("#56b4e9", "#8accf2"),
+    "series-7": ("#7a6a00", "#b9a52e"),
+    "series-8": ("#555555", "#a0a0a0"),
 }
-"""Colours by day, and of every picture that is a file of its own."""
-DARK: Mapping[str, str] = {
-    "ink": "#e8ecf0",
-    "soft": "#9aa6b2",
-    "line": "#343b43",
-    "paper": "#14181c",
-    "panel": "#1d2329",
-    "success": "#43b97f",
-    "failure": "#e0a94a",
-    "error": "#ef6f64",
-    "none": "#8794a1",
-    "series-1": "#3fa0dc",
-    "series-2": "#ec7a2c",
-    "series-3": "#21b98d",
-    "series-4": "#d992ba",
-    "series-5": "#e69f00",
-    "series-6": "#8accf2",
-    "series-7": "#b9a52e",
-    "series-8": "#a0a0a0",
-}
-"""Colours by night."""
+LIGHT, DARK = ({name: pair[i] for name, pair in COLOURS.items()} for i in (0, 1))
+"""Colours by day, and of every picture that is a file of its own; and colours by night."""
 SERIES = tuple(name for name in LIGHT if name.startswith("series"))
 
 

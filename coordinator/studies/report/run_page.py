@@ -247,12 +247,10 @@ class ObservedRun:
     def _note(self, records: Sequence[Record]) -> None:
         """Record the probabilities after each trial that ended."""
         for record in records:
-            selector = (
-                None
-                if not isinstance(record, RunEnd)
-                else self._selector.learning.selectors.get(record.primitive_task)
-            )
-            if selector is None or not isinstance(record, RunEnd) or record.outcome.status is None:
+            if not isinstance(record, RunEnd) or record.outcome.status is None:
+                continue
+            selector = self._selector.learning.selectors.get(record.primitive_task)
+            if selector is None:
                 continue
             curves = self._probability.setdefault((record.primitive_task, record.context), {})
             for action, p in selector.learned(record.context).items():

@@ -153,7 +153,6 @@ class OpcUaSession(Driver):
         return rest and "session" not in self.faults
 
     def close(self) -> None:
-        """End the session."""
         self._session.close(self.patience)
 
     # --- the session's thread -------------------------------------------------------------------

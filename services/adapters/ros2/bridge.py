@@ -41,7 +41,6 @@ class Bridge(TopicDriver):
 
     @property
     def connected(self) -> bool:
-        """Whether there is a connection to rosbridge."""
         return self.link.up
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
@@ -154,5 +153,4 @@ class Bridge(TopicDriver):
         return super().stopped() and not any(one.phase in MOVING for one in goals)
 
     def close(self) -> None:
-        """Close the connection."""
         self.link.close()

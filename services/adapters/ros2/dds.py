@@ -144,7 +144,6 @@ class Topics(TopicDriver):
         super().step(now)
 
     def close(self) -> None:
-        """Leave the domain."""
         self._writers.clear()
         self._readers.clear()
         del self._participant

@@ -237,7 +237,6 @@ class TopicDriver(Driver):
         return super().hold(now)
 
     def release(self, now: float) -> None:
-        """Forward set points again."""
         self.paused = False
 
 

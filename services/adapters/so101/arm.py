@@ -199,7 +199,6 @@ class Arm(Driver):
     # --- commands -------------------------------------------------------------------------------
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Obey a command. Raises ValueError for one that the arm must not follow."""
         do = body.get("do")
         known = {
             "move": self._move, "open": self._open, "close": self._close, "free": self._free,
@@ -430,7 +429,6 @@ class Arm(Driver):
         return "held"
 
     def release(self, now: float) -> None:
-        """Move on."""
         self.motion.paused = self.jaw.paused = False
 
     def state(self) -> Mapping[str, Any]:

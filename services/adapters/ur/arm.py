@@ -118,7 +118,6 @@ class Arm(Driver):
     # Commands
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Obey a command. Raises ValueError if it is unknown or cannot be obeyed now."""
         what = body.get("do")
         if what == "enable":
             self._wanted, self._fault, self._reason, self._ask_at = True, "", "", now
@@ -284,7 +283,6 @@ class Arm(Driver):
         return "held"
 
     def release(self, now: float) -> None:
-        """End the pause."""
         self._motion.paused = False
 
     def close(self) -> None:

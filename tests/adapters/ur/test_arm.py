@@ -13,7 +13,13 @@ from petrobot import ByteLine, Driver, Ports, check_driver, rehearse
 from petrobot.services.adapters.ur import actions
 from petrobot.services.adapters.ur.arm import PROGRAM, Arm
 from petrobot.services.comm.streams.line import TcpConnection
-from petrobot.sim.bus.ur_controller import RUNNING, ControllerSession, UrController, UrServer
+from petrobot.sim.bus.ur_controller import (
+    NORMAL,
+    RUNNING,
+    ControllerSession,
+    UrController,
+    UrServer,
+)
 
 HOME = [0.0, -1.57, 1.57, -1.57, -1.57, 0.0]
 THERE = [0.8, *HOME[1:]]
@@ -206,7 +212,8 @@ def test_a_stop_of_the_controller_is_a_fault_until_it_is_enabled_again(
     at = list(cell.controller.q)
     cell.run(2.0)
     assert cell.controller.q == pytest.approx(at, abs=1e-6) and cell.arm.stopped()
-    cell.controller.release_emergency() if fault == "emergency_stop" else None
+    if fault == "emergency_stop":
+        cell.controller.safety_mode = NORMAL  # the mushroom button is turned back
     assert cell.enabled().go(joints=THERE)
 
 

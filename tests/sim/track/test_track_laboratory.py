@@ -20,7 +20,7 @@ from petrobot.services.comm.protocol.messages import Outcome
 from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.laboratory_party import SERVICES
 from petrobot.sim.track.course import Track
-from petrobot.sim.track.laboratory import ROVER_FAULTS, TrackLaboratory, make_laboratory
+from petrobot.sim.track.laboratory import TrackLaboratory, make_laboratory
 from petrobot.sim.track.truth import TrackSite, read_track_site
 
 Bench = Callable[..., Any]
@@ -288,7 +288,7 @@ def test_a_rover_that_leaves_the_board_gets_no_power_before_the_next_experiment(
 
 def test_every_fault_can_be_requested(rover_bench: Bench) -> None:
     bench = prepared(rover_bench)
-    for kind, keys in ROVER_FAULTS.keys.items():
+    for kind, keys in TrackLaboratory.fault_kinds.keys.items():
         arguments = {"joint": 1} if "joint" in keys else {}
         assert (
             bench.call("laboratory_fault", kind=kind, after=100.0, **arguments).status == "success"

@@ -10,7 +10,7 @@ import json
 import os
 import signal
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from math import isfinite
 from pathlib import Path
 
@@ -278,7 +278,7 @@ def test_the_memory_of_a_block_is_freed_before_the_next_one(
     def orders() -> Iterator[str]:
         yield json.dumps(toy_plan.to_plain())
         for block in toy_plan.blocks:
-            yield json.dumps({"block": block.to_plain(), "weights": []})
+            yield json.dumps({"block": asdict(block), "weights": []})
             left.append(gc.collect())
 
     monkeypatch.setattr(
@@ -536,7 +536,7 @@ async def test_a_child_of_a_dead_worker_does_not_hide_its_death(
     )
     program.chmod(0o755)
     monkeypatch.setattr("sys.executable", str(program))
-    order = {"block": toy_plan.blocks[0].to_plain(), "weights": []}
+    order = {"block": asdict(toy_plan.blocks[0]), "weights": []}
     async with asyncio.timeout(60.0), LocalPool(toy_plan, 1, tmp_path / "log") as pool:
         with pytest.raises(CampaignError, match="3 workers ended"):
             await pool.run(order)

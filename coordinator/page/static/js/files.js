@@ -1,7 +1,7 @@
 // Task files on the server: open, save with revision, resolve a conflict with both versions in view, import and export.
 
-import { openDialog } from "./dialog.js";
-import { fill, h, words } from "./dom.js";
+import { askDialog, askValue, openDialog } from "./dialog.js";
+import { h, words } from "./dom.js";
 import { toast } from "./toast.js";
 
 const STOP_ANSWER_MS = 4000; // by then all devices have come to rest, or the operator must know that they may not
@@ -115,25 +115,17 @@ function differences(left, right) {
 }
 
 function settle(name, { yours, theirs }) {
-  return new Promise((resolve) => {
-    const done = (choice) => {
-      dialog.close();
-      resolve(choice);
-    };
-    const rows = differences(theirs.text, yours);
-    const near = rows.map((_, i) => rows.slice(Math.max(0, i - 2), i + 3).some((r) => r[2]));
-    const cell = (line, changed, side) => h("td", { class: changed && line !== null ? side : "" }, line ?? "");
-    const dialog = h("dialog", { class: "conflict", "aria-label": "Conflict" },
-      h("h2", {}, `${name} was changed elsewhere since you opened it`),
-      h("p", { class: "muted" }, "Nothing has been written. These are the lines that differ."),
-      h("div", { class: "sides" }, h("table", {}, h("thead", {}, h("tr", {}, h("th", {}, "On the server"), h("th", {}, "Yours"))), h("tbody", {}, rows.filter((_, i) => near[i]).map(([l, r, changed]) => h("tr", {}, cell(l, changed, "theirs"), cell(r, changed, "yours")))))),
-      h("div", { class: "buttons" },
-        h("button", { type: "button", class: "small", onclick: () => done(null) }, "Keep editing"),
-        h("button", { type: "button", class: "small", onclick: () => done("theirs") }, "Discard mine, load theirs"),
-        h("button", { type: "button", class: "command danger", onclick: () => done("yours") }, "Replace theirs by mine")));
-    dialog.addEventListener("cancel", () => done(null));
-    openDialog(dialog);
-  });
+  const rows = differences(theirs.text, yours);
+  const near = rows.map((_, i) => rows.slice(Math.max(0, i - 2), i + 3).some((r) => r[2]));
+  const cell = (line, changed, side) => h("td", { class: changed && line !== null ? side : "" }, line ?? "");
+  return askDialog({ class: "conflict", "aria-label": "Conflict" }, (end) => [
+    h("h2", {}, `${name} was changed elsewhere since you opened it`),
+    h("p", { class: "muted" }, "Nothing has been written. These are the lines that differ."),
+    h("div", { class: "sides" }, h("table", {}, h("thead", {}, h("tr", {}, h("th", {}, "On the server"), h("th", {}, "Yours"))), h("tbody", {}, rows.filter((_, i) => near[i]).map(([l, r, changed]) => h("tr", {}, cell(l, changed, "theirs"), cell(r, changed, "yours")))))),
+    h("div", { class: "buttons" },
+      h("button", { type: "button", class: "small", onclick: () => end(null) }, "Keep editing"),
+      h("button", { type: "button", class: "small", onclick: () => end("theirs") }, "Discard mine, load theirs"),
+      h("button", { type: "button", class: "command danger", onclick: () => end("yours") }, "Replace theirs by mine"))]);
 }
 
 function download(name, content, type) {
@@ -214,25 +206,14 @@ function showPicture(title, name, svg) {
     sheet, h("div", { class: "buttons" }, size,
       h("button", { type: "button", class: "small", onclick: () => download(`${name}.gspn.svg`, svg, "image/svg+xml") }, "Save"),
       h("button", { type: "button", class: "small", onclick: () => dialog.close() }, "Close")));
-  dialog.addEventListener("cancel", () => dialog.close());
   dialog.addEventListener("close", () => URL.revokeObjectURL(address));
   openDialog(dialog);
 }
 
 /** Ask for a name; null when it was cancelled. */
 export function askName(title, value) {
-  return new Promise((resolve) => {
-    const input = h("input", { value, "aria-label": "Name", pattern: "[A-Za-z0-9_][A-Za-z0-9_\\-]{0,63}", required: true });
-    const end = (result) => {
-      dialog.close();
-      resolve(result);
-    };
-    const form = h("form", { method: "dialog", onsubmit: (e) => { e.preventDefault(); end(input.value.trim()); } },
-      h("h2", {}, title), h("p", { class: "muted" }, "Letters, digits, _ and - ."), input,
-      h("div", { class: "buttons" }, h("button", { type: "button", class: "small", onclick: () => end(null) }, "Cancel"), h("button", { type: "submit", class: "command primary" }, "OK")));
-    const dialog = fill(h("dialog", { "aria-label": title }), form);
-    dialog.addEventListener("cancel", () => end(null));
-    openDialog(dialog);
-    input.select();
-  });
+  const input = h("input", { value, "aria-label": "Name", pattern: "[A-Za-z0-9_][A-Za-z0-9_\\-]{0,63}", required: true });
+  const answer = askValue(title, input, h("p", { class: "muted" }, "Letters, digits, _ and - ."));
+  input.select();
+  return answer;
 }

@@ -30,7 +30,6 @@ export class Link {
     this.behind = false; // changes are missing, and a snapshot has been asked for
     this.gaps = 0;
     this.deltas = 0;
-    this.lastPaint = 0;
     this.receivedAt = 0;
     this.painted = painted;
     this.waiting = [];

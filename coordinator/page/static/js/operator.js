@@ -25,7 +25,7 @@ const HELD_WORD = { held: "held", cannot_hold: "cannot hold", stopped: "stopped"
 /** What a pause was answered by each node, for people. */
 const heldWords = (nodes) => Object.entries(nodes ?? {}).map(([node, answer]) => `${node}: ${HELD_WORD[answer] ?? answer}`).join(", ");
 
-export const stateOf = (state) => (state.paused && ["running", "stopping"].includes(state.mission.state) ? "paused" : state.mission.state);
+const stateOf = (state) => (state.paused && ["running", "stopping"].includes(state.mission.state) ? "paused" : state.mission.state);
 const stateWord = (state) => STATE_WORD[stateOf(state)] ?? words(stateOf(state));
 
 export class Operator {

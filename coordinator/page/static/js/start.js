@@ -44,7 +44,6 @@ function formDialog(title, label, content, values, send) {
   } }, h("h2", {}, title), content,
   h("div", { class: "foot" }, fault, h("div", { class: "buttons" }, h("button", { type: "button", class: "small", onclick: () => dialog.close() }, "Cancel"), submit)));
   const dialog = fill(h("dialog", { "aria-label": title }), form);
-  dialog.addEventListener("cancel", () => dialog.close());
   openDialog(dialog);
   return dialog;
 }

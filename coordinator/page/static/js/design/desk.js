@@ -1,6 +1,6 @@
 // The open task file: open, new, save, import and export; unsaved work is never lost.
 
-import { openDialog } from "../dialog.js";
+import { askDialog } from "../dialog.js";
 import { h } from "../dom.js";
 import { askName, exportAs, importNet, listTasks, openTask, revisionOf, saveTask } from "../files.js";
 import { toast } from "../toast.js";
@@ -82,16 +82,9 @@ export class Desk {
   mayLeave() {
     if (!this.model.dirty) return Promise.resolve(true);
     const question = "Leave without saving?";
-    return new Promise((resolve) => {
-      const end = (answer) => {
-        dialog.close();
-        resolve(answer);
-      };
-      const dialog = h("dialog", { "aria-label": question }, h("h2", {}, question), h("p", { class: "muted" }, "There are changes that are not saved."),
-        h("div", { class: "buttons" }, h("button", { type: "button", class: "small", onclick: () => end(false) }, "Stay"), h("button", { type: "button", class: "command danger", onclick: () => end(true) }, "Leave")));
-      dialog.addEventListener("cancel", () => end(false));
-      openDialog(dialog);
-    });
+    return askDialog({ "aria-label": question }, (end) => [
+      h("h2", {}, question), h("p", { class: "muted" }, "There are changes that are not saved."),
+      h("div", { class: "buttons" }, h("button", { type: "button", class: "small", onclick: () => end(null) }, "Stay"), h("button", { type: "button", class: "command danger", onclick: () => end(true) }, "Leave"))]);
   }
 
   /** Notice that the file was edited by another program or person since it was opened here. */

@@ -155,7 +155,6 @@ export class KeyHelp {
     const dialog = h("dialog", { class: "key-help", "aria-label": "Keyboard" }, h("h2", {}, "Keyboard"),
       h("dl", {}, LIST.map(([keys, what]) => h("div", {}, h("dt", {}, keys), h("dd", {}, what)))),
       h("div", { class: "buttons" }, h("button", { type: "button", class: "command primary", onclick: () => dialog.close() }, "Close")));
-    dialog.addEventListener("cancel", () => dialog.close());
     openDialog(dialog);
   }
 }

@@ -68,11 +68,6 @@ export class Model {
     return result;
   }
 
-  endGroup() {
-    const last = this.past.at(-1);
-    if (last) last.group = null;
-  }
-
   undo() {
     return this.swap(this.past, this.future);
   }
