@@ -5,7 +5,7 @@ Markov chain, and in missions that the engine plays by a clock."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import exp, sqrt
+from math import exp, log, sqrt
 
 import numpy as np
 import pytest
@@ -554,6 +554,9 @@ lost = { in = ["work:error"], out = ["ready"] }
         found = forecast(stochastic_view(task))
         assert found.done.mean == pytest.approx(tokens * (4.0 + 1.5))
         assert found.one_trial.done.mean == pytest.approx(1.5)
+        # (exp(-t / 2) + exp(-t)) / 2 = 0.1
+        late = -2 * log((sqrt(1.8) - 1) / 2)
+        assert found.one_trial.completion_time().quantile(0.9) == pytest.approx(late)
 
 
 def test_a_figure_that_the_execution_graph_contradicts_is_doubtful() -> None:
