@@ -27,7 +27,7 @@ from petrobot.coordinator.analysis.net.ends_net import ends_net
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.picture import graph_svg
 from petrobot.coordinator.analysis.net.space import EngineName, SearchLimits, explore
-from petrobot.coordinator.analysis.report import CUT, Analysis, analyse
+from petrobot.coordinator.analysis.report import CUT, FULL, LATE, Analysis, analyse
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
 from petrobot.coordinator.analysis.time.measures import Measure as UserMeasure
@@ -113,7 +113,8 @@ def analyse_command(
     span = limits.seconds / analyses if limits.seconds is not None else None
     due = None if span is None else began + analyses * span
     try:
-        model = open_model(path, load_task)
+        with until(due, clock):
+            model = open_model(path, load_task)
         view = view or _view(model, rates)
         subject, name, notes = _subject(model, rates, view)
         cell = _cell(model, cell_of)
@@ -165,7 +166,7 @@ def analyse_command(
     except (NetFileError, ValueError, OverflowError) as error:
         return CommandResult(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
     except OutOfTime as late:  # the input is good, and the answer is not known
-        told = f"{_named(path, late)}; give more --seconds, or fewer --states"
+        told = f"{_named(path, late)}; give more --seconds"
         return CommandResult(FAULT, told, {"error": told})
     except MemoryError:
         told = f"{path}: the memory was used up; give more --memory, or fewer --states"
@@ -218,15 +219,18 @@ def _tokens_of(net: Net, changes: Sequence[Change]) -> list[Change]:
 def _told(found: Analysis, structure: bool) -> tuple[Analysis, dict[str, Any], list[str]]:
     """Return the analysis with its data and text.
 
-    Structure and the distribution of the completion time are computed only now, so Ctrl-C may
-    arrive here, or the time limit be reached: then the forecast is left out.
+    Structure, the verdicts of progress and the distribution of the completion time are computed
+    only now, so Ctrl-C may arrive here, or time or memory be used up: then the forecast is left
+    out, and what is not known stays unknown.
     """
     try:
         return found, found.to_json(structure=structure), [found.text()]
     except KeyboardInterrupt:
         note, cut = CUT, True
-    except OutOfTime as late:
-        note, cut = f"no forecast: {late}", found.interrupted
+    except OutOfTime:
+        note, cut = LATE, found.interrupted
+    except MemoryError:
+        note, cut = FULL, found.interrupted
     notes = tuple(dict.fromkeys((*found.notes, note)))
     part = replace(found, interrupted=cut, forecast=None, notes=notes)
     return part, part.to_json(structure=False), [part.text()]

@@ -17,7 +17,7 @@ from petrobot.coordinator.analysis.execution.progress import (
     Recovery,
     progress_of,
 )
-from petrobot.coordinator.analysis.limits import OutOfTime
+from petrobot.coordinator.analysis.limits import OutOfTime, overtime
 from petrobot.coordinator.analysis.net.coverability import Coverability, coverability, find_pump
 from petrobot.coordinator.analysis.net.deadlocks import (
     PlaceSets,
@@ -171,12 +171,24 @@ class Analysis:
         firings."""
         return self.progress.by_hand(min(self.steps // 3, BY_HAND)) if self.progress else []
 
+    @cached_property
+    def told(self) -> tuple[str, ...]:
+        """The notes, with one if the time was used up before the error exits were judged."""
+        p = self.progress
+        waiting = p is not None and p.x.complete and p.view.error_exits and not p.recoveries
+        late = (LATE,) if waiting and overtime() else ()
+        return tuple(dict.fromkeys((*self.notes, *late)))
+
     @property
     def ok(self) -> bool:
-        """Whether it is known that nothing speaks against running the task."""
+        """Whether it is known that nothing speaks against running the task. It is not known if time
+        or memory was used up before a verdict."""
         named = self.verdicts()
         known = ("bounded", "deadlock_free", "one_run_each")
-        return not self.objections and all(named[n].holds for n in known if n in named)
+        judged = self.progress is not None and self.progress.x.complete
+        stopped = judged or {LATE, FULL}.intersection(self.notes)
+        open_ = stopped and any(verdict.holds is None for verdict in named.values())
+        return not (self.objections or open_) and all(named[n].holds for n in known if n in named)
 
     @cached_property
     def odds(self) -> Odds:
@@ -261,7 +273,7 @@ class Analysis:
             "sound": named["sound"].holds if "sound" in named else None,
             "execution": self.progress.size() if self.progress else None,
             "verdicts": {name: verdict.to_json() for name, verdict in named.items()},
-            "notes": [*self.notes, *map(_by_hand, self.by_hand)],
+            "notes": [*self.told, *map(_by_hand, self.by_hand)],
         }
         if structure:
             out["structure"] = self.structure.to_json()
@@ -379,7 +391,7 @@ class Analysis:
             else []
         )
         lines += self._number_lines()
-        lines += [f"note: {note}" for note in self.notes]
+        lines += [f"note: {note}" for note in self.told]
         lines += ["note: only if the operator moves tokens:"] if self.by_hand else []
         for verdict in self.by_hand:
             lines += [f"  {verdict.reason}", *(f"    {line}" for line in verdict.details)]
@@ -472,29 +484,38 @@ def analyse(
 LOOK = 10_000
 """Markings after which boundedness is checked, before the search continues to its limits."""
 ENDLESS = "the net is unbounded"
-FULL = "the memory was used up: verdicts from the first markings only; give more --memory"
-LATE = "the time was used up: verdicts from the first markings only; give more --seconds"
+FULL = (
+    "the memory was used up: what was found by then holds, the rest is unknown; give more --memory"
+)
+LATE = (
+    "the time was used up: what was found by then holds, the rest is unknown; give more --seconds"
+)
 CUT = "Ctrl-C: a partial result, from what had been found by then"
+STOPPED = {INTERRUPTED: CUT, "memory limit": FULL, "time limit": LATE}
+"""What ended an analysis before its end, and the note that says so."""
 
 
 def _search(
-    net: Net, limits: SearchLimits | None, engine: EngineName
-) -> tuple[Space, Coverability | None]:
-    """Return the space within the limits. A net that is proven unbounded is searched only up to
-    LOOK markings."""
-    limits = limits or SearchLimits()
+    net: Net, limits: SearchLimits | None, engine: EngineName, found: list[Space]
+) -> Coverability | None:
+    """Append the space within the limits to `found`, and before it the first part of a large one.
+
+    A net that is proven unbounded is searched only up to LOOK markings.
+    """
+    limits, cover = limits or SearchLimits(), None
     if limits.states is None or limits.states > LOOK:
         first = explore(net, limits=replace(limits, states=LOOK), engine=engine)
+        found.append(first)
         if first.complete or len(first) < LOOK:
-            return first, None
+            return None
         proven = place_bounds(net)
         cover = coverability(net, bounds=proven) if None in proven else None
-        if cover is not None and cover.bounded is False:
-            return replace(first, reason=ENDLESS), cover
-        if cover is not None and cover.bounded is None and find_pump(first) is not None:
-            return replace(first, reason=ENDLESS), cover
-        return explore(net, limits=limits, engine=engine), cover
-    return explore(net, limits=limits, engine=engine), None
+        open_ = cover is not None and cover.bounded is None and find_pump(first) is not None
+        if cover is not None and (cover.bounded is False or open_):
+            found.append(replace(first, reason=ENDLESS))
+            return cover
+    found.append(explore(net, limits=limits, engine=engine))
+    return cover
 
 
 def _examined(
@@ -504,21 +525,27 @@ def _examined(
     notes: list[str],
     judge: Callable[..., Qualitative] = examine,
 ) -> Qualitative:
-    """Return all verdicts by `judge`; after Ctrl-C only the quick ones, and add a note."""
-    space: Space | None = None
-    reason = INTERRUPTED
+    """Return all verdicts by `judge`. After Ctrl-C, or if time or memory is used up, add a note and
+    return those that what was found by then proves."""
+    found, reason = list[Space](), INTERRUPTED
     try:
-        space, cover = _search(net, limits, engine)
-        if space.reason != INTERRUPTED:
-            return judge(space, cover=cover)
+        cover = _search(net, limits, engine, found)
+        if found[-1].reason != INTERRUPTED:
+            return judge(found[-1], cover=cover)
     except KeyboardInterrupt:
-        space = space or explore(net, limits=SearchLimits(states=1))
+        pass
     except MemoryError:
-        space, reason = explore(net, limits=SearchLimits(states=LOOK)), "memory limit"
+        reason = "memory limit"
     except OutOfTime:
-        space, reason = explore(net, limits=SearchLimits(states=LOOK)), "time limit"
-    notes.append({INTERRUPTED: CUT, "memory limit": FULL}.get(reason, LATE))
-    return judge(replace(space, complete=False, reason=reason), in_haste=True)
+        reason = "time limit"
+    notes.append(STOPPED[reason])
+    while found:
+        try:
+            return judge(replace(found[-1], reason=reason), in_haste=True)
+        except MemoryError:
+            found.pop()
+    start = explore(net, limits=SearchLimits(states=1), engine="integers")
+    return judge(replace(start, complete=False, reason=reason), in_haste=True)
 
 
 def _long_run(
@@ -552,7 +579,7 @@ def _analyse_task(
     found = _examined(n.net, limits, engine, notes, partial(judged, n))
     progress = None
     shown: Mapping[str, PropertyVerdict] = {}
-    why = "the analysis was interrupted"
+    why = "the analysis was stopped before"
     try:
         if not notes:
             # An unbounded net seldom has a finite execution graph, but its dead ends may be near.

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 EXAMPLE = "petrobot analyse catch_ball --view gspn --what-if locate_ball.error.share=0.01"
 TOLD_EVERY, TOLD_AFTER = 0.5, 2.0
 """Seconds between two lines of progress; the first appears after as long."""
+MEMORY = 2 << 30
+"""The most bytes of a command that has no option for it."""
 REASON_LETTERS = 150
 """Longest reason that is written below a picture (characters); the rest is cut."""
 
@@ -71,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--memory",
         type=whole(),
-        default=2048,
+        default=MEMORY >> 20,
         metavar="MIB",
         help="most memory (default: %(default)s)",
     )
@@ -176,7 +178,7 @@ LEAST = 64 << 20
 
 
 @contextmanager
-def bounded_memory(most: int) -> Iterator[None]:
+def bounded_memory(most: int = MEMORY) -> Iterator[None]:
     """Limit this process to this many bytes; beyond them Python raises MemoryError.
 
     The system counts private writable mappings (RLIMIT_DATA, setrlimit(2)), which is what numpy

@@ -15,8 +15,6 @@ from petrobot.coordinator.cli.loading import (
 )
 
 EXAMPLE = "petrobot convert catch_ball catch_ball.pnml"
-MEMORY = 2 << 30
-"""The most bytes of a conversion: a chain (`.drn`) may be far larger than its net."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
     from petrobot.coordinator.cli.analyse import bounded_memory, give
     from petrobot.coordinator.task.file import load
 
-    with bounded_memory(MEMORY):
+    with bounded_memory():  # a chain (`.drn`) may be far larger than its net
         found = convert_command(
             task_path(options.source),
             options.target,

@@ -65,14 +65,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Draw the picture and write it."""
+    from petrobot.coordinator.cli.analyse import bounded_memory
+
     _refuse_idle(options)
-    svg = (
-        _graph(options.task)
-        if options.graph
-        else _gspn(options)
-        if options.view == "gspn"
-        else _net(options)
-    )
+    drawn = _graph if options.graph else _gspn if options.view == "gspn" else _net
+    try:
+        with bounded_memory():
+            svg = drawn(options)
+    except MemoryError as fault:
+        text = f"{options.task}: the memory was used up; the net is too large for this drawing"
+        raise CommandError(2, text) from fault
     if options.out == "-":
         print(svg)
         return 0
@@ -156,11 +158,11 @@ def _heat(task: Task, options: argparse.Namespace) -> Overlay:
     return Overlay(heat=shares, legend=told)
 
 
-def _graph(name: str) -> str:
+def _graph(options: argparse.Namespace) -> str:
     from petrobot.coordinator.analysis.commands import graph_command
     from petrobot.coordinator.task.file import load
 
-    outcome = graph_command(task_path(name), load)
+    outcome = graph_command(task_path(options.task), load)
     if outcome.code:
         raise CommandError(outcome.code, outcome.text)
     return str(outcome.data["svg"])

@@ -68,7 +68,7 @@ def run(options: argparse.Namespace) -> int:
     import numpy as np
 
     from petrobot.coordinator.analysis.commands import simulate_command
-    from petrobot.coordinator.cli.analyse import give
+    from petrobot.coordinator.cli.analyse import bounded_memory, give
     from petrobot.coordinator.task.file import load
 
     random = np.random.default_rng(options.seed)
@@ -80,4 +80,6 @@ def run(options: argparse.Namespace) -> int:
     given["changes"] = options.what_if
     given["measure"] = measurements(options.estimates)
     given["cell_of"] = cell_finder(options.services, options.file)
-    return give(simulate_command(task_path(options.file), load, random, **given), options.json)
+    with bounded_memory():
+        found = simulate_command(task_path(options.file), load, random, **given)
+    return give(found, options.json)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from math import inf
 
 from petrobot.coordinator.engine.draft import Draft
@@ -122,18 +123,19 @@ def _rank_and_place(m: Match) -> tuple[int, bool, int]:
 
 def _first(draft: Draft, pulse: str, rest: list[Match], claims: Claims) -> Match:
     """Return the first match by rank, unless it would block (by inhibitor or capacity) another one
-    that does not block it."""
+    that does not block it: then the other one, or what is in conflict with that and of a higher
+    rank."""
     head, passed = rest[0], set[int]()  # blocking can go in a circle: none is examined twice
     while True:
         passed.add(head.transition.index)
+        above = (m for m in _rivals(draft, pulse, head, rest, claims) if _rank(m) < _rank(head))
         sooner = (
             m
             for m in rest
-            if m.transition.index not in passed
-            and _bars(draft, pulse, claims, head, m)
-            and not _bars(draft, pulse, claims, m, head)
+            if _bars(draft, pulse, claims, head, m) and not _bars(draft, pulse, claims, m, head)
         )
-        other = next(sooner, None)
+        others = (m for m in chain(above, sooner) if m.transition.index not in passed)
+        other = next(others, None)
         if other is None:
             return head
         head = other

@@ -60,14 +60,34 @@ def state_machines(
     return Net.build(initial, {f"t{i}": ({a: 1}, {b: 1}) for i, (a, b) in enumerate(moves)})
 
 
+def firings(net: Net, marking: Marking) -> list[tuple[int, Marking]]:
+    """Return the transitions that can fire, and where each leads, from the net's arcs alone: not by
+    the compiled tables that the explorers and `Net.enabled` read."""
+    found = []
+    for t in range(len(net.transitions)):
+        after = list(marking)
+        for p, w in net.consume[t]:
+            after[p] -= w
+        lacks = min(after, default=0) < 0 or any(marking[p] >= n for p, n in net.inhibit[t])
+        for p, w in net.produce[t]:
+            after[p] += w
+        full = any(
+            most is not None and before < now and now > most
+            for before, now, most in zip(marking, after, net.capacity, strict=True)
+        )
+        if not lacks and not full:
+            found.append((t, tuple(after)))
+    highest = max((net.priority[t] for t, _ in found), default=0)
+    return [(t, after) for t, after in found if net.priority[t] == highest]
+
+
 def brute_force(net: Net, limit: int) -> tuple[list[Marking], list[tuple[int, int, int]]] | None:
     """Return markings and edges (source, transition, target) in breadth-first order; None above
     `limit` markings."""
     order, number, edges, queue = [net.initial], {net.initial: 0}, [], deque([0])
     while queue:
         i = queue.popleft()
-        for t in net.enabled(order[i]):
-            after = net.fire(order[i], t)
+        for t, after in firings(net, order[i]):
             if after not in number:
                 if len(order) >= limit:
                     return None

@@ -16,10 +16,12 @@ from typing import Any
 
 import pytest
 
+from petrobot.coordinator.analysis import report
 from petrobot.coordinator.analysis.commands import analyse_command
 from petrobot.coordinator.analysis.formats.netfile import NetFile
 from petrobot.coordinator.analysis.formats.pnml import write_pnml
-from petrobot.coordinator.analysis.net.space import SearchLimits
+from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
+from petrobot.coordinator.analysis.net.space import SearchLimits, Space
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.cli import loading
 from petrobot.coordinator.task.file import load
@@ -42,11 +44,72 @@ def ring(places: int, tokens: int) -> Net:
 
 
 def test_what_is_not_known_in_time_is_no_bad_input() -> None:
-    """The file is good: the exit code is that of an answer that is not yes."""
-    limits = SearchLimits(seconds=100, clock=count().__next__)
-    outcome = analyse_command(CATCH.with_name("pick_and_place.toml"), load, limits=limits)
+    """The file is good: the exit code is that of an answer that is not yes. What was known by then
+    is in the answer."""
+    path, clock = CATCH.with_name("pick_and_place.toml"), count().__next__
+    late = analyse_command(path, load, limits=SearchLimits(seconds=60, clock=clock))
+    assert report.LATE in late.data["notes"] and not late.data["recoveries"]
+    clock = count().__next__
+    outcome = analyse_command(path, load, limits=SearchLimits(seconds=20, clock=clock))
+    assert outcome.code == 1 and report.LATE in outcome.data["notes"]
+    verdicts = {name: v["holds"] for name, v in outcome.data["verdicts"].items()}
+    assert verdicts["bounded"] and verdicts["deadlock_free"] and verdicts["quasi_live"]
+    assert verdicts["sound"] is None and outcome.data["verdicts"]["sound"]["reason"] == (
+        "unknown within the time limit; give more --seconds"
+    )
+
+
+class Brief:
+    """A clock on which the time is used up after so many readings."""
+
+    def __init__(self, readings: int) -> None:
+        self.left = readings
+
+    def __call__(self) -> float:
+        self.left -= 1
+        return 0.0 if self.left >= 0 else 10.0
+
+
+def stuck_and_unsafe(tokens: int) -> Net:
+    """A counter that empties, and a branch that gets stuck at once: a deadlock is near, and the
+    last markings are far."""
+    arcs = {"put": ({"many": 1}, {"box": 1}), "fall": ({"robot": 1}, {"floor": 1})}
+    return Net.build({"many": tokens, "box": 0, "robot": 1, "floor": 0}, arcs)
+
+
+@pytest.mark.parametrize("readings", [5, 20, 60, 200, 600])
+def test_facts_are_told_whenever_the_time_is_used_up(readings: int, tmp_path: Path) -> None:
+    """What is found is a fact, whatever is still unknown: tokens in a place, a dead marking."""
+    path = tmp_path / "net.pnml"
+    path.write_text(write_pnml(NetFile(stuck_and_unsafe(30_000))), encoding="utf-8")
+    limits = SearchLimits(seconds=5.0, clock=Brief(readings))
+    outcome = analyse_command(path, load, limits=limits, structure=False)
     assert outcome.code == 1
-    assert "verdicts: unknown within the time limit; give more --seconds" in outcome.text
+    assert outcome.data["verdicts"]["safe"]["holds"] is False
+    assert all(v["holds"] in (True, False, None) for v in outcome.data["verdicts"].values())
+    assert outcome.data["verdicts"]["live"]["holds"] is not True
+
+
+def test_a_large_file_is_not_read_beyond_the_time(tmp_path: Path) -> None:
+    path = tmp_path / "net.pnml"
+    path.write_text(write_pnml(NetFile(ring(2_000, 1))), encoding="utf-8")
+    outcome = analyse_command(path, load, limits=SearchLimits(seconds=5.0, clock=Brief(2)))
+    assert outcome.code == 1
+    assert "the net in the file: unknown within the time limit; give more --seconds" in outcome.text
+
+
+def test_facts_are_told_if_the_memory_is_used_up() -> None:
+    """Verdicts on the whole space need too much; a deadlock among its markings is a fact."""
+
+    def examined(space: Space, *, in_haste: bool = False, **rest: Any) -> Qualitative:
+        if not in_haste or len(space) > 11_000:
+            raise MemoryError
+        return examine(space, in_haste=True)
+
+    found = report._examined(stuck_and_unsafe(30_000), None, "auto", notes := list[str](), examined)
+    assert notes == [report.FULL]
+    assert found.safe.holds is False and found.quasi_live.holds is True
+    assert found.live.holds is None and found.bounded.holds is not False
 
 
 def started(net: Net, folder: Path, *arguments: str) -> subprocess.Popen[str]:

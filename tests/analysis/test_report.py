@@ -27,15 +27,31 @@ from petrobot.coordinator.analysis.formats.netfile import (
 from petrobot.coordinator.analysis.formats.pnml import write_pnml
 from petrobot.coordinator.analysis.net.picture import graph_svg
 from petrobot.coordinator.analysis.net.space import SearchLimits, explore
-from petrobot.coordinator.analysis.report import analyse, heat, missing
+from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
+from petrobot.coordinator.analysis.report import Analysis, analyse, heat, missing
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.task import Estimate, Status
-from petrobot.coordinator.task.file import load
+from petrobot.coordinator.task.file import load, loads
 from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import KANBAN_RATES, kanban, philosophers, queue
 
+GOOD = """
+schema = 1
+[task]
+name = "good"
+final = "parts == 0"
+[primitive_tasks]
+look = { goal = "g", alternatives = ["a"], deadline = 5.0 }
+[places]
+parts = { kind = "control", tokens = 1 }
+look = { kind = "action", task = "look" }
+[transitions]
+next = { in = ["parts"], out = ["look"] }
+seen = { in = ["look:normal"], out = [] }
+lost = { in = ["look:error"], out = [] }
+"""
 CATCH = Path(__file__).parents[2] / "coordinator" / "tasks" / "catch_ball.toml"
 PROMISED = {
     "net",
@@ -54,6 +70,24 @@ PROMISED = {
     "home_states",
 }
 NUMBERS = {"throughput", "mean_tokens", "residual"}
+
+
+def test_the_page_says_which_refused_verdicts_change_the_exit_code(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The table of docs/analysis.md, section 2, against `ok` (analyse) and `objections` (check)."""
+    page = (Path(__file__).parents[2] / "docs" / "analysis.md").read_text(encoding="utf-8")
+    rows = [line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| ")]
+    table = {row[0]: row[-1] for row in rows if row[-1] in ("refused", "-") and len(row) == 4}
+    found = analyse(loads(GOOD, "good.toml"))
+    verdicts = found.verdicts()
+    assert {name.replace("_", " ") for name in verdicts} == set(table) and found.ok
+    for name in verdicts:
+        refuted = PropertyVerdict(False, "no", Witness((), {}))
+        changed = {**verdicts, name: refuted}
+        monkeypatch.setattr(Analysis, "verdicts", lambda _, changed=changed: changed)
+        refused = table[name.replace("_", " ")] == "refused"
+        assert (name in found.objections, not found.ok) == (refused, refused), name
 
 
 def test_a_net_file_gives_the_documented_keys(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ Markov chain, and in missions that the engine plays by a clock."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import exp, sqrt
+from math import exp, log, sqrt
 
 import numpy as np
 import pytest
@@ -317,6 +317,61 @@ def test_the_view_drops_timers_and_events_where_the_engine_does(kind: str) -> No
     assert found.figures == pytest.approx(chain.figures, rel=1e-9)
 
 
+@st.composite
+def steps(draw: st.DrawFn) -> Task:
+    """A run ends, and what it gives fires at once: with inhibitor arcs, or with a variable that is
+    set and read; some tokens come a step later."""
+    n = draw(st.integers(2, 4))
+    kinds = draw(st.sampled_from((("bar", "bar", "late", ""), ("set", "read", "late", ""))))
+    moves, places = list[str](), [f"x{i} = {{ }}\ny{i} = {{ }}\n" for i in range(n)]
+    for i in range(n):
+        kind = draw(st.sampled_from(kinds))
+        take, give, more = f"x{i}", f"y{i}", ""
+        other = draw(st.integers(0, n - 1))
+        if kind == "bar" and other != i:
+            take += f",!y{other}"
+        if kind == "set":
+            more = ', set = { v = "1" }'
+        if kind == "read":
+            more = f', when = "v == {draw(st.integers(0, 1))}"'
+        if kind == "late":
+            places.append(f"z{i} = {{ }}\n")
+            moves.append(arcs(f"soon{i}", f"z{i}", f"x{i}"))
+        moves.append(arcs(f"move{i}", take, give, more))
+    last = draw(st.integers(0, n - 1))
+    late = {i for i in range(n) if f"z{i} = {{ }}\n" in places}
+    starts = {
+        how: ",".join(f"z{i}" if i in late else f"x{i}" for i in sorted(which))
+        for how in ("normal", "error")
+        if (which := draw(st.sets(st.integers(0, n - 1), min_size=1)))
+    }
+    kept = ', set = { v = "0" }'  # what a transition sets, nothing else changes
+    held = " and ".join(f"{p.split()[0]} >= 0" for p in "".join(places).splitlines())
+    return loads(
+        f'schema = 1\n[task]\nname = "t"\nfinal = "work == 0 and y{last} > 0 and {held}"\n'
+        f'final_error = "work == 0 and y{last} == 0 and {held}"\n{head("work")}'
+        '[variables.v]\ntype = "int"\ninitial = 0\n[places]\n'
+        f'work = {{ kind = "action", task = "work", tokens = 1 }}\n{"".join(places)}'
+        f"[transitions]\n{''.join(draw(st.permutations(moves)))}"
+        f"{arcs('end', 'work:normal', starts['normal'], kept)}"
+        f"{arcs('bad', 'work:error', starts['error'], kept)}",
+        "t.toml",
+    )
+
+
+@settings(COMMON, max_examples=60)
+@given(steps())
+def test_what_fires_at_once_fires_in_the_order_of_a_step(task: Task) -> None:
+    figures_agree(task)
+
+
+@pytest.mark.proof
+@settings(COMMON, max_examples=3000)
+@given(steps())
+def test_what_fires_at_once_fires_in_the_order_of_a_step_at_length(task: Task) -> None:
+    figures_agree(task)
+
+
 def test_the_time_of_one_of_several_ended_runs_is_doubtful() -> None:
     task = loads(
         f'schema = 1\n[task]\nname = "t"\nfinal = "work == 0"\n{head("work")}[places]\n'
@@ -499,6 +554,9 @@ lost = { in = ["work:error"], out = ["ready"] }
         found = forecast(stochastic_view(task))
         assert found.done.mean == pytest.approx(tokens * (4.0 + 1.5))
         assert found.one_trial.done.mean == pytest.approx(1.5)
+        # (exp(-t / 2) + exp(-t)) / 2 = 0.1
+        late = -2 * log((sqrt(1.8) - 1) / 2)
+        assert found.one_trial.completion_time().quantile(0.9) == pytest.approx(late)
 
 
 def test_a_figure_that_the_execution_graph_contradicts_is_doubtful() -> None:

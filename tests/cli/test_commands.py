@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import socket
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from petrobot.coordinator.analysis import commands
 from petrobot.coordinator.analysis.formats import read_net
 from petrobot.coordinator.analysis.net.space import explore
 from petrobot.coordinator.cli import COMMANDS, main
@@ -45,6 +47,36 @@ def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> Non
     assert all(f"  {command.name} " in shown for command in COMMANDS)
     assert main(["fly"]) == 2
     assert "unknown command 'fly'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "said"),
+    [
+        ("graph_command", ["show", "catch_ball", "--graph"], "too large for this drawing"),
+        ("gspn_of", ["show", "catch_ball", "--view", "gspn"], "too large for this drawing"),
+        ("open_model", ["simulate", "catch_ball"], "out of memory; use fewer --replicas"),
+        ("open_model", ["convert", "catch_ball", "out.drn"], "too large for .drn"),
+    ],
+)
+def test_commands_on_nets_bound_their_memory(
+    function: str,
+    arguments: list[str],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A net that is too large ends in one line, and the limit is taken back."""
+    before, limits = resource.getrlimit(resource.RLIMIT_DATA), list[int]()
+
+    def full(*_: object, **__: object) -> None:
+        limits.append(resource.getrlimit(resource.RLIMIT_DATA)[0])
+        raise MemoryError
+
+    monkeypatch.setattr(commands, function, full)
+    assert main(arguments) == 2
+    assert said in capsys.readouterr().err
+    assert limits[0] != resource.RLIM_INFINITY
+    assert resource.getrlimit(resource.RLIMIT_DATA) == before
 
 
 LOCKSTEP = ["run", "catch_ball", "--mode", "lockstep"]

@@ -295,6 +295,19 @@ def test_counting_loop_is_no_timeless_cycle(task: Tasks) -> None:
     assert "timeless-cycle" not in found(task("x=1 k=3 y", net))
 
 
+def test_places_that_wait_together_are_one_finding(task: Tasks) -> None:
+    net = {
+        "t": {"in": "x y a:normal", "event": "e"},
+        "e": {"in": "a:error"},
+        "u": {"in": "z", "event": "e"},
+    }
+    made = check(task("a!=1 x=1 y=1 z=1", net, "e*")).findings
+    texts = {f.key: f.text for f in made if f.code == "external-wait"}
+    assert set(texts) == {"places.a", "places.z"}
+    assert texts["places.a"].startswith("only e can free the tokens of a:normal, x, y:")
+    assert texts["places.z"].startswith("only e can free its token:")
+
+
 def test_after_beside_an_external_wait(task: Tasks) -> None:
     net = {"t": {"in": "x", "event": "e"}, "late": {"in": "x", "after": 9.0}}
     assert "external-wait" not in found(task("x=1", net, "e"))

@@ -145,6 +145,20 @@ def test_priority_decides_conflicts_only(play: Plays) -> None:
     assert sorted(p.fired) == ["t", "u"]
 
 
+def test_what_goes_first_for_an_inhibitor_takes_nothing_from_a_higher_priority(
+    play: Plays,
+) -> None:
+    """`t` would bar `u`, so `u` goes first; but its token belongs to `w`, which nothing bars."""
+    net = {
+        "t": {"in": "x", "out": "y", "event": "e", "priority": 1},
+        "u": {"in": "r !y", "event": "e"},
+        "w": {"in": "r", "out": "z", "event": "e", "priority": 1},
+    }
+    p = play("x=1 y r=1 z", net, events="e")
+    p(EventOccurred("e"))
+    assert sorted(p.fired) == ["t", "w"] and p.marked == {"y": 1, "z": 1}
+
+
 def test_conflict_drawn_by_weight(play: Plays) -> None:
     net = {
         "t": {"in": "x", "out": "y", "event": "e", "weight": 1.0},

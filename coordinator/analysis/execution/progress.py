@@ -41,7 +41,7 @@ from petrobot.coordinator.analysis.execution.graph import (
     with_operator,
 )
 from petrobot.coordinator.analysis.execution.names import cases
-from petrobot.coordinator.analysis.limits import OutOfTime
+from petrobot.coordinator.analysis.limits import OutOfTime, overtime
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
@@ -197,7 +197,7 @@ class Progress:
         was reached before one was found. Empty for a task that gets stuck even without the
         operator."""
         own = self.x if self.free is None else self.free.x
-        if not own.complete or own.dead.any() or own.livelocks:
+        if overtime() or not own.complete or own.dead.any() or own.livelocks:
             return []
         x = with_operator(own, limit=limit)
         found = [
@@ -250,6 +250,8 @@ class Progress:
     def sound(self) -> PropertyVerdict:
         """An end can be reached from everywhere, and not only by giving up."""
         x = self.x
+        if overtime():
+            return self._unknown("")
         final = x.engine.compiled.task.final
         good = x.final | x.given_up
         good[x.expanded :] = True
@@ -369,7 +371,7 @@ class Progress:
     def mended(self) -> dict[str, PropertyVerdict]:
         """The verdicts from mission to mission that do not hold, judged again on the assumption
         that the operator repairs what `final_error` leaves and starts the task again."""
-        if not self.x.complete or not self.x.given_up.any():
+        if not self._whole or not self.x.given_up.any():
             return {}
         again = _Again(self.x, self.x.final | self.x.given_up)
         found = {}
@@ -384,7 +386,7 @@ class Progress:
         return found
 
     def _again(self, name: str) -> PropertyVerdict:
-        if not self.x.complete:
+        if not self._whole:
             return self._unknown("")
         found = self._judged(name, self._open)
         if found is not None:
@@ -463,8 +465,8 @@ class Progress:
     @cached_property
     def recoveries(self) -> tuple[Recovery, ...]:
         """Return what happens after each error exit that can fire; empty if the graph is not
-        complete."""
-        if not self.x.complete:
+        complete, or the time is used up."""
+        if not self._whole:
             return ()
         nested = list(self._nested())
         back = self.x.graph.backward(self._nominal)
@@ -652,7 +654,7 @@ class Progress:
     def levels(self) -> tuple[int | None, ...]:
         """Liveness level of each transition, as in `qualitative.py`; None if unknown."""
         names = [t.name for t in self.x.engine.compiled.transitions]
-        if not self.x.complete:
+        if not self._whole:
             return (None,) * len(names)
         again = self._open
         always = again.in_every_bottom()
@@ -666,7 +668,7 @@ class Progress:
     @cached_property
     def home_states(self) -> int | None:
         """How many states can be reached again from every state; None if unknown."""
-        if not self.x.complete:
+        if not self._whole:
             return None
         graph = self._open.graph
         bottoms = np.flatnonzero(graph.bottom)
@@ -722,8 +724,15 @@ class Progress:
             False, reason, _witness(self.x, state), complete=self.x.complete, details=details
         )
 
+    @property
+    def _whole(self) -> bool:
+        """Whether the graph is complete and there is time to judge it."""
+        return self.x.complete and not overtime()
+
     def _unknown(self, more: str) -> PropertyVerdict:
         text = f"unknown: the execution graph was not completed ({self.x.reason})"
+        if self.x.complete:
+            text = "unknown within the time limit; give more --seconds"
         return PropertyVerdict(None, f"{text}; {more}" if more else text, complete=False)
 
 

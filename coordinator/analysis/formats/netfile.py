@@ -16,8 +16,14 @@ from itertools import chain, count
 from typing import Any
 from xml.etree.ElementTree import Element
 
+from petrobot.coordinator.analysis.limits import keep_time
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.task.net import Arcs, Net
+
+FILE = "the net in the file"
+"""What stays unknown if the time is used up before a file has been read."""
+BETWEEN = 1_000
+"""Elements or arcs of a file between two looks at the clock."""
 
 
 class NetFileError(ValueError):
@@ -146,6 +152,8 @@ class NetDraft:
         self.servers: dict[str, int | None] = {}
         self.constants: dict[str, Fraction] = {}
         self.notes: list[str] = []
+        self.arcs = 0
+        """How many arcs were read."""
 
     def fault(self, element: str, problem: str, remedy: str = "") -> NetFileError:
         """Return an error at the line that is being read."""
@@ -178,6 +186,9 @@ class NetDraft:
 
         Raises NetFileError.
         """
+        self.arcs += 1
+        if self.arcs % BETWEEN == 0:
+            keep_time(FILE)
         place, transition = (source, target) if source in self.places else (target, source)
         if place not in self.places or transition not in self.transitions:
             remedy = "an arc connects a place and a transition of the file"

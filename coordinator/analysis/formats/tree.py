@@ -15,7 +15,8 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 from xml.parsers import expat
 
-from petrobot.coordinator.analysis.formats.netfile import NetFileError
+from petrobot.coordinator.analysis.formats.netfile import BETWEEN, FILE, NetFileError
+from petrobot.coordinator.analysis.limits import keep_time
 
 DEEPEST = 100
 """The most levels of elements. Real files have about ten; deeper trees exhaust Python's stack."""
@@ -87,6 +88,8 @@ class _Parsing:
         self.last: Element | None = None
         """The child that ended last in the innermost open element; text after it is its tail."""
         self.root: LineElement | None = None
+        self.elements = 0
+        """How many elements have begun."""
 
     def parse(self, text: str | bytes) -> LineElement:
         """Return the root. Raises NetFileError."""
@@ -112,6 +115,9 @@ class _Parsing:
         return NetFileError(self.file, "XML", problem, remedy, line=line)
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
+        self.elements += 1
+        if self.elements % BETWEEN == 0:
+            keep_time(FILE)
         if len(self.open) >= DEEPEST:
             raise self._fault(
                 f"elements nested more than {DEEPEST} deep", "flatten the pages of the net"

@@ -31,6 +31,9 @@ OMEGA = 1 << 62
 """Arbitrarily many tokens, in a marking of the tree: at least as many as any number."""
 EFFORT = 20_000
 """The most nodes of the tree."""
+TOKENS = 20_000_000
+"""The most numbers of tokens in all nodes of the tree, or in all markings that are compared at
+once: a net with more than 1,000 places gets fewer of them."""
 COMPARISONS = 100
 """The most comparisons with ancestors, per allowed node: limits the time on long chains."""
 
@@ -82,6 +85,7 @@ def coverability(
             None, unknown, f"no bound is known of the inhibited place {names}", 0, False
         )
     plain = _complemented(net, limits, proven)
+    effort = min(effort, TOKENS // len(plain.places) + 1) if plain.places else effort
     tree = _Tree(plain, len(net.places))
     complete = tree.grow(effort)
     unbounded, ranked = tree.omega is not None, len(set(net.priority)) > 1
@@ -264,7 +268,8 @@ def find_pump(space: Space) -> Pump | None:
     Ancestors are those in the breadth-first tree; level by level, all markings are compared with
     their ancestor at the same distance in one numpy operation.
     """
-    count = min(MARKINGS, space.expanded, len(space))
+    most = min(MARKINGS, TOKENS // len(space.net.places) + 1) if space.net.places else MARKINGS
+    count = min(most, space.expanded, len(space))
     tokens = space.layout.unpack_many(space.words[:count])
     parent = np.zeros(count, dtype=np.int64)
     parent[1:] = space.source[space.parent_edge[1:count]]

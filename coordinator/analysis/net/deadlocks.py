@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from petrobot.coordinator.analysis.limits import overtime
+from petrobot.coordinator.analysis.limits import OutOfTime, keep_time, overtime
 from petrobot.coordinator.task.compiled import Arcs
 from petrobot.coordinator.task.net import Marking, Net
 
@@ -176,18 +176,26 @@ class _Relations:
 
     @classmethod
     def of(cls, net: Net) -> _Relations:
-        count, places = len(net.transitions), range(len(net.places))
-        change = [dict(changes) for changes in net.compiled.changes]
+        count = len(net.transitions)
         limits = tuple(dict(bars) for bars in net.compiled.bars)
-        raising = tuple(tuple(t for t in range(count) if change[t].get(p, 0) > 0) for p in places)
-        lowering = tuple(tuple(t for t in range(count) if change[t].get(p, 0) < 0) for p in places)
+        raising: list[list[int]] = [[] for _ in net.places]
+        lowering: list[list[int]] = [[] for _ in net.places]
+        for t, changes in enumerate(net.compiled.changes):
+            for p, change in changes:
+                (raising if change > 0 else lowering)[p].append(t)
         conflicts: list[set[int]] = [set() for _ in range(count)]
         for t in range(count):
+            keep_time("deadlocks")
             harmful = [lowering[p] for p, _ in net.consume[t]] + [raising[p] for p in limits[t]]
             for u in set().union(*harmful) - {t}:
                 conflicts[t].add(u)
                 conflicts[u].add(t)
-        return cls(tuple(tuple(sorted(c)) for c in conflicts), raising, lowering, limits)
+        return cls(
+            tuple(tuple(sorted(c)) for c in conflicts),
+            tuple(map(tuple, raising)),
+            tuple(map(tuple, lowering)),
+            limits,
+        )
 
 
 def hunt_deadlock(net: Net, *, effort: int = HUNT_EFFORT) -> Hunt:
@@ -196,7 +204,10 @@ def hunt_deadlock(net: Net, *, effort: int = HUNT_EFFORT) -> Hunt:
     In nets with priorities a transition depends on all transitions above it, so no stubborn set
     would be small: these nets are searched in full.
     """
-    relations = _Relations.of(net) if len(set(net.priority)) <= 1 else None
+    try:
+        relations = _Relations.of(net) if len(set(net.priority)) <= 1 else None
+    except OutOfTime:
+        return Hunt(None, 0, False)
     seen = {net.initial}
     came: dict[Marking, tuple[Marking, int]] = {}
     stack = [net.initial]
@@ -233,7 +244,7 @@ def _stubborn(net: Net, relations: _Relations, marking: Marking, enabled: list[i
         closed = _closure(net, relations, marking, able, seed, len(best))
         if closed is not None and len(closed) < len(best):
             best = closed
-            if len(best) == 1:
+            if len(best) == 1 or overtime():
                 break
     return best
 

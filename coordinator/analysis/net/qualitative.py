@@ -96,8 +96,8 @@ def examine(
     """Return all verdicts on the net of a space.
 
     `cover` passes a coverability result that is already known; otherwise it is computed if the
-    space is not complete. `in_haste` leaves out everything that takes long and judges the markings
-    found only.
+    space is not complete. `in_haste` leaves out everything that takes long: what a look at each
+    marking and edge tells is judged, all else is unknown.
     """
     graph = Graph(len(space), space.source, space.target, space.row, rooted=True)
     if in_haste and cover is None:
@@ -106,7 +106,7 @@ def examine(
     dead = space.dead
     settled = space.complete or len(dead) or in_haste
     hunt = None if settled else hunt_deadlock(space.net, effort=HUNT)
-    levels = _levels(space, graph, cover)
+    levels = _levels(space, None if in_haste else graph, cover)
     return Qualitative(
         space,
         graph,
@@ -118,10 +118,10 @@ def examine(
         _grouped(space, dead) + _hunted(space.net, hunt),
         len(dead),
         _quasi_live(space, levels, cover),
-        _live(space, graph, levels, hunt),
+        _live(space, None if in_haste else graph, levels, hunt),
         levels,
-        _reversible(space, graph, hunt),
-        _home_states(space, graph),
+        _reversible(space, None if in_haste else graph, hunt),
+        None if in_haste else _home_states(space, graph),
     )
 
 
@@ -143,7 +143,8 @@ def witness(space: Space, i: int, loop: tuple[str, ...] = ()) -> Witness:
 
 
 def _unknown(space: Space, question: str = "") -> PropertyVerdict:
-    text = f"unknown: the search stopped early ({space.reason})"
+    what = "analysis" if space.complete else "search"
+    text = f"unknown: the {what} stopped early ({space.reason})"
     return PropertyVerdict(None, f"{text}; {question}" if question else text, complete=False)
 
 
@@ -307,10 +308,14 @@ def _grouped(space: Space, dead: NDArray[np.int64]) -> tuple[Deadlock, ...]:
     return tuple(out)
 
 
-def _levels(space: Space, graph: Graph, cover: Coverability | None) -> tuple[int | None, ...]:
+def _levels(
+    space: Space, graph: Graph | None, cover: Coverability | None
+) -> tuple[int | None, ...]:
     count = len(space.net.transitions)
-    if not space.complete:
+    if not space.complete or graph is None:
         never = set(cover.never if cover is not None else ())
+        if space.complete:
+            never = {space.net.transitions[t] for t in np.flatnonzero(~space.fired)}
         return tuple(0 if name in never else None for name in space.net.transitions)
     if graph.strong:
         return tuple(4 if fired else 0 for fired in space.fired.tolist())
@@ -355,7 +360,7 @@ def _quasi_live(
 
 
 def _live(
-    space: Space, graph: Graph, levels: tuple[int | None, ...], hunt: Hunt | None
+    space: Space, graph: Graph | None, levels: tuple[int | None, ...], hunt: Hunt | None
 ) -> PropertyVerdict:
     names = space.net.transitions
     for found in _hunted(space.net, hunt):
@@ -370,13 +375,12 @@ def _live(
         reason = f"nothing can fire any more in {space.net.describe(space.marking(first))}"
         return PropertyVerdict(False, reason, witness(space, first), complete=space.complete)
     useless = [name for name, level in zip(names, levels, strict=True) if level == 0]
-    if useless and not space.complete:
+    if useless and (not space.complete or graph is None):
+        by = "" if space.complete else " (by the coverability tree)"
         return PropertyVerdict(
-            False,
-            f"can never fire: {', '.join(useless)} (by the coverability tree)",
-            complete=False,
+            False, f"can never fire: {', '.join(useless)}{by}", complete=space.complete
         )
-    if not space.complete:
+    if not space.complete or graph is None:
         return _unknown(space)
     lost = [t for t, level in enumerate(levels) if level != 4]
     if not lost:
@@ -397,8 +401,8 @@ def _live(
     raise AssertionError("a transition that is not live is missing in some bottom component")
 
 
-def _reversible(space: Space, graph: Graph, hunt: Hunt | None) -> PropertyVerdict:
-    if not space.complete:
+def _reversible(space: Space, graph: Graph | None, hunt: Hunt | None) -> PropertyVerdict:
+    if not space.complete or graph is None:
         for found in _hunted(space.net, hunt):
             if found.witness.firings:
                 return PropertyVerdict(

@@ -294,10 +294,8 @@ def _run(
                 break
             if limits.memory is not None and engine.nbytes * JUDGED > limits.memory:
                 return f"memory limit of {limits.memory} bytes"
-            if limits.seconds is not None and limits.clock:
-                due = started + limits.seconds if limits.due is None else limits.due
-                if limits.clock() > due:
-                    return f"time limit of {limits.seconds:g} s"
+            if late := _late(limits, started):
+                return late
     except TooManyTokens as grown:
         return str(grown)
     except MemoryError:
@@ -306,7 +304,15 @@ def _run(
         return ""
     if limits.states is not None and engine.states >= limits.states:
         return f"limit of {limits.states} states"
-    return _HAND_OVER
+    return _late(limits, started) or _HAND_OVER
+
+
+def _late(limits: SearchLimits, started: float) -> str:
+    """Return the reason for stopping if the time is used up, else an empty string."""
+    if limits.seconds is None or limits.clock is None:
+        return ""
+    due = started + limits.seconds if limits.due is None else limits.due
+    return f"time limit of {limits.seconds:g} s" if limits.clock() > due else ""
 
 
 def _space(found: Explored, reason: str, engine: str) -> Space:

@@ -57,16 +57,15 @@ class Completion:
         return max(0.0, float(self.z[0] / self.h[0]) - self.mean**2) if self.h[0] else float("nan")
 
 
-def completion(chain: Chain, goal: Mask, timed: Mask | None = None) -> Completion:
-    """Return time and probability of first reaching a marking of `goal` (mask of shape (n,)).
-    `timed`: the markings whose time counts (None: all)."""
+def completion(chain: Chain, goal: Mask) -> Completion:
+    """Return time and probability of first reaching a marking of `goal` (mask of shape (n,))."""
     inside = chain.graph.backward(goal) & ~goal
     plan = SolveOrder.of(chain.graph, inside)
     open_ = inside[chain.source]
     value = np.where(open_ & inside[chain.target], chain.probability, 0.0)
     direct = open_ & goal[chain.target]
     arrive = sum_by(chain.source[direct], chain.probability[direct], chain.n)
-    s = np.where(inside if timed is None else inside & timed, chain.sojourn, 0.0)
+    s = np.where(inside, chain.sojourn, 0.0)
     h = solve(plan, value, np.where(inside, arrive, 0.0))
     y = solve(plan, value, s * h)
     z = solve(plan, value, 2 * s * s * h + 2 * s * _apply(chain, value, y))

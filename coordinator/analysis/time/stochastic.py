@@ -19,13 +19,16 @@ chosen its action waits until it is free. Devices that never have to be waited f
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations, combinations_with_replacement, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from petrobot.coordinator.analysis.net.graph import Graph
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.structure import (
     exclusive_places,
@@ -71,7 +74,7 @@ from petrobot.coordinator.task.net import Marking, Net
 from petrobot.coordinator.task.validation import condition_domains, is_pulse
 
 FLUSH, TASK, CHOICE = 3_000_000, 1_000_000, 500_000
-"""Priorities of flushing, of the task's transitions (TASK and twice their own) and of choosing. As
+"""Priorities of flushing, of the task's transitions (above TASK in their order) and of choosing. As
 in the engine, runs begin when no transition can fire any more; one whose token is taken before that
 never began."""
 SERVE, CALL = 1_500_000, 4_000_000
@@ -150,6 +153,26 @@ how probable each kind of end is."""
 
 def _cut(counts: Counts | None) -> str:
     return LOST if counts in (Counts.FAILURE, Counts.ERROR) else KEPT
+
+
+Edges = set[tuple[int, int]]
+
+
+def _groups(n: int, edges: Edges) -> list[int]:
+    """Return the number of the strong component of each vertex."""
+    pairs = np.array(sorted(edges), np.int32).reshape(-1, 2)
+    found: list[int] = Graph(n, pairs[:, 0], pairs[:, 1]).components.tolist()
+    return found
+
+
+def _levels(n: int, edges: Edges) -> list[int]:
+    """Return a number for each vertex that grows along the edges, except within a cycle."""
+    group, level = _groups(n, edges), [0] * n
+    links = {(group[i], group[j]) for i, j in edges if group[i] != group[j]}
+    while late := [(i, j) for i, j in links if level[j] <= level[i]]:
+        for i, j in late:
+            level[j] = level[i] + 1
+    return [level[g] for g in group]
 
 
 Needs = tuple[dict[int, int], dict[int, int]]
@@ -343,6 +366,7 @@ class _Derivation:
         self.values: dict[str, dict[Scalar, str]] = {}
         """By variable that only transitions set, to known values: the place of each value."""
         self._variables()
+        self.turns = self._turns()
         self.droppable = [x for x in self.compiled.values() if x.after is not None]
         """Transitions with a timer, or with a latched event that the engine may drop."""
         self.timers: dict[tuple[str, frozenset[tuple[str, int]]], str] = {}
@@ -852,9 +876,10 @@ class _Derivation:
         """Let a pulse serve each transition that is fireable when it comes, once."""
         # Weights draw among equals, else the first in the file wins; arrival decides no pulse.
         drawn = all(x.weight is not None for x in waiting)
-        ranks = sorted({(x.rank, 0 if drawn else x.index) for x in waiting}, reverse=True)
+        turns = {x.name: (self.turns[x.name], 0 if drawn else -x.index) for x in waiting}
+        order = sorted(set(turns.values()))
         for x in waiting:
-            self.served[x.name] = SERVE + 1 + ranks.index((x.rank, 0 if drawn else x.index))
+            self.served[x.name] = SERVE + 1 + order.index(turns[x.name])
             called = self.called[x.name] = f"{x.name}.called"
             self.places[called] = 0
             for i, case in enumerate(self._cases(self.task.transitions[x.name])):
@@ -883,6 +908,60 @@ class _Derivation:
         return least, below
 
     # Transitions of the task.
+
+    def _turns(self) -> Weights:
+        """Return a number for each transition: of those that can fire at once, the one with the
+        highest number does so first.
+
+        By rank; among equals as in a step of the engine, whose transitions are all judged in one
+        marking. So a transition comes after those that it spoils, and after those that compete
+        with, spoil or are spoiled by what it enables. What competes for tokens, or spoils each
+        other, keeps one number: only a draw decides that.
+        """
+        moves = list(self.compiled.values())
+        takers, barred, readers, setters = (defaultdict[Any, set[int]](set) for _ in range(4))
+        for i, x in enumerate(moves):
+            ends = [(a.place, str(a.end)) for a in x.actions if a.end is not End.GOING]
+            for kind in [*ends, *((p, "") for p, _ in x.plain)]:
+                takers[kind].add(i)
+            for p, _ in x.bars:
+                barred[p].add(i)
+            for name, value in x.sets:
+                setters[name].add(i)
+                for read in value.names:
+                    readers[read].add(i)
+            for name in self.conditions[x.name].names if x.name in self.conditions else ():
+                readers[name].add(i)
+        ranks = defaultdict[Any, set[int]](set)
+        for i, x in enumerate(moves):
+            ranks[x.rank].add(i)
+        equal = [ranks[x.rank] for x in moves]
+        rivals, spoils, enables = ([set[int]() for _ in moves] for _ in range(3))
+        for group in (*takers.values(), *setters.values()):
+            for i in group:
+                rivals[i] |= group & equal[i]
+        for i, x in enumerate(moves):
+            for p, n in x.changes:
+                (spoils if n > 0 else enables)[i].update(barred[p])
+                enables[i] |= takers[p, ""] if n > 0 else set()
+            for name, _ in x.sets:
+                spoils[i] |= readers[name]
+                enables[i] |= readers[name]
+        disturbs = [set[int](r | s) for r, s in zip(rivals, spoils, strict=True)]
+        for i, spoiled in enumerate(spoils):
+            for j in spoiled:
+                disturbs[j].add(i)
+        # (i, j): i comes before j. `soon` matters less, so it yields where the two contradict.
+        hard, soon = Edges(), Edges()
+        for j in range(len(moves)):
+            hard |= {(i, j) for i in (spoils[j] & equal[j]) | rivals[j]}
+            first = set[int]().union(*(disturbs[k] for k in enables[j]))
+            soon |= {(i, j) for i in first & equal[j]}
+        ring = _groups(len(moves), hard | soon)
+        level = _levels(len(moves), hard | {(i, j) for i, j in soon if ring[i] != ring[j]})
+        keys = [(x.rank, n) for x, n in zip(moves, level, strict=True)]
+        order = sorted(set(keys), reverse=True)
+        return {x.name: order.index(key) for x, key in zip(moves, keys, strict=True)}
 
     def _transition(self, t: Transition) -> None:
         if self.compiled[t.name].never:
@@ -998,9 +1077,7 @@ class _Derivation:
     def _fires(self, t: Transition, name: str, case: _Case) -> None:
         """Add a case: it fires at once, after an exponential wait for its events, or after a
         timer."""
-        # Among equals a run's end comes before a preemption, unless weights are declared.
-        preempts = t.weight is None and any(a.end is End.PREEMPT for a in t.inputs)
-        priority = TASK + 2 * t.priority - preempts
+        priority = TASK + self.turns[t.name]
         need, give = case.need | case.values, self._given(t, name, case)
         if any((a.place, t.name) in self.by for a in t.inputs):
             self._immediate(name, need, give, 1.0, priority)

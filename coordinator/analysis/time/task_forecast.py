@@ -86,13 +86,7 @@ class Forecast:
         """The forecast of a mission run with one run token: what a campaign measures, whose figures
         are per trial. As there, its time begins when the token is taken, so without the wait before
         it. Its long-run numbers do not hold for missions of several trials."""
-        own = self.view.task.runs_place
-        if not own:
-            return self
-        alone = forecast(replace(self.view, gspn=self.view.gspn.marked({own: 1})))
-        space = alone.chain.space
-        taken = space.tokens(self.view.task.net.place_index[own]) == 0
-        return replace(alone, done=completion(alone.chain, alone.done.goal, taken))
+        return trial_forecast(self.view) if self.view.task.runs_place else self
 
     @property
     def figures(self) -> dict[str, float]:
@@ -349,6 +343,20 @@ class Forecast:
             "fit_errors": dict(self.view.fit_errors),
             "sources": {source: list(names) for source, names in self.view.numbers.items()},
         }  # fmt: skip
+
+
+def trial_forecast(view: StochasticView, limits: SearchLimits | None = None) -> Forecast:
+    """Return the forecast of one trial: with one run token if the task has a runs place, and all
+    times from when that token is taken. Raises as `forecast`."""
+    own = view.task.runs_place
+    if not own:
+        return forecast(view, limits=limits)
+    alone = forecast(replace(view, gspn=view.gspn.marked({own: 1})), limits=limits)
+    chain = alone.chain
+    waiting = chain.space.tokens(view.task.net.place_index[own]) > 0
+    waiting &= np.bincount(chain.source, minlength=chain.n) > 0
+    chain = replace(chain, vanishing=chain.vanishing | waiting)  # no time passes before
+    return replace(alone, chain=chain, done=completion(chain, alone.done.goal))
 
 
 def forecast(view: StochasticView, *, limits: SearchLimits | None = None) -> Forecast:

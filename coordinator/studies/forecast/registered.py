@@ -18,8 +18,7 @@ from petrobot.coordinator.analysis.time.completion import completion_time
 from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
 from petrobot.coordinator.analysis.time.sensitivity import reliability_slopes
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
-from petrobot.coordinator.analysis.time.task_forecast import Forecast
-from petrobot.coordinator.analysis.time.task_forecast import forecast as solve
+from petrobot.coordinator.analysis.time.task_forecast import Forecast, trial_forecast
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.propagation import ChoiceShares, measured_from
 from petrobot.coordinator.studies.campaign.observed import context_of
@@ -142,8 +141,8 @@ def exact(
     """Return the figures of the stochastic view for one trial; only `why` if it cannot be solved.
 
     `P_complete_interval` contains what the estimates leave open (see `_share_error`),
-    `P_complete_error` what the solution does (relative). Its times begin with the initial marking,
-    so they include the wait for the event that begins the trial.
+    `P_complete_error` what the solution does (relative). Its times begin when the run token is
+    taken, as those of the trials do.
     """
     context = context_of(regime)
     try:
@@ -152,9 +151,7 @@ def exact(
         unentered = _unentered(task, known)
         known = replace(known, runs={**known.runs, **unentered})
         view = stochastic_view(task, known, devices=devices)
-        if task.runs_place:
-            view = replace(view, gspn=view.gspn.marked({task.runs_place: 1}))
-        found = solve(view, limits=SearchLimits(states=LARGEST))
+        found = trial_forecast(view, SearchLimits(states=LARGEST))
         _refuse_guesses(task, found, unentered)
     except (NoEstimate, ValueError, ArithmeticError) as fault:
         return {"why": str(fault)}

@@ -98,34 +98,37 @@ def event_faults(task: Task) -> Iterator[Finding]:
 def external_waits(
     task: Task, raised: Collection[str] = (), source: str | None = None
 ) -> Iterator[Finding]:
-    """Places whose tokens only an external event can free, with no `after` beside it. One that
-    listens may wait for ever.
+    """Places whose tokens only an external event can free, with no `after` beside it: one finding
+    for those that the same transitions take. A place that listens may wait for ever.
 
     `raised`: the events that the cell is known to raise; they are awaited as designed. `source`:
     the location file, if it is known that the cell raises no others.
     """
-    for place in task.places.values():
-        if place.listen:
+    takers: dict[tuple[str, End | None], list[str]] = {}
+    for t in task.transitions.values():
+        for arc in t.inputs:
+            if arc.end not in (End.PREEMPT, End.GOING) and not task.places[arc.place].listen:
+                takers.setdefault((arc.place, arc.end), []).append(t.name)
+    joined: dict[tuple[str, ...], list[tuple[str, End | None]]] = {}
+    for place in task.places:
+        for end in dict.fromkeys(end for name, end in takers if name == place):
+            joined.setdefault(tuple(takers[place, end]), []).append((place, end))
+    for ways, places in joined.items():
+        missing = [_external(task, task.transitions[name]) - {*raised} for name in ways]
+        if not all(missing):
             continue
-        takers: dict[End | None, list[Transition]] = {}
-        for t in task.transitions.values():
-            for arc in t.inputs:
-                if arc.place == place.name and arc.end not in (End.PREEMPT, End.GOING):
-                    takers.setdefault(arc.end, []).append(t)
-        for end, ways in takers.items():
-            missing = [_external(task, t) - {*raised} for t in ways]
-            if not all(missing):
-                continue
-            waits = set[str]().union(*missing)
-            after = f" after its {end} end" if end else ""
-            text = f"only {listed(waits)} can free its token{after}"
-            remedy = "put a transition with `after` beside it"
-            if source is None:
-                text += ": if it never comes, the task hangs"
-            else:
-                text += f", and no driver, action, service or timer of {source} raises it"
-                remedy += ", or raise it by hand: petrobot raise EVENT"
-            yield Finding(Severity.WARNING, EXTERNAL_WAIT, f"places.{place.name}", text, remedy)
+        waits, (first, end) = set[str]().union(*missing), places[0]
+        text = f"only {listed(waits)} can free its token{f' after its {end} end' if end else ''}"
+        if len(places) > 1:
+            names = [f"{place}:{end}" if end else place for place, end in places]
+            text = f"only {listed(waits)} can free the tokens of {', '.join(names)}"
+        remedy = "put a transition with `after` beside it"
+        if source is None:
+            text += ": if it never comes, the task hangs"
+        else:
+            text += f", and no driver, action, service or timer of {source} raises it"
+            remedy += ", or raise it by hand: petrobot raise EVENT"
+        yield Finding(Severity.WARNING, EXTERNAL_WAIT, f"places.{first}", text, remedy)
 
 
 def _external(task: Task, t: Transition) -> set[str]:
