@@ -151,13 +151,13 @@ class Executor:
             elif isinstance(notice, Answer):
                 self._answered(now, notice)
             elif isinstance(notice, LateResult):
-                self._abort_if_latched(notice.outcome)
+                self._abort_if_latched(node, notice.outcome)
                 self._queue.extend(self.dispatch.late(now, notice.outcome))
             elif isinstance(notice, Welcome):
                 process, stops = split_boot(notice.boot)
                 self.dispatch.back(now, node, process, notice.runs)
                 if stops != self.callers[node].stops:
-                    self._abort()
+                    self._abort(node)
         self._work(now)
 
     def advance(self, now: float) -> None:
@@ -190,6 +190,11 @@ class Executor:
             self._make_safe(now)
             effects, self._effects = self._effects, []
             for instruction in effects:
+                if (
+                    isinstance(instruction, CancelRun)
+                    and instruction.run not in self.state.stopping
+                ):
+                    continue  # it ended in the same turn
                 self._queue.extend(self.dispatch.carry_out(now, instruction))
         self._make_safe(now)
 
@@ -263,26 +268,26 @@ class Executor:
 
     def _ended(self, now: float, node: str, outcome: Outcome) -> None:
         self._acks.append(lambda: self.callers[node].acknowledge(now, outcome.id))
-        self._abort_if_latched(outcome)
+        self._abort_if_latched(node, outcome)
         self._queue.extend(self.dispatch.ended(now, outcome))
 
-    def _abort_if_latched(self, outcome: Outcome) -> None:
+    def _abort_if_latched(self, node: str, outcome: Outcome) -> None:
         """Abort before the end of the run, so that no transition answers it."""
         if outcome.cause == EMERGENCY_STOP and outcome.values.get(LATCHED) is True:
-            self._abort()
+            self._abort(node)
 
-    def _abort(self) -> None:
+    def _abort(self, node: str) -> None:
         """Abort because of an emergency stop that a node reports. Who gave it also tells the
         coordinator, but it may have been frozen, or cut off, or not have been resumed yet: then
         clearing the stop would let it move the devices on."""
         if self.finished is None and self.state.mode not in (Mode.FRESH, Mode.ABORTING):
-            self._queue.append(Abort("emergency stop"))
+            self._queue.append(Abort(f"emergency stop, as {node} reports"))
 
     def _event(self, now: float, node: str, event: Event) -> None:
         if event.number:
             self._acks.append(lambda: self.callers[node].acknowledge_event(now, event))
         if event.name == STOP_EVENT:
-            self._abort()
+            self._abort(node)
         elif event.name.startswith(MEMORY_EVENTS):
             name = event.name.removeprefix(MEMORY_EVENTS)
             self._queue.append(VariableChanged(name, event.data.get("value"), event.source))

@@ -130,8 +130,9 @@ def test_an_emergency_stop_that_only_its_node_reports_aborts_the_run(
     bench.say(2.1, m.Outcome(WORK, "error", {m.LATCHED: True}, m.EMERGENCY_STOP, "", executed))
     finished = bench.executor.finished
     assert finished is not None and finished.status is Status.ERROR
-    assert "emergency stop" in finished.reason
+    assert finished.reason == "aborted: emergency stop, as motion reports"
     assert bench.fired == [] and bench.calls() == []
+    assert bench.reports == [], "the run that ended with the stop is not stopped as well"
 
 
 def test_a_stop_that_a_driver_reports_is_an_error_that_the_task_may_answer() -> None:
