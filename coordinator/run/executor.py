@@ -151,13 +151,13 @@ class Executor:
             elif isinstance(notice, Answer):
                 self._answered(now, notice)
             elif isinstance(notice, LateResult):
-                self._abort_if_latched(node, notice.outcome)
+                self._abort_if_latched(now, node, notice.outcome)
                 self._queue.extend(self.dispatch.late(now, notice.outcome))
             elif isinstance(notice, Welcome):
                 process, stops = split_boot(notice.boot)
                 self.dispatch.back(now, node, process, notice.runs)
                 if stops != self.callers[node].stops:
-                    self._abort(node)
+                    self._abort(now, node)
         self._work(now)
 
     def advance(self, now: float) -> None:
@@ -267,27 +267,28 @@ class Executor:
     # --- what nodes say -----------------------------------------------------------------------
 
     def _ended(self, now: float, node: str, outcome: Outcome) -> None:
+        self._abort_if_latched(now, node, outcome)
         self._acks.append(lambda: self.callers[node].acknowledge(now, outcome.id))
-        self._abort_if_latched(node, outcome)
         self._queue.extend(self.dispatch.ended(now, outcome))
 
-    def _abort_if_latched(self, node: str, outcome: Outcome) -> None:
+    def _abort_if_latched(self, now: float, node: str, outcome: Outcome) -> None:
         """Abort before the end of the run, so that no transition answers it."""
         if outcome.cause == EMERGENCY_STOP and outcome.values.get(LATCHED) is True:
-            self._abort(node)
+            self._abort(now, node)
 
-    def _abort(self, node: str) -> None:
+    def _abort(self, now: float, node: str) -> None:
         """Abort because of an emergency stop that a node reports. Who gave it also tells the
         coordinator, but it may have been frozen, or cut off, or not have been resumed yet: then
-        clearing the stop would let it move the devices on."""
+        clearing the stop would let it move the devices on. At once: what the node says next may
+        free a device for which a run waits."""
         if self.finished is None and self.state.mode not in (Mode.FRESH, Mode.ABORTING):
-            self._queue.append(Abort(f"emergency stop, as {node} reports"))
+            self.stimulate(now, Abort(f"emergency stop, as {node} reports"))
 
     def _event(self, now: float, node: str, event: Event) -> None:
         if event.number:
             self._acks.append(lambda: self.callers[node].acknowledge_event(now, event))
         if event.name == STOP_EVENT:
-            self._abort(node)
+            self._abort(now, node)
         elif event.name.startswith(MEMORY_EVENTS):
             name = event.name.removeprefix(MEMORY_EVENTS)
             self._queue.append(VariableChanged(name, event.data.get("value"), event.source))
