@@ -222,5 +222,7 @@ def _cause(step: RecordedStep, engine: Engine) -> Iterator[tuple[str, str, str]]
             yield "event", event, f"raised by {run}"
         case ForceExit(of) | Override(of):
             yield "operator", of, text
-        case SetBreakpoints() | Abort():
+        case SetBreakpoints():
             yield "operator", "", text
+        case Abort(reason):
+            yield "aborted", "", reason or "by the operator"

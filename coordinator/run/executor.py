@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from petrobot.coordinator.engine import Engine
+from petrobot.coordinator.engine import Engine, Mode
 from petrobot.coordinator.engine.instructions import (
     CancelRun,
     Choose,
@@ -46,7 +46,12 @@ from petrobot.coordinator.run.interfaces import (
 from petrobot.coordinator.run.recording import RecordedStep
 from petrobot.coordinator.task import Scope, Status, Task
 from petrobot.services.comm.calls.caller import Caller, LateResult, Notice
-from petrobot.services.comm.calls.events import VERDICT_EVENTS, RunVerdict, verdict_event
+from petrobot.services.comm.calls.events import (
+    STOP_EVENT,
+    VERDICT_EVENTS,
+    RunVerdict,
+    verdict_event,
+)
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import (
     EMERGENCY_STOP,
@@ -57,6 +62,7 @@ from petrobot.services.comm.protocol.messages import (
     Feedback,
     Outcome,
     Welcome,
+    split_boot,
 )
 
 MEMORY_EVENTS: Final = "memory:"
@@ -101,7 +107,7 @@ class Executor:
         """Subscribe at every node to the events and variables of the task and to verdicts on its
         runs; `fresh`: the mission run begins now."""
         known = self._external | {MEMORY_EVENTS + name for name in self.task.flat.variables}
-        names = sorted(known | {verdict_event(self.mission)})
+        names = sorted(known | {verdict_event(self.mission), STOP_EVENT})
         for caller in self.callers.values():
             caller.subscribe(now, names, fresh=fresh)
 
@@ -145,9 +151,13 @@ class Executor:
             elif isinstance(notice, Answer):
                 self._answered(now, notice)
             elif isinstance(notice, LateResult):
+                self._abort_if_latched(now, node, notice.outcome)
                 self._queue.extend(self.dispatch.late(now, notice.outcome))
             elif isinstance(notice, Welcome):
-                self.dispatch.back(now, node, notice.boot, notice.runs)
+                process, stops = split_boot(notice.boot)
+                self.dispatch.back(now, node, process, notice.runs)
+                if stops != self.callers[node].stops:
+                    self._abort(now, node)
         self._work(now)
 
     def advance(self, now: float) -> None:
@@ -180,6 +190,11 @@ class Executor:
             self._make_safe(now)
             effects, self._effects = self._effects, []
             for instruction in effects:
+                if (
+                    isinstance(instruction, CancelRun)
+                    and instruction.run not in self.state.stopping
+                ):
+                    continue  # it ended in the same turn
                 self._queue.extend(self.dispatch.carry_out(now, instruction))
         self._make_safe(now)
 
@@ -252,19 +267,29 @@ class Executor:
     # --- what nodes say -----------------------------------------------------------------------
 
     def _ended(self, now: float, node: str, outcome: Outcome) -> None:
+        self._abort_if_latched(now, node, outcome)
         self._acks.append(lambda: self.callers[node].acknowledge(now, outcome.id))
-        latched = outcome.cause == EMERGENCY_STOP and outcome.values.get(LATCHED) is True
-        if latched and self.finished is None:
-            # Before the end of the run, so that no transition answers it. Who gave the stop also
-            # tells the coordinator, but it may have been frozen, or not have been resumed yet: then
-            # clearing the stop would let it move the devices on.
-            self._queue.append(Abort("emergency stop"))
         self._queue.extend(self.dispatch.ended(now, outcome))
+
+    def _abort_if_latched(self, now: float, node: str, outcome: Outcome) -> None:
+        """Abort before the end of the run, so that no transition answers it."""
+        if outcome.cause == EMERGENCY_STOP and outcome.values.get(LATCHED) is True:
+            self._abort(now, node)
+
+    def _abort(self, now: float, node: str) -> None:
+        """Abort because of an emergency stop that a node reports. Who gave it also tells the
+        coordinator, but it may have been frozen, or cut off, or not have been resumed yet: then
+        clearing the stop would let it move the devices on. At once: what the node says next may
+        free a device for which a run waits."""
+        if self.finished is None and self.state.mode not in (Mode.FRESH, Mode.ABORTING):
+            self.stimulate(now, Abort(f"emergency stop, as {node} reports"))
 
     def _event(self, now: float, node: str, event: Event) -> None:
         if event.number:
             self._acks.append(lambda: self.callers[node].acknowledge_event(now, event))
-        if event.name.startswith(MEMORY_EVENTS):
+        if event.name == STOP_EVENT:
+            self._abort(now, node)
+        elif event.name.startswith(MEMORY_EVENTS):
             name = event.name.removeprefix(MEMORY_EVENTS)
             self._queue.append(VariableChanged(name, event.data.get("value"), event.source))
         elif event.name.startswith(VERDICT_EVENTS):

@@ -34,6 +34,7 @@ from petrobot.services.comm.protocol.messages import (
     Feedback,
     Outcome,
     Welcome,
+    split_boot,
 )
 
 _log = logging.getLogger(__package__)
@@ -471,7 +472,7 @@ class Mission:
                 self.lost[node] = notice.reason
             elif isinstance(notice, Welcome):
                 self.lost.pop(node, None)
-                self.executor.store.record(NODE, {"node": node, "boot": notice.boot})
+                self.executor.store.record(NODE, {"node": node, "boot": split_boot(notice.boot)[0]})
                 self._send_seed(now, node)
 
     def _send_seed(self, now: float, node: str) -> None:

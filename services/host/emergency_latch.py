@@ -6,6 +6,9 @@ commands (`*`: all). The node writes it, and checks it before each run on a devi
 per second. `petrobot estop` writes it for a node of its own host that does not answer. A file that
 cannot be read or understood counts as `*`: in doubt, devices stay stopped.
 
+Beside it another file counts the stops that were cleared. It stays, so that a caller that was
+frozen from before a stop until after it was cleared is still known to have missed it.
+
 The file is in `$PETROBOT_STATE`; else in `.petrobot` beside services.toml; else, if that cannot be
 written, in a folder of the user (`$XDG_STATE_HOME` or `~/.local/state`). A file in any of these
 folders counts, and clearing clears all of them.
@@ -47,11 +50,19 @@ class Latch:
     def stop(self, devices: Iterable[str]) -> Path:
         """Add devices to the stopped ones. Return the file, once it is safe on disk. Raises
         LatchError."""
-        names = sorted(self.stopped() | set(devices))
+        return self._write(".stopped", sorted(self.stopped() | set(devices)))
+
+    @property
+    def cleared(self) -> int:
+        """How many stops were cleared; files that cannot be read do not count."""
+        return max(_number(path.with_suffix(".cleared")) for path in self.paths)
+
+    def _write(self, suffix: str, lines: list[str]) -> Path:
+        """Write a file in the first folder in which that is possible, and return it."""
         faults = []
-        for path in self.paths:
+        for path in (path.with_suffix(suffix) for path in self.paths):
             try:
-                _write(path, names)
+                _write(path, lines)
             except OSError as fault:
                 faults.append(f"{path}: {fault.strerror}")
             else:
@@ -63,6 +74,8 @@ class Latch:
         LatchError, and then nothing is cleared."""
         stopped = self.stopped()
         left = (set(all_devices) if ALL in stopped else set(stopped)) - set(devices)
+        if stopped:  # Counted first: a stop that is not counted must not be cleared.
+            self._write(".cleared", [str(self.cleared + 1)])
         if left:
             self.stop(left)
         for path in self.paths:
@@ -101,6 +114,13 @@ def _read(path: Path) -> frozenset[str]:
     except (OSError, ValueError):
         return frozenset({ALL})
     return frozenset(names) or frozenset({ALL})
+
+
+def _number(path: Path) -> int:
+    try:
+        return int(path.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return 0
 
 
 def _write(path: Path, names: list[str]) -> None:

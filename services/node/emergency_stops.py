@@ -77,6 +77,8 @@ class EmergencyStops:
         self._devices = tuple(devices)
         self._latch = latch
         self._stopped: set[str] = set()
+        self.cleared = 0 if latch is None else latch.cleared
+        """How many stops were cleared. A caller that knows of fewer slept through one."""
 
     def __contains__(self, device: str) -> bool:
         return device in self._stopped
@@ -97,6 +99,7 @@ class EmergencyStops:
         if self._latch is None:
             return []
         self.due = now + LOOK if self._devices else NEVER
+        self.cleared = max(self.cleared, self._latch.cleared)
         stopped = self._latch.stopped()
         return (
             self._add(d for d in self._devices if d in stopped or ALL in stopped) if stopped else []
@@ -124,6 +127,8 @@ class EmergencyStops:
                 self._latch.clear(devices, self._devices)
         except LatchError as fault:
             return str(fault)
+        cleared = self.cleared + (not self._stopped.isdisjoint(devices))
+        self.cleared = max(cleared, self._latch.cleared if self._latch is not None else 0)
         self._stopped.difference_update(devices)
         return ""
 

@@ -19,6 +19,7 @@ from petrobot.services.comm.calls.callee import (
     Order,
 )
 from petrobot.services.comm.calls.caller import Caller, Notice
+from petrobot.services.comm.calls.events import STOP_EVENT
 from petrobot.services.comm.calls.peers import NODE
 from petrobot.services.comm.location_file import (
     MEMORY,
@@ -33,6 +34,7 @@ from petrobot.services.comm.protocol.messages import (
     COORDINATOR,
     LATCHED,
     SEED,
+    STOPS,
     Answer,
     Call,
     Cancel,
@@ -41,6 +43,7 @@ from petrobot.services.comm.protocol.messages import (
     Executed,
     Hello,
     Outcome,
+    split_boot,
 )
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 from petrobot.services.device import PICTURE
@@ -156,6 +159,11 @@ VERBS = frozenset(
 """Verbs of a COMMAND."""
 _OWN_CAUSES = ("deadline", "orphan", EMERGENCY_STOP)
 _WELL_HELD = ("held", "stopped")
+MISSED = (
+    "an emergency stop was given and cleared after this caller had connected: nothing that began "
+    "before it moves a device"
+)
+"""Why a device is refused to a caller that does not know of a stop."""
 
 
 @dataclass
@@ -230,6 +238,7 @@ class Node:
             [key for key in self.places if key not in (LOOP, GENERAL)], latch
         )
         self._stop_places(0.0, self._stops.at_start())
+        self.callee.stops = self._stops.cleared
 
     def _offers(self, waiting: Mapping[str, ActionEntry]) -> dict[str, Offer]:
         offers = {
@@ -285,7 +294,7 @@ class Node:
         """Do all that is due: orders of callers, runs, devices, timers, and their results."""
         self._now = now
         if now >= self._stops.due:
-            self._stop_places(now, self._stops.look(now))
+            self._look_for_stops(now)
         self._advance_ends(now)
         self.obey(now, self.callee.orders())
         self._answer_runs(now)
@@ -381,10 +390,12 @@ class Node:
     def _start(self, now: float, call: Call) -> None:
         key = self._host_of(call.service)
         if key not in (LOOP, GENERAL):  # a look opens files; what has no device needs none
-            self._stop_places(now, self._stops.look(now))
-            if key in self._stops:
+            self._look_for_stops(now)
+            missed = bool(call.boot) and split_boot(call.boot)[1] != self._stops.cleared
+            if key in self._stops or missed:
                 _log.info("run %s of %s refused: %s", call.id, call.service, EMERGENCY_STOP)
-                refused = ({LATCHED: True}, EMERGENCY_STOP, IN_EMERGENCY, Executed.NO)
+                text = IN_EMERGENCY if key in self._stops else MISSED
+                refused = (self._latched(key), EMERGENCY_STOP, text, Executed.NO)
                 self.callee.finish(now, Outcome(call.id, Status.ERROR, *refused))
                 return
         _log.info("run %s of %s started", call.id, call.service)
@@ -414,18 +425,20 @@ class Node:
             text = f"{self.name} has no device {command.target!r}"
             self.callee.answer(now, command.id, False, {"cause": "unknown_device", "text": text})
         else:
-            if command.verb == CLEAR_EMERGENCY and (why := self._stops.clear(keys)):
-                self.callee.answer(now, command.id, False, {"cause": "latched", "text": why})
-                return
+            if command.verb == CLEAR_EMERGENCY:
+                why = self._stops.clear(keys)
+                self.callee.stops = self._stops.cleared
+                if why:
+                    self.callee.answer(now, command.id, False, {"cause": "latched", "text": why})
+                    return
             self._commands[command.id] = _Commanded(command.verb, now + ANSWER_WITHIN, set(keys))
             for key in keys:
                 self.places[key].command(now, command)
-            if (
-                command.verb == EMERGENCY_STOP
-            ):  # the devices first, the disk then; both before the answer
-                self._commands[command.id].note = self._stops.stop(
-                    [key for key in keys if key != GENERAL]
-                )
+            devices = [key for key in keys if key != GENERAL]
+            if command.verb == EMERGENCY_STOP and devices:
+                # the devices first, the disk then; both before the answer
+                self._commands[command.id].note = self._stops.stop(devices)
+                self._tell_of_stop(now)
 
     def _has_ended(self, run: object) -> bool:
         """Whether a run that is to be held is not active any more: a hold would catch the next run,
@@ -439,6 +452,21 @@ class Node:
     def _stop_places(self, now: float, keys: Iterable[str]) -> None:
         for key in keys:
             self.places[key].command(now, Command("", EMERGENCY_STOP))
+
+    def _look_for_stops(self, now: float) -> None:
+        """Stop what the latch on disk says; it may have been set and cleared while this process
+        was frozen."""
+        if fresh := self._stops.look(now):
+            self._stop_places(now, fresh)
+            self._tell_of_stop(now)
+        self.callee.stops = self._stops.cleared
+
+    def _tell_of_stop(self, now: float) -> None:
+        """Tell the coordinators, which abort: one may have no run on a stopped device now."""
+        self.callee.raise_event(now, STOP_EVENT, source=self.name)
+
+    def _latched(self, device: str) -> dict[str, Any]:
+        return {LATCHED: True, STOPS: self._stops.cleared + (device in self._stops)}
 
     def _answer_commands(self, now: float) -> None:
         if not self._commands:
@@ -487,9 +515,9 @@ class Node:
         if (service := self.callee.service_of(end.id)) is None:
             return
         if end.cause == EMERGENCY_STOP:
-            self._stop_places(now, self._stops.look(now))  # this process may have been frozen
-            if self._host_of(service) in self._stops:
-                end = replace(end, values={LATCHED: True})
+            self._look_for_stops(now)  # this process may have been frozen
+            if (device := self._host_of(service)) in self._stops:
+                end = replace(end, values=self._latched(device))
         for caller in self.callers.values():
             caller.cancel_children(now, end.id, "its run is over")
         _log.info("run %s ended: %s %s %s", end.id, end.status, end.cause, end.text)

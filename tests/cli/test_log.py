@@ -84,7 +84,7 @@ STORY: tuple[tuple[Stimulus, str], ...] = (
     (RunStarted("carrying#1"), ""),
     (RunRaised("carrying#1", "other"), "event     other                raised by carrying#1"),
     (ForceExit("carried"), "operator  carried              forced by the operator"),
-    (Abort("by ben"), "operator                       aborted: by ben"),
+    (Abort("by ben"), "aborted                        by ben"),
 )  # fmt: skip
 
 

@@ -61,9 +61,10 @@ async def test_a_node_that_is_frozen_counts_as_lost(petrobot: Terminal) -> None:
 
 
 async def test_a_node_without_active_runs_is_idle_in_a_pause(petrobot: Terminal) -> None:
-    """No device had to hold."""
+    """No device had to hold, which does not say that none moves."""
     said = await petrobot("pause", "--json", "-")
     assert said.json["nodes"] == {"robot": "idle"}
+    assert "robot        runs no action: nothing was asked to hold" in (await petrobot("pause")).out
 
 
 async def test_an_abort_releases_held_devices(petrobot: Terminal) -> None:

@@ -64,6 +64,44 @@ def test_a_call_carries_epoch_boot_and_its_arguments_as_plain_data() -> None:
     assert caller.messages(0.0) == []
 
 
+def test_a_call_names_the_stops_that_its_caller_knows_of() -> None:
+    """Those before the first connection and those of which a result told, but none of which only a
+    later WELCOME tells: the owner has to decide whether it goes on."""
+    caller = Caller("motion", HELLO)
+
+    def boot(n: int) -> str:
+        caller.call(0.0, m.Call(str(n), "move"))
+        (call,) = caller.messages(0.0)
+        assert isinstance(call, m.Call)
+        return call.boot
+
+    caller.link_up(0.0, _welcome("n1+2"))
+    assert (caller.boot, boot(1)) == ("n1", "n1+2")
+    caller.link_down(1.0, "cut")
+    caller.link_up(1.1, _welcome("n1+3"))
+    caller.messages(1.1)
+    assert boot(2) == "n1+2"
+    caller.receive(1.2, m.Outcome("2", "error", {m.LATCHED: True, m.STOPS: 3}, m.EMERGENCY_STOP))
+    assert boot(3) == "n1+3"
+    caller.link_down(2.0, "cut")
+    caller.link_up(2.1, _welcome("n2+4"))
+    caller.messages(2.1)
+    assert (caller.boot, boot(4)) == ("n2", "n2+3"), "another process keeps the count"
+
+
+@pytest.mark.parametrize(
+    ("boot", "parts"),
+    [
+        ("n1", ("n1", 0)),
+        ("n1+12", ("n1", 12)),
+        ("a+b in lock step", ("a+b in lock step", 0)),
+        ("", ("", 0)),
+    ],
+)
+def test_a_boot_is_a_process_and_a_number_of_stops(boot: str, parts: tuple[str, int]) -> None:
+    assert m.split_boot(boot) == parts and m.boot_text(*parts) == boot
+
+
 def test_a_run_from_accept_to_acknowledged_result() -> None:
     caller = _caller()
     caller.call(0.0, CALL)

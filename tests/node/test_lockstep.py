@@ -25,6 +25,8 @@ from petrobot.services.comm.lockstep.channels import (
 )
 from petrobot.services.comm.lockstep.party import TICK, Envelope
 from petrobot.services.comm.protocol.messages import (
+    LATCHED,
+    STOPS,
     Accept,
     Answer,
     Call,
@@ -227,8 +229,8 @@ def test_an_action_on_a_cyclic_device() -> None:
 
 
 def test_a_stopped_device_starts_no_run_before_it_is_cleared() -> None:
-    """The run is refused before it begins, so none of it was executed. Devices of other nodes still
-    work."""
+    """The run is refused before it begins, so none of it was executed; so is the run of a caller
+    that missed a stop which is cleared. Devices of other nodes still work."""
     bench = Bench(directory())
     assert bench.call("go", 1.0, to=0.1).status == "success"
     coordinator = bench.coordinator
@@ -239,10 +241,17 @@ def test_a_stopped_device_starts_no_run_before_it_is_cleared() -> None:
         bench.run(0.5)
 
     order(1, "emergency_stop")
+    order(2, "clear_emergency")
+    missed = bench.call("go", to=0.5)
+    assert (missed.cause, missed.executed) == ("emergency_stop", "no")
+    assert missed.values == {LATCHED: True, STOPS: 1} and "given and cleared" in missed.text
+    assert bench.call("go", to=0.2).status == "success", "its caller knows of the stop by now"
+    order(3, "emergency_stop")
     refused = bench.call("go", to=0.5)
     assert (refused.status, refused.cause, refused.executed) == ("error", "emergency_stop", "no")
     assert bench.call("look", images=1).status == "success"
-    order(2, "clear_emergency")
+    assert refused.values == {LATCHED: True, STOPS: 2}
+    order(4, "clear_emergency")
     moved = bench.call("go", to=0.3)
     assert (moved.status, moved.values["position"]) == ("success", pytest.approx(0.3))
 

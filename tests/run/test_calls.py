@@ -394,3 +394,13 @@ def test_of_timers_that_elapse_together_the_one_armed_first_is_first() -> None:
     timers.arm(1.0, "never#13", 5.0)
     assert timers.over(2.0) == ["late#12", "open#9", "open#10", "close#11"]
     assert len(timers) == 1
+
+
+def test_a_run_that_ended_in_the_turn_of_its_cancel_is_not_stopped_again() -> None:
+    """The bell and the end come together: the run counts as preempted, and nothing is odd."""
+    bench = Bench().begin()
+    for message in (m.Event("bell", "desk", 1), done(WORK, "success")):
+        bench.caller.receive(1.0, message)
+    bench.go(1.0)
+    assert [record.cancelled for record in bench.records] == [True] and bench.reports == []
+    assert bench.calls() == [TIDY]

@@ -17,6 +17,7 @@ from petrobot.coordinator.engine import (
 )
 from petrobot.coordinator.run.calls import STOP_MARGIN
 from petrobot.coordinator.task import Executed, Status
+from petrobot.services.comm.calls.events import STOP_EVENT
 from petrobot.services.comm.protocol import messages as m
 from tests.run.toy_arm import TIDY, WORK, Bench
 
@@ -129,8 +130,9 @@ def test_an_emergency_stop_that_only_its_node_reports_aborts_the_run(
     bench.say(2.1, m.Outcome(WORK, "error", {m.LATCHED: True}, m.EMERGENCY_STOP, "", executed))
     finished = bench.executor.finished
     assert finished is not None and finished.status is Status.ERROR
-    assert "emergency stop" in finished.reason
+    assert finished.reason == "aborted: emergency stop, as motion reports"
     assert bench.fired == [] and bench.calls() == []
+    assert bench.reports == [], "the run that ended with the stop is not stopped as well"
 
 
 def test_a_stop_that_a_driver_reports_is_an_error_that_the_task_may_answer() -> None:
@@ -138,3 +140,33 @@ def test_a_stop_that_a_driver_reports_is_an_error_that_the_task_may_answer() -> 
     bench = Bench().begin()
     bench.say(2.1, m.Outcome(WORK, "error", {}, m.EMERGENCY_STOP, "the drives have no power"))
     assert bench.fired[-1] == "failed" and bench.calls() == [TIDY]
+
+
+@pytest.mark.parametrize("how", ["told at once", "told when it is back", "told too late"])
+def test_an_emergency_stop_aborts_the_run_whichever_way_its_node_tells_it(how: str) -> None:
+    """By the pulse, while the link holds; by WELCOME, if the stop was given and cleared while there
+    was no link; by the result of a run that was given up."""
+    bench = Bench().begin()
+    if how == "told at once":
+        bench.say(2.0, m.Event(STOP_EVENT, "motion", 0))
+    elif how == "told when it is back":
+        bench.caller.link_down(1.0, "cut")
+        bench.link(2.0, "n1+1", runs=[WORK])
+    else:
+        bench.caller.link_down(1.0, "silent", final=True)
+        assert bench.executor.state.mode is Mode.RUNNING
+        values = {m.LATCHED: True, m.STOPS: 1}
+        bench.link(1.2, "n1", [WORK])
+        bench.say(1.3, m.Outcome(WORK, "error", values, m.EMERGENCY_STOP))
+    assert bench.executor.state.mode in (Mode.ABORTING, Mode.FINISHED)
+    assert TIDY not in bench.calls()
+
+
+def test_a_run_that_is_resumed_after_a_stop_was_cleared_continues() -> None:
+    """To resume it was decided after the stop. The journal names processes of nodes alone."""
+    bench = Bench().begin()
+    after = bench.resumed(2.0, boot="n1+1", runs=[WORK])
+    (call,) = after.sent(m.Call)
+    assert isinstance(call, m.Call) and (call.id, call.boot) == (WORK, "n1+1")
+    after.say(2.1, m.Outcome(WORK, "success"))
+    assert after.calls() == [TIDY] and after.executor.state.mode is Mode.RUNNING

@@ -110,3 +110,26 @@ def test_the_folders_of_the_latch(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert latch_of(tmp_path / "services.toml", "motion").paths == (
         tmp_path / "given" / "motion.stopped",
     )
+
+
+def test_cleared_stops_are_counted_and_the_count_stays(tmp_path: Path) -> None:
+    """In memory and on disk alike: whoever clears a stop, its node knows how many there were, even
+    if it was frozen or is another process. Where nothing was stopped, nothing is counted."""
+    stops = EmergencyStops(DEVICES, latch(tmp_path))
+    assert stops.clear(DEVICES) == "" and stops.cleared == 0
+    stops.stop(["arm"])
+    assert stops.clear(["arm"]) == "" and stops.clear(["arm"]) == "" and stops.cleared == 1
+    latch(tmp_path).stop([ALL])
+    latch(tmp_path).clear(DEVICES, DEVICES)
+    assert stops.look(1.0) == [] and stops.cleared == 2
+    assert EmergencyStops(DEVICES, latch(tmp_path)).cleared == 2
+    assert [path.name for path in tmp_path.rglob("*.*")] == ["motion.cleared"]
+
+
+def test_a_stop_that_cannot_be_counted_is_not_cleared(tmp_path: Path) -> None:
+    latch(tmp_path).stop(["arm"])
+    for folder in ("first", "second"):
+        (tmp_path / folder / "motion.cleared").mkdir(parents=True)
+    with pytest.raises(LatchError, match=r"motion\.cleared: Is a directory"):
+        latch(tmp_path).clear(DEVICES, DEVICES)
+    assert latch(tmp_path).stopped() == {"arm"}

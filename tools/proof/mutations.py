@@ -174,7 +174,7 @@ MUTATIONS = (
     _m(
         "a node executes a call that was meant for its former process",
         COMM + "calls/callee.py",
-        "if call.boot and call.boot != self.boot:\n            text",
+        "if self._means_another(call):\n            text",
         "if False:\n            text",
         "tests/comm",
     ),
@@ -217,8 +217,15 @@ MUTATIONS = (
     _m(
         "a run starts although its device is stopped",
         "services/node/node.py",
-        "            if key in self._stops:\n                _log.info",
-        "            if False:\n                _log.info",
+        "            if key in self._stops or missed:",
+        "            if missed:",
+        "tests/node/test_lockstep.py",
+    ),
+    _m(
+        "a run of a caller that missed an emergency stop starts",
+        "services/node/node.py",
+        "            if key in self._stops or missed:",
+        "            if key in self._stops:",
         "tests/node/test_lockstep.py",
     ),
     _m(

@@ -15,7 +15,7 @@ WORDS = {
     "held": "holds",
     "cannot_hold": "CANNOT HOLD: its action continues",
     "stopped": "stands still",
-    "idle": "has nothing to do",
+    "idle": "runs no action: nothing was asked to hold",
     "lost": "DID NOT ANSWER",
 }
 

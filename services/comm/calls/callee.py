@@ -59,6 +59,8 @@ from petrobot.services.comm.protocol.messages import (
     ResultAck,
     Subscribe,
     Welcome,
+    boot_text,
+    split_boot,
 )
 from petrobot.services.comm.protocol.plain import NotPlainError, plain
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, negotiate
@@ -338,6 +340,8 @@ class Callee:
     ) -> None:
         self.name = name
         self.boot = boot
+        self.stops = 0
+        """How many emergency stops of the node were cleared; WELCOME tells it."""
         self.offers: Mapping[str, Offer] = dict(offers)
         self.directory = directory
         self.events = EventBoard()
@@ -398,7 +402,8 @@ class Callee:
         runs = [id_ for id_, run in self._running.items() if run.peer == peer] + self._results.of(
             peer
         )
-        return Welcome(version, self.name, self.boot, offers, tuple(runs), self.directory)
+        boot = boot_text(self.boot, self.stops)
+        return Welcome(version, self.name, boot, offers, tuple(runs), self.directory)
 
     def link_down(self, now: float, peer: str, *, leaves: bool = False) -> None:
         """The connection of a caller is closed. With `leaves` it said BYE and gives up leases and
@@ -433,7 +438,7 @@ class Callee:
         if id_ in self._running or id_ in self._results:
             self._known(peer, id_)
             return
-        if call.boot and call.boot != self.boot:
+        if self._means_another(call):
             text = f"{self.name} was restarted; this call was meant for its previous process"
             # The outcome is stored. Otherwise a following CANCEL would find no trace of the call
             # and answer executed = no.
@@ -470,7 +475,7 @@ class Callee:
             or id_ in self._running
         ):
             return None
-        if (call.boot and call.boot != self.boot) or (call.again and not results.gone.complete):
+        if self._means_another(call) or (call.again and not results.gone.complete):
             return None
         if self._peers.refusal_of_call(now, peer, call, offer, self._in_use) is not None:
             return None
@@ -486,6 +491,11 @@ class Callee:
         due = now + self._keeping.results
         if due < self.soonest:
             self.soonest = due
+
+    def _means_another(self, call: Call) -> bool:
+        """Whether the call was meant for an earlier process of this node."""
+        boot = call.boot
+        return bool(boot) and boot != self.boot and split_boot(boot)[0] != self.boot
 
     def _known(self, peer: str, id_: str) -> None:
         """Answer a call id that came before with what is known; never run it again."""

@@ -23,7 +23,14 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from petrobot.services.comm.calls.events import EventIntake
 from petrobot.services.comm.protocol import messages as m
-from petrobot.services.comm.protocol.messages import Call, Executed, Outcome, ResultAck
+from petrobot.services.comm.protocol.messages import (
+    Call,
+    Executed,
+    Outcome,
+    ResultAck,
+    boot_text,
+    split_boot,
+)
 from petrobot.services.comm.protocol.plain import plain
 
 NEVER: Final = float("inf")
@@ -390,7 +397,10 @@ class Caller:
         self.hello = hello
         self.up = False
         self.boot = ""
-        """Boot of the peer; empty before the first connection."""
+        """Boot of the peer's process; empty before the first connection."""
+        self.stops = 0
+        """How many cleared emergency stops of the peer are known: those before the first
+        connection, and those of which a result told."""
         self.offers: tuple[str, ...] = ()
         self.soonest = NEVER
         """A time that is never later than `due` (s). A shell whose timer is not set for later need
@@ -475,7 +485,7 @@ class Caller:
             arguments,
             deadline,
             epoch or self.hello.epoch,
-            boot or self.boot,
+            boot_text(boot or self.boot, self.stops),
             parent,
             seed,
             again,
@@ -572,10 +582,13 @@ class Caller:
     def link_up(self, now: float, welcome: m.Welcome) -> None:
         """The peer welcomed us: send pending calls again under their ids, or end them if it is
         another boot."""
-        same = welcome.boot == self.boot
+        process, stops = split_boot(welcome.boot)
+        same = process == self.boot
+        if not self.boot:
+            self.stops = stops
         self.up = True
         self._absence.over()
-        self.boot, self.offers = welcome.boot, welcome.offers
+        self.boot, self.offers = process, welcome.offers
         self._notices.append(welcome)
         if not same:
             self._forget_boot()
@@ -655,6 +668,8 @@ class Caller:
         take = self._pending.pop
         for outcome in outcomes:
             id_ = outcome.id
+            if outcome.cause == m.EMERGENCY_STOP:
+                self._learn_of_stop(outcome)
             pending = take(id_, None)
             if pending is None:
                 if id_ not in safe:
@@ -673,6 +688,11 @@ class Caller:
             self._notices.append(outcome)
         if safe:
             self._ack(now, *safe)
+
+    def _learn_of_stop(self, outcome: m.Outcome) -> None:
+        stops = outcome.values.get(m.STOPS)
+        if outcome.values.get(m.LATCHED) is True and type(stops) is int:
+            self.stops = stops
 
     def _take_late(self, now: float, outcome: m.Outcome) -> None:
         id_ = outcome.id
@@ -760,8 +780,8 @@ class Caller:
 
     def _send(self, now: float, pending: PendingCall) -> None:
         call = pending.call
-        if pending.any_boot and call.boot != self.boot:
-            call = pending.call = replace(call, boot=self.boot)
+        if pending.any_boot and split_boot(call.boot)[0] != self.boot:
+            call = pending.call = replace(call, boot=boot_text(self.boot, self.stops))
         if pending.sent and not call.again:
             call = pending.call = replace(call, again=True)
         pending.sent, pending.accepted = True, False

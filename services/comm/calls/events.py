@@ -198,6 +198,8 @@ class EventIntake:
 # node, raises the event `verdict:MISSION` with the data {run, status, cause, text}. The coordinator
 # of that mission run subscribes to this name and acknowledges the event when it has stored it.
 
+STOP_EVENT: Final = "emergency_stop:"
+"""The pulse that a node raises at an emergency stop, for coordinators."""
 VERDICT_EVENTS: Final = "verdict:"
 """Prefix of the names of these events."""
 STATUSES: Final = ("success", "failure", "error")

@@ -21,9 +21,24 @@ EMERGENCY_STOP: Final = "emergency_stop"
 """Verb of the operator: stop at once and refuse all commands. Also the cause of a run that its node
 ended or refused because of it; a driver may give this cause, too, for a stop of its own device."""
 LATCHED: Final = "latched"
-"""Value of such a result while the node's stop is not cleared."""
+"""Value of such a result if the node's stop is not cleared, or its caller did not know of it."""
+STOPS: Final = "stops"
+"""Value of a latched result: the number of cleared stops that its caller knows of from then on."""
 SEED: Final = "seed"
 """Verb and key of the COMMAND that tells the mission's seed to devices that no action uses."""
+
+
+def boot_text(process: str, stops: int) -> str:
+    """Return the boot of a node: the random text of its process, and how many emergency stops were
+    cleared on it, if any. A call to a device that names another number is refused, so a caller that
+    slept through a stop moves nothing."""
+    return f"{process}+{stops}" if stops else process
+
+
+def split_boot(boot: str) -> tuple[str, int]:
+    """Return what `boot_text` put together."""
+    process, plus, stops = boot.rpartition("+")
+    return (process, int(stops)) if plus and stops.isdecimal() else (boot, 0)
 
 
 class Executed(StrEnum):
@@ -99,8 +114,8 @@ class Call:
     """Longest duration of the run (s); the node enforces it."""
     epoch: int = 0
     boot: str = ""
-    """Boot of the peer that the caller means; empty: any. Another boot answers `executed =
-    unknown`."""
+    """Boot of the peer that the caller means (`boot_text`); empty: any. Another process answers
+    `executed = unknown`."""
     parent: str = ""
     """Id of the call on whose behalf this one is made; it is cancelled together with its parent."""
     seed: int = 0

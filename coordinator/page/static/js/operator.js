@@ -20,7 +20,7 @@ const STATE_WORD = {
   failure: "Failure", error: "Error", aborted: "Aborted", stopped: "Emergency stop",
 };
 const PAUSE_WORD = { operator: "Paused by the operator", step: "Paused after one firing" };
-const HELD_WORD = { held: "held", cannot_hold: "cannot hold", stopped: "stopped", lost: "no answer" };
+const HELD_WORD = { held: "held", idle: "no action to hold", cannot_hold: "cannot hold", stopped: "stopped", lost: "no answer" };
 
 /** What a pause was answered by each node, for people. */
 const heldWords = (nodes) => Object.entries(nodes ?? {}).map(([node, answer]) => `${node}: ${HELD_WORD[answer] ?? answer}`).join(", ");
