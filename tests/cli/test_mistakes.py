@@ -120,12 +120,6 @@ IN_THE_TASK: list[Mistake] = [
         "",
         r":31: places.fetch: no outgoing arc `error`[^|]*\[errors\] to = ",
     ),
-    (
-        TASK,
-        "[errors]",
-        "[events.button]\n[errors]",
-        r": events.button.scope: missing; give one of internal, external",
-    ),
     (TASK, '["grip:normal"]', '["grip"]', r":LINE: .*its arc must say when.*write grip:normal"),
     (TASK, '["grip:normal"]', '["grip:success"]', r":LINE: .*'success' is none of normal, error"),
     (TASK, '["grip:normal"]', '["grab:normal"]', r":LINE: .*unknown place 'grab'"),

@@ -276,11 +276,12 @@ def _task(root: Table) -> Task:
 
 
 def _primitive_task(name: str, t: Table) -> PrimitiveTask:
+    alternatives = t.texts("alternatives")
     primitive = PrimitiveTask(
         name=name,
-        goal=t.text("goal"),
+        goal=t.text("goal", ""),
         specification=t.text("specification", ""),
-        alternatives=t.texts("alternatives"),
+        alternatives=alternatives if "alternatives" in t.data else (name,),
         deadline=t.number("deadline"),
         target_reliability=t.maybe_number("target_reliability"),
         cost=t.text("cost", "wall"),
@@ -323,7 +324,7 @@ def _variable(name: str, t: Table) -> Variable:
 def _event(name: str, t: Table) -> Event:
     event = Event(
         name=name,
-        scope=t.word("scope", Scope),
+        scope=t.word("scope", Scope, Scope.INTERNAL if "by" in t.data else Scope.EXTERNAL),
         memory=t.word("memory", EventMemory, EventMemory.PULSE),
         early=t.word("early", EarlyEvent, EarlyEvent.DROP),
         by=t.text("by", ""),
@@ -346,12 +347,13 @@ def _errors_to(t: Table) -> str:
 
 
 def _place(name: str, t: Table) -> Place:
+    kind = _kind(t)
     place = Place(
         name=name,
-        kind=_kind(t),
+        kind=kind,
         tokens=t.integer("tokens", 0),
         capacity=t.maybe_integer("capacity"),
-        task=t.text("task", ""),
+        task=t.text("task", name if kind is Kind.ACTION else ""),
         args={n: _argument(v) for n, v in t.plain("args").items()},
         out=_texts(t.table("out")),
         servers=t.maybe_integer("servers"),

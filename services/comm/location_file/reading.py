@@ -171,24 +171,30 @@ class Faults:
         self.lines.append(f"{place}: {key}: {fault}")
 
     def _line(self, path: list[str]) -> int:
-        """Return the line of the key; else of the header of its table; else 0.
+        """Return the line of the key, or of the table around it, which may be an inline one; else
+        0.
 
         tomllib reports no positions, so the line is searched in the text.
         """
-        table, wanted, header, first = path[:-1], ".".join(path), "", 0
+        wanted, header, first, longest = f"{'.'.join(path)}.", "", 0, 0
         for number, raw in enumerate(self._lines, 1):
-            line = raw.strip()
-            if opened := re.fullmatch(r"\[+\s*([^\]]+?)\s*\]+\s*(#.*)?", line):
-                header = ".".join(part.strip().strip("\"'") for part in opened[1].split("."))
-                if f"{header}.".startswith(f"{wanted}."):
+            if opened := re.fullmatch(r"\[+\s*([^\]]+?)\s*\]+\s*(#.*)?", raw.strip()):
+                here = header = _bare(opened[1])
+                if f"{here}.".startswith(wanted):
                     return number
-                if header == ".".join(table):
-                    first = number
-            elif header == ".".join(table) and re.match(
-                rf"[\"']?{re.escape(path[-1])}[\"']?\s*=", line
-            ):
+            elif key := re.match(r"\s*([\w./\-\"']+)\s*=", raw):
+                here = f"{header}.{_bare(key[1])}".lstrip(".")
+            else:
+                continue
+            if wanted == f"{here}.":
                 return number
+            if wanted.startswith(f"{here}.") and len(here) > longest:
+                first, longest = number, len(here)
         return first
+
+
+def _bare(key: str) -> str:
+    return ".".join(part.strip().strip("\"'") for part in key.split("."))
 
 
 def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
