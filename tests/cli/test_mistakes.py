@@ -64,14 +64,14 @@ IN_THE_TASK: list[Mistake] = [
     ),
     (
         TASK,
-        '["move"] ',
-        '["mov"] ',
+        "move = {",
+        'move = { alternatives = ["mov"],',
         r":LINE: .*no node offers the action 'mov'.*'move'[^|]*add \[act",
     ),
     (
         TASK,
-        '["move"] ',
-        "[] ",
+        "move = {",
+        "move = { alternatives = [],",
         r":LINE: primitive_tasks.move.alternatives: it has no action; name at",
     ),
     (TASK, "tokens = 3", "tokens = -3", r":LINE: places.parts.tokens: expected 0 or more.*got -3"),
@@ -90,11 +90,11 @@ IN_THE_TASK: list[Mistake] = [
     ),
     (
         TASK,
-        'kind = "action", task = "grip"',
-        'task = "grip"',
+        'kind = "action", tries',
+        'task = "grip", tries',
         r":LINE: .*kind: missing.*write kind =",
     ),
-    (TASK, 'task = "grip"', 'task = "gripp"', r":LINE: .*unknown primitive task 'gripp'.*'grip'"),
+    (TASK, '"action", tries', '"action", task = "gripp", tries', r":LINE: .*'gripp'.*mean 'grip'"),
     (TASK, "tries = 3", "tries = 0", r":LINE: places.grip.tries: 0 tries; give 1 or more"),
     (
         TASK,
@@ -118,7 +118,7 @@ IN_THE_TASK: list[Mistake] = [
         TASK,
         '[errors]\nto = "broken"',
         "",
-        r":31: places.fetch: no outgoing arc `error`[^|]*\[errors\] to = ",
+        r":23: places.fetch: no outgoing arc `error`[^|]*\[errors\] to = ",
     ),
     (TASK, '["grip:normal"]', '["grip"]', r":LINE: .*its arc must say when.*write grip:normal"),
     (TASK, '["grip:normal"]', '["grip:success"]', r":LINE: .*'success' is none of normal, error"),
@@ -147,7 +147,7 @@ IN_THE_TASK: list[Mistake] = [
         TASK,
         '{ in = ["carry:normal"] }',
         '{ in = ["carry:error"] }',
-        r":34: places.carry: no outgoing arc `normal`",
+        r":26: places.carry: no outgoing arc `normal`",
     ),
 ]
 
@@ -180,7 +180,7 @@ IN_THE_CELL: list[Mistake] = [
         "arm_bot:gripp",
         r":LINE: actions.grip.run: .*no 'gripp'; did you mean 'gri",
     ),
-    (CELL, "[actions.grip]", "[action.grip]", r":LINE: action: .*did you mean 'actions'"),
+    (CELL, "[actions]", "[action]", r":LINE: action: .*did you mean 'actions'"),
     (
         CELL,
         "port = 7501",
@@ -190,8 +190,8 @@ IN_THE_CELL: list[Mistake] = [
     (
         CELL,
         'run = "arm_bot:grip"',
-        'run = "arm_bot:grip"\nargs = { slip = 1 }',
-        r":18: .*no argument 'slip'; did you mean",
+        'run = "arm_bot:grip", args = { slip = 1 }',
+        r":11: .*no argument 'slip'; did you mean",
     ),
 ]
 
@@ -313,7 +313,7 @@ IN_THE_CODE: list[Mistake] = [
 BOTH: list[tuple[list[Mistake], str]] = [
     (
         [
-            (TASK, 'task = "grip", tries', 'task = "grip", out = { width = "w" }, tries', ""),
+            (TASK, '"action", tries', '"action", out = { width = "w" }, tries', ""),
             (TASK, "[places]", '[variables.w]\ntype = "float"\n\n[places]', ""),
         ],
         r"places.grip.out.width: no action of grip returns a value 'width'.*return it",
@@ -481,7 +481,7 @@ def test_an_event_that_a_driver_misspells_is_told(
 
 
 RAISED = 'self.ports.raise_event("button")\n        if not self.paused:'
-TIMER = '[timers.button]\nnode = "pc"\nperiod = 1.0\n\n[nodes.pc]'
+TIMER = '[timers.button]\nnode = "pc"\nperiod = 1.0\n\n[nodes]'
 
 
 @pytest.mark.processes
@@ -489,7 +489,7 @@ TIMER = '[timers.button]\nnode = "pc"\nperiod = 1.0\n\n[nodes.pc]'
     ("file", "old", "new", "told"),
     [
         (CODE, "if not self.paused:", RAISED, ""),
-        (CELL, "[nodes.pc]", TIMER, ""),
+        (CELL, "[nodes]", TIMER, ""),
         (CODE, "if not self.paused:", RAISED.replace('"button"', "NAME"), "if it never comes"),
         (CODE, "", "", "no driver, action, service or timer of services.toml raises it"),
     ],
@@ -523,9 +523,9 @@ def test_a_wait_for_an_event_is_reported_unless_the_cell_raises_it(
 def test_a_memory_that_is_on_a_node_is_no_mistake(
     sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    node = '[services.memory]\nnode = "pc"\n\n[actions.grip]'
+    node = '[services.memory]\nnode = "pc"\n\n[actions]'
     used = (CODE, "await ctx.sleep(0.3)", 'await ctx.put("parts", 1)', "")
-    damaged(sound, [(CELL, "[actions.grip]", node, ""), used], tmp_path)
+    damaged(sound, [(CELL, "[actions]", node, ""), used], tmp_path)
     monkeypatch.chdir(tmp_path)
     kept, mended = r"yes  .*, sound\n", r"NO unless repaired  live, proper, stable, controllable "
     expect(rf"^arm_bot.toml: may run\n  {kept}  {mended}", CHECK, 0)
