@@ -28,6 +28,19 @@ IN_THE_TASK: list[Mistake] = [
         "schema = 2",
         r"arm_bot.toml:LINE: schema: 2 is not known.*write schema = 1",
     ),
+    (TASK, "schema = 1", "", r":1: schema: missing; write schema = 1, the layout that"),
+    (
+        TASK,
+        "there = {",
+        "start = {",
+        r":30: transitions.start: already written in line 29; drop one",
+    ),
+    (
+        TASK,
+        'kind = "resource", tokens = 1',
+        'kind = "resource"',
+        r":LINE: places.axis: it never holds a token; so .*start, .* can never fire, and .*fetch",
+    ),
     (TASK, "[task]", "[tsk]", r":LINE: tsk: unknown key.*did you mean 'task'\?"),
     (TASK, 'final = "parts == 0"', "", r":5: task.final: missing; give a text"),
     (TASK, '"parts == 0"', '"part == 0"', r":LINE: task.final: in 'part == 0'.*'part'.*parts"),
@@ -179,6 +192,12 @@ IN_THE_CELL: list[Mistake] = [
         "arm_bot:grip",
         "arm_bot:gripp",
         r":LINE: actions.grip.run: .*no 'gripp'; did you mean 'gri",
+    ),
+    (
+        CELL,
+        "grip = {",
+        "move = {",
+        r":LINE: actions.move: already written in line 10; a name belongs to one table",
     ),
     (CELL, "[actions]", "[action]", r":LINE: action: .*did you mean 'actions'"),
     (
@@ -545,13 +564,26 @@ def test_a_class_that_cannot_be_hashed_is_read_like_any_other(
 
 
 @pytest.mark.processes
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("await ctx.sleep(0.3)", "await ctx.sleep(0.3", "SyntaxError"),
+        ("from petrobot", "import nothere\nfrom petrobot", "it imports 'nothere', which is not on"),
+    ],
+)
 def test_a_module_that_cannot_be_imported_is_told_once(
-    sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sound: dict[str, str],
+    old: str,
+    new: str,
+    told: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    damaged(sound, [(CODE, "await ctx.sleep(0.3)", "await ctx.sleep(0.3", "")], tmp_path)
+    """Not once for each action and driver in it."""
+    damaged(sound, [(CODE, old, new, "")], tmp_path)
     monkeypatch.chdir(tmp_path)
     code, words = said(*CHECK)
-    assert code == 2 and words.count("SyntaxError") == 1, words
+    assert code == 2 and words.count(told) == words.count("services.toml:") == 1, words
 
 
 @pytest.mark.processes

@@ -159,7 +159,7 @@ FAULTS = [
     (
         "[actions.look_twice]",
         "[actions.look]",
-        "actions.look: is placed twice; a name may belong to one node only",
+        "actions.look: already written in line 21; a name belongs to one table",
     ),
     (
         "[actions.add]",

@@ -65,7 +65,7 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "[actions.locate_mog2]",
         "[actions.locate_background]",
-        ":85: actions.locate_background: is placed twice",
+        ":85: actions.locate_background: already written in line",
     ),
     (
         'device = "camera"',

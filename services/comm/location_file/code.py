@@ -114,7 +114,7 @@ def code_faults(directory: Directory, code: Mapping[str, Facts], text: str) -> t
         module = (path.partition(":")[0], why)
         if why and module not in told:
             faults.add(key, why)
-        if why.startswith("importing"):
+        if why.startswith(("importing", "cannot import")):  # the module, not a name in it
             told.add(module)
 
     for table in (directory.actions, directory.services):
