@@ -294,6 +294,12 @@ class Driver:
         """Release the device."""
 
 
+RESERVED = frozenset(
+    ("node", "driver", "obeys", "ports", *(n for n, v in vars(Driver).items() if callable(v)))
+)
+"""Names that no key of a driver can have: they mean something else in the table, or in `Driver`."""
+
+
 def keys_of(driver: type) -> dict[str, Key]:
     """Return the keys that a driver's class declares, those of its base classes first."""
     return {
@@ -380,6 +386,10 @@ def _is_number(value: Any) -> bool:
 def _faults_of_keys(driver: type, config: Mapping[str, Any]) -> list[tuple[str, str]]:
     own, faults = keys_of(driver), list[tuple[str, str]]()
     for name, declared in own.items():
+        if name in RESERVED:
+            text = f"{driver.__name__} declares the key {name!r}, which has another meaning here"
+            faults.append((name, f"{text}; rename it in the driver, such as own_{name}"))
+            continue
         try:
             declared.read(config)
         except ValueError as fault:

@@ -172,6 +172,12 @@ IN_THE_CELL: list[Mistake] = [
         "arm_bot:Axes",
         r":LINE: devices.axis.driver: .*no 'Axes'; did you mean 'Axis'",
     ),
+    (
+        CELL,
+        'move", device = "axis"',
+        'move", node = "pc"',
+        r":LINE: actions.move: calls ctx.command \(arm_bot.py:\d+\) and has no device; write",
+    ),
     (CELL, "arm_bot:Axis", "armbot:Axis", r":LINE: .*no module 'armbot' on this host; install"),
     (CELL, "arm_bot:Axis", "arm_bot.Axis", r":LINE: .*write an import path \"module:Class\""),
     (CELL, "arm_bot:Axis", "arm_bot:move", r":LINE: .*is not a class; a driver is a class derived"),
@@ -220,6 +226,18 @@ IN_THE_CODE: list[Mistake] = [
         "period = 0.01",
         "period = 0",
         r":LINE: devices.axis.driver: Axis.period: .*above 0.*found 0",
+    ),
+    (
+        CODE,
+        "    length: float = key(",
+        "    limit: float = key(1.0)\n    length: float = key(",
+        r":7: devices.axis.limit: Axis declares the key 'limit', which has another .*; rename",
+    ),
+    (
+        CODE,
+        "    length: float = key(",
+        "    ports: str = key('x')\n    length: float = key(",
+        r":7: devices.axis.ports: Axis declares the key 'ports'.*such as own_ports",
     ),
     (
         CODE,

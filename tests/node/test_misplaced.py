@@ -55,7 +55,7 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "schema = 1",
         'schema = 1\n[keys]\nfile = "lost.key"',
-        ":11: keys.file: {folder}/lost.key is not there; make it with `petrobot keys`",
+        ":11: keys.file: {folder}/lost.key is not there; copy it from a host that has it",
     ),
     (
         "schema = 1",

@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from petrobot.services.comm.location_file import MEMORY, Directory
@@ -121,6 +122,12 @@ def code_faults(directory: Directory, code: Mapping[str, Facts], text: str) -> t
         for entry in table.values():
             key = f"{'actions' if entry.name in directory.actions else 'services'}.{entry.name}"
             unread(f"{key}.run", entry.run)
+    for action in directory.actions.values():
+        place = code.get(action.run, {}).get("commands")
+        if place and not action.device:
+            where = f"{Path(place[0]).name}:{place[1]}"
+            text = f'calls ctx.command ({where}) and has no device; write device = "..." for node'
+            faults.add(f"actions.{action.name}", text)
     for device in directory.devices.values():
         unread(f"devices.{device.name}.driver", device.driver)
         facts = code.get(device.driver, {})

@@ -47,7 +47,8 @@ def misplaced(
         for name, path in files.items():
             if not directory.file(path).exists():
                 made = (
-                    "make it with `petrobot keys`"
+                    "copy it from a host that has it; if none has, make it with `petrobot keys` "
+                    "and copy it to each host"
                     if table == "keys"
                     else "write the path of a file"
                 )
