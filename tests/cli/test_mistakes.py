@@ -484,6 +484,39 @@ def test_mistakes_on_the_command_line_are_reported(
     expect(pattern, arguments)
 
 
+CAMPAIGN = ["campaign", TASK, "--services", CELL, "--runs", "2", "--out", "out"]
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("command", [RUN, CAMPAIGN], ids=["run", "campaign"])
+@pytest.mark.parametrize(
+    ("new", "told"),
+    [
+        (
+            "*, goal: float)",
+            r"toml:24: places.fetch.args.to: .*'move' has no argument 'to'",
+        ),
+        (
+            "*, to: float, fast: bool)",
+            r":24: places.fetch.args: .*'move' needs the argument 'fast'",
+        ),
+    ],
+)
+def test_a_run_does_not_begin_with_wrong_arguments(
+    sound: dict[str, str],
+    command: list[str],
+    new: str,
+    told: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its source shows them: the first run of the action would fail."""
+    damaged(sound, [(CODE, "*, to: float)", new, "")], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    expect(told, command)
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.processes
 def test_an_event_does_not_become_internal_by_its_declaration(tmp_path: Path) -> None:
     """The catching task with `ball_caught` as an internal event, which no action raises: it would
