@@ -66,6 +66,8 @@ class _Seen:
     """Whether it raises events whose names are not literals."""
     memory: tuple[str, int] | None = None
     """Where it uses the global memory first."""
+    commands: tuple[str, int] | None = None
+    """Where it first calls `ctx.command` on every way, not in a branch."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,12 @@ class _Code:
             ):
                 found.add(node.value)
         return found
+
+    @cached_property
+    def branched(self) -> set[ast.AST]:
+        """What is in a branch, so that it may never be executed."""
+        return {inner for node in self.nodes if isinstance(node, ast.If | ast.Try | ast.Match)
+                for inner in ast.walk(node)}  # fmt: skip
 
     def value(self, node: ast.AST) -> Any:
         """Return the object of a dotted name or a constant; None if it is not known."""
@@ -249,6 +257,8 @@ def _method(code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen) -
             seen.faults.append((code.file, node.lineno, text))
         if name in REMEMBERS and not ports and seen.memory is None:
             seen.memory = (code.file, node.lineno)
+        if name == "command" and not ports and seen.commands is None and node not in code.branched:
+            seen.commands = (code.file, node.lineno)
         if name == "raise_event" and not isinstance(first, str):
             seen.any_event = True
         if isinstance(first, str):
@@ -380,6 +390,7 @@ def _plain(seen: _Seen) -> dict[str, Any]:
         "events": seen.events,
         "any_event": seen.any_event,
         "memory": seen.memory,
+        "commands": seen.commands,
     }
 
 

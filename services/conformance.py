@@ -67,8 +67,8 @@ def check_driver(
     positions: Sequence[str] = (),
     simulated: bool = False,
 ) -> DriverCheck:
-    """Check a driver. `make()` makes a new one each time; `make(speed=0.25)` adds this key to the
-    device's table, as `lambda **keys: Axis(keys, ports)` does.
+    """Check a driver. `make` is its class, or makes a new one each time; `make(speed=0.25)` adds
+    this key to the device's table, as `lambda **keys: Axis(keys, ports)` does.
 
     `commands` are two or more that move to different positions, each in at most `seconds`,
     preferably in more than `within`; `first` are those that a new driver needs before them, to
@@ -80,6 +80,8 @@ def check_driver(
     `random`, `raise_event` and silent streams.
     """
     clock: Any = _Clock() if simulated else time
+    if isinstance(make, type):
+        make = partial(_without_ports, make)
     check = _Check(_with_ports(make, clock.monotonic), clock, within, first, positions)
     try:
         check.rules(commands, seconds, cable)
@@ -88,6 +90,10 @@ def check_driver(
     finally:  # also after Ctrl-C: the device may be moving
         check.end()
     return check.found
+
+
+def _without_ports(kind: Callable[..., Driver], **keys: Any) -> Driver:
+    return kind(keys, None)
 
 
 def _with_ports(make: Callable[..., Driver], clock: Callable[[], float]) -> Callable[..., Driver]:

@@ -221,8 +221,8 @@ class Driver:
     period: float | None = None
     """Seconds between calls of `step`; None for a driver without cyclic work."""
     obeys: Collection[str] = ()
-    """Which of `speed`, `workspace` and `dry_run` this driver obeys. A table that asks for another
-    one is refused."""
+    """Which of `speed`, `workspace` and `dry_run` this driver obeys: a table that asks for another
+    one is refused. And "pause", if it obeys `paused`."""
     speed: float = 1.0
     """Share of its normal speed at which the device may move: above 0, at most 1."""
     workspace = Workspace()
@@ -231,6 +231,8 @@ class Driver:
     dry_run: bool = False
     """Drives off: obey all commands as usual and report the motion that would result, but enable no
     drive and send no motion."""
+    paused: bool = False
+    """The operator pauses: let the device stand still until it is False again, then continue."""
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         """Read the keys of the device's table. Raises ValueError with every wrong key."""
@@ -238,6 +240,10 @@ class Driver:
         for name, value in read_keys(type(self), config).items():
             setattr(self, name, value)
         self.limit(config)
+        self.setup()
+
+    def setup(self) -> None:
+        """Prepare the driver: its keys are read, and `ports` can be used."""
 
     def limit(self, config: Mapping[str, Any]) -> None:
         """Read `speed`, `workspace` and `dry_run` of the device's table: for a constructor that
@@ -272,14 +278,26 @@ class Driver:
         return True
 
     def hold(self, now: float) -> str:
-        """Pause for the operator: answer "held", "cannot hold" or "stopped"."""
+        """Pause for the operator: answer "held", "cannot hold" or "stopped". A driver with "pause"
+        in `obeys` only looks at `paused`."""
+        if "pause" in self.obeys:
+            self.paused = True
+            return "held"
         return "held" if self.stopped() else "cannot hold"
 
     def release(self, now: float) -> None:
         """End the operator's pause."""
+        if "pause" in self.obeys:
+            self.paused = False
 
     def close(self) -> None:
         """Release the device."""
+
+
+RESERVED = frozenset(
+    ("node", "driver", "obeys", "ports", *(n for n, v in vars(Driver).items() if callable(v)))
+)
+"""Names that no key of a driver can have: they mean something else in the table, or in `Driver`."""
 
 
 def keys_of(driver: type) -> dict[str, Key]:
@@ -309,16 +327,19 @@ def faults_of_keys(driver: type, config: Mapping[str, Any]) -> list[tuple[str, s
     return own + faults_of_limits(driver, config)
 
 
-def faults_of_limits(driver: type, config: Mapping[str, Any]) -> list[tuple[str, str]]:
+def faults_of_limits(
+    driver: type, config: Mapping[str, Any], moves: bool | None = None
+) -> list[tuple[str, str]]:
     """Return what is wrong with `speed`, `workspace` and `dry_run` in a device's table, by key: a
     driver that does not obey a key would ignore it. A key of this name that the driver declares
     belongs to the driver, as does a key of a class that is not derived from `Driver` and has no
-    `obeys`."""
+    `obeys`. `moves`: whether the device can move, if that is known better than from the class."""
     faults = list[tuple[str, str]]()
+    moves = can_move(driver) if moves is None else moves
     foreign = not issubclass(driver, Driver) and not hasattr(driver, "obeys")
     obeys = getattr(driver, "obeys", ())
     for name in LIMITS:
-        still = name == "dry_run" and not can_move(driver)  # as in every dry run
+        still = name == "dry_run" and not moves  # as in every dry run
         own = name in keys_of(driver) or (foreign and name != "dry_run")
         if name not in config or own or still:
             continue
@@ -341,9 +362,12 @@ def faults_of_limits(driver: type, config: Mapping[str, Any]) -> list[tuple[str,
 
 
 def can_move(driver: type) -> bool:
-    """Return whether the class is that of a cyclic driver: any other device does not move."""
+    """Return whether the class is that of a cyclic driver which takes commands or can be stopped:
+    any other device, such as a button, does not move."""
     steps = getattr(driver, "step", Driver.step) is not Driver.step
-    return steps or getattr(driver, "period", None) is not None
+    cyclic = steps or getattr(driver, "period", None) is not None
+    moving = ("command", "stop", "quick_stop")
+    return cyclic and any(getattr(driver, m, None) is not getattr(Driver, m, None) for m in moving)
 
 
 def numbers(value: Any, count: int, name: str) -> list[float]:
@@ -362,6 +386,10 @@ def _is_number(value: Any) -> bool:
 def _faults_of_keys(driver: type, config: Mapping[str, Any]) -> list[tuple[str, str]]:
     own, faults = keys_of(driver), list[tuple[str, str]]()
     for name, declared in own.items():
+        if name in RESERVED:
+            text = f"{driver.__name__} declares the key {name!r}, which has another meaning here"
+            faults.append((name, f"{text}; rename it in the driver, such as own_{name}"))
+            continue
         try:
             declared.read(config)
         except ValueError as fault:

@@ -1,11 +1,15 @@
-"""Try out an action on a simulated clock, without node, device or network: for the tests of people
-who write actions."""
+"""Try out an action on a simulated clock, without node, device or network, or a whole task in lock
+step: for the tests of people who write a robot."""
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from petrobot.services.action import Result, Status, error
@@ -88,6 +92,27 @@ def rehearse(
     raise StillRunningError(
         f"the action has not ended after {limit:g} s; {_last_acts(stage.played)}"
     )
+
+
+def rehearse_task(task: str | Path, /, *options: str) -> dict[str, Any]:
+    """Check a task, run it in simulated time, and return the result of the run: what `petrobot
+    check TASK` and `petrobot run TASK --mode lockstep --json -` do.
+
+    `options` are those of `petrobot run`, such as "--seed", "3". Raises AssertionError with the
+    messages if the task may not run, or could not be run. A run that ends in ERROR has a result.
+    """
+    _command("check", str(task), ends=(0,))
+    told = _command("run", str(task), "--mode", "lockstep", "--json", "-", *options, ends=(0, 1))
+    result: dict[str, Any] = json.loads(told)
+    return result
+
+
+def _command(*arguments: str, ends: Collection[int]) -> str:
+    command = [sys.executable, "-m", "petrobot.coordinator", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode not in ends:
+        raise AssertionError(f"petrobot {arguments[0]}:\n{done.stdout}{done.stderr}")
+    return done.stdout
 
 
 def _last_acts(played: Rehearsal) -> str:

@@ -19,6 +19,7 @@ from petrobot.coordinator.cli.loading import (
     cell_path,
     load_directory,
     load_task,
+    refuse_arguments,
     refuse_misplaced,
     refuse_script,
     task_path,
@@ -276,7 +277,9 @@ def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
         raise CommandError(2, refusal)
     refuse_script(options.mock, directory)
     if not options.cluster:
-        refuse_misplaced(directory, everywhere=True, scripted=options.mock is not None)
+        scripted = options.mock is not None
+        refuse_misplaced(directory, everywhere=True, scripted=scripted)
+        refuse_arguments(task, options.task, directory, everywhere=True, scripted=scripted)
 
 
 async def _conduct(campaign: Campaign, options: argparse.Namespace) -> None:

@@ -19,6 +19,7 @@ from petrobot.coordinator.cli.loading import (
     cell_path,
     load_directory,
     load_task,
+    refuse_arguments,
     refuse_misplaced,
     task_path,
 )
@@ -268,7 +269,9 @@ def run(options: argparse.Namespace) -> int:
         )
     _refuse_unfit(task, directory)
     if (lockstep or options.up) and not options.join:
-        refuse_misplaced(directory, everywhere=lockstep, scripted=options.mock is not None)
+        where = {"everywhere": lockstep, "scripted": options.mock is not None}
+        refuse_misplaced(directory, **where)
+        refuse_arguments(task, options.task, directory, **where)
     request = _request(task, directory, options)
     _warn(task, directory, options)
     if not lockstep:

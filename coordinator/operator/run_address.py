@@ -52,15 +52,29 @@ def find_address(name: str | None = None, folder: Path = DEFAULT) -> RunAddress:
         run = journal_of(name, folder).parent
         address = _read(run / ADDRESS_FILE)
         if address is None:
+            _refuse_dead(run / ADDRESS_FILE)
             raise NoRunError(f"{run.name} is not active: only an active run can be controlled")
         return address
-    addresses = [address for path in _newest_first(folder) if (address := _read(path)) is not None]
+    files = _newest_first(folder)
+    addresses = [address for path in files if (address := _read(path)) is not None]
     if not addresses:
+        for path in files[:1]:
+            _refuse_dead(path)
         raise NoRunError(
             f"no run in {folder} is active; start one with `petrobot run`, or name its folder "
             "with --journal"
         )
     return addresses[0]
+
+
+def _refuse_dead(path: Path) -> None:
+    """Raise NoRunError if the coordinator of a run has died: else it would have removed the
+    file."""
+    if path.exists():
+        run = path.parent.name
+        raise NoRunError(
+            f"the coordinator of {run} has died: continue the run with `petrobot resume {run}`"
+        )
 
 
 def _newest_first(folder: Path) -> list[Path]:

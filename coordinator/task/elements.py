@@ -127,6 +127,7 @@ class PrimitiveTask:
 
     name: str
     goal: str
+    """What its success means, in one sentence for people."""
     alternatives: tuple[str, ...]
     """Names of actions. If there are several, a selector chooses one at each start."""
     deadline: float

@@ -118,8 +118,6 @@ def _names(task: Task) -> Iterator[Fault]:
 
 def _primitive_task(p: PrimitiveTask) -> Iterator[Fault]:
     key = f"primitive_tasks.{p.name}"
-    if not p.goal:
-        yield Fault(f"{key}.goal", "it has no goal", "say in one sentence what its success means")
     if not p.alternatives:
         yield Fault(f"{key}.alternatives", "it has no action", "name at least one action")
     for action, n in Counter(p.alternatives).items():
@@ -406,7 +404,8 @@ def _place(names: _Names, key: str, p: Place) -> Iterator[Fault]:
 
 def _action_place(names: _Names, key: str, p: Place) -> Iterator[Fault]:
     if p.task not in names.primitive_tasks:
-        remedy = f"name one of [primitive_tasks]{nearest(p.task, names.primitive_tasks)}"
+        near = nearest(p.task, names.primitive_tasks)
+        remedy = f'write task = "..." with one of [primitive_tasks]{near}'
         yield Fault(f"{key}.task", f"unknown primitive task {p.task!r}", remedy)
     if p.servers is not None and p.servers < 1:
         yield Fault(f"{key}.servers", f"{p.servers} servers", "give 1 or more")

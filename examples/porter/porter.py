@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from petrobot import Context, Driver, Ports, Remote, Result, error, failure, key, success
+from petrobot import Context, Driver, Remote, Result, error, failure, key, success
 
 STATIONS = {"dock": 0.0, "shelf": 1.0, "left": 2.5, "right": 3.0}  # m along the corridor
 
@@ -12,15 +12,14 @@ class Base(Driver):
     """Drives along a corridor, never faster than the stream `limit` allows."""
 
     period = 0.02
-    obeys = ("speed", "workspace", "dry_run")
+    obeys = ("speed", "workspace", "dry_run", "pause")
     top_speed: float = key(1.0, "m/s")
     blind: float = key(0.4, "m/s while nobody watches the corridor")
 
-    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
-        super().__init__(config, ports)
-        self.allowed = ports.stream("limit")
+    def setup(self) -> None:
+        self.allowed = self.ports.stream("limit")
         self.at = self.goal = 0.0
-        self.share, self.paused = 1.0, False
+        self.share = 1.0
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
         if body.get("to") not in STATIONS:
@@ -44,13 +43,6 @@ class Base(Driver):
     def stopped(self) -> bool:
         return self.at == self.goal
 
-    def hold(self, now: float) -> str:
-        self.paused = True
-        return "held"
-
-    def release(self, now: float) -> None:
-        self.paused = False
-
 
 class Gripper(Driver):
     """Opens and closes; some parts slip. In a dry run it moves, but grips nothing."""
@@ -59,8 +51,7 @@ class Gripper(Driver):
     obeys = ("speed", "dry_run")
     slips: float = key(0.2, "share of the parts that slip out")
 
-    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
-        super().__init__(config, ports)
+    def setup(self) -> None:
         self.left, self.holds = 0.0, False
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
@@ -98,7 +89,6 @@ class Button(Driver):
     """Somebody presses it now and then; a real one would read a pin in `step`."""
 
     period = 0.1
-    obeys = ("dry_run",)  # it moves nothing
     every: float = key(6.0, "s, mean time between two presses")
 
     def step(self, now: float) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from petrobot import Context, Driver, Ports, Remote, Result, error, failure, key, success
+from petrobot import Context, Driver, Remote, Result, error, failure, key, success
 
 STATIONS = {"home": 0.0, "belt": 0.2, "left": 0.5, "right": 0.8}  # m along the rail
 
@@ -13,13 +13,11 @@ class Arm(Driver):
     `dry_run`."""
 
     period = 0.01  # s between two steps
-    obeys = ("speed", "workspace", "dry_run")  # keys of its table for its first motions
+    obeys = ("speed", "workspace", "dry_run", "pause")  # first motions, and pause
     top_speed: float = key(0.5, "m/s")
 
-    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
-        super().__init__(config, ports)
+    def setup(self) -> None:
         self.at = self.goal = 0.0  # m
-        self.paused = False
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
         if body.get("to") not in STATIONS:
@@ -41,13 +39,6 @@ class Arm(Driver):
 
     def stopped(self) -> bool:
         return self.at == self.goal
-
-    def hold(self, now: float) -> str:
-        self.paused = True
-        return "held"
-
-    def release(self, now: float) -> None:
-        self.paused = False
 
 
 class Scanner(Driver):

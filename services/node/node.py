@@ -382,7 +382,8 @@ class Node:
                 cause = order.reason if order.reason in _OWN_CAUSES else "cancelled"
                 service = self.callee.service_of(order.id)
                 if service is not None:
-                    stop = Cancel(order.id, stop_reason(cause, order.reason))
+                    text = self.callee.late(order.id) if cause == "deadline" else order.reason
+                    stop = Cancel(order.id, stop_reason(cause, text))
                     self.places[self._host_of(service)].take(now, stop)
             else:
                 self._command(now, order)

@@ -262,7 +262,14 @@ class RunContext:
         CommandRefused."""
         device = self._device
         if not hasattr(device, "send"):
-            raise CommandRefused("this action has no cyclic driver that takes commands")
+            action = self._call.service
+            raise CommandRefused(
+                f'{action!r} runs without a device: write device = "..." in [actions.{action}] of '
+                "services.toml"
+                if device is None
+                else f"the driver of {action!r} takes no commands, because it has no `period`: "
+                "call its methods, as in ctx.device.read()"
+            )
         number = device.send(body)
         if not await self.wait(lambda: device.handled >= number, timeout):
             raise CommandRefused(f"the driver did not take {dict(body)} within {timeout:g} s")

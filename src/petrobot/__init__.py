@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from petrobot.services.joint_chain import JointChain
     from petrobot.services.joint_motion import JointMotion
     from petrobot.services.perform import perform
-    from petrobot.services.rehearsal import Rehearsal, rehearse
+    from petrobot.services.rehearsal import Rehearsal, rehearse, rehearse_task
     from petrobot.services.session_thread import SessionThread
 
 __all__ = [
@@ -63,6 +63,7 @@ __all__ = [
     "perform",
     "provisional",
     "rehearse",
+    "rehearse_task",
     "success",
 ]
 
@@ -76,7 +77,7 @@ _HOMES = {
     **dict.fromkeys(("DriverCheck", "check_driver"), "petrobot.services.conformance"),
     "perform": "petrobot.services.perform",
     "SessionThread": "petrobot.services.session_thread",
-    **dict.fromkeys(("Rehearsal", "rehearse"), "petrobot.services.rehearsal"),
+    **dict.fromkeys(("Rehearsal", "rehearse", "rehearse_task"), "petrobot.services.rehearsal"),
 }
 
 

@@ -570,7 +570,7 @@ def test_a_given_up_run_says_why(
 
     monkeypatch.chdir(tmp_path)
     broken = TASK.replace("{name}", "broken").replace(
-        "[places.work]", '[places.work]\nargs = { force = "x" }'
+        'work = { kind = "action" }', 'work = { kind = "action", args = { force = "x" } }'
     )
     Path("pressing.py").write_text(PRESSING, encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))

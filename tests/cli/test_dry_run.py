@@ -4,6 +4,8 @@ sent to the device."""
 from __future__ import annotations
 
 import json
+import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -13,9 +15,11 @@ from petrobot.coordinator.cli import main
 from petrobot.coordinator.cli.loading import load_directory
 from petrobot.services.adapters.ros2.topics import TopicDriver
 from petrobot.services.comm.calls.peers import Peers
-from petrobot.services.comm.location_file import dry, load, parse, resolve
+from petrobot.services.comm.location_file import DirectoryError, dry, load, parse, resolve
 from petrobot.services.comm.protocol.messages import Hello, Refuse
 from petrobot.services.device import LIMITS, can_move, keys_of
+from petrobot.services.node.drivers import make_driver
+from petrobot.services.node.ports import ProcessPorts
 from petrobot.services.rehearsal import TestPorts
 from petrobot.services.worker.setpoints import SetpointReceiver
 from tests.ports import free_ports
@@ -25,11 +29,20 @@ ROBOT = '''
 from pathlib import Path
 from petrobot import Context, Driver, Remote, success
 
-class Deaf(Driver):
+class Button(Driver):
+    """It raises an event and moves nothing: a dry run is nothing to it."""
     period = 0.01
+    def step(self, now):
+        assert not self.dry_run
+
+class Deaf(Button):
+    def command(self, now, body):
+        pass
 
 class Axis(Deaf):
     obeys = ("speed", "workspace", "dry_run")
+    def step(self, now):
+        pass
     def command(self, now, body):
         if outside := self.workspace.outside((body["to"], 0.0, 0.0)):
             raise ValueError(outside)
@@ -53,6 +66,9 @@ driver = "dry_robot:{driver}"
 [devices.sensor]
 node = "pc"
 driver = "dry_robot:Sensor"
+[devices.button]
+node = "pc"
+driver = "dry_robot:Button"
 [actions.go]
 run = "dry_robot:go"
 device = "axis"
@@ -133,7 +149,20 @@ def test_a_dry_run_is_refused_where_a_driver_cannot(
     assert main([*command, "--dry-run"]) == 2
     told = capsys.readouterr().err
     assert "devices.axis.dry_run: dry_run: Deaf does not obey it" in told
-    assert "Sensor" not in told
+    assert "Sensor" not in told and "Button" not in told
+
+
+def test_a_device_that_receives_set_points_counts_as_moving(cell: Path) -> None:
+    """Also if its driver forgot to override `stop`: a dry run must not move it."""
+    file = place(cell)
+    told = r"devices.button: dry_robot:Button refuses it: dry_run: Button does not obey it"
+    for stream, refused in (("", False), ('[streams.to]\nto = "button"\nperiod = 0.1\n', True)):
+        file.write_text(file.read_text() + stream)
+        directory = load(file, dry_run=True)
+        button = directory.devices["button"]
+        ports = ProcessPorts(directory, button, time.monotonic, {})
+        with pytest.raises(DirectoryError, match=told) if refused else nullcontext():
+            assert not make_driver(directory, button, ports).dry_run
 
 
 SHIPPED: dict[tuple[str, str], tuple[str, ...]] = {
@@ -148,7 +177,6 @@ SHIPPED: dict[tuple[str, str], tuple[str, ...]] = {
     ("examples/sorter", "robot:Arm"): LIMITS,
     ("examples/porter", "porter:Base"): LIMITS,
     ("examples/porter", "porter:Gripper"): ("speed", "dry_run"),
-    ("examples/porter", "porter:Button"): ("dry_run",),
 }
 """What docs/first-motion.md promises: by folder of its location file, each driver that may move
 something, and what it obeys."""
@@ -180,7 +208,7 @@ def test_a_new_driver_and_a_new_robot_obey(
     monkeypatch.chdir(tmp_path)
     assert main(["new", "driver", "dry_gripper"]) == main(["new", "robot", "dry_carrier"]) == 0
     monkeypatch.syspath_prepend(tmp_path)
-    assert set(resolve("dry_gripper:DryGripper").obeys) == set(LIMITS)
+    assert set(resolve("dry_gripper:DryGripper").obeys) == {*LIMITS, "pause"}
     monkeypatch.chdir("dry_carrier")
     run = ["run", "dry_carrier.toml", "--mode", "lockstep", "--quiet", "--no-page"]
     assert main([*run, "--dry-run", "--json", "out.json"]) == 0, capsys.readouterr()

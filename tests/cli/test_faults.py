@@ -183,7 +183,7 @@ def test_an_action_for_another_primitive_task_is_a_warning(petrobot: Petrobot) -
     assert code == 0
     found = " ".join(out.split())
     assert (
-        "warning work.toml:13: primitive_tasks.work.alternatives: services.toml says that "
+        "warning work.toml:12: primitive_tasks.work.alternatives: services.toml says that "
         "the action 'work' translates 'wrok'" in found
     )
     assert "write task = 'work' in its [actions.work]" in found

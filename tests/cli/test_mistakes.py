@@ -28,6 +28,19 @@ IN_THE_TASK: list[Mistake] = [
         "schema = 2",
         r"arm_bot.toml:LINE: schema: 2 is not known.*write schema = 1",
     ),
+    (TASK, "schema = 1", "", r":1: schema: missing; write schema = 1, the layout that"),
+    (
+        TASK,
+        "there = {",
+        "start = {",
+        r":30: transitions.start: already written in line 29; drop one",
+    ),
+    (
+        TASK,
+        'kind = "resource", tokens = 1',
+        'kind = "resource"',
+        r":LINE: places.axis: it never holds a token; so .*start, .* can never fire, and .*fetch",
+    ),
     (TASK, "[task]", "[tsk]", r":LINE: tsk: unknown key.*did you mean 'task'\?"),
     (TASK, 'final = "parts == 0"', "", r":5: task.final: missing; give a text"),
     (TASK, '"parts == 0"', '"part == 0"', r":LINE: task.final: in 'part == 0'.*'part'.*parts"),
@@ -64,14 +77,14 @@ IN_THE_TASK: list[Mistake] = [
     ),
     (
         TASK,
-        '["move"] ',
-        '["mov"] ',
+        "move = {",
+        'move = { alternatives = ["mov"],',
         r":LINE: .*no node offers the action 'mov'.*'move'[^|]*add \[act",
     ),
     (
         TASK,
-        '["move"] ',
-        "[] ",
+        "move = {",
+        "move = { alternatives = [],",
         r":LINE: primitive_tasks.move.alternatives: it has no action; name at",
     ),
     (TASK, "tokens = 3", "tokens = -3", r":LINE: places.parts.tokens: expected 0 or more.*got -3"),
@@ -90,11 +103,11 @@ IN_THE_TASK: list[Mistake] = [
     ),
     (
         TASK,
-        'kind = "action", task = "grip"',
-        'task = "grip"',
+        'kind = "action", tries',
+        'task = "grip", tries',
         r":LINE: .*kind: missing.*write kind =",
     ),
-    (TASK, 'task = "grip"', 'task = "gripp"', r":LINE: .*unknown primitive task 'gripp'.*'grip'"),
+    (TASK, '"action", tries', '"action", task = "gripp", tries', r":LINE: .*'gripp'.*mean 'grip'"),
     (TASK, "tries = 3", "tries = 0", r":LINE: places.grip.tries: 0 tries; give 1 or more"),
     (
         TASK,
@@ -118,13 +131,7 @@ IN_THE_TASK: list[Mistake] = [
         TASK,
         '[errors]\nto = "broken"',
         "",
-        r":31: places.fetch: no outgoing arc `error`[^|]*\[errors\] to = ",
-    ),
-    (
-        TASK,
-        "[errors]",
-        "[events.button]\n[errors]",
-        r": events.button.scope: missing; give one of internal, external",
+        r":23: places.fetch: no outgoing arc `error`[^|]*\[errors\] to = ",
     ),
     (TASK, '["grip:normal"]', '["grip"]', r":LINE: .*its arc must say when.*write grip:normal"),
     (TASK, '["grip:normal"]', '["grip:success"]', r":LINE: .*'success' is none of normal, error"),
@@ -153,7 +160,7 @@ IN_THE_TASK: list[Mistake] = [
         TASK,
         '{ in = ["carry:normal"] }',
         '{ in = ["carry:error"] }',
-        r":34: places.carry: no outgoing arc `normal`",
+        r":26: places.carry: no outgoing arc `normal`",
     ),
 ]
 
@@ -164,6 +171,12 @@ IN_THE_CELL: list[Mistake] = [
         "arm_bot:Axis",
         "arm_bot:Axes",
         r":LINE: devices.axis.driver: .*no 'Axes'; did you mean 'Axis'",
+    ),
+    (
+        CELL,
+        'move", device = "axis"',
+        'move", node = "pc"',
+        r":LINE: actions.move: calls ctx.command \(arm_bot.py:\d+\) and has no device; write",
     ),
     (CELL, "arm_bot:Axis", "armbot:Axis", r":LINE: .*no module 'armbot' on this host; install"),
     (CELL, "arm_bot:Axis", "arm_bot.Axis", r":LINE: .*write an import path \"module:Class\""),
@@ -186,7 +199,13 @@ IN_THE_CELL: list[Mistake] = [
         "arm_bot:gripp",
         r":LINE: actions.grip.run: .*no 'gripp'; did you mean 'gri",
     ),
-    (CELL, "[actions.grip]", "[action.grip]", r":LINE: action: .*did you mean 'actions'"),
+    (
+        CELL,
+        "grip = {",
+        "move = {",
+        r":LINE: actions.move: already written in line 10; a name belongs to one table",
+    ),
+    (CELL, "[actions]", "[action]", r":LINE: action: .*did you mean 'actions'"),
     (
         CELL,
         "port = 7501",
@@ -196,8 +215,8 @@ IN_THE_CELL: list[Mistake] = [
     (
         CELL,
         'run = "arm_bot:grip"',
-        'run = "arm_bot:grip"\nargs = { slip = 1 }',
-        r":18: .*no argument 'slip'; did you mean",
+        'run = "arm_bot:grip", args = { slip = 1 }',
+        r":11: .*no argument 'slip'; did you mean",
     ),
 ]
 
@@ -207,6 +226,18 @@ IN_THE_CODE: list[Mistake] = [
         "period = 0.01",
         "period = 0",
         r":LINE: devices.axis.driver: Axis.period: .*above 0.*found 0",
+    ),
+    (
+        CODE,
+        "    length: float = key(",
+        "    limit: float = key(1.0)\n    length: float = key(",
+        r":7: devices.axis.limit: Axis declares the key 'limit', which has another .*; rename",
+    ),
+    (
+        CODE,
+        "    length: float = key(",
+        "    ports: str = key('x')\n    length: float = key(",
+        r":7: devices.axis.ports: Axis declares the key 'ports'.*such as own_ports",
     ),
     (
         CODE,
@@ -319,7 +350,7 @@ IN_THE_CODE: list[Mistake] = [
 BOTH: list[tuple[list[Mistake], str]] = [
     (
         [
-            (TASK, 'task = "grip", tries', 'task = "grip", out = { width = "w" }, tries', ""),
+            (TASK, '"action", tries', '"action", out = { width = "w" }, tries', ""),
             (TASK, "[places]", '[variables.w]\ntype = "float"\n\n[places]', ""),
         ],
         r"places.grip.out.width: no action of grip returns a value 'width'.*return it",
@@ -453,6 +484,39 @@ def test_mistakes_on_the_command_line_are_reported(
     expect(pattern, arguments)
 
 
+CAMPAIGN = ["campaign", TASK, "--services", CELL, "--runs", "2", "--out", "out"]
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("command", [RUN, CAMPAIGN], ids=["run", "campaign"])
+@pytest.mark.parametrize(
+    ("new", "told"),
+    [
+        (
+            "*, goal: float)",
+            r"toml:24: places.fetch.args.to: .*'move' has no argument 'to'",
+        ),
+        (
+            "*, to: float, fast: bool)",
+            r":24: places.fetch.args: .*'move' needs the argument 'fast'",
+        ),
+    ],
+)
+def test_a_run_does_not_begin_with_wrong_arguments(
+    sound: dict[str, str],
+    command: list[str],
+    new: str,
+    told: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its source shows them: the first run of the action would fail."""
+    damaged(sound, [(CODE, "*, to: float)", new, "")], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    expect(told, command)
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.processes
 def test_an_event_does_not_become_internal_by_its_declaration(tmp_path: Path) -> None:
     """The catching task with `ball_caught` as an internal event, which no action raises: it would
@@ -487,7 +551,7 @@ def test_an_event_that_a_driver_misspells_is_told(
 
 
 RAISED = 'self.ports.raise_event("button")\n        if not self.paused:'
-TIMER = '[timers.button]\nnode = "pc"\nperiod = 1.0\n\n[nodes.pc]'
+TIMER = '[timers.button]\nnode = "pc"\nperiod = 1.0\n\n[nodes]'
 
 
 @pytest.mark.processes
@@ -495,7 +559,7 @@ TIMER = '[timers.button]\nnode = "pc"\nperiod = 1.0\n\n[nodes.pc]'
     ("file", "old", "new", "told"),
     [
         (CODE, "if not self.paused:", RAISED, ""),
-        (CELL, "[nodes.pc]", TIMER, ""),
+        (CELL, "[nodes]", TIMER, ""),
         (CODE, "if not self.paused:", RAISED.replace('"button"', "NAME"), "if it never comes"),
         (CODE, "", "", "no driver, action, service or timer of services.toml raises it"),
     ],
@@ -529,9 +593,9 @@ def test_a_wait_for_an_event_is_reported_unless_the_cell_raises_it(
 def test_a_memory_that_is_on_a_node_is_no_mistake(
     sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    node = '[services.memory]\nnode = "pc"\n\n[actions.grip]'
+    node = '[services.memory]\nnode = "pc"\n\n[actions]'
     used = (CODE, "await ctx.sleep(0.3)", 'await ctx.put("parts", 1)', "")
-    damaged(sound, [(CELL, "[actions.grip]", node, ""), used], tmp_path)
+    damaged(sound, [(CELL, "[actions]", node, ""), used], tmp_path)
     monkeypatch.chdir(tmp_path)
     kept, mended = r"yes  .*, sound\n", r"NO unless repaired  live, proper, stable, controllable "
     expect(rf"^arm_bot.toml: may run\n  {kept}  {mended}", CHECK, 0)
@@ -551,13 +615,26 @@ def test_a_class_that_cannot_be_hashed_is_read_like_any_other(
 
 
 @pytest.mark.processes
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("await ctx.sleep(0.3)", "await ctx.sleep(0.3", "SyntaxError"),
+        ("from petrobot", "import nothere\nfrom petrobot", "it imports 'nothere', which is not on"),
+    ],
+)
 def test_a_module_that_cannot_be_imported_is_told_once(
-    sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sound: dict[str, str],
+    old: str,
+    new: str,
+    told: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    damaged(sound, [(CODE, "await ctx.sleep(0.3)", "await ctx.sleep(0.3", "")], tmp_path)
+    """Not once for each action and driver in it."""
+    damaged(sound, [(CODE, old, new, "")], tmp_path)
     monkeypatch.chdir(tmp_path)
     code, words = said(*CHECK)
-    assert code == 2 and words.count("SyntaxError") == 1, words
+    assert code == 2 and words.count(told) == words.count("services.toml:") == 1, words
 
 
 @pytest.mark.processes

@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 import json
 import stat
+import subprocess
 import time
 from pathlib import Path
 
@@ -301,6 +302,24 @@ def test_without_a_run_every_command_says_so(
     }
     assert main([name, *arguments.get(name, []), "--journal", str(tmp_path)]) == 2
     assert "is active; start one with `petrobot run`" in capsys.readouterr().err
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("named", [[], ["--run", "tidy-1"]])
+def test_of_a_run_whose_coordinator_died_it_says_how_to_continue(
+    named: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was killed, so its address is still there."""
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    folder = tmp_path / "tidy-1"
+    folder.mkdir()
+    address = {"run": "tidy-1", "url": "", "token": "", "process": gone.pid}
+    (folder / ADDRESS_FILE).write_text(json.dumps(address))
+    (folder / JOURNAL).write_text("")
+    assert main(["pause", *named, "--journal", str(tmp_path)]) == 2
+    told = "the coordinator of tidy-1 has died: continue the run with `petrobot resume tidy-1`"
+    assert told in capsys.readouterr().err
 
 
 async def test_an_unreachable_coordinator_is_exit_code_3(petrobot: Terminal) -> None:

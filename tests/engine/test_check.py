@@ -144,7 +144,6 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
         ),
         ("never-marked", W, "places.r", lambda t: t("r~ y", {"t": {"in": "r", "out": "y"}})),
         ("never-marked", N, "places.x", lambda t: t("x y", {"t": {"in": "x", "out": "y"}})),
-        ("never-fires", W, "transitions.t", lambda t: t("r~ y", {"t": {"in": "r", "out": "y"}})),
         (
             "final-at-start",
             W,
@@ -357,6 +356,23 @@ def test_action_that_is_said_to_translate_another_primitive_task(
         "mine.toml says" in f.text and repr(said) in f.text and "'look' or 'take'" in f.remedy
         for f in found
     )
+
+
+def test_a_place_without_tokens_is_told_once_with_all_that_it_stops(task: Tasks) -> None:
+    """A forgotten token of a resource gave one warning for each place and transition."""
+    net = {
+        "begin": {"in": "runs arm", "out": "a"},
+        "n": {"in": "a:normal", "out": "arm"},
+        "e": {"in": "a:error", "out": "arm broken"},
+        "more": {"in": "lost", "out": "y"},
+    }
+    report = check(task("runs~=1 a! arm~ lost~ broken~ y", net))
+    told = {f.key: f.text for f in report.findings if f.code == "never-marked"}
+    assert told == {
+        "places.lost": "it never holds a token; so more can never fire",
+        "places.arm": "it never holds a token; so begin, e, n can never fire, and a, broken stay "
+        "empty",
+    }
 
 
 def test_final_error_at_the_start(task: Tasks) -> None:

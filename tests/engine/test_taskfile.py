@@ -65,6 +65,35 @@ def test_good_file_reads() -> None:
 
 
 @pytest.mark.parametrize(
+    ("written", "short"),
+    [
+        ('alternatives = ["look"]\n', ""),
+        ('kind = "action"\ntask = "look"\n', 'kind = "action"\n'),
+        ('scope = "external"\n', 'text = ""\n'),
+        ('scope = "internal"\nby = "look"\n', 'by = "look"\n'),
+        ('goal = ""\n', ""),
+    ],
+)
+def test_what_a_name_says_already_may_be_left_out(written: str, short: str) -> None:
+    """Also of an event whose `by` names who raises it."""
+    text = GOOD.replace('alternatives = ["look_once", "look_twice"]', 'alternatives = ["look"]')
+    if "goal" in written:
+        text = text.replace('goal = "it is seen"', 'goal = ""')
+    if "internal" in written:
+        text = text.replace('scope = "external"', 'scope = "internal"\nby = "look"')
+    assert text.count(written) == 1
+    assert loads(text.replace(written, short)) == loads(text)
+
+
+def test_a_place_that_is_named_like_no_primitive_task_must_name_one() -> None:
+    text = (
+        GOOD.replace('task = "look"\n', "").replace("look:", "see:").replace('["look"]', '["see"]')
+    )
+    with pytest.raises(TaskFileError, match=r":26: places.see.task: unknown .*'see'; write task ="):
+        loads(text.replace("[places.look]", "[places.see]"))
+
+
+@pytest.mark.parametrize(
     ("old", "new", "where", "words"),
     [
         ("schema = 1", "schema = 2", "schema", "write schema = 1"),
@@ -133,7 +162,6 @@ def test_good_file_reads() -> None:
             "primitive_tasks.look.alternatives",
             "expected a text",
         ),
-        ('goal = "it is seen"', 'goal = ""', "primitive_tasks.look.goal", "no goal"),
         ('type = "bool"', 'type = "boolean"', "variables.seen.type", "did you mean 'bool'"),
         ('type = "bool"', 'type = "bool"\ninitial = 1', "variables.seen.initial", "expected bool"),
         (

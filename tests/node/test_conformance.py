@@ -9,7 +9,9 @@ from typing import Any, ClassVar, cast
 import pytest
 
 from petrobot.services.conformance import DriverCheck, check_driver
-from petrobot.services.device import Driver, Ports
+from petrobot.services.device import Driver, Ports, key
+
+NO_PORTS = cast(Ports, None)
 
 
 class Axis(Driver):
@@ -53,6 +55,29 @@ class Axis(Driver):
         self.paused = False
 
 
+class Obedient(Axis):
+    """Leaves the operator's pause to the base class."""
+
+    obeys = ("pause",)
+    hold, release = Driver.hold, Driver.release
+
+
+class Forgets(Obedient):
+    """Says that it obeys the pause, and does not."""
+
+    def step(self, now: float) -> None:
+        self.at += max(-0.001, min(0.001, self.goal - self.at))
+
+
+class Ready(Driver):
+    """Prepares itself without a constructor of its own."""
+
+    start: float = key(0.0, "m")
+
+    def setup(self) -> None:
+        self.made = self.start, self.ports, self.speed
+
+
 COMMANDS = [{"to": 0.2}, {"to": 0.0}]
 
 
@@ -68,6 +93,16 @@ def test_a_good_driver_passes() -> None:
     found = checked(Axis)
     assert found.faults == []
     assert found.notes == ["not checked: a pulled cable: give `cable`"]
+
+
+def test_the_base_class_holds_for_a_driver_that_obeys_paused() -> None:
+    assert checked(Obedient).faults == []
+    assert checked(Forgets).faults == ["hold: answered 'held', and axis[0].at still changes"]
+
+
+def test_a_driver_prepares_itself_when_its_keys_are_read() -> None:
+    config = {"start": 0.1, "speed": 0.5}
+    assert type("Slow", (Ready,), {"obeys": ("speed",)})(config, NO_PORTS).made == (0.1, None, 0.5)
 
 
 def test_a_driver_without_ports_may_draw_read_a_stream_and_raise_events() -> None:

@@ -67,7 +67,13 @@ def test_a_refused_command_cannot_be_ignored() -> None:
 
 def test_a_command_that_no_driver_accepts_is_an_error() -> None:
     """There is no driver that accepts commands, or it accepts none in time."""
-    assert "no cyclic driver" in rehearse(open_door, device=object(), share=0).result.text
+    direct = rehearse(open_door, device=object(), share=0).result.text
+    assert direct == (
+        "the driver of 'action' takes no commands, because it has no `period`: call its methods, "
+        "as in ctx.device.read()"
+    )
+    alone = rehearse(open_door, share=0).result.text
+    assert alone.startswith("'action' runs without a device: write device = ")
 
     class Silent:
         handled, refused = 0, ""

@@ -159,7 +159,7 @@ FAULTS = [
     (
         "[actions.look_twice]",
         "[actions.look]",
-        "actions.look: is placed twice; a name may belong to one node only",
+        "actions.look: already written in line 21; a name belongs to one table",
     ),
     (
         "[actions.add]",
@@ -230,6 +230,33 @@ def test_faults_are_named_with_their_remedy(old: str, new: str, says: str) -> No
         parse(GOOD.replace(old, new, 1), Path("cell/services.toml"))
     assert says in str(caught.value), str(caught.value)
     assert all(fault.startswith("cell/services.toml") for fault in caught.value.faults)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("port = 7301", "port = 0", ":4: nodes.pc.port: is 0; write a port"),
+        ('node = "pc"', 'node = "pcc"', ":6: devices.arm.node: no node is named 'pcc'"),
+        (', device = "arm"', "", ":8: actions.look: is on no node"),
+        ("deadline = 5", "dedline = 5", ":8: actions.look.dedline: unknown key"),
+        ("0.008", "-1", ":10: links.look/world: is -1"),
+    ],
+)
+def test_faults_in_inline_tables_have_their_lines(old: str, new: str, message: str) -> None:
+    text = """schema = 1
+
+[nodes]
+pc = { host = "127.0.0.1", port = 7301 }
+[devices]
+arm = { node = "pc", driver = "json:JSONDecoder" }
+[actions]
+look = { run = "json:loads", device = "arm", deadline = 5 }
+[links]
+"look/world" = 0.008
+"""
+    with pytest.raises(DirectoryError) as caught:
+        parse(text.replace(old, new, 1), Path("services.toml"))
+    assert message in str(caught.value)
 
 
 def test_all_faults_are_reported_at_once() -> None:

@@ -4,6 +4,7 @@ remedy, and exit code 2."""
 from __future__ import annotations
 
 import io
+import sys
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from petrobot.coordinator.cli import main
 from petrobot.services.comm.location_file import DirectoryError, load, parse
-from petrobot.services.comm.location_file.host_checks import misplaced
+from petrobot.services.comm.location_file.host_checks import misplaced, signatures
 from petrobot.services.comm.protocol.security import is_loopback
 
 SHIPPED = Path(__file__).parents[2] / "services.toml"
@@ -55,7 +56,7 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "schema = 1",
         'schema = 1\n[keys]\nfile = "lost.key"',
-        ":11: keys.file: {folder}/lost.key is not there; make it with `petrobot keys`",
+        ":11: keys.file: {folder}/lost.key is not there; copy it from a host that has it",
     ),
     (
         "schema = 1",
@@ -65,7 +66,7 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "[actions.locate_mog2]",
         "[actions.locate_background]",
-        ":85: actions.locate_background: is placed twice",
+        ":85: actions.locate_background: already written in line",
     ),
     (
         'device = "camera"',
@@ -255,3 +256,37 @@ def test_a_file_in_another_code_is_refused_with_its_line(tmp_path: Path) -> None
 def test_loopback(host: str, here: bool) -> None:
     """Addresses that only this host reaches."""
     assert is_loopback(host) is here
+
+
+@pytest.mark.parametrize(
+    ("code", "required", "known"),
+    [
+        ("def go(ctx, *, to, fast=False): ...", ["to"], ["to", "fast"]),
+        ("async def go(ctx, /, to, *, fast): ...", ["to", "fast"], ["to", "fast"]),
+        ("def go(ctx, to=1.0): ...", [], ["to"]),
+        ("def go(ctx, a): ...\ndef go(ctx): ...", [], []),
+        ("def go(ctx, **more): ...", None, None),
+        ("@wrapped\ndef go(ctx): ...", None, None),
+        ("def go(ctx, to): ...\ngo = partial(go, to=1)", None, None),
+        ("go = make()", None, None),
+    ],
+)
+def test_the_arguments_of_an_action_are_read_from_its_source(
+    code: str,
+    required: list[str] | None,
+    known: list[str] | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nothing is said of what the source does not show, such as a decorated function."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / "robot_of_test.py").write_text(code)
+    text = """schema = 1
+[nodes]
+pc = { host = "127.0.0.1", port = 7301 }
+[actions]
+go = { run = "robot_of_test:go", node = "pc" }
+"""
+    found = signatures(parse(text, tmp_path / "services.toml"), everywhere=False).get("go")
+    told = None if found is None else (found["required"], list(found["parameters"]))
+    assert told == (None if required is None else (required, known))

@@ -118,6 +118,7 @@ async def test_a_wait_without_an_end_ends_at_its_deadline(
 ) -> None:
     end = await operator.call("nap", 0.3, seconds=seconds)
     assert (end.status, end.cause) == ("error", "deadline"), end
+    assert end.text.startswith("took longer than its deadline of 0.3 s"), end
     assert (await operator.call("nap", None, seconds=0.01)).status == "success"
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from petrobot.services.action import Context, Result, Status, failure, provisional, success
 from petrobot.services.device import Driver
-from petrobot.services.rehearsal import StillRunningError, rehearse
+from petrobot.services.rehearsal import StillRunningError, rehearse, rehearse_task
 from petrobot.services.scripted import ScriptError, load
 
 
@@ -176,3 +176,28 @@ def test_a_rehearsal_has_memory_and_streams_without_a_location_file() -> None:
     played = rehearse(tell, device=desk, memory={"parts": 4})
     assert played.result.values == {"shown": 4.0}
     assert {(stream, values) for _, stream, values in played.published} == {("place", (4.0,))}
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    ("old", "new", "status", "told"),
+    [
+        ("", "", "success", ""),
+        ("tokens = 5", "tokens = -5", "", r"petrobot check:\n.*sort.toml:\d+: places.parts.tokens"),
+        ("timeout = 7.0", "timeout = 0.1", "error", ""),
+    ],
+)
+def test_a_task_is_checked_and_run(
+    old: str, new: str, status: str, told: str, tmp_path: Path
+) -> None:
+    """One that may not run fails the test with the message of `check`; an ERROR is a result."""
+    sorter = Path(__file__).parents[2] / "examples" / "sorter"
+    for file in sorter.iterdir():
+        text = file.read_text(encoding="utf-8").replace('"belt" }', '"belt" }, timeout = 7.0')
+        (tmp_path / file.name).write_text(text.replace(old, new))
+    if told:
+        with pytest.raises(AssertionError, match=told):
+            rehearse_task(tmp_path / "sort.toml")
+    else:
+        result = rehearse_task(str(tmp_path / "sort.toml"), "--seed", "3", "--runs", "1")
+        assert (result["status"], result["seed"], result["runs"]) == (status, 3, 1)

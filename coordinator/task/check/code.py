@@ -44,14 +44,13 @@ def code_findings(
             text = f"there is no service {service!r}{nearest(service, services)}"
             remedy = f"declare [services.{service}] in the location file, or drop the key"
             yield Finding(Severity.ERROR, "no-service", f"task.{key}", text, remedy)
+    yield from argument_findings(task, code, args)
     used: dict[str, None] = {}
     for place in task.flat.places.values():
         if place.task:
             primitive = task.primitive_tasks[place.task]
             known = [a for a in primitive.alternatives if a in code]
             used |= dict.fromkeys(known)
-            for action in known:
-                yield from _arguments(place, action, code[action], args.get(action, {}))
             if known and len(known) == len(primitive.alternatives):
                 yield from _values(place, [code[a] for a in known])
     for primitive in task.primitive_tasks.values():
@@ -69,6 +68,17 @@ def code_findings(
         found = {tuple(fault) for facts in read for fault in facts.get(kind, ())}
         for file, line, text in sorted(found):
             yield Finding(severity, "code", f"{file}:{line}", text)
+
+
+def argument_findings(
+    task: Task, code: Code, args: Mapping[str, Mapping[str, Any]]
+) -> Iterator[Finding]:
+    """Arguments of places that their actions do not have or that do not fit, and those that are
+    missing."""
+    for place in task.flat.places.values():
+        for action in task.primitive_tasks[place.task].alternatives if place.task else ():
+            if action in code:
+                yield from _arguments(place, action, code[action], args.get(action, {}))
 
 
 def _arguments(

@@ -21,10 +21,44 @@ def timeless_cycles(task: Task) -> Iterator[Finding]:
 
 
 def never_marked(task: Task) -> Iterator[Finding]:
-    """Find places that no firing can mark and transitions that can never fire. The search
-    over-approximates: it never removes a token."""
+    """Find places that no firing can mark, and name with each what else it keeps empty and which
+    transitions can never fire. The search over-approximates: it never removes a token."""
+    fed = {o.place for t in task.transitions.values() for o in t.outputs}
+    for place in task.places.values():
+        if place.kind is Kind.CONTROL and not place.tokens and place.name not in fed:
+            yield _never_marked(Severity.NOTE, place.name, ", unless the operator adds one")
     marked = {p.name for p in task.places.values() if p.tokens or p.kind is Kind.CONTROL}
-    able: set[str] = set()
+    marked, able = _reached(task, marked)
+    # A place that nothing feeds is a cause, and else a resource: in a circle of empty places, its
+    # tokens are what was forgotten.
+    order = sorted(
+        (p for p in task.places.values() if not p.expanded_from),
+        key=lambda p: (p.name in fed, p.kind is not Kind.RESOURCE),
+    )
+    for place in order:
+        if place.name in marked:
+            continue
+        now_marked, now_able = _reached(task, marked | {place.name})
+        empty = [p.name for p in order if p.name in now_marked - marked - {place.name}]
+        idle = [t.name for t in task.transitions.values()
+                if t.name in now_able - able and not t.expanded_from]  # fmt: skip
+        marked, able = now_marked, now_able
+        text = f"; so {listed(idle)} can never fire" if idle else ""
+        text += (
+            f", and {listed(empty)} {'stay' if len(empty) > 1 else 'stays'} empty" if empty else ""
+        )
+        yield _never_marked(Severity.WARNING, place.name, text)
+
+
+def _never_marked(severity: Severity, place: str, more: str) -> Finding:
+    text, remedy = f"it never holds a token{more}", "give it tokens or an arc from a transition"
+    return Finding(severity, "never-marked", f"places.{place}", text, remedy)
+
+
+def _reached(task: Task, marked: set[str]) -> tuple[set[str], set[str]]:
+    """Return the places that may get a token if these have some, and the transitions that may
+    fire."""
+    marked, able = set(marked), set[str]()
     while True:
         new = {
             t.name
@@ -32,32 +66,9 @@ def never_marked(task: Task) -> Iterator[Finding]:
             if t.name not in able and all(a.place in marked for a in t.inputs)
         }
         if not new:
-            break
+            return marked, able
         able |= new
         marked |= {o.place for name in new for o in task.transitions[name].outputs}
-    fed = {o.place for t in task.transitions.values() for o in t.outputs}
-    for place in task.places.values():
-        if place.name not in marked or (
-            place.kind is Kind.CONTROL and not place.tokens and place.name not in fed
-        ):
-            hand = ", unless the operator adds one" if place.kind is Kind.CONTROL else ""
-            text = f"it never holds a token{hand}"
-            severity = Severity.NOTE if place.kind is Kind.CONTROL else Severity.WARNING
-            yield Finding(
-                severity,
-                "never-marked",
-                f"places.{place.name}",
-                text,
-                "give it tokens or an arc from a transition",
-            )
-    for name in task.transitions:
-        if name not in able:
-            yield Finding(
-                Severity.WARNING,
-                "never-fires",
-                f"transitions.{name}",
-                "one of its inputs is never marked",
-            )
 
 
 def odd_ends(task: Task) -> Iterator[Finding]:

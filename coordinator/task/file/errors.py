@@ -4,7 +4,8 @@ error."""
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
 
 from petrobot.coordinator.task.wording import Fault
 
@@ -36,18 +37,36 @@ def key_lines(text: str) -> dict[str, int]:
     """
     lines: dict[str, int] = {}
     implied: dict[str, int] = {}
-    table = ""
-    for number, line in enumerate(text.splitlines(), 1):
-        if header := _HEADER.match(line):
-            name = table = _bare(header[1])
-        elif key := _KEY.match(line):
-            name = f"{table}.{_bare(key[1])}".lstrip(".")
-        else:
-            continue
+    for number, name in _keys(text):
         lines.setdefault(name, number)
         while name := name.rpartition(".")[0]:
             implied.setdefault(name, number)
     return {**implied, **lines}
+
+
+def syntax_fault(text: str, error: tomllib.TOMLDecodeError) -> tuple[Fault, int]:
+    """What is wrong with a text that is not TOML, and its line. A key that is there twice is named
+    with both its lines."""
+    found = re.search(r"at line (\d+)", str(error))
+    line = int(found[1]) if found else text.count("\n") + 1  # "at end of document"
+    name = next((name for number, name in _keys(text) if number == line), "")
+    first = next((number for number, own in _keys(text) if own == name), line)
+    if first < line:
+        return Fault(
+            name, f"already written in line {first}", "drop one of the two, or rename it"
+        ), line
+    return Fault("TOML", str(error), "see toml.io for the syntax"), line
+
+
+def _keys(text: str) -> Iterator[tuple[int, str]]:
+    """Yield the line and the dotted key of each header and each key that begins a line."""
+    table = ""
+    for number, line in enumerate(text.splitlines(), 1):
+        if header := _HEADER.match(line):
+            table = _bare(header[1])
+            yield number, table
+        elif key := _KEY.match(line):
+            yield number, f"{table}.{_bare(key[1])}".lstrip(".")
 
 
 def line_of(key: str, lines: Mapping[str, int]) -> int:

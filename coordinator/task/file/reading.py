@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -37,7 +36,7 @@ from petrobot.coordinator.task import (
 from petrobot.coordinator.task.conditions import ConditionError, Expression, parse
 from petrobot.coordinator.task.expansion import written
 from petrobot.coordinator.task.file.arcs import ArcError, read_input, read_output
-from petrobot.coordinator.task.file.errors import TaskFileError, key_lines, line_of
+from petrobot.coordinator.task.file.errors import TaskFileError, key_lines, line_of, syntax_fault
 from petrobot.coordinator.task.validation import faults as task_faults
 from petrobot.coordinator.task.wording import Fault, nearest
 
@@ -222,11 +221,8 @@ def loads(text: str, source: str = "task", *, flat: bool = False) -> Task:
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        found = re.search(r"at line (\d+)", str(error))
-        line = int(found[1]) if found else text.count("\n") + 1  # "at end of document"
-        raise TaskFileError(
-            source, [Fault("TOML", str(error), "see toml.io for the syntax")], [line]
-        ) from error
+        fault, line = syntax_fault(text, error)
+        raise TaskFileError(source, [fault], [line]) from error
     except RecursionError as error:
         raise TaskFileError(
             source, [Fault("TOML", "nested too deeply", "flatten it")], [0]
@@ -244,7 +240,9 @@ def loads(text: str, source: str = "task", *, flat: bool = False) -> Task:
 def _task(root: Table) -> Task:
     schema = root.any("schema")
     if schema != SCHEMA or isinstance(schema, bool):
-        root.fault("schema", f"{schema!r} is not known here", f"write schema = {SCHEMA}")
+        known = "missing" if schema is None else f"{schema!r} is not known here"
+        remedy = f"write schema = {SCHEMA}, the layout that this version reads"
+        root.fault("schema", known, remedy)
     head = root.table("task")
     task = Task(
         name=head.text("name"),
@@ -276,11 +274,12 @@ def _task(root: Table) -> Task:
 
 
 def _primitive_task(name: str, t: Table) -> PrimitiveTask:
+    alternatives = t.texts("alternatives")
     primitive = PrimitiveTask(
         name=name,
-        goal=t.text("goal"),
+        goal=t.text("goal", ""),
         specification=t.text("specification", ""),
-        alternatives=t.texts("alternatives"),
+        alternatives=alternatives if "alternatives" in t.data else (name,),
         deadline=t.number("deadline"),
         target_reliability=t.maybe_number("target_reliability"),
         cost=t.text("cost", "wall"),
@@ -323,7 +322,7 @@ def _variable(name: str, t: Table) -> Variable:
 def _event(name: str, t: Table) -> Event:
     event = Event(
         name=name,
-        scope=t.word("scope", Scope),
+        scope=t.word("scope", Scope, Scope.INTERNAL if "by" in t.data else Scope.EXTERNAL),
         memory=t.word("memory", EventMemory, EventMemory.PULSE),
         early=t.word("early", EarlyEvent, EarlyEvent.DROP),
         by=t.text("by", ""),
@@ -346,12 +345,13 @@ def _errors_to(t: Table) -> str:
 
 
 def _place(name: str, t: Table) -> Place:
+    kind = _kind(t)
     place = Place(
         name=name,
-        kind=_kind(t),
+        kind=kind,
         tokens=t.integer("tokens", 0),
         capacity=t.maybe_integer("capacity"),
-        task=t.text("task", ""),
+        task=t.text("task", name if kind is Kind.ACTION else ""),
         args={n: _argument(v) for n, v in t.plain("args").items()},
         out=_texts(t.table("out")),
         servers=t.maybe_integer("servers"),

@@ -711,6 +711,12 @@ class Callee:
         run = self._running.get(id_)
         return None if run is None else run.call.service
 
+    def late(self, id_: str) -> str:
+        """Return in words that an active run is over its deadline."""
+        call = self._running[id_].call
+        seconds = self.offers[call.service].deadline if call.deadline is None else call.deadline
+        return f"took longer than its deadline of {seconds:g} s"
+
     def commander(self, id_: str) -> str:
         """Return the caller of a command that waits for its answer; empty if none does."""
         return self._commands[id_][0] if id_ in self._commands else ""

@@ -447,6 +447,10 @@ def resolve(path: str) -> Any:
     try:
         module = importlib.import_module(module_name(written))
     except ImportError as fault:
+        missing = fault.name if isinstance(fault, ModuleNotFoundError) else None
+        if missing and not f"{module_name(written)}.".startswith(f"{missing}."):
+            text = f"cannot import {written!r}: it imports {missing!r}, which is not on this host"
+            raise ImportError(f"{text}; install it, or correct the name") from fault
         raise ImportError(
             f"cannot import {written!r} ({fault}); put it beside the location file, or install "
             "its package on this host"

@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from petrobot.services.comm.location_file import MEMORY, Directory
@@ -114,13 +115,19 @@ def code_faults(directory: Directory, code: Mapping[str, Facts], text: str) -> t
         module = (path.partition(":")[0], why)
         if why and module not in told:
             faults.add(key, why)
-        if why.startswith("importing"):
+        if why.startswith(("importing", "cannot import")):  # the module, not a name in it
             told.add(module)
 
     for table in (directory.actions, directory.services):
         for entry in table.values():
             key = f"{'actions' if entry.name in directory.actions else 'services'}.{entry.name}"
             unread(f"{key}.run", entry.run)
+    for action in directory.actions.values():
+        place = code.get(action.run, {}).get("commands")
+        if place and not action.device:
+            where = f"{Path(place[0]).name}:{place[1]}"
+            text = f'calls ctx.command ({where}) and has no device; write device = "..." for node'
+            faults.add(f"actions.{action.name}", text)
     for device in directory.devices.values():
         unread(f"devices.{device.name}.driver", device.driver)
         facts = code.get(device.driver, {})

@@ -12,10 +12,12 @@ import ast
 import errno
 import importlib.util
 import socket
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
 from importlib.machinery import ModuleSpec
 from pathlib import Path
+from typing import Any
 
 from petrobot.services.comm.location_file import Directory, DirectoryError, module_name
 from petrobot.services.comm.location_file.reading import Faults, nearest
@@ -47,7 +49,8 @@ def misplaced(
         for name, path in files.items():
             if not directory.file(path).exists():
                 made = (
-                    "make it with `petrobot keys`"
+                    "copy it from a host that has it; if none has, make it with `petrobot keys` "
+                    "and copy it to each host"
                     if table == "keys"
                     else "write the path of a file"
                 )
@@ -88,29 +91,49 @@ def _imports(
 
 def _check_arguments(directory: Directory, here: Container[str], faults: Faults) -> None:
     for action in directory.actions.values():
-        known = _parameters(action.run) if action.node in here and action.args else None
+        known = _signature(action.run) if action.node in here and action.args else None
         for name in action.args if known is not None else ():
-            if name not in (known or ()):
+            if known is not None and name not in known["parameters"]:
                 function = action.run.partition(":")[2]
                 faults.add(
                     f"actions.{action.name}.args",
-                    f"{function} has no argument {name!r}{nearest(name, known or ())}",
+                    f"{function} has no argument {name!r}{nearest(name, known['parameters'])}",
                 )
 
 
-def _parameters(path: str) -> set[str] | None:
-    """Return the names of a function's arguments without its context; None if unknown or if it
-    accepts any name."""
+def signatures(directory: Directory, *, everywhere: bool) -> dict[str, Mapping[str, Any]]:
+    """Return by action what its source says of its arguments: `parameters` by name, `required` and
+    `open`; actions whose source does not show it, or of other hosts, are left out. `everywhere`: as
+    in `misplaced`."""
+    here = {n.name for n in directory.nodes.values() if everywhere or is_loopback(n.host)}
+    actions = (a for a in directory.actions.values() if a.node in here)
+    found = {action.name: _signature(action.run) for action in actions}
+    return {name: facts for name, facts in found.items() if facts is not None}
+
+
+def _signature(path: str) -> Mapping[str, Any] | None:
+    """Return the arguments of a function without its context; None if unknown or if it accepts any
+    name."""
     module, _, attribute = path.partition(":")
     tree = _source(_spec(module))
-    for statement in tree.body if tree is not None else ():
-        if (
-            isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef)
-            and statement.name == attribute
-        ):
-            if statement.args.kwarg is not None or statement.decorator_list:
+    for statement in reversed(tree.body if tree is not None else ()):  # the last one counts
+        match statement:
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) if name == attribute:
+                if statement.args.kwarg is not None or statement.decorator_list:
+                    return None
+                given = statement.args
+                ordered = [*given.posonlyargs, *given.args]
+                needed = ordered[1 : len(ordered) - len(given.defaults)]
+                pairs = zip(given.kwonlyargs, given.kw_defaults, strict=True)
+                needed += [one for one, default in pairs if default is None]
+                known = [one.arg for one in (*ordered[1:], *given.kwonlyargs)]
+                return {
+                    "parameters": dict.fromkeys(known, ""),
+                    "required": [one.arg for one in needed],
+                    "open": False,
+                }
+            case ast.Assign() | ast.AnnAssign() if attribute in _bound(statement):
                 return None
-            return {a.arg for a in [*statement.args.args[1:], *statement.args.kwonlyargs]}
     return None
 
 
@@ -125,9 +148,16 @@ def _source(spec: ModuleSpec | None) -> ast.Module | None:
     if spec is None or not spec.has_location or not str(spec.origin).endswith(".py"):
         return None
     try:
-        return ast.parse(Path(str(spec.origin)).read_bytes())
+        file = Path(str(spec.origin))
+        return _parsed(file, file.stat().st_mtime_ns)
     except (OSError, SyntaxError, ValueError):
         return None
+
+
+@lru_cache(maxsize=64)
+def _parsed(file: Path, changed: int) -> ast.Module:
+    """Parse a source file once for all that it is asked for; `changed` is its time."""
+    return ast.parse(file.read_bytes())
 
 
 def _unknown(path: str) -> str:
@@ -152,6 +182,11 @@ def _unknown(path: str) -> str:
     return f"{module!r} has no {attribute!r}{nearest(attribute, names)}"
 
 
+def _bound(statement: ast.Assign | ast.AnnAssign) -> set[str]:
+    targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
+    return {target.id for target in targets if isinstance(target, ast.Name)}
+
+
 def _names(spec: ModuleSpec) -> set[str] | None:
     """Return the names that a module's source binds at its top level; None if the source does not
     show them."""
@@ -168,10 +203,7 @@ def _names(spec: ModuleSpec) -> set[str] | None:
                     (alias.asname or alias.name).partition(".")[0] for alias in statement.names
                 }
             case ast.Assign() | ast.AnnAssign():
-                targets = (
-                    statement.targets if isinstance(statement, ast.Assign) else [statement.target]
-                )
-                found |= {target.id for target in targets if isinstance(target, ast.Name)}
+                found |= _bound(statement)
             case ast.Expr():
                 pass
             case _:

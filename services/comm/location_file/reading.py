@@ -171,24 +171,34 @@ class Faults:
         self.lines.append(f"{place}: {key}: {fault}")
 
     def _line(self, path: list[str]) -> int:
-        """Return the line of the key; else of the header of its table; else 0.
+        """Return the line of the key, or of the table around it, which may be an inline one; else
+        0.
 
         tomllib reports no positions, so the line is searched in the text.
         """
-        table, wanted, header, first = path[:-1], ".".join(path), "", 0
-        for number, raw in enumerate(self._lines, 1):
-            line = raw.strip()
-            if opened := re.fullmatch(r"\[+\s*([^\]]+?)\s*\]+\s*(#.*)?", line):
-                header = ".".join(part.strip().strip("\"'") for part in opened[1].split("."))
-                if f"{header}.".startswith(f"{wanted}."):
-                    return number
-                if header == ".".join(table):
-                    first = number
-            elif header == ".".join(table) and re.match(
-                rf"[\"']?{re.escape(path[-1])}[\"']?\s*=", line
-            ):
+        wanted, first, longest = f"{'.'.join(path)}.", 0, 0
+        for number, here, is_header in _keys(self._lines):
+            if wanted == f"{here}." or (is_header and f"{here}.".startswith(wanted)):
                 return number
+            if wanted.startswith(f"{here}.") and len(here) > longest:
+                first, longest = number, len(here)
         return first
+
+
+def _keys(lines: Iterable[str]) -> Iterator[tuple[int, str, bool]]:
+    """Yield each header and each key that begins a line: its number, its dotted name, and whether
+    it is a header."""
+    header = ""
+    for number, raw in enumerate(lines, 1):
+        if opened := re.fullmatch(r"\[+\s*([^\]]+?)\s*\]+\s*(#.*)?", raw.strip()):
+            header = _bare(opened[1])
+            yield number, header, True
+        elif key := re.match(r"\s*([\w./\-\"']+)\s*=", raw):
+            yield number, f"{header}.{_bare(key[1])}".lstrip("."), False
+
+
+def _bare(key: str) -> str:
+    return ".".join(part.strip().strip("\"'") for part in key.split("."))
 
 
 def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
@@ -198,7 +208,7 @@ def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as fault:
-        return {}, "", [_syntax_fault(source, str(fault))]
+        return {}, "", [_syntax_fault(text, source, str(fault))]
     _check_top(data, faults)
     tables: Tables = {name: data.get(name, {}) for name in (*SHAPES, *FLAT)}
     tables[COORDINATOR] = _coordinator(data, faults)
@@ -250,16 +260,18 @@ def _digest(data: Mapping[str, Any]) -> str:
     return (DRY if data.get("dry_run") else "") + digest
 
 
-def _syntax_fault(source: str, text: str) -> str:
-    place = re.search(r"\(at line (\d+)", text)
+def _syntax_fault(text: str, source: str, why: str) -> str:
+    place = re.search(r"\(at line (\d+)", why)
     line = f":{place[1]}" if place else ""
-    twice = re.search(r"Cannot declare \('(\w+)', '([^']+)'\) twice", text)
-    if twice:
+    keys = [(number, name) for number, name, _ in _keys(text.splitlines())]
+    name = next((name for number, name in keys if place and number == int(place[1])), "")
+    first = next((number for number, own in keys if own == name), 0)
+    if place and 0 < first < int(place[1]):
         return (
-            f"{source}{line}: {twice[1]}.{twice[2]}: is placed twice; "
-            "a name may belong to one node only: remove one of the two tables or rename it"
+            f"{source}{line}: {name}: already written in line {first}; a name belongs to one "
+            "table: remove one of the two or rename it"
         )
-    return f"{source}{line}: not valid TOML: {text}; correct this line"
+    return f"{source}{line}: not valid TOML: {why}; correct this line"
 
 
 def _check_top(data: Mapping[str, Any], faults: Faults) -> None:

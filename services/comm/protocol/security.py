@@ -207,7 +207,8 @@ def read_key(path: Path) -> bytes:
         key = bytes.fromhex(read_secret(path).decode("ascii").strip())
     except OSError as fault:
         raise KeyFileError(
-            f"{path}: {fault.strerror}; make one with `petrobot keys` and copy it to each host"
+            f"{path}: {fault.strerror}; copy it from a host that has it; if none has, make one "
+            "with `petrobot keys` and copy it to each host"
         ) from None
     except ValueError:
         key = b""

@@ -1,6 +1,7 @@
 // Copy and paste: elements with the arcs among them, and what they need to mean the same in another task.
 
 import { listed, readArc, repoint } from "./arcs.js";
+import { taskOf } from "./drawn.js";
 import { groups, within } from "./macros.js";
 
 const SHARED = ["primitive_tasks", "events", "variables", "subnets"];
@@ -26,8 +27,8 @@ function needed(data, net, found = Object.fromEntries(SHARED.map((group) => [gro
     if (group === "subnets") needed(data, data.subnets[name], found);
     if (group === "events") add("primitive_tasks", data.events[name].by);
   };
-  for (const place of Object.values(net.places ?? {})) {
-    add("primitive_tasks", place.task);
+  for (const [name, place] of Object.entries(net.places ?? {})) {
+    add("primitive_tasks", taskOf(name, place));
     add("subnets", place.subnet);
     for (const value of Object.values(place.args ?? {})) add("variables", value?.var);
     for (const variable of Object.values(place.out ?? {})) add("variables", variable);
@@ -49,7 +50,8 @@ export function paste(model, made, dx, dy) {
         const free = model.freeName(name, net);
         names.set(name, free);
         const where = Object.fromEntries([["x", dx], ["y", dy]].filter(([axis]) => Number.isFinite(value[axis])).map(([axis, d]) => [axis, value[axis] + d]));
-        net[kind][free] = { ...structuredClone(value), ...where };
+        const task = free !== name && data.primitive_tasks?.[taskOf(name, value)] ? { task: taskOf(name, value) } : {};
+        net[kind][free] = { ...structuredClone(value), ...task, ...where };
       }
     }
     for (const [name, free] of names) {

@@ -3,6 +3,7 @@
 import { h, keep, words } from "../dom.js";
 import { icon } from "../icons.js";
 import { toast } from "../toast.js";
+import { scopeOf } from "./drawn.js";
 import { readValue, writeValue } from "./values.js";
 
 const NAME = /^[\p{L}_][\p{L}\p{N}_]*$/u;
@@ -41,8 +42,8 @@ export function events(form) {
       data.events[entry] = { ...(value ? { scope: "internal", by: value } : { scope: "external" }), ...(text ? { text } : {}), ...(wait && !value ? { mean_wait: wait } : {}) };
     });
     return [
-      form.choice(event.scope === "internal" ? event.by : "", [["", "external"], ...primitives], source, { "aria-label": `Where ${words(entry)} comes from` }),
-      event.scope === "internal" ? null : form.choice(event.memory ?? "pulse", MEMORY, (memory) => set("memory", memory), { "aria-label": `How ${words(entry)} is remembered` }),
+      form.choice(scopeOf(event) === "internal" ? event.by : "", [["", "external"], ...primitives], source, { "aria-label": `Where ${words(entry)} comes from` }),
+      scopeOf(event) === "internal" ? null : form.choice(event.memory ?? "pulse", MEMORY, (memory) => set("memory", memory), { "aria-label": `How ${words(entry)} is remembered` }),
     ];
   }, { scope: "external" });
 }

@@ -5,6 +5,11 @@ import { caption, onlyErrors } from "../sheet.js";
 import { arcsOf, listed } from "./arcs.js";
 import { around, drawnAs, groups, within } from "./macros.js";
 
+/** What a file may leave out: an action place does the primitive task of its name, the action of its name does that, and an event that names who raises it is internal. */
+export const taskOf = (name, place) => place.task ?? (place.kind === "action" ? name : "");
+export const actionsOf = (name, primitive) => primitive?.alternatives ?? [name];
+export const scopeOf = (event) => event?.scope ?? (event?.by === undefined ? "external" : "internal");
+
 /** The drawing {places, transitions, arcs} of a net of the document, where the macro place `inside` is opened. */
 export function drawn(data, net, inside) {
   const shown = drawnAs(net, inside);
@@ -44,7 +49,7 @@ function placeOf(data, net, name, p, errors) {
 
 function transitionOf(data, name, t, error, outside) {
   const events = data.events ?? {};
-  const when = { events: listed(t.event).map((e) => ({ name: e, scope: events[e]?.scope ?? "external" })), when: t.when ?? "", after: t.after };
+  const when = { events: listed(t.event).map((e) => ({ name: e, scope: scopeOf(events[e]) })), when: t.when ?? "", after: t.after };
   // the automatic layout puts an element outside next to the opened macro place
   const where = outside ? { x: undefined, y: undefined, outside } : { x: t.x, y: t.y };
   return { name, label: t.label ?? "", error, hint: name, ...where, ...when };

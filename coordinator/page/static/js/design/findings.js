@@ -3,6 +3,7 @@
 import { attribute, fill, h, Press, words } from "../dom.js";
 import { checkDocument } from "../files.js";
 import { icon } from "../icons.js";
+import { taskOf } from "./drawn.js";
 import { around, drawnAs } from "./macros.js";
 
 const CHECK_MS = 300;
@@ -61,7 +62,7 @@ export class Findings {
     const at = model.sheet ? 2 : 0;
     if (model.sheet ? parts[0] !== "subnets" || parts[1] !== model.sheet : parts[0] === "subnets") return null;
     if (parts[at] === "places" || parts[at] === "transitions") return parts[at + 1] ?? "";
-    if (parts[0] === "primitive_tasks") return Object.entries(model.net.places ?? {}).find(([, p]) => p.task === parts[1])?.[0] ?? "";
+    if (parts[0] === "primitive_tasks") return Object.entries(model.net.places ?? {}).find(([name, p]) => taskOf(name, p) === parts[1])?.[0] ?? "";
     return "";
   }
 

@@ -5,6 +5,7 @@ import { icon } from "../icons.js";
 import { toast } from "../toast.js";
 import { align, distribute, layOut } from "./arrange.js";
 import { events, variables } from "./declared.js";
+import { actionsOf, scopeOf, taskOf } from "./drawn.js";
 import { around, groups, within } from "./macros.js";
 import { readValue, writeValue } from "./values.js";
 
@@ -133,17 +134,18 @@ export class Inspector {
     const options = [["", "choose …"], ...[...known].sort().map((p) => [p, label(p)])];
     const exits = new Set(this.designer.picture.arcs.filter((a) => a.direction === "in" && a.place === name).map((a) => a.end));
     const add = (end, text) => (exits.has(end) ? null : h("button", { type: "button", class: "small", onclick: () => this.designer.tools.addExit(name, end) }, icon("plus"), text));
-    const primitive = data.primitive_tasks?.[place.task];
+    const task = taskOf(name, place);
+    const primitive = data.primitive_tasks?.[task];
     return [
-      this.field("Primitive task", this.choice(place.task, options, (p) => p && this.model.choosePrimitiveTask(name, p, offers))),
-      primitive ? this.primitive(place.task, primitive, offers) : null,
-      this.pairs("Arguments", place.args ?? {}, this.argumentNames(place, offers), (args) => this.model.set(name, { args: Object.keys(args).length ? args : null })),
+      this.field("Primitive task", this.choice(primitive ? task : place.task, options, (p) => p && this.model.choosePrimitiveTask(name, p, offers))),
+      primitive ? this.primitive(task, primitive, offers) : null,
+      this.pairs("Arguments", place.args ?? {}, this.argumentNames(task, offers), (args) => this.model.set(name, { args: Object.keys(args).length ? args : null })),
       h("div", { class: "buttons" }, add("normal", "Add normal transition"), add("error", "Add error branch")),
     ];
   }
 
-  argumentNames(place, offers) {
-    const actions = new Set(this.model.data.primitive_tasks?.[place.task]?.alternatives ?? []);
+  argumentNames(task, offers) {
+    const actions = new Set(actionsOf(task, this.model.data.primitive_tasks?.[task]));
     return [...new Set(offers.filter((o) => actions.has(o.action)).flatMap((o) => Object.keys(o.args ?? {})))];
   }
 
@@ -153,12 +155,13 @@ export class Inspector {
       else data.primitive_tasks[name][key] = value;
     });
     const offered = new Set(offers.map((o) => o.action));
-    const all = [...new Set([...(primitive.alternatives ?? []), ...offers.filter((o) => o.primitive_task === name).map((o) => o.action)])];
-    const toggle = (action, on) => set("alternatives", all.filter((a) => (a === action ? on : (primitive.alternatives ?? []).includes(a))));
+    const chosen = actionsOf(name, primitive);
+    const all = [...new Set([...chosen, ...offers.filter((o) => o.primitive_task === name).map((o) => o.action)])];
+    const toggle = (action, on) => set("alternatives", all.filter((a) => (a === action ? on : chosen.includes(a))));
     return h("fieldset", {}, h("legend", {}, words(name)),
       this.field("Goal", this.input(primitive.goal, (v) => set("goal", v))),
       this.field("Deadline (s)", this.number(primitive.deadline, (v) => set("deadline", v), { min: 0, step: "any" })),
-      h("div", { class: "field", role: "group", "aria-label": "Alternatives" }, h("span", {}, "Alternatives"), all.map((action) => h("label", { class: "tick" }, h("input", { type: "checkbox", checked: (primitive.alternatives ?? []).includes(action), onchange: (e) => toggle(action, e.target.checked) }), words(action), offers.length && !offered.has(action) ? h("em", { class: "warn" }, "no node offers it") : null))));
+      h("div", { class: "field", role: "group", "aria-label": "Alternatives" }, h("span", {}, "Alternatives"), all.map((action) => h("label", { class: "tick" }, h("input", { type: "checkbox", checked: chosen.includes(action), onchange: (e) => toggle(action, e.target.checked) }), words(action), offers.length && !offered.has(action) ? h("em", { class: "warn" }, "no node offers it") : null))));
   }
 
   pairs(title, values, known, onchange) {
@@ -209,7 +212,7 @@ export class Inspector {
     return [
       this.head("Transition", t.label || name), this.name(name), this.label(name, t),
       h("fieldset", {}, h("legend", {}, "Events"),
-        chosen.map((e) => h("div", { class: "row" }, h("span", { class: "chip" }, `${events[e]?.scope === "internal" ? "int" : "ext"}: ${words(e)}`), h("button", { type: "button", class: "tool", "aria-label": `Remove event ${words(e)}`, onclick: () => setEvents(chosen.filter((x) => x !== e)) }, icon("close")))),
+        chosen.map((e) => h("div", { class: "row" }, h("span", { class: "chip" }, `${scopeOf(events[e]) === "internal" ? "int" : "ext"}: ${words(e)}`), h("button", { type: "button", class: "tool", "aria-label": `Remove event ${words(e)}`, onclick: () => setEvents(chosen.filter((x) => x !== e)) }, icon("close")))),
         h("div", { class: "row" }, this.choice("", [["", "add event …"], ...free.map((e) => [e, words(e)])], (e) => e && setEvents([...chosen, e]), { "aria-label": "Add event" })),
         this.newEvent((e) => setEvents([...chosen, e]))),
       this.field("Condition", this.input(t.when, (when) => set({ when }), { placeholder: "visible and distance < 1.5" }), "names of variables, comparisons, and, or, not"),

@@ -269,6 +269,7 @@ export class Model {
   }
 
   renamePlace(data, net, from, to) {
+    if (net.places[to].kind === "action" && data.primitive_tasks?.[from]) net.places[to].task ??= from;
     for (const t of Object.values(net.transitions)) {
       repoint(t, new Map([[from, to]]));
       if (t.when) t.when = renamed(t.when, from, to);
@@ -296,7 +297,7 @@ export class Model {
       data.primitive_tasks ??= {};
       if (!data.primitive_tasks[primitive]) {
         const alternatives = offers.filter((o) => o.primitive_task === primitive).map((o) => o.action);
-        data.primitive_tasks[primitive] = { goal: words(primitive), alternatives: alternatives.length ? alternatives : [primitive], deadline: 10 };
+        data.primitive_tasks[primitive] = { ...(alternatives.length ? { alternatives } : {}), deadline: 10 };
       }
       net.places[place].task = primitive;
     });
