@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from petrobot.coordinator.analysis.net.explore import Explored, Numbers, widened_layout
 from petrobot.coordinator.analysis.net.pack import Layout, Rules, Words
 
-SUCCESSORS = 1 << 18
+SUCCESSORS = 1 << 17
 """Successors aimed at in a block: many of them are equal, but their arrays should stay in the
 cache."""
 TESTS = 1 << 22
