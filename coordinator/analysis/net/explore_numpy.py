@@ -3,10 +3,12 @@
 A block of markings is tested against every transition at once. Its successors are written behind
 the known markings, looked up in a hash table, and only the new ones are kept.
 
-The table maps a slot to the number of a marking. Keys are compared in full, so the search is exact.
-Before its bits are mixed, the hash is linear in the words: h(M + d) = h(M) + h(d). What costs here
-is not computing but waiting for the memory: the table holds nothing but numbers of 32 bits, so that
-it stays in the cache for long, and the growing arrays are moved by pages, not copied.
+The table maps a slot to the number of a marking. Keys are compared in full, so the search is exact;
+words that follow from the others by invariants (`Layout.telling`) are computed for new markings
+only. What costs here is not computing but waiting for the memory: successors that equal another
+one of their block are found before the large table is asked, the table holds nothing but numbers of
+32 bits, so that it stays in the cache for long, and the growing arrays are moved by pages, not
+copied.
 """
 
 from __future__ import annotations
@@ -16,17 +18,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.coordinator.analysis.net.explore import Explored, Labels, Numbers, widened_layout
+from petrobot.coordinator.analysis.net.explore import Explored, Numbers, widened_layout
 from petrobot.coordinator.analysis.net.pack import Layout, Rules, Words
 
 SUCCESSORS = 1 << 17
-"""Successors aimed at in a block: enough to hide the interpreter, few enough for the cache."""
+"""Successors aimed at in a block: many of them are equal, but their arrays should stay in the
+cache."""
 TESTS = 1 << 22
 """The most pairs of marking and transition that a block tests."""
 EMPTY = -1
 """What the table holds in a free slot."""
-DENSE = 4
-"""Pairs of marking and transition per enabled pair up to which all pairs are computed."""
+NEAR = 1 << 18
+"""Slots of the table of the successors of one block."""
 MULTIPLIERS = (
     np.random.Generator(np.random.PCG64(0x9E3779B97F4A7C15)).integers(1, 1 << 63, 4096, np.uint64)
     * 2
@@ -52,10 +55,10 @@ class NumpyEngine:
         """Rebuild everything that depends on the layout."""
         self._layout = layout
         self._rules = Rules.compiled(self._net, layout)
-        self._factors = MULTIPLIERS[: layout.words].copy()
-        self._delta_hash = _hash(self._rules.word_delta, self._factors)
         self._keys = [Column(words[:, w].copy()) for w in range(layout.words)]
+        self._telling = self._keys[: layout.telling]
         self._table = np.full(0, EMPTY, dtype=np.int32)
+        self._near = np.zeros(NEAR, dtype=np.int32)
         self._grow(len(words))
 
     @property
@@ -78,30 +81,35 @@ class NumpyEngine:
         """Expand a block of markings; return False when none is left."""
         if self._expanded == self._states or (cap is not None and self._states >= cap):
             return self._expanded < self._states
-        block = max(
-            1, min(int(SUCCESSORS / self._degree), TESTS // max(1, len(self._net.transitions)))
-        )
+        transitions = len(self._net.transitions)
+        block = max(1, min(int(SUCCESSORS / self._degree), TESTS // max(1, transitions)))
         if cap is not None:
             block = max(1, min(block, 2 * (cap - self._states)))
         stop = min(self._states, self._expanded + block)
         able = self._enabled(stop)
-        pairs = Pairs(able)
-        self._reserve(pairs.count)
-        overflown = self._fire(stop, pairs)
+        degree = able.view(np.uint8).sum(axis=0, dtype=np.int64)
+        source = np.repeat(np.arange(self._expanded, stop), degree)
+        label = np.flatnonzero(able.T.ravel()) - (source - self._expanded) * transitions
+        self._reserve(len(label))
+        new, telling = label[:0], self._layout.telling
+        overflown = self._fire(range(telling), source, label)
+        if not overflown:
+            target, new = self._intern(len(label))
+            overflown = self._fire(range(telling, len(self._keys)), source[new], label[new])
         if overflown:
             words = self._words()
             wider = widened_layout(self._layout, overflown)
             self._use(wider, self._layout.repack(words, wider))
             return True
-        target = self._intern(stop, pairs)
-        self._commit(stop, able, pairs, target, cap)
+        self._states += len(new)
+        self._commit(degree, label, target, cap)
         return self._expanded < self._states
 
     def _words(self) -> Words:
         return np.stack([key.values[: self._states] for key in self._keys], axis=1)
 
     def _enabled(self, stop: int) -> NDArray[np.bool_]:
-        """Return which transitions the markings of the block enable, shape (block, transitions)."""
+        """Return which transitions the markings of the block enable, shape (transitions, block)."""
         guarded = [
             key.values[self._expanded : stop] | guard
             for key, guard in zip(self._keys, self._layout.guard_words, strict=True)
@@ -112,7 +120,7 @@ class NumpyEngine:
             for word, sub, guard, want in self._rules.word_tests[t]:
                 able[t] &= ((guarded[word] - sub) & guard) == want
         self._keep_highest(able)
-        return np.ascontiguousarray(able.T)
+        return able
 
     def _keep_highest(self, able: NDArray[np.bool_]) -> None:
         """Disable transitions in markings where one of a higher priority is enabled."""
@@ -125,101 +133,101 @@ class NumpyEngine:
                 able[t] &= ~beaten
             beaten |= some
 
-    def _fire(self, stop: int, pairs: Pairs) -> list[int]:
-        """Write the successors behind the known markings; return the places that overflowed."""
-        n, delta = self._states, self._rules.word_delta
-        spilt = np.zeros(self._layout.words, dtype=np.uint64)
-        for w, key in enumerate(self._keys):
-            fresh = pairs.sums(key.values[self._expanded : stop], delta[:, w])
-            key.values[n : n + pairs.count] = fresh
+    def _fire(self, words: range, source: NDArray[np.int64], label: NDArray[np.int64]) -> list[int]:
+        """Write some words of the successors behind the known markings; return the places that
+        overflowed."""
+        n, spilt = self._states, np.zeros(self._layout.words, dtype=np.uint64)
+        for w in words:
+            key = self._keys[w].values
+            fresh = key.take(source)
+            fresh += self._rules.word_delta[:, w].take(label)
+            key[n : n + len(label)] = fresh
             spilt[w] = np.bitwise_or.reduce(fresh, initial=0) & self._layout.guard_words[w]
         if not spilt.any():
             return []
         return self._layout.overflown(self._layout.join_many(spilt[None, :])[0])
 
-    def _intern(self, stop: int, pairs: Pairs) -> Numbers:
-        """Return the numbers of the successors that were written behind the known markings.
+    def _intern(self, m: int) -> tuple[Numbers, NDArray[np.int64]]:
+        """Return the numbers of the m successors that were written behind the known markings, and
+        which of them are new.
 
         New markings are numbered in the order in which they were found, and moved up to follow the
         known ones without a gap.
         """
-        n, m = self._states, pairs.count
-        if len(self._keys) == 1:
-            hashed = self._keys[0].values[n : n + m] * self._factors[0]
-        else:
-            hashed = pairs.sums(self._hashes(self._expanded, stop), self._delta_hash)
-        number, new, slot = self._probe(self._slot(hashed))
+        n, every = self._states, np.arange(m, dtype=np.int32)
+        slot = self._slots(n, n + m)
+        # More than half of the successors equal an earlier one of their block. A table that stays
+        # in the cache finds most of these: it holds the first successor that hashes to a slot.
+        near = slot & (NEAR - 1)
+        self._near[near[::-1]] = every[::-1]
+        first = self._near.take(near)
+        own = [key.values[n : n + m] for key in self._telling]
+        differ = np.zeros(m, dtype=np.bool_)
+        for key in own:
+            differ |= key.take(first) != key
+        single = np.flatnonzero(differ | (first == every))
+        number, new, taken = self._probe(single, slot.take(single))
         order = np.argsort(new)
-        rank = np.zeros(m, dtype=np.int32)
-        rank[new[order]] = np.arange(n, n + len(new), dtype=np.int32)
-        self._table[slot] = rank[new]
-        moved = n + new[order]
-        for key_column in self._keys:
-            key_column.values[n : n + len(new)] = key_column.values[moved]
+        new = new.take(order)
+        rank = np.empty(m, dtype=np.int32)
+        rank[new] = np.arange(n, n + len(new), dtype=np.int32)
+        self._table[taken.take(order)] = rank.take(new)
+        for key in own:
+            key[: len(new)] = key.take(new)
         fresh = np.flatnonzero(number >= n)
-        number[fresh] = rank[number[fresh] - n]
-        self._states = n + len(new)
-        return number
+        number[fresh] = rank.take(number.take(fresh) - n)
+        rank[single] = number
+        target = rank.take(first)
+        target[single] = number
+        return target, new
 
     def _probe(
-        self, slot: NDArray[np.int64]
+        self, waiting: NDArray[np.int64], slot: NDArray[np.int64]
     ) -> tuple[Numbers, NDArray[np.int64], NDArray[np.int64]]:
-        """Find or claim a table slot for each successor.
+        """Find or claim a table slot for each of these successors.
 
-        Return (number of each successor, which successors are new, their slots). Linear probing in
+        Return (number of each one, which successors are new, their slots). Linear probing in
         rounds: every successor that is still waiting looks at its next slot. Successor k counts as
         marking n + k until it is known to be new. If several want the same empty slot, the first
         one gets it (assignment in reversed order, since numpy keeps the last). Equal successors
         probe the same slots in the same rounds, so the first of them becomes the new marking.
         """
         n, table, mask = self._states, self._table, len(self._table) - 1
-        number = table.take(slot)
-        own = [key.values[n : n + len(slot)] for key in self._keys]
-        new, taken = [], []
-        # Most successors are known and stand where they are looked for first: the first round is
-        # for all of them, without an index of who is waiting. -1 looks at a key that is no marking.
-        waiting = np.flatnonzero(self._differ(number, own))
-        found, slot = number[waiting], slot[waiting]
-        own = [key[waiting] for key in own]
+        number, at = np.empty(len(waiting), dtype=np.int32), np.arange(len(waiting))
+        own = [key.values[n:].take(waiting) for key in self._telling]
+        new, taken = [waiting[:0]], [slot[:0]]
         while len(waiting):
+            found = table.take(slot)
             empty = np.flatnonzero(found < 0)
             if len(empty):
-                wanted = (n + waiting[empty]).astype(np.int32)
-                table[slot[empty[::-1]]] = wanted[::-1]
-                found[empty] = table.take(slot[empty])
-                won = empty[found[empty] == wanted]
-                new.append(waiting[won])
-                taken.append(slot[won])
-            number[waiting] = found
-            lost = np.flatnonzero(self._differ(found, own))
-            waiting, slot = waiting[lost], (slot[lost] + 1) & mask
-            own = [key[lost] for key in own]
-            found = table.take(slot)
-        none = np.zeros(0, dtype=np.int64)
-        return number, np.concatenate([none, *new]), np.concatenate([none, *taken])
-
-    def _differ(self, number: Numbers, own: list[Words]) -> NDArray[np.bool_]:
-        """Return which keys are not those of the markings with these numbers (-1: of none)."""
-        differ: NDArray[np.bool_] = number < 0
-        for key, mine in zip(self._keys, own, strict=True):
-            differ |= key.values.take(number, mode="clip") != mine
-        return differ
+                free, wanted = slot.take(empty), (n + waiting.take(empty)).astype(np.int32)
+                table[free[::-1]] = wanted[::-1]
+                got = table.take(free)
+                found[empty] = got
+                won = np.flatnonzero(got == wanted)
+                new.append(waiting.take(empty.take(won)))
+                taken.append(free.take(won))
+            number[at] = found
+            differ = np.zeros(len(found), dtype=np.bool_)
+            for key, mine in zip(self._telling, own, strict=True):
+                differ |= key.values.take(found) != mine
+            lost = np.flatnonzero(differ)
+            at, waiting, slot = at.take(lost), waiting.take(lost), (slot.take(lost) + 1) & mask
+            own = [key.take(lost) for key in own]
+        return number, np.concatenate(new), np.concatenate(taken)
 
     def _commit(
         self,
-        stop: int,
-        able: NDArray[np.bool_],
-        pairs: Pairs,
+        degree: NDArray[np.int64],
+        label: NDArray[np.int64],
         target: Numbers,
         cap: int | None,
     ) -> None:
         """Append the block to the result, up to the marking whose successors reach the cap."""
-        degree = np.count_nonzero(able, axis=1)
-        label = pairs.label
         if cap is not None and self._states >= cap and len(target):
             over = int(np.argmax(target >= cap - 1))
             last = int(np.searchsorted(np.cumsum(degree), over, side="right"))
-            stop, degree = self._expanded + last + 1, degree[: last + 1]
+            degree = degree[: last + 1]
             cut = int(degree.sum())
             target, label = target[:cut], label[:cut]
             self._states = int(target.max()) + 1
@@ -228,21 +236,18 @@ class NumpyEngine:
             self._label.append(label)
         self._row.append(self._edges + np.cumsum(degree))  # last: it says how many edges count
         self._edges += len(target)
-        self._degree = max(
-            1.0, 0.5 * self._degree + 0.5 * len(target) / max(1, stop - self._expanded)
-        )
-        self._expanded = stop
+        self._degree = max(1.0, 0.5 * self._degree + 0.5 * len(target) / max(1, len(degree)))
+        self._expanded += len(degree)
 
-    def _slot(self, hashed: Words) -> NDArray[np.int64]:
-        mixed = hashed ^ (hashed >> np.uint64(32))
-        mixed *= MIX
-        mixed >>= np.uint64(64 - (len(self._table).bit_length() - 1))
-        return mixed.view(np.int64)
-
-    def _hashes(self, start: int, stop: int) -> Words:
-        return _hash(
-            np.stack([key.values[start:stop] for key in self._keys], axis=1), self._factors
-        )
+    def _slots(self, start: int, stop: int) -> NDArray[np.int64]:
+        """Return the slots at which the table looks first for the keys of these numbers."""
+        hashed = np.zeros(stop - start, dtype=np.uint64)
+        for key, factor in zip(self._telling, MULTIPLIERS, strict=False):
+            hashed += key.values[start:stop] * factor
+        hashed ^= hashed >> np.uint64(32)
+        hashed *= MIX
+        hashed >>= np.uint64(64 - (len(self._table).bit_length() - 1))
+        return hashed.view(np.int64)
 
     def _reserve(self, more: int) -> None:
         """Make room for `more` further markings and keep the table at most half full."""
@@ -261,12 +266,12 @@ class NumpyEngine:
         for start in range(0, self._states, SUCCESSORS):
             stop = min(start + SUCCESSORS, self._states)
             waiting = np.arange(start, stop, dtype=np.int32)
-            slot = self._slot(self._hashes(start, stop))
+            slot = self._slots(start, stop)
             while len(waiting):
-                empty = self._table.take(slot) < 0
-                self._table[slot[empty]] = waiting[empty]
-                lost = self._table.take(slot) != waiting
-                waiting, slot = waiting[lost], (slot[lost] + 1) & mask
+                empty = np.flatnonzero(self._table.take(slot) < 0)
+                self._table[slot.take(empty)] = waiting.take(empty)
+                lost = np.flatnonzero(self._table.take(slot) != waiting)
+                waiting, slot = waiting.take(lost), (slot.take(lost) + 1) & mask
 
     def explored(self) -> Explored:
         """Return the search so far."""
@@ -315,36 +320,6 @@ class Column:
         return values[: self.length]
 
 
-class Pairs:
-    """The enabled pairs (marking of the block, transition), sorted in that order."""
-
-    def __init__(self, able: NDArray[np.bool_]) -> None:
-        """Find the pairs in the matrix `able`."""
-        self.shape = able.shape
-        self.flat = np.flatnonzero(able)
-        self.count = len(self.flat)
-        self.dense = able.size <= DENSE * self.count
-        self.source = self.flat[:0] if self.dense else self.flat // max(1, able.shape[1])
-
-    @property
-    def label(self) -> Labels:
-        """The transition of each pair."""
-        if self.dense:
-            every = np.broadcast_to(np.arange(self.shape[1], dtype=np.int32), self.shape)
-            label: Labels = every.ravel().take(self.flat)
-        else:
-            label = self.flat - self.source * self.shape[1]
-        return label
-
-    def sums(self, rows: Words, columns: Words) -> Words:
-        """Return rows[marking] + columns[transition] for each pair."""
-        if self.dense:
-            sums: Words = np.add.outer(rows, columns).ravel().take(self.flat)
-            return sums
-        parts: Words = rows.take(self.source) + columns.take(self.label)
-        return parts
-
-
 def joined(parts: list[NDArray[Any]], length: int) -> NDArray[Any]:
     """Return the parts one after the other, cut to a length.
 
@@ -360,10 +335,3 @@ def joined(parts: list[NDArray[Any]], length: int) -> NDArray[Any]:
         at += len(kept)
     parts.append(whole)
     return whole
-
-
-def _hash(words: Words, factors: Words) -> Words:
-    hashed: Words = words[:, 0] * factors[0]
-    for w in range(1, words.shape[1]):
-        hashed += words[:, w] * factors[w]
-    return hashed

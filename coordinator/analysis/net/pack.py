@@ -40,27 +40,33 @@ class Layout:
     word: tuple[int, ...]
     shift: tuple[int, ...]
     words: int
+    implied: frozenset[int]
+    """Places whose tokens follow from those of the others; their fields come last."""
 
     @classmethod
-    def of_widths(cls, width: Sequence[int]) -> Layout:
-        """Fields in place order; one that does not fit in what is left of a word starts the next
-        word."""
-        word, shift, at, used = [], [], 0, 0
-        for bits in width:
+    def of_widths(cls, width: Sequence[int], implied: frozenset[int] = frozenset()) -> Layout:
+        """Fields in place order, those of implied places last; one that does not fit in what is
+        left of a word starts the next word."""
+        word, shift, at, used = [0] * len(width), [0] * len(width), 0, 0
+        for p in sorted(range(len(width)), key=lambda p: p in implied):
+            bits = width[p]
             if bits > WIDEST:
                 raise TooManyTokens(
                     f"a place needs {bits} bits for its tokens; at most {WIDEST} can be counted"
                 )
             if used + bits + 1 > WORD:
                 at, used = at + 1, 0
-            word.append(at)
-            shift.append(used)
+            word[p], shift[p] = at, used
             used += bits + 1
-        return cls(tuple(width), tuple(word), tuple(shift), at + 1)
+        return cls(tuple(width), tuple(word), tuple(shift), at + 1, implied)
 
     @classmethod
     def for_net(
-        cls, net: Net, bounds: Sequence[int | None] | None = None, least: int = 1
+        cls,
+        net: Net,
+        bounds: Sequence[int | None] | None = None,
+        least: int = 1,
+        implied: frozenset[int] = frozenset(),
     ) -> Layout:
         """A layout that holds the initial marking, the given bounds (None: unknown) and every
         single effect.
@@ -73,14 +79,20 @@ class Layout:
             bound = bounds[p] if bounds is not None else None
             wanted = max(1, bound.bit_length()) if bound is not None else least
             width.append(max(wanted, start.bit_length(), effect.bit_length()))
-        return cls.of_widths(width)
+        return cls.of_widths(width, implied)
 
     def widened(self, places: Sequence[int]) -> Layout:
         """The layout with twice the value bits for each of the places."""
         grown = set(places)
         return Layout.of_widths(
-            [min(2 * w, WIDEST) if p in grown else w for p, w in enumerate(self.width)]
+            [min(2 * w, WIDEST) if p in grown else w for p, w in enumerate(self.width)],
+            self.implied,
         )
+
+    @cached_property
+    def telling(self) -> int:
+        """Number of the first words that tell any two reachable markings apart."""
+        return 1 + max((w for p, w in enumerate(self.word) if p not in self.implied), default=0)
 
     @cached_property
     def offsets(self) -> tuple[int, ...]:

@@ -9,7 +9,7 @@ out to be large.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -25,7 +25,11 @@ from petrobot.coordinator.analysis.net.explore import (
     Numbers,
 )
 from petrobot.coordinator.analysis.net.pack import Layout, Tokens, TooManyTokens, Words
-from petrobot.coordinator.analysis.net.structure import place_bounds, place_semiflows
+from petrobot.coordinator.analysis.net.structure import (
+    implied_places,
+    place_bounds,
+    place_semiflows,
+)
 from petrobot.coordinator.task.net import Marking, Net
 
 EngineName = Literal["auto", "integers", "numpy", "numba"]
@@ -204,33 +208,27 @@ def explore(
     engine: EngineName = "auto",
     limits: SearchLimits | None = None,
     edges: bool = True,
-    bounds: Sequence[int | None] | None = None,
 ) -> Space:
     """Return the markings that are reachable from the initial one.
 
-    `bounds` (tokens by place, None if unknown; by default from the P-invariants) only choose the
-    width of the fields, so they need not be right. With `edges=False` the edges are counted but not
-    kept. Ctrl-C, a limit, or a place with more tokens than 63 bits can count ends the search; the
-    space found so far is returned, marked as incomplete. Raises TooManyTokens if the initial
-    marking has such a place, and ImportError if the engine "numba" is requested but not installed.
+    With `edges=False` the edges are counted but not kept. Ctrl-C, a limit, or a place with more
+    tokens than 63 bits can count ends the search; the space found so far is returned, marked as
+    incomplete. Raises TooManyTokens if the initial marking has such a place, and ImportError if the
+    engine "numba" is requested but not installed.
     """
     limits = limits or SearchLimits()
     started = limits.clock() if limits.clock else 0.0
     if engine in ("auto", "integers"):
-        layout = Layout.for_net(net, bounds, NARROW)
+        layout = Layout.for_net(net, least=NARROW)
         name, found = "integers", _plain_engine(net, layout, edges)
         budget = HANDOVER if engine == "auto" else None
     else:
-        layout = Layout.for_net(net, bounds, 2)
-        name, found, budget = (
-            engine,
-            _engine(engine, Explored.start(net, layout, edges), bounds),
-            None,
-        )
+        layout = Layout.for_net(net, least=2)
+        name, found, budget = engine, _engine(engine, Explored.start(net, layout, edges)), None
     try:
         reason = _run(found, limits, started, budget)
         if reason == _HAND_OVER:
-            name, found = "numpy", _engine("numpy", found.explored(), bounds)
+            name, found = "numpy", _engine("numpy", found.explored())
             reason = _run(found, limits, started, None)
     except KeyboardInterrupt:
         reason = INTERRUPTED
@@ -248,22 +246,18 @@ def _plain_engine(net: Net, layout: Layout, edges: bool) -> ExplorationEngine:
 _HAND_OVER = "hand over"
 
 
-def _engine(name: str, begun: Explored, bounds: Sequence[int | None] | None) -> ExplorationEngine:
+def _engine(name: str, begun: Explored) -> ExplorationEngine:
     """Return an engine of machine words that continues a search, in the narrowest safe layout.
 
     A place gets the bits of its proven bound, or else room for twice the tokens seen so far: few
     words per marking matter more than avoiding an overflow, after which the layout is widened.
     """
     seen = begun.layout.unpack_many(begun.words).max(axis=0).tolist()
-    known = (
-        bounds
-        if bounds is not None
-        else place_bounds(begun.net, place_semiflows(begun.net, 2 * len(seen)))
-    )
-    guess = [b if b is not None else 2 * top + 1 for b, top in zip(known, seen, strict=True)]
-    begun = begun.relaid(
-        Layout.for_net(begun.net, [max(g, top) for g, top in zip(guess, seen, strict=True)])
-    )
+    flows = place_semiflows(begun.net, 2 * len(seen))
+    known = place_bounds(begun.net, flows)
+    guess = [max(top, 2 * top + 1 if b is None else b) for b, top in zip(known, seen, strict=True)]
+    implied = implied_places(flows, known)
+    begun = begun.relaid(Layout.for_net(begun.net, guess, implied=implied))
     if name == "numba":
         from petrobot.coordinator.analysis.net.explore_compiled import NumbaEngine, expand_block
         from petrobot.services.host.numba_kernels import plain

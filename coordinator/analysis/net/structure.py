@@ -191,6 +191,22 @@ def place_bounds(net: Net, flows: Semiflows | None = None) -> list[int | None]:
     return bounds
 
 
+def implied_places(flows: Semiflows, bounds: Sequence[int | None]) -> frozenset[int]:
+    """Return places whose tokens follow from those of the other places in every reachable marking:
+    one place of each independent P-invariant, of those with the largest bounds."""
+    pivots: list[tuple[int, Vector]] = []
+    for y in flows.vectors:
+        rest = y
+        for place, pivot in pivots:
+            if place in rest:
+                rest = _combined(rest, pivot[place], pivot, -rest[place])
+        if rest:
+            shared = gcd(*rest.values())
+            rest = {p: n // shared for p, n in rest.items()}
+            pivots.append((max(rest, key=lambda p: bounds[p] or 0), rest))
+    return frozenset(place for place, _ in pivots)
+
+
 def linear_bound(net: Net, place: int) -> int | None:
     """Return an upper bound of the tokens of a place by the state equation, or None if it has none.
 
