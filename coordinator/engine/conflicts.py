@@ -30,19 +30,23 @@ def choose_step(
     only: Sequence[str] | None,
     *,
     ask: bool = False,
+    keep_ranks: bool = True,
 ) -> list[Match] | Draw:
     """Return the transitions that fire together in this marking, in an order in which each can fire
     after those before it.
 
     `choices` are the outcomes of earlier draws for this step. With `ask`, a conflict that is
     otherwise decided by first come, first served is drawn, too, with weight 0 for its transitions.
+    Without `keep_ranks`, the order of older journals applies (`Policy.keep_ranks`).
+
     Examines the dirty transitions and clears their set.
     """
     fireable = [found for x in _marked(draft, pulse, only) if (found := match(draft, x, pulse))]
     draft.dirty.clear()
     if len(fireable) < 2:
         return fireable
-    return _settle(draft, pulse, sorted(fireable, key=_rank_and_place), list(choices), ask)
+    fireable.sort(key=_rank_and_place)
+    return _settle(draft, pulse, fireable, list(choices), ask=ask, keep_ranks=keep_ranks)
 
 
 def _marked(draft: Draft, pulse: str, only: Sequence[str] | None) -> Iterator[CompiledTransition]:
@@ -61,7 +65,7 @@ def _marked(draft: Draft, pulse: str, only: Sequence[str] | None) -> Iterator[Co
 
 
 def _settle(
-    draft: Draft, pulse: str, rest: list[Match], choices: list[str], ask: bool
+    draft: Draft, pulse: str, rest: list[Match], choices: list[str], *, ask: bool, keep_ranks: bool
 ) -> list[Match] | Draw:
     claims, step = Claims(), list[Match]()
     while rest:
@@ -70,7 +74,7 @@ def _settle(
         rest = [m for old in rest if (m := match(draft, old.transition, pulse, claims))]
         if not rest:
             break
-        head = _first(draft, pulse, rest, claims)
+        head = _first(draft, pulse, rest, claims, keep_ranks)
         rivals = [m for m in _rivals(draft, pulse, head, rest, claims) if _rank(m) == _rank(head)]
         if rivals:
             contest = sorted([head, *rivals], key=_rank_and_place)
@@ -121,14 +125,15 @@ def _rank_and_place(m: Match) -> tuple[int, bool, int]:
     return (*_rank(m), m.transition.index)
 
 
-def _first(draft: Draft, pulse: str, rest: list[Match], claims: Claims) -> Match:
+def _first(draft: Draft, pulse: str, rest: list[Match], claims: Claims, keep_ranks: bool) -> Match:
     """Return the first match by rank, unless it would block (by inhibitor or capacity) another one
     that does not block it: then the other one, or what is in conflict with that and of a higher
     rank."""
     head, passed = rest[0], set[int]()  # blocking can go in a circle: none is examined twice
     while True:
         passed.add(head.transition.index)
-        above = (m for m in _rivals(draft, pulse, head, rest, claims) if _rank(m) < _rank(head))
+        rivals = _rivals(draft, pulse, head, rest, claims) if keep_ranks else ()
+        above = (m for m in rivals if _rank(m) < _rank(head))
         sooner = (
             m
             for m in rest

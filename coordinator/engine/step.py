@@ -66,16 +66,24 @@ class Policy:
     listed_values: bool = True
     """A variable that lists its `values` takes no other. Journals with `semantics` 4 or less in
     their header were recorded without that."""
+    keep_ranks: bool = True
+    """What goes first in a step because another would bar it takes no token for which a transition
+    of higher priority competes. Journals with `semantics` 5 or less in their header were recorded
+    without that."""
     ask_undecided: bool = False
     """Ask with `Choose` for each conflict that neither priority nor weight decides. The analysis
     uses this to see whether a verdict depends on the answer."""
 
 
 RECORDED: Final[Mapping[int, Policy]] = {
-    1: Policy(firing_limit=1000, report_dead_ends=False, first_come=False, listed_values=False),
-    2: Policy(report_dead_ends=False, first_come=False, listed_values=False),
-    3: Policy(first_come=False, listed_values=False),
-    4: Policy(listed_values=False),
+    semantics: Policy(
+        firing_limit=1000 if semantics < 2 else None,
+        report_dead_ends=semantics >= 3,
+        first_come=semantics >= 4,
+        listed_values=semantics >= 5,
+        keep_ranks=False,
+    )
+    for semantics in range(1, 6)
 }
 """The engine's policy in older journals, by the `semantics` of their header."""
 
@@ -171,7 +179,12 @@ def abort(draft: Draft, reason: str) -> None:
 def _fire_until_stable(draft: Draft, policy: Policy, current: Suspended) -> None:
     while True:
         step = choose_step(
-            draft, current.pulse, current.choices, current.only, ask=policy.ask_undecided
+            draft,
+            current.pulse,
+            current.choices,
+            current.only,
+            ask=policy.ask_undecided,
+            keep_ranks=policy.keep_ranks,
         )
         if isinstance(step, Draw):
             _ask(draft, current, step)

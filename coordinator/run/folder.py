@@ -18,13 +18,14 @@ RESULT = "result.json"
 DEFAULT = Path("runs")
 NODE_LOGS = DEFAULT / "logs"
 """Folder of the logs of the programs that are started for a run, a file for each."""
-SEMANTICS = 5
+SEMANTICS = 6
 """The rules by which this engine executes a net, in the header of each journal (key `semantics`).
 
 1 (and no such key): after 1,000 firings without time the net pauses. 2: endless firing ends in
 ERROR. 3: every dead end is reported. 4: conflicts over a token are decided first come, first
-served, before the order in the file. 5: a variable that lists its `values` takes no other. A
-journal is replayed and resumed under its own rules (`recording.as_recorded`).
+served, before the order in the file. 5: a variable that lists its `values` takes no other. 6: what
+goes first in a step takes no token of a higher priority. A journal is replayed and resumed under
+its own rules (`recording.as_recorded`).
 """
 
 

@@ -157,6 +157,9 @@ def test_what_goes_first_for_an_inhibitor_takes_nothing_from_a_higher_priority(
     p = play("x=1 y r=1 z", net, events="e")
     p(EventOccurred("e"))
     assert sorted(p.fired) == ["t", "w"] and p.marked == {"y": 1, "z": 1}
+    older = play("x=1 y r=1 z", net, events="e", policy=RECORDED[5])
+    older(EventOccurred("e"))
+    assert older.fired == ["u", "t"], "a journal with `semantics` 5 is replayed as it was recorded"
 
 
 def test_conflict_drawn_by_weight(play: Plays) -> None:

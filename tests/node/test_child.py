@@ -125,7 +125,7 @@ async def test_a_child_that_is_not_forked_yet_can_be_ended(
     assert await Started(folder).ask()
     os.kill(forge()._process.pid, signal.SIGSTOP)
     started = Started(folder)
-    assert started.child.pid == 0 and started.child.code is None
+    assert (started.child.pid, started.child.code) == (0, None)
     how(started.child)
     async with asyncio.timeout(PATIENCE):
         await started.over.wait()
