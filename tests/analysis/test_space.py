@@ -10,7 +10,6 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.analysis.net import explore_compiled as explore_numba
 from petrobot.coordinator.analysis.net.explore import ExplorationEngine, Explored, IntegerEngine
 from petrobot.coordinator.analysis.net.explore_numpy import NumpyEngine
 from petrobot.coordinator.analysis.net.pack import Layout, TooManyTokens
@@ -21,7 +20,6 @@ from petrobot.coordinator.analysis.net.structure import (
     place_semiflows,
 )
 from petrobot.coordinator.task.net import Net
-from petrobot.services.host.numba_kernels import COMPILED
 from tests.analysis.generators import fms, kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets
 from tests.effort import memory
@@ -30,7 +28,6 @@ from tests.waiting import Limit
 ENGINES: dict[str, Callable[[Explored], ExplorationEngine]] = {
     "integers": IntegerEngine,
     "numpy": NumpyEngine,
-    "kernel": explore_numba.NumbaEngine,
 }
 
 
@@ -260,14 +257,6 @@ def test_without_edges_the_counts_are_kept() -> None:
     kept, bare = explore(philosophers(5)), explore(philosophers(5), edges=False)
     assert bare.edges == kept.edges and not bare.target.size
     assert bare.dead.tolist() == kept.dead.tolist() != []
-
-
-def test_numba_is_used_only_on_request() -> None:
-    if COMPILED:
-        assert len(explore(kanban(2), engine="numba")) == 4600
-    else:
-        with pytest.raises(ImportError, match=r"petrobot\[fast\]"):
-            explore(kanban(1), engine="numba")
 
 
 def test_layout_round_trips_and_fields_stay_apart() -> None:

@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 from petrobot.coordinator.analysis.net.columns import concession
 from petrobot.coordinator.analysis.net.explore import ExplorationEngine as Explorer
 from petrobot.coordinator.analysis.net.explore import Explored, IntegerEngine
-from petrobot.coordinator.analysis.net.explore_compiled import NumbaEngine
 from petrobot.coordinator.analysis.net.explore_numpy import NumpyEngine
 from petrobot.coordinator.analysis.net.pack import Layout
 from petrobot.coordinator.analysis.time.gspn import Gspn
@@ -46,7 +45,7 @@ from petrobot.coordinator.task.net import Marking, Net
 from petrobot.services.host.numba_kernels import plain
 from tests.engine.test_properties import DEVICES, Journal, tasks
 
-EXPLORERS: tuple[Callable[[Explored], Explorer], ...] = (IntegerEngine, NumpyEngine, NumbaEngine)
+EXPLORERS: tuple[Callable[[Explored], Explorer], ...] = (IntegerEngine, NumpyEngine)
 COMMON = settings(
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],

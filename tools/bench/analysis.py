@@ -386,7 +386,6 @@ def bench_spaces(names: tuple[str, ...]) -> None:
             ("numpy", "space", "numpy"),
             ("auto", "space", "auto"),
             ("integers", "space", "integers"),
-            ("numba", "space", "numba"),
             ("Storm", "space-storm", ""),
             ("SNAKES", "space-snakes", ""),
             ("pm4py", "space-pm4py", ""),

@@ -1,6 +1,6 @@
 """The reachability graph of a net: markings in breadth-first order, edges in compact arrays.
 
-Three engines explore it and give identical results, down to the numbers of the markings and the
+Two engines explore it and give identical results, down to the numbers of the markings and the
 order of the edges: marking i is expanded before marking i + 1, its transitions are tried in order,
 and a new marking gets the next number. So one engine can continue where another one stopped. `auto`
 starts with plain integers, which need no preparation, and hands over to numpy when the net turns
@@ -32,7 +32,7 @@ from petrobot.coordinator.analysis.net.structure import (
 )
 from petrobot.coordinator.task.net import Marking, Net
 
-EngineName = Literal["auto", "integers", "numpy", "numba"]
+EngineName = Literal["auto", "integers", "numpy"]
 
 HANDOVER = 10_000
 """Markings after which `auto` changes from plain integers to numpy."""
@@ -213,8 +213,7 @@ def explore(
 
     With `edges=False` the edges are counted but not kept. Ctrl-C, a limit, or a place with more
     tokens than 63 bits can count ends the search; the space found so far is returned, marked as
-    incomplete. Raises TooManyTokens if the initial marking has such a place, and ImportError if the
-    engine "numba" is requested but not installed.
+    incomplete. Raises TooManyTokens if the initial marking has such a place.
     """
     limits = limits or SearchLimits()
     started = limits.clock() if limits.clock else 0.0
@@ -224,11 +223,11 @@ def explore(
         budget = HANDOVER if engine == "auto" else None
     else:
         layout = Layout.for_net(net, least=2)
-        name, found, budget = engine, _engine(engine, Explored.start(net, layout, edges)), None
+        name, found, budget = engine, _word_engine(Explored.start(net, layout, edges)), None
     try:
         reason = _run(found, limits, started, budget)
         if reason == _HAND_OVER:
-            name, found = "numpy", _engine("numpy", found.explored())
+            name, found = "numpy", _word_engine(found.explored())
             reason = _run(found, limits, started, None)
     except KeyboardInterrupt:
         reason = INTERRUPTED
@@ -246,8 +245,8 @@ def _plain_engine(net: Net, layout: Layout, edges: bool) -> ExplorationEngine:
 _HAND_OVER = "hand over"
 
 
-def _engine(name: str, begun: Explored) -> ExplorationEngine:
-    """Return an engine of machine words that continues a search, in the narrowest safe layout.
+def _word_engine(begun: Explored) -> ExplorationEngine:
+    """Return the engine of machine words that continues a search, in the narrowest safe layout.
 
     A place gets the bits of its proven bound, or else room for twice the tokens seen so far: few
     words per marking matter more than avoiding an overflow, after which the layout is widened.
@@ -258,15 +257,6 @@ def _engine(name: str, begun: Explored) -> ExplorationEngine:
     guess = [max(top, 2 * top + 1 if b is None else b) for b, top in zip(known, seen, strict=True)]
     implied = implied_places(flows, known)
     begun = begun.relaid(Layout.for_net(begun.net, guess, implied=implied))
-    if name == "numba":
-        from petrobot.coordinator.analysis.net.explore_compiled import NumbaEngine, expand_block
-        from petrobot.services.host.numba_kernels import plain
-
-        if plain(expand_block) is expand_block:
-            raise ImportError(
-                "the engine 'numba' needs numba: install petrobot[fast], or take the engine 'numpy'"
-            )
-        return NumbaEngine(begun)
     from petrobot.coordinator.analysis.net.explore_numpy import NumpyEngine
 
     return NumpyEngine(begun)
