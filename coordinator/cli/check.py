@@ -42,7 +42,7 @@ PATIENCE = 2.0
 """Seconds that a node has to answer."""
 HANG = 8
 """Columns before the details of a finding."""
-UNLESS = "NO unless repaired"
+UNLESS = "only if repaired"
 """The answer of a verdict that holds if the operator repairs what `final_error` leaves."""
 
 
@@ -297,7 +297,7 @@ def _summary(analysis: Analysis) -> list[str]:
             word = UNLESS if key in mended else _word(verdict)
             by_word[word].append(key.replace("_", " "))
     rows = [(word, ", ".join(names)) for word, names in by_word.items() if names]
-    rows = [(w, f"{t} (what `final_error` leaves)" if w == UNLESS else t) for w, t in rows]
+    rows = [(w, f"{t} (after `final_error`)" if w == UNLESS else t) for w, t in rows]
     rows.append(("searched", f"{_size(analysis)}{_cut(analysis)}"))
     wide = max(len(word) for word, _ in rows) + 2
     return [wrapped(f"  {word:{wide}}{text}", wide + 2) for word, text in rows]

@@ -597,7 +597,7 @@ def test_a_memory_that_is_on_a_node_is_no_mistake(
     used = (CODE, "await ctx.sleep(0.3)", 'await ctx.put("parts", 1)', "")
     damaged(sound, [(CELL, "[actions]", node, ""), used], tmp_path)
     monkeypatch.chdir(tmp_path)
-    kept, mended = r"yes  .*, sound\n", r"NO unless repaired  live, proper, stable, controllable "
+    kept, mended = r"yes  .*, sound\n", r"only if repaired  live, proper, stable, controllable "
     expect(rf"^arm_bot.toml: may run\n  {kept}  {mended}", CHECK, 0)
 
 
