@@ -113,6 +113,8 @@ PORT_KEYS = ("interface", "channel", "bitrate", "can", *CAMERA_KEYS)
 LIMITS = ("speed", "workspace", "dry_run")
 """Keys of a device's table for its first motions: any device may have them if its driver obeys them
 (`Driver.obeys`)."""
+OBEYED = frozenset((*LIMITS, "pause"))
+"""What `Driver.obeys` may name."""
 COMMON_KEYS = (*PORT_KEYS, *LIMITS)
 
 
@@ -338,6 +340,9 @@ def faults_of_limits(
     moves = can_move(driver) if moves is None else moves
     foreign = not issubclass(driver, Driver) and not hasattr(driver, "obeys")
     obeys = getattr(driver, "obeys", ())
+    for name in sorted({*([obeys] if isinstance(obeys, str) else obeys)} - OBEYED):
+        text = f"{driver.__name__}.obeys: expected some of {', '.join(sorted(OBEYED))}"
+        faults.append(("driver", f"{text}; found {name!r:.60}"))
     for name in LIMITS:
         still = name == "dry_run" and not moves  # as in every dry run
         own = name in keys_of(driver) or (foreign and name != "dry_run")

@@ -241,6 +241,12 @@ IN_THE_CODE: list[Mistake] = [
     ),
     (
         CODE,
+        '"dry_run", "pause")',
+        '"dry_run", "puase")',
+        r":7: devices.axis.driver: Axis.obeys: expected some of dry_run, pause, .*; found 'puase'",
+    ),
+    (
+        CODE,
         "    period = 0.01",
         "    # period = 0.01",
         r":LINE: devices.axis.driver: Axis has `step` and no period: it is never called; wri",
