@@ -192,7 +192,7 @@ def test_a_task_is_checked_and_run(
 ) -> None:
     """One that may not run fails the test with the message of `check`; an ERROR is a result."""
     sorter = Path(__file__).parents[2] / "examples" / "sorter"
-    for file in sorter.iterdir():
+    for file in filter(Path.is_file, sorter.iterdir()):
         text = file.read_text(encoding="utf-8").replace('"belt" }', '"belt" }, timeout = 7.0')
         (tmp_path / file.name).write_text(text.replace(old, new))
     if told:
