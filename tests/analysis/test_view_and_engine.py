@@ -191,6 +191,16 @@ def never_begun() -> Task:
     return text.task()
 
 
+def dropped_between_two_firings() -> Task:
+    """A button that is pressed while the first run waits for a timer is dropped when that run is
+    taken, although the second run stands in its place at once."""
+    text = Text(2, 'memory = "latched"', done=", after = 1.0")
+    listening(text, 0, "gives nothing back", "button")
+    listening(text, 1, "preempt=failure", "button")
+    text.moves.append(arcs("bad", "work:error", "arm"))
+    return text.task()
+
+
 def in_both(
     x: ExecutionGraph, measured: Measured | None = None
 ) -> tuple[ExecutionChain, StochasticView, Forecast]:
@@ -223,6 +233,7 @@ def figures_agree(task: Task, measured: Measured | None = None) -> None:
 @settings(COMMON, max_examples=25)
 @given(tasks())
 @example(never_begun())
+@example(dropped_between_two_firings())
 def test_the_view_has_the_figures_of_the_execution_graph(task: Task) -> None:
     figures_agree(task)
 

@@ -858,13 +858,21 @@ class _Derivation:
         self.flags.add(event.name)
         if not kept:
             self.droppable += waiting
+        barred = any(x.bars for x in waiting)
         for i, case in enumerate([] if kept else list(_none_enabled(waiting))):
             need, inhibit = self._named(case)
-            self._drop(f"{flag} dropped {i + 1}", flag, need, inhibit)
+            name = f"{flag} dropped {i + 1}"
+            if barred:
+                self._drop(name, flag, need, inhibit)
+                continue
+            # What a firing gives cannot end the waiting, so the flag was gone before it gave.
+            self._immediate(name, {**need, flag: 1}, need, 1.0, FLUSH - 2)
+            self.inhibit[name] = inhibit
 
     def _drop(self, name: str, what: str, need: Weights, inhibit: Weights) -> None:
-        """Take a token of a place as the engine drops a timer or a latched event: between taking
-        and giving of a firing, or when nothing can fire any more."""
+        """Take a token of a place as the engine drops a timer or a latched event that may be
+        barred for a moment: between taking and giving of a firing, or when nothing can fire any
+        more."""
         self.places[GIVING] = 0
         tests: list[tuple[str, Weights, int]]
         tests = [("", {}, REST), (f" {GIVING}", {GIVING: 1}, FLUSH - 2)]
