@@ -153,16 +153,10 @@ def analyse_command(
                 data |= {"what_if": what, "as_it_is": now.to_json(structure=False)}
                 said += ["", f"what if {', '.join(what)}:", *_compared(now, then)]
             if measures:
-                rows = {
-                    m.name: _measure_values(m, [now, then] if wanted else [then])
-                    for m in map(read_measure, measures)
-                }
-                data["measures"] = {name: values[-1] for name, values in rows.items()}
-                said += ["", "measures:"]
-                said += [
-                    f"  {name:28}" + " -> ".join(f"{value:.6g}" for value in values)
-                    for name, values in rows.items()
-                ]
+                data["measures"], lines = _tell_measures(
+                    measures, (now, then) if wanted else (then,)
+                )
+                said += lines
     except (NetFileError, ValueError, OverflowError) as error:
         return CommandResult(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
     except OutOfTime as late:  # the input is good, and the answer is not known
@@ -178,6 +172,19 @@ def analyse_command(
         data | {"notes": [*data["notes"], *notes]},
         analysis=then,
     )
+
+
+def _tell_measures(
+    measures: Sequence[str], analyses: Sequence[Analysis]
+) -> tuple[dict[str, float], list[str]]:
+    """Return each measure of the user in the last analysis, and the lines that tell it in all.
+    Raises NetFileError."""
+    rows = {m.name: _measure_values(m, analyses) for m in map(read_measure, measures)}
+    lines = [
+        f"  {name:28}" + " -> ".join(f"{value:.6g}" for value in values)
+        for name, values in rows.items()
+    ]
+    return {name: values[-1] for name, values in rows.items()}, ["", "measures:", *lines]
 
 
 def _measure_values(measure: UserMeasure, analyses: Sequence[Analysis]) -> list[float]:
