@@ -37,13 +37,13 @@ TURN = 1 << 14
 would otherwise keep the node from all else: from heartbeats, devices and an emergency stop."""
 
 
-class Forge:
+class ForkServer:
     """The process that forks the keepers of this process's children (`services/worker/keeper.py`).
     It has the working directory, environment and output of its start, so another one takes its
     place when one of these has changed, and also when it has ended or does not read."""
 
-    _current: ClassVar[Forge | None] = None
-    _former: ClassVar[list[Forge]] = []
+    _current: ClassVar[ForkServer | None] = None
+    _former: ClassVar[list[ForkServer]] = []
     """Those that take no more orders and have perhaps not ended."""
 
     def __init__(self, surroundings: object) -> None:
@@ -66,8 +66,8 @@ class Forge:
             )
 
     @classmethod
-    def order(cls, patience: int, passed: Sequence[int]) -> Forge:
-        """Order a keeper and its worker, and return the forge that forks them. Raises OSError."""
+    def order(cls, patience: int, passed: Sequence[int]) -> ForkServer:
+        """Order a keeper and its worker, and return who forks them. Raises OSError."""
         cls._former = [one for one in cls._former if one._process.poll() is None]
         surroundings = _surroundings()
         if cls._current is not None and cls._current._surroundings != surroundings:
@@ -86,9 +86,9 @@ class Forge:
     def close(self) -> None:
         """Give it no more orders; it exits after it has forked for the last one."""
         self._orders.close()
-        if Forge._current is self:
-            Forge._current = None
-            Forge._former.append(self)
+        if ForkServer._current is self:
+            ForkServer._current = None
+            ForkServer._former.append(self)
 
     def kill(self) -> None:
         """Kill it, as it does not fork. What it has forked lives on."""
@@ -135,7 +135,7 @@ class Child:
         ends = [pipe_end, descriptors_end, *([link] if link else [])]
         numbers = [end.fileno() for end in ends]
         try:
-            self._forge = Forge.order(patience, [*numbers[:2], counter, *numbers[2:]])
+            self._fork_server = ForkServer.order(patience, [*numbers[:2], counter, *numbers[2:]])
         except OSError:
             self.pipe.close()
             self._descriptors.close()
@@ -232,7 +232,7 @@ class Child:
                 os.kill(self._keeper, KILL_ORDER)
                 os.kill(self._keeper, signal.SIGCONT)  # it may be frozen
             else:
-                self._forge.kill()
+                self._fork_server.kill()
 
     def _require_keeper(self) -> None:
         if not self._keeper:
@@ -302,7 +302,7 @@ class Child:
             await until_ended(self._keeper)
         else:
             self._code = -signal.SIGKILL
-            self._killed = self._killed or "its forge ended, or could not fork it"
+            self._killed = self._killed or "its fork server ended, or could not fork it"
         for limit in self._limits:
             limit.cancel()
         if not self._let_go:

@@ -8,8 +8,8 @@ the node orders it or dies, kills what is left once the worker has ended, and th
 worker did. So the end of this process says that nothing of the worker runs any more.
 
 To start Python and to import what a worker needs takes some twenty times as long as a fork. So a
-node starts one process that does both once, the forge, and that forks a keeper for each order of
-its node; the keeper forks the worker. The forge runs no user code and holds nothing of a run. If it
+node starts one process that does both once, the fork server. It forks a keeper for each order of
+its node, and the keeper forks the worker. It runs no user code and holds nothing of a run. If it
 ends, the keepers and workers live on, and the node starts another one.
 
 What escapes: a process that user code starts as another user (set-user-ID programs cannot be
@@ -49,7 +49,7 @@ LOOK_AGAIN = 0.01
 KEPT = "kept"
 """First word in the pipe of a worker, from its keeper: the keeper's process id."""
 MOST_PASSED = 4
-"""Most descriptors of an order to the forge: PIPE, DESCRIPTORS, PERMITS, LINK."""
+"""Most descriptors of an order to the fork server: PIPE, DESCRIPTORS, PERMITS, LINK."""
 CLONE_PARENT = 0x8000
 _CLONE = {"x86_64": 56, "ppc64le": 120}.get(os.uname().machine, 220)
 """Number of the system call clone (syscalls(2)): most 64-bit machines share one table."""
@@ -126,8 +126,9 @@ def end_as(status: int) -> NoReturn:
 
 def fork_sibling() -> int:
     """Fork this process, which must have one thread. The child is a child of this process's own
-    parent (CLONE_PARENT, clone(2)): so the node, not the forge, is notified of the end of a keeper
-    and reaps it, and the kernel notifies the keeper of the node's end. Return 0 in the child.
+    parent (CLONE_PARENT, clone(2)): so the node, not the fork server, is notified of the end of a
+    keeper and reaps it, and the kernel notifies the keeper of the node's end. Return 0 in the
+    child.
 
     The C library does not know of this fork: the child must not run user code before it has forked
     in the usual way.
@@ -143,7 +144,7 @@ def fork_sibling() -> int:
     return found
 
 
-def forge(node: int, orders: socket.socket) -> None:
+def serve(node: int, orders: socket.socket) -> None:
     """Fork a keeper for each order, until the node closes the socket. An order is one byte, the
     patience (s), and the descriptors PIPE, DESCRIPTORS, PERMITS and, for some, LINK."""
     # Imported here, once for all workers. None of it starts a thread.
@@ -188,12 +189,12 @@ def keep_worker(
 
 
 def main(arguments: list[str]) -> None:
-    """Entry point of the forge: `NODE ORDERS`, a process id and an inherited socket."""
+    """Entry point of the fork server: `NODE ORDERS`, a process id and an inherited socket."""
     node, orders = map(int, arguments)
     die_with(node)
     for ignored in _IGNORED:
         signal.signal(ignored, signal.SIG_IGN)
-    forge(node, socket.socket(fileno=orders))
+    serve(node, socket.socket(fileno=orders))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The processes of a node are forked by its forge, which may die, hang, or be out of date."""
+"""The processes of a node are forked by its fork server, which may die, hang, or be out of date."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from petrobot.services.comm.protocol.messages import Call, Outcome
 from petrobot.services.node import child as children
-from petrobot.services.node.child import Child, Forge
+from petrobot.services.node.child import Child, ForkServer
 from petrobot.services.worker.pipe import Item
 from petrobot.services.worker.process import READY, Setup
 from tests.node.test_processes import PATIENCE, ROOT
@@ -62,21 +62,21 @@ class Started:
         return dict(self.results[0].values)
 
 
-def forge() -> Forge:
-    """The forge of this process."""
-    assert Forge._current is not None
-    return Forge._current
+def fork_server() -> ForkServer:
+    """The fork server of this process."""
+    assert ForkServer._current is not None
+    return ForkServer._current
 
 
 @pytest.fixture
 async def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Path]:
-    """A location file and the module of its action, and a forge of their own."""
+    """A location file and the module of its action, and a fork server of their own."""
     (tmp_path / "services.toml").write_text(TEXT)
     (tmp_path / "asked.py").write_text(CODE)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     yield tmp_path
-    if Forge._current is not None:
-        forge().kill()
+    if ForkServer._current is not None:
+        fork_server().kill()
 
 
 async def test_a_worker_and_its_keeper(folder: Path) -> None:
@@ -86,7 +86,7 @@ async def test_a_worker_and_its_keeper(folder: Path) -> None:
         await started.ready.wait()
     worker = started.child.pid
     keeper = parent(worker)
-    assert parent(keeper) == os.getpid() and keeper != forge()._process.pid
+    assert parent(keeper) == os.getpid() and keeper != fork_server()._process.pid
     assert (await started.ask())["setting"] == ""
     assert not alive(worker) and not Path(f"/proc/{keeper}").exists()
 
@@ -94,25 +94,25 @@ async def test_a_worker_and_its_keeper(folder: Path) -> None:
 async def test_a_process_has_the_environment_of_its_start(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also where the forge was started before the environment or the folder changed."""
+    """Also where the fork server was started before the environment or the folder changed."""
     assert (await Started(folder).ask())["setting"] == ""
-    first = forge()
+    first = fork_server()
     (there := folder / "there").mkdir()
     late = Started(folder)
     monkeypatch.setenv("SETTING", "other")
     monkeypatch.chdir(there)
     values = await Started(folder).ask()
-    assert values == {"setting": "other", "folder": str(there)} and forge() is not first
-    assert (await late.ask())["setting"] == "", "the former forge has an order left"
-    await until(lambda: first._process.poll() == 0, "the end of the former forge")
+    assert values == {"setting": "other", "folder": str(there)} and fork_server() is not first
+    assert (await late.ask())["setting"] == "", "the former fork server has an order left"
+    await until(lambda: first._process.poll() == 0, "the end of the former fork server")
 
 
-async def test_another_forge_takes_the_place_of_one_that_was_killed(folder: Path) -> None:
+async def test_another_fork_server_takes_the_place_of_one_that_was_killed(folder: Path) -> None:
     former = Started(folder)
     async with asyncio.timeout(PATIENCE):
         await former.ready.wait()
-    os.kill(forge()._process.pid, signal.SIGKILL)
-    forge()._process.wait(PATIENCE)
+    os.kill(fork_server()._process.pid, signal.SIGKILL)
+    fork_server()._process.wait(PATIENCE)
     assert await Started(folder).ask()
     assert await former.ask(), "what it has forked lives on"
 
@@ -123,7 +123,7 @@ async def test_a_child_that_is_not_forked_yet_can_be_ended(
 ) -> None:
     monkeypatch.setattr(children, "LEAVE_LIMIT", 0.5)
     assert await Started(folder).ask()
-    os.kill(forge()._process.pid, signal.SIGSTOP)
+    os.kill(fork_server()._process.pid, signal.SIGSTOP)
     started = Started(folder)
     assert (started.child.pid, started.child.code) == (0, None)
     how(started.child)
@@ -133,9 +133,11 @@ async def test_a_child_that_is_not_forked_yet_can_be_ended(
     assert await Started(folder).ask()
 
 
-async def test_a_frozen_forge_is_replaced(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_frozen_fork_server_is_replaced(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert await Started(folder).ask()
-    frozen = forge()
+    frozen = fork_server()
     os.kill(frozen._process.pid, signal.SIGSTOP)
     monkeypatch.setattr(children, "FORK_LIMIT", 0.5)
     started = Started(folder)
@@ -143,11 +145,11 @@ async def test_a_frozen_forge_is_replaced(folder: Path, monkeypatch: pytest.Monk
         await started.over.wait()
     assert started.child.describe() == "it was not forked within 0.5 s"
     monkeypatch.undo()
-    assert await Started(folder).ask() and forge() is not frozen
+    assert await Started(folder).ask() and fork_server() is not frozen
 
 
-async def test_a_forge_ends_with_its_node(folder: Path) -> None:
+async def test_a_fork_server_ends_with_its_node(folder: Path) -> None:
     assert await Started(folder).ask()
-    process = forge()._process
-    forge().close()
-    await until(lambda: process.poll() == 0, "the end of the forge")
+    process = fork_server()._process
+    fork_server().close()
+    await until(lambda: process.poll() == 0, "the end of the fork server")

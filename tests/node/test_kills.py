@@ -252,8 +252,8 @@ def nodes_command(file: Path) -> dict[str, Any]:
 
 @pytest.mark.parametrize("how", ["SIGKILL", "SIGSTOP"])
 async def test_a_killed_or_frozen_keeper_costs_only_its_worker(tmp_path: Path, how: str) -> None:
-    """The keepers are directly below the node, and beside them only the forge, so a tool that kills
-    the node's children kills these."""
+    """The keepers are directly below the node, and beside them only the fork server, so a tool that
+    kills the node's children kills these."""
     running = Nodes(tmp_path, "left")
     try:
         async with operator_of(running.directory, "left") as operator:
