@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,8 +16,6 @@ from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import COORDINATOR, Welcome
 from petrobot.services.comm.tls.credentials import Credentials, credentials
-
-_log = logging.getLogger(__package__)
 
 PERIOD: Final = 0.05
 """Time between two checks (s)."""
@@ -219,10 +216,8 @@ class RealtimeMission:
             for notice in notices:
                 if isinstance(notice, PeerLost):
                     self._lost_at[node] = self._loop.time()
-                    _log.info("link to node %s lost: %s", node, notice.reason)
                 elif isinstance(notice, Welcome):
                     self._lost_at.pop(node, None)
-                    _log.info("link to node %s is up", node)
             if not self._closed:
                 self._guarded(lambda now: self.mission.take(now, node, notices))
 

@@ -160,8 +160,7 @@ async def draw_the_task(tab: Tab) -> None:
 
 
 async def start_mission(tab: Tab, task: str = "") -> None:
-    """Take the controls and start."""
-    await hold_controls(tab)
+    """Start, which takes the free controls."""
     await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start").click()
     await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Running")
 

@@ -24,7 +24,7 @@ if browser_missing() and os.environ.get("CI") != "true":
 from playwright.async_api import Browser, Locator, expect
 from playwright.async_api import Page as Tab
 
-from tests.page.steps import Watch, element, hold_controls, opened
+from tests.page.steps import Watch, element, opened
 
 expect.set_options(timeout=PATIENCE_MS)
 
@@ -59,9 +59,8 @@ def mission(tab: Tab) -> Locator:
 
 
 async def chosen(tab: Tab, task: str) -> Locator:
-    """Take the controls and open the start form of a task: one form, though the button is pressed
-    twice while the server is asked."""
-    await hold_controls(tab)
+    """Open the start form of a task, which takes the free controls: one form, though the button is
+    pressed twice while the server is asked."""
     toolbar = tab.get_by_role("toolbar", name="Mission")
     await toolbar.get_by_label("Task to start").select_option(task)
     await toolbar.get_by_role("button", name="Start with").dblclick()
@@ -274,7 +273,7 @@ async def test_the_holder_of_the_controls_clears_the_emergency_stop(
         await expect(tab.get_by_role("button", name="Start", exact=True)).to_be_disabled()
     await expect(ben.get_by_role("button", name="Clear the stop")).to_be_disabled()
     await expect(ben.get_by_role("button", name="Clear the stop")).to_have_attribute(
-        "title", "Take the controls first"
+        "title", re.compile("holds the controls. Ask for them under Live.")
     )
     await cell.until(lambda: cell.station._going is None)
     await expect(mission(ana)).to_contain_text("Emergency stop")

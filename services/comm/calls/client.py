@@ -331,7 +331,8 @@ class Client:
 
     def welcomed(self, now: float, link: _ClientLink, welcome: Welcome) -> None:
         """The peer welcomed a connection."""
-        _log.info("link to %s is up", self.caller.peer)
+        level = logging.INFO if self.trouble else logging.DEBUG  # a first contact is no news
+        _log.log(level, "link to %s is up", self.caller.peer)
         self._link, self.trouble = link, ""
         self._up.set()
         self.caller.link_up(now, welcome)
@@ -342,7 +343,9 @@ class Client:
             # In TLS 1.3 the client's handshake ends before the server has checked its certificate.
             link.reason += f"; {NOT_TRUSTED}"
         self.trouble = link.reason
-        level = logging.INFO if link.welcome else logging.DEBUG  # one try after the other may fail
+        serving = self._task is not None and not self._task.done()  # not ended by `close`
+        # One try after the other may fail.
+        level = logging.INFO if link.welcome and serving else logging.DEBUG
         _log.log(level, "link to %s is lost: %s", self.caller.peer, link.reason)
         if self._link is link:
             self._link = None

@@ -146,7 +146,7 @@ export class History {
     const { mission } = this.link.state;
     const seen = this.reel?.run.id === SESSION;
     const live = ["running", "paused", "stopping", "preparing"].includes(mission.state);
-    const why = !this.link.mayAct ? "First take the controls, under Live" : seen ? "Open the recorded run in the list" : live ? "A run is active. Wait until it has finished." : "";
+    const why = this.link.barred || (seen ? "Open the recorded run in the list" : live ? "A run is active. Wait until it has finished." : "");
     this.startHere.hidden = mission.starts === false;
     this.startHere.disabled = Boolean(why) || !this.reel?.run.task;
     attribute(this.startHere, "title", why || null);

@@ -227,8 +227,10 @@ export class Link {
     });
   }
 
-  get mayAct() {
+  /** Why this page can give no command now; empty if it can. Free controls are taken with the first command. */
+  get barred() {
     const { controls, you } = this.state;
-    return this.connected && controls.holder === you;
+    if (!this.connected) return "No connection";
+    return controls.holder === null || controls.holder === you ? "" : `${controls.holder} holds the controls. Ask for them under Live.`;
   }
 }

@@ -9,6 +9,7 @@ import { toast } from "./toast.js";
 const ESTOP_KEY = "F9";
 const STOP_MS = 1500; // without an answer for so long, an emergency stop takes another way
 
+const ABOUT_CONTROLS = ["take_controls", "ask_controls", "release_controls"]; // all other commands take free controls
 const DONE = {
   start: "Started", pause: "Paused", resume: "Resumed", step: "Continued for one firing", abort: "Aborted", estop: "Emergency stop sent",
   add_tokens: "Token added", remove_tokens: "Token removed", raise_event: "Event raised", force_exit: "Transition forced",
@@ -58,20 +59,19 @@ export class Operator {
 
   /** Give a command and tell how it was answered. */
   async give(verb, data, silent = false, shown = false) {
-    const answer = await this.link.command(verb, data);
+    const held = ABOUT_CONTROLS.includes(verb) ? { ok: true } : await this.hold();
+    const answer = held.ok ? await this.link.command(verb, data) : held;
     if (!answer.ok && shown) return answer; // the dialog that asked shows why
     if (!answer.ok) toast("error", `${words(verb)}: ${answer.text ?? answer.code ?? "refused"}`);
     else if (!silent) toast("ok", [DONE[verb] ?? words(verb), answer.text, verb === "pause" ? heldWords(answer.nodes) : ""].filter(Boolean).join(" · "));
     return answer;
   }
 
-  /** Take the controls if they are free. Returns false, and shows a message, if another operator holds them. */
+  /** Take the controls if they are free. */
   async hold() {
-    if (this.link.mayAct) return true;
-    const { holder } = this.link.state.controls;
-    if (holder === null) return (await this.give("take_controls", {}, true)).ok;
-    toast("error", `${holder} holds the controls. Ask for them under Live.`);
-    return false;
+    const { controls, you } = this.link.state;
+    if (controls.holder === you) return { ok: true };
+    return controls.holder === null ? this.link.command("take_controls", {}) : { ok: false, text: this.link.barred };
   }
 
   async stopNow() {
@@ -124,7 +124,7 @@ export class Operator {
   }
 
   update(state) {
-    const may = this.link.mayAct;
+    const may = !this.link.barred;
     const now = stateOf(state);
     const live = ["running", "paused", "stopping"].includes(now);
     const set = { start: may && !live && now !== "preparing" && now !== "stopped", pause: may && now === "running", step: may && now === "paused", resume: may && now === "paused", abort: may && (live || now === "preparing") };
@@ -136,8 +136,7 @@ export class Operator {
     this.options.disabled = this.buttons.start.disabled;
     this.clear.hidden = now !== "stopped";
     this.clear.disabled = !may;
-    const why = may ? "" : "Take the controls first";
-    for (const button of [...Object.values(this.buttons), this.options, this.clear]) attribute(button, "title", button.disabled && why ? why : null);
+    for (const button of [...Object.values(this.buttons), this.options, this.clear]) attribute(button, "title", (button.disabled && this.link.barred) || null);
     this.estop.disabled = false;
     this.showPause(state);
     this.showHolder(state);
@@ -148,7 +147,7 @@ export class Operator {
     const { mission } = state;
     this.picker.hidden = mission.file === undefined;
     this.picker.disabled = !may;
-    attribute(this.picker, "title", this.link.mayAct ? null : "Take the controls first");
+    attribute(this.picker, "title", this.link.barred || null);
     const key = `${mission.file}`;
     if (this.picker.hidden || this.tasksKey === key) return;
     this.tasksKey = key;

@@ -4,8 +4,9 @@ import { fill, h, Press, seconds, words } from "./dom.js";
 import { icon } from "./icons.js";
 import { caption } from "./sheet.js";
 
-const action = (name, label, onclick, disabled, why) =>
-  h("button", { type: "button", class: "small", onclick, disabled, title: disabled ? why : null }, icon(name), label);
+/** A button; `why` says why it cannot be pressed now. */
+const action = (name, label, onclick, why = "") =>
+  h("button", { type: "button", class: "small", onclick, disabled: Boolean(why), title: why || null }, icon(name), label);
 
 /** Whether the run that an arc waits for has ended as the arc wants: none is active in its place, and the last one ended so. */
 const ended = (state, { place, end }) =>
@@ -30,7 +31,7 @@ export class Selected {
     if (this.root.hidden) return;
     const run = place ? Object.values(state.runs).find((r) => r.place === this.name) : null;
     const stop = state.breakpoints.includes(`${place ? "places" : "transitions"}.${this.name}`);
-    const key = JSON.stringify([this.name, state.marking[this.name], run?.id, run?.state, stop, this.link.mayAct, state.mission.id, state.mission.state, transition && this.missing(state, transition), this.lastFiring(state)?.number]);
+    const key = JSON.stringify([this.name, state.marking[this.name], run?.id, run?.state, stop, this.link.barred, state.mission.id, state.mission.state, transition && this.missing(state, transition), this.lastFiring(state)?.number]);
     if (key === this.key) return;
     if (this.drawn === this.name && this.press.holds(() => this.update(this.link.state, this.link.now()))) return;
     Object.assign(this, { key, drawn: this.name });
@@ -41,13 +42,13 @@ export class Selected {
     return h("h2", {}, h("span", { class: "kind" }, kind), words(label || name));
   }
 
-  stopButton(element, stop, may) {
+  stopButton(element, stop) {
     const label = stop ? "Remove breakpoint" : "Set breakpoint";
-    return action("dot", label, () => this.operator.give("breakpoint", { element, on: !stop }), !may, "Take the controls first");
+    return action("dot", label, () => this.operator.give("breakpoint", { element, on: !stop }), this.link.barred);
   }
 
   place(state, place, run, stop) {
-    const may = this.link.mayAct;
+    const { barred } = this.link;
     const tokens = state.marking[place.name] ?? 0;
     const full = place.capacity !== null && place.capacity !== undefined && tokens >= place.capacity;
     const facts = [["Tokens", place.capacity ? `${tokens} of ${place.capacity}` : tokens]];
@@ -59,26 +60,24 @@ export class Selected {
     if (primitive?.deadline) facts.push(["Deadline", seconds(primitive.deadline)]);
     if (run) facts.push(["Action", `${words(run.action)} on ${run.node}`], ["Why this one", run.why || "the only alternative"]);
     const give = (verb) => this.operator.give(verb, { place: place.name, count: 1 });
-    const why = may ? "" : "Take the controls first";
-    const buttons = [this.stopButton(`places.${place.name}`, stop, may)];
+    const buttons = [this.stopButton(`places.${place.name}`, stop)];
     if (place.kind === "control") {
-      buttons.unshift(action("plus", "Add token", () => give("add_tokens"), !may || full, full ? "The place is full" : why),
-        action("minus", "Remove token", () => give("remove_tokens"), !may || tokens < 1, tokens < 1 ? "The place is empty" : why));
+      buttons.unshift(action("plus", "Add token", () => give("add_tokens"), barred || (full ? "The place is full" : "")),
+        action("minus", "Remove token", () => give("remove_tokens"), barred || (tokens < 1 ? "The place is empty" : "")));
     }
-    if (run) buttons.push(...this.exits(state, place, run, may));
-    if (place.kind === "macro") buttons.push(action("macro", "Open", () => this.open(place.name), false));
+    if (run) buttons.push(...this.exits(state, place, run));
+    if (place.kind === "macro") buttons.push(action("macro", "Open", () => this.open(place.name)));
     return [this.head(place.kind === "action" ? "Action place" : `${words(place.kind)} place`.replace(/^./, (c) => c.toUpperCase()), place.name, place.label), this.facts(facts), h("div", { class: "buttons" }, buttons)];
   }
 
   /** A button for each outgoing transition of a place whose run is active. */
-  exits(state, place, run, may) {
+  exits(state, place, run) {
     const made = new Set(state.task.transitions.filter((t) => t.made_from).map((t) => t.name));
     return state.task.arcs.filter((a) => a.direction === "in" && a.place === place.name && !made.has(a.transition)).map((a) =>
-      action("exit", `Force ${words(a.transition)}`, () => this.operator.give("force_exit", { run: run.id, transition: a.transition }), !may, "Take the controls first"));
+      action("exit", `Force ${words(a.transition)}`, () => this.operator.give("force_exit", { run: run.id, transition: a.transition }), this.link.barred));
   }
 
   transition(state, transition, stop) {
-    const may = this.link.mayAct;
     const facts = [];
     const text = caption(transition);
     if (text) facts.push(["Fires on", text]);
@@ -86,10 +85,10 @@ export class Selected {
     const last = this.lastFiring(state);
     if (last) facts.push(["Last fired", `at ${seconds(last.at)}: ${last.cause ?? ""}`]);
     if (last?.reason?.text || last?.reason?.code) facts.push(["Reason", `${last.reason.text ?? ""}${last.reason.code ? ` [${last.reason.code}]` : ""}`]);
-    const buttons = [this.stopButton(`transitions.${transition.name}`, stop, may)];
+    const buttons = [this.stopButton(`transitions.${transition.name}`, stop)];
     for (const event of transition.events ?? []) {
       if (event.scope === "internal") continue;
-      buttons.push(action("bolt", `Raise ${words(event.name)}`, () => this.operator.give("raise_event", { event: event.name }), !may, "Take the controls first"));
+      buttons.push(action("bolt", `Raise ${words(event.name)}`, () => this.operator.give("raise_event", { event: event.name }), this.link.barred));
     }
     return [this.head("Transition", transition.name, transition.label), this.facts(facts), h("div", { class: "buttons" }, buttons)];
   }

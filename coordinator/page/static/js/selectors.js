@@ -27,7 +27,7 @@ export class Selectors {
 
   update(row, { alternatives, override }) {
     const choose = row.querySelector("select");
-    choose.disabled = !this.link.mayAct;
+    choose.disabled = Boolean(this.link.barred);
     const told = override ?? "";
     if (row.dataset.override !== told) choose.value = row.dataset.override = told;
     alternatives.forEach(({ probability }, i) => {

@@ -146,9 +146,7 @@ export class Desk {
       toast("error", "The task has faults: they are listed below the drawing.");
       return;
     }
-    const { operator } = this.designer;
-    if (!(await operator.hold())) return;
-    const answer = await operator.give("start", { task: this.model.name, revision: this.model.base });
+    const answer = await this.designer.operator.give("start", { task: this.model.name, revision: this.model.base });
     if (answer.ok) location.hash = "#Live";
     else if (answer.code === CHANGED) await this.look();
   }
