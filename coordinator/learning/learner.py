@@ -22,6 +22,7 @@ from petrobot.coordinator.engine.instructions import (
     Finished,
     Fired,
     Instruction,
+    Marked,
     RunRecorded,
     StartRun,
 )
@@ -39,6 +40,7 @@ from petrobot.coordinator.learning.records import (
 )
 from petrobot.coordinator.learning.selectors import TASK, cost_of, verdicts_of_task
 from petrobot.coordinator.learning.statistics import added
+from petrobot.coordinator.learning.trial_tokens import NOBODY, TrialTokens
 from petrobot.coordinator.learning.waits import EventWaits
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.task import Status, Task
@@ -123,6 +125,7 @@ class _ActiveRun:
 class _Trial:
     """A token on its way, from the runs place until every token is back."""
 
+    number: int
     begun: float
     goals: int = 0
     met: bool | None = None
@@ -173,9 +176,10 @@ class LearningSelector(FirstAlternative):
         self._trials: Counter[tuple[str, str]] = Counter()
         self._waits = EventWaits(learning.task)
         self._goals = frozenset(learning.task.flat.goal_transitions)
-        runs_place = learning.task.flat.runs_place
-        self._own = learning.task.net.place_index[runs_place] if runs_place else None
-        self._trial: _Trial | None = None
+        self._tokens = TrialTokens(learning.task)
+        self._open: dict[int, _Trial] = {}
+        """The trials that are not recorded yet, by number: a late run may still belong to them."""
+        self._latest = NOBODY
         self._served: dict[str, _Trial] = {}
         """The trial of each active run."""
 
@@ -224,8 +228,7 @@ class LearningSelector(FirstAlternative):
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Remember the context of a choice, and what a run's result contains beside its status."""
-        if self._trial is None and self._own is None:
-            self._trial = _Trial(now, context=self.context)
+        self._begin(now)
         self._waits.stimulus(now, stimulus)
         if isinstance(stimulus, Chosen):
             self._choice(now, stimulus)
@@ -238,8 +241,10 @@ class LearningSelector(FirstAlternative):
             self._fired(now, instruction)
         elif isinstance(instruction, StartRun):
             self._run(now, instruction.run)
-            if self._trial is not None:
-                self._served[instruction.run] = self._trial
+            if self._open:
+                self._served[instruction.run] = self._open[self._tokens.of(instruction.run)]
+        elif isinstance(instruction, Marked):
+            self._tokens.marked(instruction)
         elif isinstance(instruction, RunRecorded):
             self._ended(now, instruction)
         elif isinstance(instruction, Finished):
@@ -321,7 +326,8 @@ class LearningSelector(FirstAlternative):
         if record.deferred:
             self._deferred[record.run] = (end, self._trials[where])
         self._note(end)
-        trial = self._served.pop(record.run, self._trial)
+        latest = self._open.get(self._tokens.begun)
+        trial = self._served.pop(record.run, latest)
         if trial is not None:
             known = [run[:3] for run in trial.runs]
             trial.runs.append((end.primitive_task, end.action, context, outcome))
@@ -331,39 +337,47 @@ class LearningSelector(FirstAlternative):
 
     # --- the task's verdict on choices --------------------------------------------------------
 
-    def _pass(self, now: float, fired: Fired) -> None:
-        """Follow a token from the runs place until every token is back, and count goals. As in
-        campaigns, what happens belongs to the token taken last."""
-        own, trial = self._own, self._trial
-        if own is not None and fired.after[own] < fired.before[own]:
-            if trial is not None and trial.met is None and trial.goals:
-                self._judge(now, trial, True)  # otherwise nobody can say whether it met the goal
-            if trial is not None:  # the task could take the next token, so this one is completed
-                self._count(trial, True)
-            self._trial = trial = _Trial(now, context=self.context)
-        if trial is None:
+    def _begin(self, now: float) -> None:
+        """Begin a trial if a token has left the runs place, and record those that it ends."""
+        number = self._tokens.begun
+        if number == self._latest:
             return
-        trial.goals += fired.transition in self._goals
-        initial = self.learning.task.net.initial
-        if own is not None and trial.met is None:
-            back = fired.after[:own] + fired.after[own + 1 :]
-            if back == initial[:own] + initial[own + 1 :]:
+        self._latest = number
+        for trial in [*self._open.values()]:
+            if trial.met is None and trial.goals:
+                self._judge(now, trial, True)  # otherwise nobody can say whether it met the goal
+            if not self._tokens.on_its_way(trial.number):
+                # The task could take the next token, so this one is completed.
+                self._count(trial, True)
+        self._open[number] = _Trial(number, now, context=self.context)
+
+    def _pass(self, now: float, fired: Fired) -> None:
+        """Follow the tokens from the runs place until all of a trial are back, and count goals."""
+        number = self._tokens.fired(fired)
+        self._begin(now)
+        if number not in self._open:
+            return
+        self._open[number].goals += fired.transition in self._goals
+        for back in self._tokens.back:
+            trial = self._open.get(back)
+            if trial is not None and trial.met is None:
                 trial.back = True
                 self._judge(now, trial, trial.goals > 0 or not self._goals)
 
     def _finished(self, now: float, finished: Finished) -> None:
-        """Judge the last token if the task came to its end, or if the goal was met before it was
-        given up. What was given up otherwise is censored."""
-        trial = self._trial
-        if trial is None:
-            return
-        completed = finished.status is Status.SUCCESS or (self._own is not None and trial.back)
-        if trial.met is None and (finished.status is Status.SUCCESS or trial.goals):
-            self._judge(now, trial, trial.goals > 0 or not self._goals)
-        self._count(trial, completed)
+        """Judge the last tokens if the task came to its end, or if the goal was met before it was
+        given up. What was given up otherwise is censored, and what was cut is not recorded."""
+        success, lost = finished.status is Status.SUCCESS, self._tokens.lost(finished)
+        for trial in [*self._open.values()]:
+            if trial.met is None and (success or trial.goals):
+                self._judge(now, trial, trial.goals > 0 or not self._goals)
+            if success or trial.back or trial.goals or trial.number in lost:
+                met = trial.back or (bool(trial.goals) and trial.number not in lost)
+                self._count(trial, success or met)
 
     def _count(self, trial: _Trial, completed: bool) -> None:
         """Record what a trial of the task came to, as campaigns count it."""
+        del self._open[trial.number]
         ends = [end for *_, end in trial.runs]
         success = completed and all(end.status in (Status.SUCCESS, None) for end in ends)
         costs = [cost_of(e, self.learning.question(name).measure) for name, _, _, e in trial.runs]
@@ -403,10 +417,10 @@ class LearningSelector(FirstAlternative):
 
     def _replace(self, was: Observation, status: Status) -> None:
         """Let a run of the trial that is not counted yet have the status of its verdict."""
-        for i, run in enumerate(self._trial.runs if self._trial is not None else ()):
-            if run[3] is was:
-                assert self._trial is not None
-                self._trial.runs[i] = (*run[:3], replace(was, status=status))
+        for trial in self._open.values():
+            for i, run in enumerate(trial.runs):
+                if run[3] is was:
+                    trial.runs[i] = (*run[:3], replace(was, status=status))
 
     def _corrected(self, corrected: Corrected) -> None:
         end, trials = self._deferred.pop(corrected.run, (None, 0))

@@ -79,8 +79,8 @@ class BlockSelector:
     def __init__(self, seed: int, weights: Sequence[Weights]) -> None:
         self._seed, self._weights = seed, weights
         self._counts: dict[tuple[int, str], int] = {}
-        self.trial: Callable[[], int] = lambda: 0
-        """Returns the index of the current trial, from 0."""
+        self.trial: Callable[[str], int] = lambda run: 1
+        """Returns the number of a run's trial, from 1."""
 
     def choose(
         self,
@@ -90,7 +90,7 @@ class BlockSelector:
         variables: Mapping[str, Any] | None = None,
     ) -> tuple[str, str]:
         """Choose one alternative and say why."""
-        k = max(0, min(self.trial(), len(self._weights) - 1))
+        k = max(0, min(self.trial(run), len(self._weights)) - 1)
         given = self._weights[k].get(task, {}) if self._weights else {}
         offered = [
             (action, given[action]) for action in alternatives if given.get(action, 0.0) > 0.0
@@ -121,7 +121,7 @@ def run_block(bench: LoadedPlan, block: Block, weights: Sequence[Weights]) -> di
     mission, parties = _cell(bench, block, selector)
     log = TrialLog(bench.task, costs(bench.task, bench.directory))
     mission.executor.observers.append(log)
-    selector.trial = lambda: len(log.trials) - 1
+    selector.trial = log.tokens.of
     coordinator = CoordinatorParty(bench.directory, mission)
     try:
         cell = LockStepCell([coordinator, *parties], Delays(bench.directory.delays()))

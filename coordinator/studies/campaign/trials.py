@@ -1,5 +1,5 @@
-"""One trial (one run token taken out of the runs place, and everything that followed) as plain
-data, and the observer that records it.
+"""One trial (one run token taken out of the runs place, and everything that followed from it) as
+plain data, and the observer that records it.
 
 A *trial* is one run of a task, whatever the task does; a mission run is a whole execution and may
 contain several trials. A task without a runs place has one trial per mission run.
@@ -17,14 +17,15 @@ from petrobot.coordinator.engine.instructions import (
     Finished,
     Fired,
     Instruction,
+    Marked,
     RunRecorded,
     StartRun,
 )
 from petrobot.coordinator.engine.stimuli import RunEnded, Stimulus
 from petrobot.coordinator.learning.records import Waited, WaitEnd
+from petrobot.coordinator.learning.trial_tokens import TrialTokens
 from petrobot.coordinator.learning.waits import EventWaits
 from petrobot.coordinator.task import End, Executed, Kind, Status, Task
-from petrobot.coordinator.task.net import Marking
 from petrobot.services.comm.protocol.messages import Feedback
 
 DIGITS = 6
@@ -89,7 +90,7 @@ class Trial:
     happened."""
     completed: bool = False
     """True if the task could continue, or finished as designed; False if it was given up in this
-    trial."""
+    trial. Trials that were cut because another one was given up are not kept."""
     goals: int = 0
     """Number of firings of goal transitions."""
     status: str = Status.SUCCESS.value
@@ -138,7 +139,8 @@ class TrialLog:
         flat = task.flat
         self._net, self._cost_of = flat.net, cost_of
         self._goals = frozenset(flat.goal_transitions)
-        self._runs_place = self._net.place_index[flat.runs_place] if flat.runs_place else None
+        self.tokens = TrialTokens(task)
+        """Which trial each token belongs to."""
         self._actions = {p.name for p in flat.places.values() if p.kind is Kind.ACTION}
         self._timers = {
             t.name: [a.place for a in t.inputs]
@@ -158,7 +160,7 @@ class TrialLog:
         self._ends: dict[int, list[RunEntry]] = {}
         """By trial: its runs in the order of their ends."""
         self._given_up: str | None = None
-        """Why the mission run ended before its last trial completed, if it did."""
+        """Why the mission run ended before all its trials completed, if it did."""
         self._origin: float | None = None
 
     # --- an observer --------------------------------------------------------------------------
@@ -169,8 +171,7 @@ class TrialLog:
         if self._origin is None:
             self._origin = now
             self._since = dict.fromkeys(self._net.places, now)
-            if self._runs_place is None:
-                self._begin(now)
+            self._begin(now)
         self._waits.stimulus(now, stimulus)
         if isinstance(stimulus, RunEnded):
             self._values[stimulus.run] = stimulus.values
@@ -179,6 +180,8 @@ class TrialLog:
         """Record what belongs to a trial."""
         if isinstance(instruction, Fired):
             self._fired(now, instruction)
+        elif isinstance(instruction, Marked):
+            self.tokens.marked(instruction)
         elif isinstance(instruction, StartRun):
             self._entry(now, instruction)
         elif isinstance(instruction, RunRecorded):
@@ -198,14 +201,18 @@ class TrialLog:
     # --- what happened ------------------------------------------------------------------------
 
     def _begin(self, now: float) -> None:
+        """Begin a trial if a token has left the runs place."""
+        if len(self.trials) == self.tokens.begun:
+            return
+        for trial in self.trials:
+            trial.completed |= not self.tokens.on_its_way(trial.k)
         if self.trials:
-            self.trials[-1].completed = True
             self._note_waits(self._waits.cut(now))
         assert self._origin is not None
         self.trials.append(Trial(len(self.trials) + 1, round(now - self._origin, DIGITS)))
 
     def _note_waits(self, ended: list[Waited]) -> None:
-        """Note waits in the present trial, those from before the first one in the first one."""
+        """Note waits in the latest trial, those from before the first one in the first one."""
         self._ended_waits += ended
         if self.trials:
             self.trials[-1].waits += self._ended_waits
@@ -213,20 +220,19 @@ class TrialLog:
 
     def _fired(self, now: float, fired: Fired) -> None:
         wait = self._waits.fired(now, fired.transition)  # before a new trial cuts it
-        if (
-            self._runs_place is not None
-            and fired.after[self._runs_place] < fired.before[self._runs_place]
-        ):
-            self._begin(now)
+        number = self.tokens.fired(fired)
+        self._begin(now)
         for run in fired.runs:
             if run in self._entries:
                 self._entries[run][1].taken = fired.transition
                 if run in self._active:  # preempted
                     self._ended(now, run)
-        self._note_waits([] if wait is None else [wait])
         if not self.trials:
+            self._note_waits([] if wait is None else [wait])
             return
-        trial = self.trials[-1]
+        trial = self.trials[number - 1]
+        trial.waits += self._ended_waits + ([] if wait is None else [wait])
+        self._ended_waits = []
         trial.goals += fired.transition in self._goals
         trial.fired[fired.transition] = trial.fired.get(fired.transition, 0) + 1
         if fired.transition in self._timers:
@@ -237,26 +243,17 @@ class TrialLog:
         for name, before, after in zip(self._net.places, fired.before, fired.after, strict=True):
             if after > before:
                 self._since[name] = now
-        if trial.time is None and self._idle(fired.after):
-            trial.completed = True
-            trial.time = self._span(now, trial)
-
-    def _idle(self, marking: Marking) -> bool:
-        """Return whether the marking is the initial one, except for the remaining run tokens."""
-        if self._runs_place is None:
-            return False
-        own = self._runs_place
-        return (
-            marking[:own] == self._net.initial[:own]
-            and marking[own + 1 :] == self._net.initial[own + 1 :]
-        )
+        for k in self.tokens.back:
+            back = self.trials[k - 1]
+            if back.time is None:
+                back.completed, back.time = True, self._span(now, back)
 
     def _span(self, now: float, trial: Trial) -> float:
         assert self._origin is not None
         return round(now - self._origin - trial.begun, DIGITS) + 0.0  # no -0.0
 
     def _entry(self, now: float, start: StartRun) -> RunEntry:
-        trial = self.trials[-1] if self.trials else None
+        trial = self.trials[self.tokens.of(start.run) - 1] if self.trials else None
         came = self._since[start.place]
         begun = self._span(came, trial) if trial else 0.0
         entry = RunEntry(start.place, start.action, begun, waited=round(now - came, DIGITS))
@@ -307,23 +304,27 @@ class TrialLog:
         trial.status, trial.cause = (
             (worst.status, worst.cause) if bad else (Status.SUCCESS.value, "")
         )
-        if trial is self.trials[-1]:
-            self._give_up(trial)
+        self._give_up(trial)
 
-    def _give_up(self, last: Trial) -> None:
-        if self._given_up is not None:
-            last.status, last.cause = Status.ERROR.value, last.cause or self._given_up
+    def _give_up(self, trial: Trial) -> None:
+        if self._given_up is not None and not trial.completed:
+            trial.status, trial.cause = Status.ERROR.value, trial.cause or self._given_up
 
     def _finished(self, now: float, finished: Finished) -> None:
         if not self.trials:
             return
+        lost = self.tokens.lost(finished)
+        for trial in self.trials:
+            met = bool(trial.goals) and trial.k not in lost
+            trial.completed |= finished.status is Status.SUCCESS or met
         last = self.trials[-1]
-        last.completed = last.completed or finished.status is Status.SUCCESS
         if last.completed and last.time is None:
             last.time = self._span(now, last)
-        if not last.completed:
+        self.trials = [t for t in self.trials if t.completed or t.k in lost]
+        if finished.status is not Status.SUCCESS:
             self._given_up = finished.reason
-            self._give_up(last)
+            for trial in self.trials:
+                self._give_up(trial)
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:

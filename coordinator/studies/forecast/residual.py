@@ -207,12 +207,29 @@ def _means(values: Values, unit: Codes) -> Values:
     return np.asarray(np.bincount(number, values) / np.bincount(number))
 
 
+def overlapping(training: Training) -> int:
+    """Return how many trials began before an earlier one of their mission run had ended."""
+    count, end, before = 0, 0.0, -1
+    for trial, mission in zip(training.trials, missions(training), strict=True):
+        end, before = (end if mission == before else 0.0), mission
+        count += trial.begun < end - EXACT
+        end = max(end, trial.begun + (trial.time or 0.0))
+    return count
+
+
 def order_doubts(training: Training) -> list[str]:
-    """Return in words whether trials depend on their order: a trend, or a dependence of each trial
-    on the one before (rank correlations, Holm). All forecasts assume that trials are independent
-    and alike."""
+    """Return in words whether trials depend on their order: a trend, a dependence of each trial on
+    the one before (rank correlations, Holm), or trials at the same time. All forecasts assume that
+    trials are independent and alike."""
     if not training.whole:
         return []
+    n, both = len(training.trials), overlapping(training)
+    if both > NEGLIGIBLE * n:
+        return [
+            f"{both} of the training's {n} trials began before an earlier one had ended: their "
+            "times contain waits for each other, so they hold for as many runs at a time, and the "
+            "stochastic view, which has one, does not show them"
+        ]
     real, found, mission = measured(training), [], missions(training)
     done = ~np.isnan(real.time)
     for name, each, own in (

@@ -16,6 +16,7 @@ from petrobot.coordinator.studies.forecast.residual import (
     doubts,
     measured,
     order_doubts,
+    overlapping,
     residuals,
     routing,
 )
@@ -109,6 +110,26 @@ def test_trials_that_depend_on_their_order_are_doubtful() -> None:
         follows[k] = 0.5 * follows[k - 1] + random.normal()
     (lag,) = order_doubts(timed(10.0 + follows, goals))
     assert "time depends on the trial before" in lag
+
+
+def test_trials_at_the_same_time_are_doubtful() -> None:
+    """A task that works on several tokens at once: what a trial waits for the others is in its
+    time. A new mission run begins at 0 again."""
+    random, n = np.random.default_rng(3), 100
+    training = timed(random.exponential(1.0, n), np.ones(n, np.int64))
+    begins = np.concatenate([[0.0], np.cumsum([t.time or 0.0 for t in training.trials])[:-1]])
+    for early, found in ((0.0, 0), (0.001, n - 2)):
+        trials = [
+            replace(
+                trial,
+                k=i % 50 + 1,
+                begun=round(float(at - begins[i // 50 * 50]), 6) - early * (i % 50),
+            )
+            for i, (trial, at) in enumerate(zip(training.trials, begins, strict=True))
+        ]
+        one = Training.of(training.task, trials)
+        assert overlapping(one) == found
+        assert [doubt[:2] for doubt in order_doubts(one)] == [str(found)] * (found > 0)
 
 
 def test_independent_trials_are_seldom_doubtful() -> None:

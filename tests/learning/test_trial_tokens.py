@@ -1,0 +1,172 @@
+"""Which trial a token belongs to: tasks that work on several tokens at a time, and tasks that take
+one after the other, for which a trial ends when the marking is as it was."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from petrobot.coordinator.cli.loading import load_task
+from petrobot.coordinator.engine import State, Stimulus
+from petrobot.coordinator.engine.instructions import Finished, Fired, Instruction
+from petrobot.coordinator.launch import Setting, lockstep_cell
+from petrobot.coordinator.learning.learner import LearningSelector
+from petrobot.coordinator.learning.learning import Learning
+from petrobot.coordinator.learning.records import TrialEnd
+from petrobot.coordinator.learning.trial_tokens import TrialTokens
+from petrobot.coordinator.studies.campaign.trials import Trial, TrialLog
+from petrobot.coordinator.task import Status, Task
+from petrobot.coordinator.task.file import loads
+from petrobot.services.action import Status as ActionStatus
+from petrobot.services.comm.protocol.messages import Feedback
+from petrobot.services.scripted import ScriptedRun
+from tests.run.scripted_cell import directory_for, scripts
+
+PIPE = """
+schema = 1
+[task]
+name = "pipe"
+final = "rack == 0 and hand == 1"
+goal_transitions = ["weighed"]
+runs_place = "rack"
+final_error = "broken > 0"
+[errors]
+to = "broken"
+[primitive_tasks]
+load = { deadline = 3.0 }
+weigh = { deadline = 9.0 }
+[places]
+rack = { kind = "control", tokens = 1 }
+hand = { kind = "resource", tokens = 1 }
+scale = { kind = "resource", tokens = 2 }
+broken = {}
+there = { capacity = 2 }
+load = { kind = "action", holds = "hand" }
+weigh = { kind = "action", holds = "scale", servers = 2 }
+[transitions]
+start = { in = ["rack"], out = ["load"] }
+loaded = { in = ["load:normal"], out = ["there"] }
+next = { in = ["there"], out = ["weigh"] }
+weighed = { in = ["weigh:normal"] }
+"""
+"""A hand loads one part after the other, two scales weigh them: up to five at a time."""
+
+
+def run(seconds: float, status: ActionStatus = ActionStatus.SUCCESS) -> ScriptedRun:
+    return ScriptedRun(status, (seconds, seconds), cause="" if status == "success" else "slipped")
+
+
+@dataclass
+class Watched:
+    """An observer that compares the ends of trials with the markings."""
+
+    task: Task
+    tokens: TrialTokens = field(init=False)
+    ends: int = 0
+
+    def __post_init__(self) -> None:
+        self.tokens = TrialTokens(self.task)
+
+    def instruction(self, now: float, instruction: Instruction) -> None:
+        if not isinstance(instruction, Fired):
+            return
+        net, before = self.task.net, self.tokens.begun
+        own = net.place_index[self.task.flat.runs_place]
+        number = self.tokens.fired(instruction)
+        idle = all(
+            tokens == net.initial[place]
+            for place, tokens in enumerate(instruction.after)
+            if place != own
+        )
+        began = instruction.after[own] < instruction.before[own]
+        assert number == self.tokens.begun == before + began
+        assert self.tokens.back == ([number] if idle else [])
+        self.ends += idle
+
+    def stimulus(self, now: float, stimulus: Stimulus) -> None: ...
+
+    def progress(self, now: float, run: str, notice: Feedback) -> None: ...
+
+    def settled(self, now: float, state: State) -> None: ...
+
+
+def played(
+    task: Task, runs: int, lines: dict[str, list[ScriptedRun]], *observers: Any
+) -> tuple[list[Trial], list[TrialEnd]]:
+    """Return the trials as a campaign records them and as the learner does."""
+    selector = LearningSelector(Learning(task, "fixed"))
+    setting = Setting(task, runs=runs, selector=selector)
+    cell, party = lockstep_cell(directory_for(task), setting, scripts(task, lines))
+    log = TrialLog(task, lambda record, values: record.seconds)
+    party.mission.executor.observers += [log, *observers]
+    assert cell.run(lambda: party.over, 400_000)
+    return log.trials, [r for r in selector.records if isinstance(r, TrialEnd)]
+
+
+def test_what_happens_to_a_token_is_told_to_its_trial() -> None:
+    """Each of twelve parts is loaded and weighed once and meets its goal, also where a later part
+    is ready first. Its time goes from the rack to the scale."""
+    task = loads(PIPE, "pipe.toml")
+    weighing = [run(3.0), run(0.5), run(2.5), run(0.25), run(1.0)]
+    trials, ends = played(task, 12, {"load": [run(0.5)], "weigh": weighing})
+    assert [trial.k for trial in trials] == [*range(1, 13)]
+    for trial in trials:
+        assert [entry.place for entry in trial.runs] == ["load", "weigh"]
+        assert trial.goals == 1 and trial.completed and trial.all_success
+        weigh = trial.runs[1]
+        assert trial.time == pytest.approx(weigh.begun + weigh.took)
+        assert trial.fired == {"start": 1, "loaded": 1, "next": 1, "weighed": 1}
+    left = [trial.begun + (trial.time or 0.0) for trial in trials]
+    assert left != sorted(left)  # the second part was ready before the first
+    assert [(end.goal, end.success) for end in ends] == [(True, True)] * 12
+
+
+def test_the_lost_trial_is_the_one_whose_token_is_lost() -> None:
+    """The third part slips while two others are weighed: these meet their goals, and the third is
+    the one that was not completed."""
+    task = loads(PIPE, "pipe.toml")
+    loading = [run(0.5), run(0.5), run(0.25, ActionStatus.ERROR), *[run(0.5)] * 9]
+    trials, ends = played(task, 8, {"load": loading, "weigh": [run(4.0)]})
+    lost = [trial.k for trial in trials if not trial.completed]
+    assert lost == [3]
+    assert [trial.goals for trial in trials if trial.completed] == [1] * (len(trials) - 1)
+    assert trials[2].status == "error" and trials[2].cause == "slipped"
+    assert sorted((end.goal, end.success) for end in ends) == [
+        (False, False),
+        *[(True, True)] * (len(trials) - 1),
+    ]
+
+
+@pytest.mark.parametrize("lines", [
+    {},
+    {"move_to_point": [run(0.2, ActionStatus.ERROR), run(0.2), run(0.2)]},
+    {"locate_ball": [run(0.3, ActionStatus.ERROR), run(0.3)]},
+    {"track_ball": [run(0.3), run(0.2, ActionStatus.ERROR)]},
+    {"return_home": [run(0.3), run(0.2, ActionStatus.ERROR)]},
+])  # fmt: skip
+def test_one_token_at_a_time_is_back_when_the_marking_is(
+    lines: dict[str, list[ScriptedRun]],
+) -> None:
+    """In the shipped task every firing belongs to the token taken last, and a trial ends when the
+    marking is the initial one."""
+    task = load_task("catch_ball")
+    watched = Watched(task)
+    trials, _ = played(task, 6, lines, watched)
+    assert len(trials) == watched.tokens.begun
+    assert watched.ends == sum(trial.time is not None for trial in trials)
+
+
+def test_a_finished_mission_loses_what_its_final_error_looks_at() -> None:
+    """Without tokens there, all that are not back are lost; after success none is."""
+    task = loads(PIPE, "pipe.toml")
+    for status, expected in ((Status.SUCCESS, set()), (Status.ERROR, {1})):
+        tokens = TrialTokens(task)
+        net = task.net
+        after = [*net.initial]
+        for place, more in (("rack", -1), ("hand", -1), ("load", 1)):
+            after[net.place_index[place]] += more
+        assert tokens.fired(Fired(1, "start", net.initial, tuple(after), "begin")) == 1
+        assert tokens.on_its_way(1) and tokens.of("load#1") == 1
+        assert tokens.lost(Finished(status, "aborted")) == expected
