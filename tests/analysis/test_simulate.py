@@ -10,19 +10,18 @@ from scipy.stats import gamma
 
 from petrobot.coordinator.analysis.time.completion import completion, completion_time
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
-from petrobot.coordinator.analysis.time.markov import long_run, transient
-from petrobot.coordinator.analysis.time.phase_type import fit, fit_samples, gamma_quantile
+from petrobot.coordinator.analysis.time.markov import long_run
+from petrobot.coordinator.analysis.time.phase_type import fit, gamma_quantile
 from petrobot.coordinator.analysis.time.simulate import (
     IntervalEstimate,
     goal_by_marking,
     simulate,
-    token_game,
 )
 from petrobot.coordinator.analysis.time.simulate_kernel import Tables, play
 from petrobot.coordinator.task.net import Net
 from petrobot.services.host.numba_kernels import COMPILED
 from tests.analysis.generators import KANBAN_RATES, kanban, queue, stages
-from tests.analysis.random_nets import gspns
+from tests.analysis.random_nets import gspns, transient
 
 
 def sure(name: int) -> np.random.Generator:
@@ -110,13 +109,6 @@ def test_a_dead_replica_is_not_completed() -> None:
     )
 
 
-def test_token_game_plays_the_net() -> None:
-    played, last = token_game(kanban(1), sure(7), 500)
-    assert len(played) == 500 and list(kanban(1).replay(played))[-1] == last
-    played, last = token_game(stages(3), sure(8), 500)
-    assert played == ["t0", "t1", "t2"] and last == (0, 0, 0, 1)
-
-
 @settings(max_examples=200, deadline=None)
 @given(st.floats(0.05, 50.0), st.floats(0.13, 3.0))
 def test_fits_meet_mean_and_variance(mean: float, cv: float) -> None:
@@ -141,16 +133,7 @@ def test_a_variance_that_needs_more_stages_keeps_the_mean_and_reports_the_error(
         fit(1.0, 0.1, shift=1.0)
 
 
-def test_fitting_measured_durations() -> None:
-    sample = np.random.default_rng(9).gamma(6.0, 0.5, 5000)
-    fitted, error = fit_samples(sample.tolist())
-    assert fitted.mean == pytest.approx(float(sample.mean())) and abs(error) < 0.02
-    late = sample + 20
-    plain, with_shift = (
-        fit_samples(late.tolist(), stages=25)[1],
-        fit_samples(late.tolist(), stages=25, shifted=True)[1],
-    )
-    assert abs(with_shift) < 0.01 < abs(plain)
+def test_the_reference_of_declared_durations_is_the_gamma_distribution() -> None:
     assert gamma_quantile(3.0, 1.5) == pytest.approx(gamma(6.0, scale=0.5).ppf(0.9))
     assert gamma_quantile(3.0, 0.0) == 3.0
 

@@ -221,7 +221,8 @@ def test_a_preempting_event_races_with_the_run() -> None:
     assert done.mean == pytest.approx(1 / (1 / 2 + 1 / 3))
     transient = (done.h > 0) & ~done.goal
     flow = visits_before(done.chain, transient)[done.chain.source] * done.chain.probability
-    hits = [done.chain.gspn.net.transition_index[case] for case in view.cases["caught"]]
+    numbers = done.chain.gspn.net.transition_index
+    hits = [numbers[case] for case, name in view.origin.items() if name == "caught"]
     assert flow[np.isin(done.chain.label, hits)].sum() == pytest.approx(2 / 5)
     assert not done.chain.space.bounds[done.chain.space.net.place_index["act.begin"]] > 1
     steady = replace(

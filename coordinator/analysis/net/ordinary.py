@@ -88,14 +88,3 @@ class OrdinaryView:
             for p in flat.places.values()
             if p.kind is Kind.ACTION
         }
-
-    @cached_property
-    def run_starts(self) -> frozenset[str]:
-        """The transitions that take a run from the runs place."""
-        net = self.task.net
-        place = net.place_index[self.task.runs_place] if self.task.runs_place else -1
-        return frozenset(
-            name
-            for name, changes in zip(net.transitions, net.compiled.changes, strict=True)
-            if dict(changes).get(place, 0) < 0
-        )

@@ -19,7 +19,7 @@ from petrobot.coordinator.analysis.net.columns import concession
 from petrobot.coordinator.analysis.net.graph import Mask
 from petrobot.coordinator.analysis.net.pack import Tokens
 from petrobot.coordinator.analysis.time.gspn import Gspn, Values
-from petrobot.coordinator.task.net import Marking, Net
+from petrobot.coordinator.task.net import Marking
 
 Stop = Callable[[Tokens], Mask]
 """From tokens of shape (places, replicas) to which replicas have reached their goal, shape
@@ -106,7 +106,6 @@ class _Replicas:
         self.levels = [
             [t for t, own in enumerate(net.priority) if own == level] for level in levels
         ]
-        self.timed = np.array([r is not None for r in gspn.rate])
         self.tokens = np.repeat(np.array(net.initial, dtype=np.int64)[:, None], count, axis=1)
 
     def amounts(self) -> tuple[Values, Mask]:
@@ -379,17 +378,3 @@ def goal_by_marking(predicate: Callable[[Marking], bool]) -> Stop:
         return out
 
     return stop
-
-
-def token_game(net: Net, random: np.random.Generator, firings: int) -> tuple[list[str], Marking]:
-    """Return a random firing sequence and its last marking; enabled transitions are equally
-    likely."""
-    marking, played = net.initial, []
-    for _ in range(firings):
-        enabled = net.enabled(marking)
-        if not enabled:
-            break
-        t = enabled[int(random.integers(len(enabled)))]
-        marking = net.fire(marking, t)
-        played.append(net.transitions[t])
-    return played, marking

@@ -284,14 +284,6 @@ class StochasticView:
                 out.setdefault(self.sources[case], {})[name] = None
         return {source: tuple(names) for source, names in out.items()}
 
-    @cached_property
-    def cases(self) -> dict[str, tuple[str, ...]]:
-        """By transition of the task: its cases in the GSPN."""
-        out: dict[str, list[str]] = {}
-        for case, name in self.origin.items():
-            out.setdefault(name, []).append(case)
-        return {name: tuple(cases) for name, cases in out.items()}
-
 
 def stochastic_view(
     task: Task,
