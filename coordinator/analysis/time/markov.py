@@ -1,4 +1,4 @@
-"""The long run of a GSPN (throughput, mean tokens, utilisation) and its transient behaviour.
+"""The long run of a GSPN (throughput, mean tokens, utilisation), and its uniformised chain.
 
 In the long run the chain stays in one of the bottom components of its graph. Seen from the initial
 marking, the long run is the mixture of their stationary vectors, weighted with the probabilities of
@@ -245,15 +245,16 @@ def _without_cycles(chain: Chain, step: Any) -> Any:
     return cleaned
 
 
-def poisson_weights(mean: float, epsilon: float = 1e-13) -> tuple[int, Values]:
+def poisson_weights(mean: float) -> tuple[int, Values]:
     """Return (first k, probabilities from there on) of a Poisson distribution.
 
-    Less than `epsilon` is left out on both sides. Starting at the mode and multiplying outwards
+    Less than 1e-13 is left out on both sides. Starting at the mode and multiplying outwards
     avoids overflow and underflow of mean^k / k!. Source: B. L. Fox, P. W. Glynn, Computing Poisson
     probabilities, Commun. ACM 31 (1988).
     """
     if mean == 0:
         return 0, np.ones(1)
+    epsilon = 1e-13
     reach = ceil(sqrt(mean) * sqrt(-2 * log(epsilon)) + 10 - log(epsilon))
     low, high = max(0, int(mean) - reach), int(mean) + reach + 10
     k = np.arange(low, high + 1)

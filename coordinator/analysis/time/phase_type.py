@@ -121,8 +121,8 @@ def fit(mean: float, variance: float, *, stages: int = STAGES, shift: float = 0.
     return PhaseType((ErlangBranch(p, wanted - 1, rate), ErlangBranch(1 - p, wanted, rate)), shift)
 
 
-def gamma_quantile(mean: float, variance: float, q: float = 0.9) -> float:
-    """Return the quantile (s) of the gamma distribution with this mean (s) and variance (s^2).
+def gamma_quantile(mean: float, variance: float) -> float:
+    """Return the 90 % quantile (s) of the gamma distribution with this mean (s) and variance (s^2).
 
     Declared estimates give only mean and cv; the gamma distribution is their reference.
     """
@@ -131,4 +131,4 @@ def gamma_quantile(mean: float, variance: float, q: float = 0.9) -> float:
     from scipy.special import gammaincinv
 
     shape = mean**2 / variance
-    return float(gammaincinv(shape, q)) * variance / mean
+    return float(gammaincinv(shape, 0.9)) * variance / mean
