@@ -60,9 +60,9 @@ def place_semiflows(net: Net, effort: int = EFFORT) -> Semiflows:
     return _semiflows(rows, effort)
 
 
-def transition_semiflows(net: Net, effort: int = EFFORT) -> Semiflows:
+def transition_semiflows(net: Net) -> Semiflows:
     """Return the minimal x >= 0 with C x = 0: firing counts that reproduce a marking."""
-    return _semiflows([dict(changes) for changes in net.compiled.changes], effort)
+    return _semiflows([dict(changes) for changes in net.compiled.changes], EFFORT)
 
 
 def _semiflows(rows: Sequence[Vector], effort: int) -> Semiflows:
