@@ -23,7 +23,7 @@ from petrobot.coordinator.engine.instructions import (
 from petrobot.coordinator.engine.stimuli import RunEnded, Stimulus
 from petrobot.coordinator.learning.records import Waited, WaitEnd
 from petrobot.coordinator.learning.waits import EventWaits
-from petrobot.coordinator.task import End, Executed, Kind, Status, Task
+from petrobot.coordinator.task import End, Executed, Status, Task
 from petrobot.coordinator.task.net import Marking
 from petrobot.services.comm.protocol.messages import Feedback
 
@@ -139,7 +139,6 @@ class TrialLog:
         self._net, self._cost_of = flat.net, cost_of
         self._goals = frozenset(flat.goal_transitions)
         self._runs_place = self._net.place_index[flat.runs_place] if flat.runs_place else None
-        self._actions = {p.name for p in flat.places.values() if p.kind is Kind.ACTION}
         self._timers = {
             t.name: [a.place for a in t.inputs]
             for t in flat.transitions.values()
