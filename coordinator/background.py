@@ -158,23 +158,6 @@ class BackgroundProcess:
         return newest
 
 
-async def analyse_in_background(
-    text: str, filename: str, cell: Mapping[str, Any] | None = None
-) -> dict[str, Any]:
-    """Return the result of `analysed` from a process of its own.
-
-    Without the forecast if that takes too long. Raises RefusedError.
-    """
-    apart = BackgroundProcess()
-    try:
-        answer: dict[str, Any] = json.loads(
-            await apart.do("analysis", {"text": text, "filename": filename, "cell": cell})
-        )
-    finally:
-        await apart.close()
-    return answer
-
-
 def analysed(
     text: str, filename: str, cell: Mapping[str, Any] | None = None
 ) -> Iterator[dict[str, Any]]:

@@ -185,13 +185,10 @@ def lockstep_cell(
     directory: Directory,
     setting: Setting,
     substitutes: Substitutes | None = None,
-    watch: Callable[[Mission, float], None] | None = None,
     store: Store | None = None,
 ) -> tuple[LockStepCell, CoordinatorParty]:
     """The whole cell in this process."""
-    mission = lockstep_mission(directory, setting, store)
-    watching = None if watch is None else lambda now: watch(mission, now)
-    coordinator = CoordinatorParty(directory, mission, watching)
+    coordinator = CoordinatorParty(directory, lockstep_mission(directory, setting, store))
     parties = [lockstep_party(directory, node, substitutes) for node in directory.nodes.values()]
     return LockStepCell([coordinator, *parties], Delays(directory.delays())), coordinator
 
@@ -281,7 +278,7 @@ def resumed_mission(
     mission = Mission(executor, header["parameters"], header["runs"])
     executor.observers.extend(observers)
     for step in steps:
-        mission.relive(origin + step.time, step)
+        mission.replay(origin + step.time, step)
     return mission, lambda now: mission.resume(now, stages(journal))
 
 
@@ -320,9 +317,8 @@ def local_nodes(
     *,
     lockstep: bool = False,
     mock: Path | None = None,
-    awaited: float = 0.0,
     respawn: bool = True,
 ) -> Supervisor:
     """Launch the nodes of this host while the context lasts; each writes to its log in `logs`."""
-    programs = local_programs(directory, lockstep=lockstep, mock=mock, awaited=awaited)
+    programs = local_programs(directory, lockstep=lockstep, mock=mock)
     return Supervisor(programs, logs, respawn=respawn)

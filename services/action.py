@@ -164,7 +164,7 @@ class Context(Protocol[Device]):
         """Awaitable: True as soon as `ready()` is true, False after `timeout` seconds."""
 
     def sleep(self, seconds: float) -> Wait:
-        """Awaitable: returns after so many seconds of the cell's clock."""
+        """Awaitable: returns after this number of seconds of the cell's clock."""
 
     def publish(self, stream: str, values: Sequence[float]) -> None:
         """Send a set point to a stream. The receiver sees only the newest one. It is sent

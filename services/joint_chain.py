@@ -21,7 +21,7 @@ STUCK: Final = 1e-6
 STEP: Final = 0.5
 """Longest step of a joint in one step of a search (rad or m)."""
 PART: Final = 0.02, 0.004
-"""rad and m between two places of a straight way."""
+"""Greatest distance between two poses of a straight way (rad and m)."""
 JUMP: Final = 0.2
 """Change of a joint between two such places that shows a singularity (rad or m)."""
 

@@ -37,7 +37,7 @@ class ScriptError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class ScriptedEvent:
-    """An event that a scripted run raises, so many seconds after its begin."""
+    """An event that a scripted run raises, with the seconds after its beginning."""
 
     after: float
     name: str

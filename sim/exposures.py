@@ -12,7 +12,7 @@ from petrobot.sim.catching.camera import Picture, PinholeCamera
 from petrobot.sim.catching.truth import Truth
 
 _ON_TIME = 1e-9
-"""s by which rounding may change a time."""
+"""How much rounding may change a time (s)."""
 _NOISE_FIELD = 0x6361
 """Seed of a camera's noise field: the same whichever run comes first."""
 _BUILT: dict[str, PinholeCamera] = {}

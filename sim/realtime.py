@@ -46,11 +46,11 @@ from petrobot.sim.laboratory_party import LaboratoryParty, answer_command
 _log = logging.getLogger(__package__)
 
 SLIP: Final = 0.1
-"""s behind the clock from which the world's time slips."""
+"""Lag behind the clock from which the world's time slips (s)."""
 
 
 LOOK = 0.001
-"""s between two looks at the serial lines of a laboratory that also waits for its bus."""
+"""Time between two looks at the serial lines, where there is a bus as well (s)."""
 PRIORITY = 5
 """Priority of the pacemaker's thread under SCHED_FIFO; below that of the driver processes."""
 
@@ -72,7 +72,7 @@ class Pacemaker:
         OSError, ValueError."""
         self.lock = threading.Lock()
         self.slipped = 0.0
-        """s by which the world has permanently fallen behind the clock."""
+        """How far the world has permanently fallen behind the clock (s)."""
         self._laboratory = laboratory
         self._hub = hub
         self._port = hub.port() if hub else None

@@ -13,6 +13,7 @@ import subprocess
 import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,7 +23,6 @@ from petrobot.coordinator.background import (
     BackgroundProcess,
     RefusedError,
     Superseded,
-    analyse_in_background,
     analysed,
 )
 from tests.waiting import until
@@ -32,9 +32,21 @@ CATCH_BALL = (Path(background.__file__).parent / "tasks" / "catch_ball.toml").re
 )
 
 
+async def analysis(text: str, filename: str) -> dict[str, Any]:
+    """Return the analysis of a task from a process of its own."""
+    apart = BackgroundProcess()
+    try:
+        answer: dict[str, Any] = json.loads(
+            await apart.do("analysis", {"text": text, "filename": filename, "cell": None})
+        )
+    finally:
+        await apart.close()
+    return answer
+
+
 @pytest.mark.processes
 async def test_verdicts_and_forecast_come_from_a_process_of_its_own() -> None:
-    answer = await analyse_in_background(CATCH_BALL, "catch_ball.toml")
+    answer = await analysis(CATCH_BALL, "catch_ball.toml")
     assert answer["complete"] is True
     assert {"bounded", "sound", "controllable"} <= {
         verdict["name"] for verdict in answer["verdicts"]
@@ -49,7 +61,7 @@ async def test_verdicts_and_forecast_come_from_a_process_of_its_own() -> None:
 @pytest.mark.processes
 async def test_an_invalid_task_is_refused_with_its_fault() -> None:
     with pytest.raises(ValueError, match=r"drawn\.toml"):
-        await analyse_in_background("schema = 1\n[task]\n", "drawn.toml")
+        await analysis("schema = 1\n[task]\n", "drawn.toml")
 
 
 def test_a_search_that_ran_out_of_states_leaves_verdicts_unknown(
@@ -111,10 +123,10 @@ async def test_a_process_that_does_not_end_is_given_up(
     monkeypatch.setattr("sys.executable", str(mute))
     monkeypatch.setattr(background, "PATIENCE", 1.0)
     if said:
-        assert await analyse_in_background("", "drawn.toml") == {"said": 1}
+        assert await analysis("", "drawn.toml") == {"said": 1}
     else:
         with pytest.raises(ValueError, match="took too long"):
-            await analyse_in_background("", "drawn.toml")
+            await analysis("", "drawn.toml")
 
 
 @pytest.fixture

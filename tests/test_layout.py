@@ -48,7 +48,6 @@ ALLOWED: tuple[tuple[str, tuple[str, ...]], ...] = (
         (
             "coordinator.task",
             "coordinator.engine",
-            "services.host.numba_kernels",
             "services.host.whole_file",
         ),
     ),

@@ -26,7 +26,7 @@ from petrobot.coordinator.analysis.may_run import Cell, assumed, devices_of
 from petrobot.coordinator.analysis.net.ends_net import ends_net
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.picture import graph_svg
-from petrobot.coordinator.analysis.net.space import EngineName, SearchLimits, explore
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.analysis.report import CUT, FULL, LATE, Analysis, analyse
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
@@ -86,7 +86,6 @@ def analyse_command(
     rates: Path | str | None = None,
     stages: int = 8,
     limits: SearchLimits | None = None,
-    engine: EngineName = "auto",
     structure: bool = True,
     changes: Sequence[str] = (),
     measure: Measure | None = None,
@@ -108,10 +107,8 @@ def analyse_command(
     in the data; they are not computed otherwise.
     """
     limits = limits or SearchLimits()
-    clock, analyses = limits.clock, 1 + bool(changes)
-    began = clock() if clock else 0.0
-    span = limits.seconds / analyses if limits.seconds is not None else None
-    due = None if span is None else began + analyses * span
+    clock, deadlines = limits.clock, _deadlines(limits, 1 + bool(changes))
+    due = deadlines[-1][0]
     try:
         with until(due, clock):
             model = open_model(path, load_task)
@@ -121,44 +118,37 @@ def analyse_command(
         known = _measured(model, measure, cell)
         notes = (*notes, *_assumed(model, cell))
         wanted = [read_change(text) for text in changes]
-        altered = _changed(subject, known, wanted) if wanted else None
         plain = model.net if isinstance(model, NetFile) and rates is not None else None
-
-        def found(one: Subject, measured: Measured | None) -> Analysis:
-            last = one is not subject or not altered
-            ends = None if due is None or span is None else due - (0 if last else span)
-            searched = None if ends is None or span is None else ends - (1 - SEARCHED) * span
-            tokens = plain and (
-                change_net(plain, _tokens_of(plain, wanted)) if one is not subject else plain
-            )
+        asked: list[tuple[Subject, Measured | None, Net | None]] = [(subject, known, plain)]
+        if wanted:
+            tokens = plain and change_net(plain, _tokens_of(plain, wanted))
+            asked.append((*_changed(subject, known, wanted), tokens))
+        analyses: list[Analysis] = []
+        for (one, measured, ordinary), (ends, searched) in zip(asked, deadlines, strict=True):
             with until(ends, clock):
-                return analyse(
+                found = analyse(
                     one,
                     name=name or path.stem,
                     view=view,
                     measured=measured,
                     stages=stages,
                     limits=replace(limits, due=searched),
-                    engine=engine,
-                    ordinary=tokens,
+                    ordinary=ordinary,
                     devices=devices_of(cell),
                 )
-
-        now = found(subject, known)
-        then = found(*altered) if altered else now
+            analyses.append(found)
         with until(due, clock):
-            then, data, said = _told(then, structure)
+            analyses[-1], data, said = _told(analyses[-1], structure)
             if wanted:
+                now, then = analyses
                 what = [change.text for change in wanted]
                 data |= {"what_if": what, "as_it_is": now.to_json(structure=False)}
                 said += ["", f"what if {', '.join(what)}:", *_compared(now, then)]
             if measures:
-                data["measures"], lines = _tell_measures(
-                    measures, (now, then) if wanted else (then,)
-                )
+                data["measures"], lines = _tell_measures(measures, analyses)
                 said += lines
     except (NetFileError, ValueError, OverflowError) as error:
-        return CommandResult(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
+        return _refused(path, error)
     except OutOfTime as late:  # the input is good, and the answer is not known
         told = f"{_named(path, late)}; give more --seconds"
         return CommandResult(FAULT, told, {"error": told})
@@ -167,11 +157,23 @@ def analyse_command(
         return CommandResult(FAULT, told, {"error": told})
     said += [wrapped(f"note: {note}", 4) for note in notes]
     return CommandResult(
-        OK if then.ok else FAULT,
+        OK if analyses[-1].ok else FAULT,
         "\n".join(said),
         data | {"notes": [*data["notes"], *notes]},
-        analysis=then,
+        analysis=analyses[-1],
     )
+
+
+def _deadlines(limits: SearchLimits, analyses: int) -> list[tuple[float | None, float | None]]:
+    """Return when each of so many analyses must end, and its search before that; None: no limit.
+
+    Each gets the same share of the seconds.
+    """
+    if limits.seconds is None:
+        return [(None, None)] * analyses
+    began, span = limits.clock() if limits.clock else 0.0, limits.seconds / analyses
+    ends = [began + (i + 1) * span for i in range(analyses)]
+    return [(end, end - (1 - SEARCHED) * span) for end in ends]
 
 
 def _tell_measures(
@@ -216,6 +218,11 @@ def _named(path: Path, error: Exception) -> str:
         if isinstance(error, NetFileError) or told.startswith(f"{path}:")
         else f"{path}: {told}"
     )
+
+
+def _refused(path: Path, error: Exception) -> CommandResult:
+    told = _named(path, error)
+    return CommandResult(BAD_INPUT, told, {"error": told})
 
 
 def _tokens_of(net: Net, changes: Sequence[Change]) -> list[Change]:
@@ -355,53 +362,39 @@ def simulate_command(
         model, wanted = open_model(path, load_task), [read_change(text) for text in changes]
         cell = _cell(model, cell_of)
         known = _measured(model, measure, cell)
+        subject, name, notes = _subject(model, rates, "gspn")
+        goal = lost = None
         if isinstance(model, Task):
-            _subject(model, rates, "gspn")  # refuses rates
             model, measured = change_task(model, known, wanted)
             view = stochastic_view(
-                model,
-                measured,
-                stages=stages,
-                timer_stages=stages,
-                devices=devices_of(cell),
+                model, measured, stages=stages, timer_stages=stages, devices=devices_of(cell)
             )
+            gspn, notes = view.gspn, (*view.assumptions, assumed(cell))
             goal = goal_by_marking(lambda m: view.ended(m) is Status.SUCCESS)
             lost = goal_by_marking(lambda m: view.ended(m) is Status.ERROR)
-            seen = simulate(
-                view.gspn,
-                random,
-                replicas=replicas,
-                horizon=horizon or np.inf,
-                warmup=warmup,
-                goal=goal,
-                lost=lost,
-                firings=firings,
-                progress=progress,
-            )
-            return _simulated(model.name, seen, (*view.assumptions, assumed(cell)))
-        subject, name, notes = _subject(model, rates, "gspn")
-        assert isinstance(subject, Gspn)
-        gspn = change_gspn(subject, wanted)
-        if horizon is None:
-            raise NetFileError(
-                str(path), "horizon", "a net has no final marking", "give --horizon SECONDS"
-            )
+        else:
+            assert isinstance(subject, Gspn)
+            gspn = change_gspn(subject, wanted)
+            if horizon is None:
+                raise NetFileError(
+                    str(path), "horizon", "a net has no final marking", "give --horizon SECONDS"
+                )
         seen = simulate(
             gspn,
             random,
             replicas=replicas,
-            horizon=horizon,
+            horizon=np.inf if horizon is None else horizon,
             warmup=warmup,
+            goal=goal,
+            lost=lost,
             firings=firings,
             progress=progress,
         )
         return _simulated(name or path.stem, seen, notes)
-    except (NetFileError, NoEstimate, ValueError, KeyError, OverflowError, MemoryError) as error:
-        told = (
-            _named(path, error)
-            if not isinstance(error, MemoryError)
-            else f"{path}: out of memory; use fewer --replicas"
-        )
+    except (NetFileError, NoEstimate, ValueError, KeyError, OverflowError) as error:
+        return _refused(path, error)
+    except MemoryError:
+        told = f"{path}: out of memory; use fewer --replicas"
         return CommandResult(BAD_INPUT, told, {"error": told})
 
 
@@ -448,7 +441,6 @@ def convert_command(
     target: Path,
     load_task: LoadTask,
     *,
-    stages: int = 8,
     view: str | None = None,
     exact: bool = False,
     measure: Measure | None = None,
@@ -456,9 +448,8 @@ def convert_command(
 ) -> CommandResult:
     """Run `petrobot convert`: formats follow from the file endings; losses are listed.
 
-    `view` of a task: "ordinary" or "gspn" (default: gspn for formats that are for rates, or
-    if there is `measure`). `exact` writes the ends net in place of the
-    ordinary one.
+    `view` of a task: "ordinary" or "gspn" (default: "gspn" for formats with rates, or if there is
+    a `measure`). `exact` writes the ends net in place of the ordinary one.
     """
     assumed: list[str] = []
     which = ""
@@ -473,7 +464,7 @@ def convert_command(
             wanted = view or ("exact" if exact else "gspn" if timed else "ordinary")
             cell = _cell(model, cell_of if wanted == "gspn" else None)
             known = _measured(model, measure, cell)
-            model, lost, assumed = _exported(model, wanted, known, stages, cell)
+            model, lost, assumed = _exported(model, wanted, known, cell)
             which = f" ({WRITTEN[wanted]})"
         elif view == "gspn" and model.gspn is None:
             raise NetFileError(str(source), "rates", "the file has none", "convert it as it is")
@@ -484,7 +475,7 @@ def convert_command(
         text, more = written(model, target)
         write_whole(target, text)
     except (NetFileError, NoEstimate, ValueError, OverflowError) as error:
-        return CommandResult(BAD_INPUT, _named(source, error), {"error": _named(source, error)})
+        return _refused(source, error)
     except MemoryError:
         told = f"{source}: the memory was used up; the net is too large for {target.suffix}"
         return CommandResult(BAD_INPUT, told, {"error": told})
@@ -510,12 +501,12 @@ WRITTEN = {
 
 
 def _exported(
-    task: Task, view: str, measured: Measured, stages: int, cell: Cell | None
+    task: Task, view: str, measured: Measured, cell: Cell | None
 ) -> tuple[NetFile, list[str], list[str]]:
     """Return a task as a net file in one of its views, what is lost, and what is assumed."""
     if view == "gspn":
         devices = devices_of(cell)
-        timed = stochastic_view(task, measured, stages=stages, timer_stages=stages, devices=devices)
+        timed = stochastic_view(task, measured, stages=8, timer_stages=8, devices=devices)
         made = NetFile(timed.gspn.net, task.name, timed.gspn)
         return made, [], [*timed.assumptions, assumed(cell)]
     flat = task.flat
@@ -553,27 +544,19 @@ def net_file_of(task: Task) -> NetFile:
     return NetFile(task.net, task.name, None, labels, positions)
 
 
-def graph_command(
-    path: Path,
-    load_task: LoadTask,
-    *,
-    witness: tuple[str, ...] | None = None,
-    limits: SearchLimits | None = None,
-) -> CommandResult:
-    """Run `petrobot show --graph`: the reachability graph as SVG in data["svg"].
-
-    By default the path to the first deadlock is highlighted.
-    """
+def graph_command(path: Path, load_task: LoadTask) -> CommandResult:
+    """Run `petrobot show --graph`: the reachability graph as SVG in data["svg"], with the path to
+    the first deadlock highlighted."""
     try:
         model = open_model(path, load_task)
         net, final = model.net, None
-        space = explore(net, limits=limits or SearchLimits(states=10_000))
+        space = explore(net, limits=SearchLimits(states=10_000))
     except (NetFileError, ValueError, OverflowError) as error:
-        return CommandResult(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
+        return _refused(path, error)
     if isinstance(model, Task):
         final = space.where(OrdinaryView(model).is_end)
     stuck = [int(i) for i in space.dead if final is None or not final[i]]
-    shown = witness if witness is not None else tuple(space.path(stuck[0])) if stuck else ()
+    shown = tuple(space.path(stuck[0])) if stuck else ()
     svg = graph_svg(space, witness=shown, final=final)
     partial = "" if space.complete else f" (partial: {space.reason})"
     return CommandResult(
@@ -604,8 +587,3 @@ def gspn_of(
     if model.gspn is None:
         raise NetFileError(str(path), "rates", "the file has none", "give a file with rates")
     return model, dict.fromkeys(model.net.transitions, f"from {path.name}"), ""
-
-
-def limited(limits: SearchLimits, progress: Callable[[int, int], None]) -> SearchLimits:
-    """Return the limits with a progress callback (markings found, markings expanded)."""
-    return replace(limits, progress=progress)

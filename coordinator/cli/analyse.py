@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -150,7 +151,6 @@ def _draw(analysis: Analysis, path: Path, folder: Path, *, quiet: bool) -> None:
 def progress_of_search(limits: SearchLimits) -> Iterator[SearchLimits]:
     """Return the limits with a progress line in the terminal; unchanged where there is no
     terminal."""
-    from petrobot.coordinator.analysis.commands import limited
 
     if not sys.stderr.isatty():
         yield limits
@@ -168,7 +168,7 @@ def progress_of_search(limits: SearchLimits) -> Iterator[SearchLimits]:
                 file=sys.stderr,
             )
 
-    yield limited(limits, tell)
+    yield replace(limits, progress=tell)
     if told[0]:
         print(file=sys.stderr)
 

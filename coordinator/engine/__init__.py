@@ -3,7 +3,6 @@
 docs/semantics.md defines what it does."""
 
 from petrobot.coordinator.engine.instructions import (
-    ORDERS,
     ArmTimer,
     CancelRun,
     Choose,
@@ -35,7 +34,6 @@ from petrobot.coordinator.engine.serialization import (
 from petrobot.coordinator.engine.state import Mode, Phase, Run, State, Timer
 from petrobot.coordinator.engine.step import Policy
 from petrobot.coordinator.engine.stimuli import (
-    OPERATOR,
     Abort,
     AddTokens,
     Begin,
@@ -66,8 +64,6 @@ from petrobot.coordinator.engine.stimuli import (
 from petrobot.coordinator.task.wording import Severity
 
 __all__ = [
-    "OPERATOR",
-    "ORDERS",
     "Abort",
     "AddTokens",
     "ArmTimer",

@@ -226,16 +226,3 @@ Instruction = (
     | Resumed
     | Finished
 )
-
-ORDERS = (
-    StartRun,
-    CancelRun,
-    HoldRun,
-    ReleaseRun,
-    Choose,
-    ArmTimer,
-    DisarmTimer,
-    HoldTimer,
-    ReleaseTimer,
-)
-"""The instructions that must be carried out; all others are records."""

@@ -157,7 +157,7 @@ def _scalar_reader(kind: type) -> Reader:
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             return float(value)
         if kind is int and isinstance(value, bool):
-            raise ValueError(f"{where}: {value!r} is no int")
+            raise ValueError(f"{where}: expected an integer, got {value!r}")
         return _of(value, kind, where)
 
     return read

@@ -255,17 +255,3 @@ Stimulus = (
     | ForceExit
     | Abort
 )
-
-OPERATOR = (
-    Pause,
-    Resume,
-    Step,
-    SetBreakpoints,
-    Override,
-    AddTokens,
-    RemoveTokens,
-    RaiseEvent,
-    ForceExit,
-    Abort,
-)
-"""The stimuli that only the operator with the controls may send."""

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.analysis.net.graph import sum_by
-from petrobot.coordinator.analysis.net.space import SearchLimits
+from petrobot.coordinator.analysis.net.ordinary import contended
 from petrobot.coordinator.analysis.time.measured import Ending, Measured, is_cause
-from petrobot.coordinator.analysis.time.stochastic import contended, stochastic_view
+from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.learning.batch import Array
 from petrobot.coordinator.learning.estimate import CENSORED, Tally
@@ -233,25 +233,18 @@ def _cause(exit_: str, takers: set[str]) -> str | None:
     return f"by:{transition}" if transition in takers else None
 
 
-@dataclass(frozen=True, slots=True)
-class _EndShare:
-    share: float
-    mean: float
-    cv: float
-
-
-def _exact(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _EndShare | Incidence]:
+def _exact(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, Estimate | Incidence]:
     """Estimate from relative frequencies and exact moments: no run was cut off."""
     whole = sum(m.n for m in tally.durations.values())
     out: dict[str, Any] = {}
     for cause in sorted({c for c in causes.values() if c is not None}):
         parts = [tally.durations[e] for e, c in causes.items() if c == cause]
         moments = reduce(lambda a, b: a.merged(b), parts)
-        out[cause] = _EndShare(moments.n / whole, moments.mean, moments.cv)
+        out[cause] = Estimate(moments.n / whole, moments.mean, moments.cv)
     return out
 
 
-def _incident(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _EndShare | Incidence]:
+def _incident(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, Estimate | Incidence]:
     """Estimate by Aalen-Johansen over the sampled runs, with a constant rate beyond the longest
     one: some runs were cut off."""
     kept = tally.sample.kept
@@ -277,13 +270,13 @@ def unended(times: Sequence[float], causes: Sequence[str | None]) -> tuple[float
     return left, max(times, default=0.0)
 
 
-def _with_tail(end: Incidence, left: float, longest: float, mean: float) -> _EndShare:
+def _with_tail(end: Incidence, left: float, longest: float, mean: float) -> Estimate:
     """Return a distribution of which the part `left` ends after `longest` s, by an exponential time
     of this mean (s) later."""
     first = (1 - left) * end.mean + left * (longest + mean)
     own = (end.cv**2 + 1) * end.mean**2
     second = (1 - left) * own + left * (longest**2 + 2 * longest * mean + 2 * mean**2)
-    return _EndShare(end.share, first, sqrt(max(0.0, second - first**2)) / first)
+    return Estimate(end.share, first, sqrt(max(0.0, second - first**2)) / first)
 
 
 def _with_missing(
@@ -439,7 +432,6 @@ def propagate(
     *,
     questions: Mapping[str, Question] | None = None,
     rho: float | None = None,
-    limits: SearchLimits | None = None,
 ) -> Propagated:
     """Compute R, C and J of the primitive tasks and of the whole task from estimates of actions,
     through the net.
@@ -456,10 +448,10 @@ def propagate(
             asked[name] = replace(asked[name], declared=tuple(primitive.costs.items()))
     scenarios = [context] if context is not None else _scenarios(task, estimates)
     where: Sequence[str | None] = scenarios or [None]
-    solved = [(_solve(task, measured_from(task, estimates, w, choice), limits), w) for w in where]
+    solved = [(_solve(task, measured_from(task, estimates, w, choice)), w) for w in where]
     hardest = min(solved, key=lambda one: (one[0].solved.conjunctive_reliability, one[1] or ""))
     # The lowest of m: intervals at 1 - (1 - level) / m pay for the choice (Bonferroni).
-    return _figures(task, estimates, *hardest, asked, context, rho, limits, len(where))
+    return _figures(task, estimates, *hardest, asked, context, rho, len(where))
 
 
 def _scenarios(task: Task, estimates: Estimates) -> list[str]:
@@ -490,8 +482,8 @@ class _Solved:
         return _visits(self.solved)
 
 
-def _solve(task: Task, measured: Measured, limits: SearchLimits | None) -> _Solved:
-    return _Solved(measured, forecast(stochastic_view(task, measured), limits=limits))
+def _solve(task: Task, measured: Measured) -> _Solved:
+    return _Solved(measured, forecast(stochastic_view(task, measured)))
 
 
 def _figures(
@@ -502,7 +494,6 @@ def _figures(
     asked: Mapping[str, Question],
     context: str | None,
     rho: float | None,
-    limits: SearchLimits | None,
     scenarios: int,
 ) -> Propagated:
     parts: dict[str, PrimitiveFigures] = {}
@@ -520,9 +511,7 @@ def _figures(
     alike = len({p.measure for p in needed}) == 1
     largest = added(p.runs * p.largest_cost for p in needed) if alike else nan
     weight = rho if rho is not None else 1.0 / largest if largest > 0 else 0.0
-    moves = _moves(
-        task, estimates, found, scenario, costs if alike else {}, asked, limits, scenarios
-    )
+    moves = _moves(task, estimates, found, scenario, costs if alike else {}, asked, scenarios)
     r = found.solved.conjunctive_reliability
     c = _total(found.visits, costs) if alike else nan
     of_r = [(-min(m.low_r, m.high_r), max(m.low_r, m.high_r)) for m in moves.values()]
@@ -603,7 +592,6 @@ def _moves(
     scenario: str | None,
     costs: Mapping[tuple[str, str], Uncertain],
     asked: Mapping[str, Question],
-    limits: SearchLimits | None,
     scenarios: int,
 ) -> dict[tuple[str, str], _Move]:
     """Return the move of each (place, action), for the hardest of so many scenarios.
@@ -622,7 +610,7 @@ def _moves(
         own = known[Status.SUCCESS].share if Status.SUCCESS in known else 0.0
         step = -STEP if own > 0.5 else STEP
         runs = {**found.measured.runs, (place, action): _shifted(known, step)}
-        other = _solve(task, replace(found.measured, runs=runs), limits)
+        other = _solve(task, replace(found.measured, runs=runs))
         slope_r = (other.solved.conjunctive_reliability - r) / step
         slope_c = (_total(other.visits, costs) - c) / step if c == c else 0.0
         level = 1.0 - (1.0 - asked[primitive].level) / scenarios

@@ -149,7 +149,7 @@ def prepare(
 
 
 def _refuse_too_many(runs: int | None, task: Task) -> None:
-    """Raise RequestError if the place of the runs does not hold so many tokens."""
+    """Raise RequestError if the place of the runs cannot hold that number of tokens."""
     place = task.places.get(task.runs_place)
     most = None if place is None else place.capacity
     if runs is not None and most is not None and runs > most:
@@ -213,7 +213,7 @@ def resume(found: Recorded, observers: Sequence[Observer] = ()) -> RunSession:
         mock = Path(then["mock"]) if then.get("mock") else None
         script = scripted_actions(mock, found.directory)
         store = RetracingStore(JournalWriter(found.journal.path), found.journal)
-        cell, party = lockstep_cell(found.directory, setting, script, None, store)
+        cell, party = lockstep_cell(found.directory, setting, script, store)
         return LockstepSession(
             party, selector, learning, folder, observers, cell=cell, resumed=True
         )
@@ -291,7 +291,7 @@ def _new(
             mission = realtime_mission(directory, setting, identity, store)
             return RealtimeSession(directory, mission, selector, learning, folder, observers)
         if request.nodes == ONE_PROCESS:
-            cell, party = lockstep_cell(directory, setting, script, None, store)
+            cell, party = lockstep_cell(directory, setting, script, store)
             return LockstepSession(
                 party, selector, learning, folder, observers, cell=cell, pace=request.pace
             )

@@ -41,11 +41,6 @@ class Page:
         self.token = page_state.access.token
 
     @property
-    def sessions(self) -> frozenset[Session]:
-        """The connected clients."""
-        return frozenset(self._page_state.sessions)
-
-    @property
     def limit(self) -> ConnectionLimit:
         """The factory of connections."""
         assert self._page_state.limit is not None

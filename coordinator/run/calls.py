@@ -146,7 +146,7 @@ class AfterTimers:
         return len(self._timers)
 
     def arm(self, now: float, key: str, seconds: float) -> None:
-        """Arm a timer that elapses after so many seconds."""
+        """Arm a timer that elapses after `seconds`."""
         self._timers[key] = _Timer(now + seconds)
 
     def disarm(self, key: str) -> None:
@@ -477,7 +477,7 @@ class Dispatch:
 
     # --- after a resume -----------------------------------------------------------------------
 
-    def relive(
+    def replay(
         self,
         now: float,
         stimulus: Stimulus,
@@ -492,9 +492,9 @@ class Dispatch:
         elif isinstance(stimulus, RunStarted):
             self._accepted.add(stimulus.run)
         elif isinstance(stimulus, RunEnded | StopConfirmed):
-            self._relive_end(now, stimulus)
+            self._replay_end(now, stimulus)
         elif isinstance(stimulus, StopFailed):
-            self._relive_fence(now, stimulus.run, "no_answer")
+            self._replay_fence(now, stimulus.run, "no_answer")
         for instruction in instructions:
             if isinstance(instruction, _TIMERS):
                 self.carry_out(now, instruction)
@@ -505,16 +505,16 @@ class Dispatch:
                     boots.get(entry.node, "") if entry else "",
                 )
 
-    def _relive_end(self, now: float, end: RunEnded | StopConfirmed) -> None:
+    def _replay_end(self, now: float, end: RunEnded | StopConfirmed) -> None:
         cause = end.cause if isinstance(end, RunEnded) else ""
         unsure = isinstance(end, RunEnded) and cause in UNSURE and end.executed is Executed.UNKNOWN
         self._settled[end.run] = cause not in _GIVEN_UP
         self._parting.pop(end.run, None)
         self._fences.lift(end.run)
         if unsure:
-            self._relive_fence(now, end.run, cause)
+            self._replay_fence(now, end.run, cause)
 
-    def _relive_fence(self, now: float, run: str, cause: str) -> None:
+    def _replay_fence(self, now: float, run: str, cause: str) -> None:
         start, _ = self._earlier.get(run, (None, ""))
         entry = self.directory.actions.get(start.action) if start is not None else None
         if start is not None and entry is not None and entry.device:

@@ -111,11 +111,11 @@ class Executor:
         for caller in self.callers.values():
             caller.subscribe(now, names, fresh=fresh)
 
-    def relive(self, now: float, step: RecordedStep) -> None:
+    def replay(self, now: float, step: RecordedStep) -> None:
         """Replay a step that an earlier process recorded at `now`: observers see it, but nothing is
         carried out again."""
         self.state = step.state
-        self.dispatch.relive(now, step.stimulus, step.instructions, step.boots)
+        self.dispatch.replay(now, step.stimulus, step.instructions, step.boots)
         for observer in self.observers:
             observer.stimulus(now, step.stimulus)
             for instruction in step.instructions:

@@ -293,11 +293,11 @@ class Mission:
         else:
             self.stage = Stage.PREPARING
 
-    def relive(self, now: float, step: RecordedStep) -> None:
+    def replay(self, now: float, step: RecordedStep) -> None:
         """Replay a step that another process recorded at `now` (on this process's clock)."""
         if isinstance(step.stimulus, Begin):
             self.begun = now
-        self.executor.relive(now, step)
+        self.executor.replay(now, step)
         if self.executor.finished is not None and not self.ended:
             self.ended = now
 

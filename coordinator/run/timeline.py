@@ -41,7 +41,6 @@ class Firing:
     number: int
     transition: str
     cause: str
-    marking: tuple[int, ...]
 
 
 @dataclass
@@ -85,7 +84,6 @@ class Timeline:
                     instruction.number,
                     instruction.transition,
                     instruction.cause,
-                    instruction.after,
                 )
             )
         elif isinstance(instruction, Report):

@@ -250,7 +250,7 @@ class Transition:
     weight: float | None = None
     """Decides conflicts of equal priority by a random draw with these weights."""
     after: float | None = None
-    """Fires so many seconds after its arcs became satisfied."""
+    """Seconds after which it fires, counted from when its arcs became satisfied."""
     sets: tuple[tuple[str, Expression], ...] = ()
     """Variables that its firing writes, with their new values: a literal, a variable or a
     parameter each. Conditions of the same step still read the old values."""

@@ -133,7 +133,7 @@ def ridges(grid: ScanGrid, samples: Grey, width: float) -> Candidates:
 # --- From candidates to the line -----------------------------------------------------------------
 
 GATE = 0.07
-"""m that the line may be off the expected one."""
+"""Greatest distance of the line from the expected one (m)."""
 STEP_GATE = 0.016
 """m that a point may be off the line through the points before it, plus `STEP_SLOPE` m per metre of
 distance."""
@@ -145,9 +145,9 @@ STEEPEST = 1.6
 FIRST_SLOPE = 0.9
 """Steepest slope with which a line that was not expected may begin."""
 SURELY = 0.45
-"""m of line from an expected beginning after which no other beginning is tried."""
+"""Length of line from an expected beginning after which no other is tried (m)."""
 SHORTEST = 0.16
-"""m that a line must be long."""
+"""Least length of a line (m)."""
 
 
 class TrackDetector(Protocol):
@@ -300,9 +300,9 @@ def _broke_off(grid: ScanGrid, line: _Chain) -> bool:
 # --- Whole-line fits ------------------------------------------------------------------------------
 
 WINDOW = 0.55
-"""m of line to which a parabola is fitted as a whole."""
+"""Length of line to which a parabola is fitted as a whole (m)."""
 INLIER = 0.018
-"""m off the parabola within which a candidate belongs to it."""
+"""Distance from the parabola within which a candidate belongs to it (m)."""
 DRAWS = 60
 """Triples of points that are tried."""
 

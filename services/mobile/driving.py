@@ -35,17 +35,17 @@ TAKE_OVER: Final = 0.34
 """m before the end of the line at which following is finished: the next action begins on the
 move."""
 BEYOND: Final = 0.6
-"""m that a plan continues straight on where the track should have been found."""
+"""How far a plan continues straight on where the track should have been found (m)."""
 ROLLED: Final = 0.3
-"""m that must have been followed for a line to count as one that has ceased."""
+"""Length that must have been followed for a line to count as one that has ceased (m)."""
 SILENT: Final = 1.0
 """Seconds of standing without a set point after which the stream counts as ceased."""
 STUCK: Final = 0.5
 """Seconds of standing without a line after which the line counts as lost."""
 NEAR_GATE: Final = 0.40
-"""m from where a track can resume within which a reflector is taken to mark it."""
+"""Distance from where a track can resume within which a reflector marks it (m)."""
 STALENESS: Final = 0.1
-"""m/s by which a reflector's position loses value per second since its last echo."""
+"""What a reflector's position loses in value per second since its last echo (m/s)."""
 REFLECTOR_PATIENCE: Final = 1.2
 """Seconds to wait for a reflector at the line's end."""
 LOOKS: Final = ((0.8, (0.0, 1.4, -1.4, 0.7, -0.7)), (0.2, (0.0, 0.8, -0.8)))
@@ -55,7 +55,7 @@ LOOK: Final = 0.35
 STANDS_FOR: Final = 0.6
 """Seconds that the rover must have stood at the T: the rules require half a second."""
 STOP_AT: Final = 0.10
-"""m beyond the T's bar where the axle stops: the middle of what the rules allow."""
+"""Where the axle stops beyond the T's bar (m): the middle of what the rules allow."""
 
 Judge = Callable[[Mapping[str, Any]], Result | None]
 

@@ -112,7 +112,7 @@ class ScanGrid:
 
     @property
     def step(self) -> float:
-        """m between samples of a row."""
+        """Distance between samples of a row (m)."""
         return float(self.y[1] - self.y[0])
 
     def sample(self, image: NDArray[np.uint8]) -> Grey:

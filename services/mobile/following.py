@@ -59,7 +59,7 @@ class FeedForward:
     gain: float = 60.0
     damping: float = 1.1
     lead: float = 0.09
-    """s from a set point until the wheels have responded."""
+    """Time from a set point until the wheels have responded (s)."""
     bent: float = 1.2
     """1/m, greatest curvature of the line that is believed: the track's arcs have 1 m radius, what
     seems tighter is a kink."""
@@ -96,7 +96,7 @@ class SpeedProfile:
     raising: float = 0.8
     """m/s^2, greatest acceleration."""
     margin: float = 0.02
-    """m before the end of the known line at which to stand."""
+    """Where to stand before the end of the known line (m)."""
 
     def speed(self, asked: float, curvature: float, ahead: float) -> float:
         """Return the speed (m/s) for a curvature (1/m) with the line known for `ahead` m."""

@@ -43,7 +43,7 @@ class Odometry:
         self._width = track_width
         self.pose = Pose(0.0, 0.0, 0.0)
         self.way = 0.0
-        """m travelled, however curved; turning on the spot adds nothing."""
+        """Way travelled, however curved (m); turning on the spot adds nothing."""
         self._history: deque[tuple[float, Pose]] = deque(maxlen=HISTORY)
 
     def add(self, now: float, left: float, right: float) -> None:

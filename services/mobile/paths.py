@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from petrobot.services.mobile.odometry import Pose, turned
 
 SPACING = 0.05
-"""m between points."""
+"""Distance between points (m)."""
 Points = list[tuple[float, float]]
 
 

@@ -19,7 +19,7 @@ ECHOES: Final = struct.Struct("<hHhH")
 """TPDO1 of the sensor: bearing (0.1 mrad, left positive) and slant range (mm, 0: no echo),
 twice."""
 NEAR: Final = 0.25
-"""m within which echoes belong to one reflector."""
+"""Distance within which echoes belong to one reflector (m)."""
 BELIEVED: Final = 4
 """Echoes that make a reflector."""
 LONELY: Final = 1.5

@@ -29,29 +29,29 @@ from petrobot.services.mobile.wheel_drives import MasterPhase, WheelMaster
 LEASE: Final = 0.4
 """Seconds after which a motion ends unless its command is repeated."""
 STANDING: Final = 0.004
-"""m/s below which the rover counts as standing."""
+"""Speed below which the rover counts as standing (m/s)."""
 STREAM: Final = "track_ahead"
 JOINING: Final = PurePursuit(0.6)
 """Law towards a line that is known ahead, but not yet at the axle."""
 AT_END: Final = 0.04
-"""m before the end of all that is known at which the line counts as finished."""
+"""Distance before the end of all that is known at which the line is finished (m)."""
 TURN_GAIN: Final = 3.0
 """1/s: turning speed per radian that is left."""
 TURNED: Final = 0.02
-"""rad within which a turn has arrived."""
+"""Angle within which a turn has arrived (rad)."""
 END_REACH: Final = 0.45
-"""m of line from which its direction at its end is computed."""
+"""Length of line from which its direction at its end is computed (m)."""
 REGAINED_SIGHTS: Final = 4
 """Sights of a new stretch after which it can be followed."""
 REGAINED_AHEAD: Final = (0.2, 0.62)
 """m ahead of the axle at which that stretch must begin; not behind, since the rover may have
 turned."""
 REGAINED_ASIDE: Final = 0.25
-"""m to the side at most."""
+"""Greatest distance to the side (m)."""
 REGAINED_TURN: Final = 0.6
-"""rad askew at most."""
+"""Greatest angle to the line (rad)."""
 EDGE: Final = 0.02
-"""m from the edge of its workspace at which the rover stands."""
+"""Distance from the edge of its workspace at which the rover stands (m)."""
 DRIVES_SHARE: Final = 0.95
 """Share of the wheels' top speed that set points use; the rest is for the lead over their lag."""
 
@@ -74,7 +74,6 @@ class Rover(Driver):
         )
         wheels, bus = self.numbers.wheels, self.numbers.bus
         self.period = bus.period
-        self._ports = ports
         self._bus = ports.can()
         self._setpoint: Setpoint = ports.stream(STREAM)
         self._master = WheelMaster(

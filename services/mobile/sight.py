@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 Vector = NDArray[np.float64]
 
 FIT_REACH = 0.5
-"""m ahead of the nearest point over which one parabola describes the line."""
+"""Length ahead of the nearest point over which one parabola describes the line (m)."""
 POINT_SPACING = 0.05
-"""m between streamed points."""
+"""Distance between streamed points (m)."""
 STREAMED = 12
 """Most points in a set point."""
 HEAD = 5

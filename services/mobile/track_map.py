@@ -25,22 +25,22 @@ Vector = NDArray[np.float64]
 CAPACITY = 640
 """Points kept; the oldest are overwritten."""
 STEP = 0.015
-"""m between two places from which sights are taken."""
+"""Distance between two places from which sights are taken (m)."""
 TURN_STEP = 0.03
-"""rad, the same for turning."""
+"""The same for turning (rad)."""
 ALIKE = 5
 """Sights that are taken from one place: the noise of a standing rover is averaged, then nothing new
 is learned."""
 REACH = 0.22
-"""m around a place within which points count for the fit there, the nearer the more."""
+"""Radius in which points count for the fit at a place, the nearer the more (m)."""
 NEEDED = 3
 """Points that a fit needs."""
 OTHER = 0.15
-"""m off the known line from which a sight shows something else."""
+"""Distance from the known line beyond which a sight shows something else (m)."""
 GATE_ASIDE, GATE_TURN = 0.3, 0.6
-"""m and rad that a line may be off a gate."""
+"""Greatest distance and angle of a line from a gate (m, rad)."""
 STEP_ASIDE = 0.06
-"""m beside the plan from which a seen line is joined by a new path."""
+"""Distance beside the plan from which a seen line is joined by a new path (m)."""
 ENDS = 12
 """Sights of an end that are averaged."""
 

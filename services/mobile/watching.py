@@ -33,12 +33,12 @@ from petrobot.services.mobile.sight import (
 # --- Line ends in one image ----------------------------------------------------------------------
 
 BACK, ON, STEP = 0.16, 0.26, 0.01
-"""m before and after the last point of the line that are searched, and the step."""
+"""What is searched before and after the last point of the line, and the step (m)."""
 AT_LEAST, AT_MOST = -0.06, 0.20
 """Least and greatest distance (m) from the line's last point to its end: rows are centimetres
 apart, and the last ones may have been missed."""
 SURE = 0.012
-"""m, root mean square, that a stripe or an edge may be off a straight line."""
+"""Greatest rms distance of a stripe or an edge from a straight line (m)."""
 ASKEW = 0.45
 """Greatest slope of stripe or edge against the perpendicular of the line."""
 LEAST_CONTRAST = 14.0
@@ -167,9 +167,9 @@ def _last(sight: Sight) -> tuple[float, float, float]:
 # --- From image to image -------------------------------------------------------------------------
 
 FOLLOW_FAR, FIND_FAR = 1.2, 1.5
-"""m ahead up to which scan rows lie while the line is followed, and while it is searched."""
+"""How far ahead scan rows lie while the line is followed, and while it is searched (m)."""
 NEAR = 0.6
-"""m ahead within which a line must begin for the rows of following to suffice."""
+"""How far ahead a line may begin for the rows of following to suffice (m)."""
 FORGET = 3
 """Images without a sight after which the line may begin anywhere again."""
 VOTES, NEEDED = 6, 3
@@ -187,7 +187,7 @@ class FloorWatch:
     wide: ScanGrid
     """Rows for finding."""
     width: float
-    """m, width of the track."""
+    """Width of the track (m)."""
 
     @staticmethod
     def of(rover: RoverModel) -> FloorWatch:

@@ -467,7 +467,7 @@ class Arm(Driver):
 
 
 _STANDING: Final = 0.01
-"""rad/s below which a joint counts as standing."""
+"""Speed below which a joint counts as standing (rad/s)."""
 
 
 def _share(value: Any) -> float:

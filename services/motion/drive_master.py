@@ -89,7 +89,6 @@ class JointDriveLink:
         self.limited = False
         """Whether the drive cuts its set points because they are faster than it can move."""
         self.position = 0.0
-        self.torque = 0.0
         self.silent = 0
         self.spoken = False
         self.max_speed = 0.0
@@ -157,12 +156,12 @@ class JointDriveLink:
             raise ValueError(
                 f"TPDO of node {self.node}: expected {_TPDO.size} bytes, got {len(data)}"
             )
-        statusword, position, torque = _TPDO.unpack(data)
+        statusword, position, _ = _TPDO.unpack(data)
         other = statusword != self.statusword or not self.spoken
         if other:
             self.state, self.statusword = state_of(statusword), statusword
             self.limited = bool(statusword & StatusBit.INTERNAL_LIMIT)
-        self.position, self.torque = from_units(position), torque / 1e3
+        self.position = from_units(position)
         self.silent, self.spoken, self._taken = 0, True, data
         return other
 
@@ -193,18 +192,18 @@ _GO_ON: Final = ENABLING[DriveState.OPERATION_ENABLED].word
 
 SILENT_CYCLES: Final = 10
 """Cycles without a drive's TPDO after which the drive counts as lost."""
+INPUT_NODE: Final = 7
 INPUT_TIMER_MS: Final = 100
 INPUT_OBJECTS: Final = (Mapped(0x6000, 1, DataType.UNSIGNED8),)
 
 
 class DriveMaster(CanopenMaster[JointDriveLink]):
-    """Master of nodes 1 to 6 (drives, base to flange) and of the node `inputs` (digital inputs)."""
+    """Master of nodes 1 to 6 (drives, base to flange) and of node 7 (digital inputs)."""
 
     def __init__(
         self,
         settings: Sequence[DriveSettings],
         cycle: float,
-        inputs: int = 7,
         enable: bool = True,
         dry_run: bool = False,
     ) -> None:
@@ -214,8 +213,8 @@ class DriveMaster(CanopenMaster[JointDriveLink]):
         drives = {
             f"joint {node}": JointDriveLink(node, each) for node, each in enumerate(settings, 1)
         }
-        transfers = companion_transfers(inputs, INPUT_TIMER_MS, INPUT_OBJECTS)
-        companion = Companion(inputs, transfers, self._take_inputs)
+        transfers = companion_transfers(INPUT_NODE, INPUT_TIMER_MS, INPUT_OBJECTS)
+        companion = Companion(INPUT_NODE, transfers, self._take_inputs)
         super().__init__(
             drives,
             (companion,),

@@ -33,7 +33,7 @@ LARGEST: Final = 1000.0
 """s, m or m/s above which a number cannot belong to a catch point of any laboratory; rejects NaN
 and infinity too."""
 SLOWEST: Final = 1e-3
-"""m/s towards the arm below which the ball does not arrive."""
+"""Speed towards the arm below which the ball does not arrive (m/s)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,18 +106,18 @@ level cup further down."""
 PRIOR_SPREAD: Final = 0.17
 """m, standard deviation of where balls leave: uniform within +-0.30 m, so 0.30 / sqrt(3)."""
 DEPTH_COST: Final = 2.0
-"""s per m from the preferred depth."""
+"""Price of a metre from the preferred depth (s)."""
 CLOSED_COST: Final = 4.0
-"""s per unit of cosine by which the mouth is less open to the ball than it should be."""
+"""Price of the cosine by which the mouth is less open to the ball than it should be (s)."""
 RETREAT: Final = 0.08
 """m back from a catching pose to the pose from which it is approached where the straight path is
 not clear."""
 LATE_COST: Final = 20.0
 """Weight of each second too late."""
 EARLY: Final = 0.05
-"""s of slack below which time costs more."""
+"""Slack below which time costs more (s)."""
 HASTE: Final = 0.05
-"""s of motion from which the full margin is required."""
+"""Duration of a motion from which the full margin is required (s)."""
 KEEP: Final = 0.03
 """Cost by which another candidate must be better than the present one."""
 

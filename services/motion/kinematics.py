@@ -182,7 +182,7 @@ class Puma:
 
 
 LIMIT_SLACK = 1e-9
-"""rad by which rounding may carry a solution beyond a joint limit."""
+"""How far rounding may carry a solution beyond a joint limit (rad)."""
 
 
 def branch_of(puma: Puma, q: NDArray[np.float64]) -> ArmBranch:

@@ -217,9 +217,9 @@ Geometry = tuple[Six, Six, Links, Radii, Cup, Solids]
 """Least and greatest angles, and the other arguments of the kernels."""
 
 CUP_MARGIN = 0.005
-"""m between cup and table."""
+"""Least distance between cup and table (m)."""
 ARM_MARGIN = 0.01
-"""m between arm and table, and of every part to floor and pedestal."""
+"""Least distance between arm and table, and of every part to floor and pedestal (m)."""
 BARELY = 0.1
 """Share of the margins that is left to an arm that has to creep out of them."""
 NEAR = 0.02
@@ -229,7 +229,7 @@ LOOKS = (0.25, 0.5)
 """Shares of the braking time at which a long path to rest is checked, besides its beginning and its
 end; `clear_step` uses the same."""
 JOINT_SLACK = 1e-6
-"""rad by which rounding may carry a command beyond a joint limit."""
+"""How far rounding may carry a command beyond a joint limit (rad)."""
 
 
 def point(values: Sequence[float]) -> Point:

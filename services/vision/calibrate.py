@@ -197,9 +197,7 @@ def _flash_terminal(bright: bool) -> None:
     sys.stdout.flush()
 
 
-def measure_latency(
-    source: ImageSource, flash: Callable[[bool], None], flashes: int = FLASHES
-) -> tuple[float, float]:
+def measure_latency(source: ImageSource, flash: Callable[[bool], None]) -> tuple[float, float]:
     """Return the median time from mid-exposure until an image is available (s), and the half width
     of the middle half of all measurements (s).
 
@@ -223,7 +221,7 @@ def measure_latency(
             )
         middle = float((dark + 0.5 * change)[lit].mean())
         found, times = [], []
-        for _ in range(flashes):
+        for _ in range(FLASHES):
             flash(False)
             times += _until(source, SEEN_AFTER + chance.random() * 0.2, lambda level: False, lit)
             begin = time.monotonic()

@@ -47,23 +47,6 @@ class BallTrack:
     residual: float
 
 
-@dataclass(frozen=True, slots=True)
-class Rolling:
-    """What counts as a ball that rolls towards the near edge (m, s)."""
-
-    slowest: float = 0.25
-    """Slowest and fastest ball (m/s)."""
-    fastest: float = 3.5
-    towards: float = -0.15
-    """m/s, greatest x velocity: negative, towards the near edge."""
-    gate: float = 0.015
-    """m that a candidate may lie from where the track expects it."""
-    spread: float = 0.008
-    """m, largest rms residual of a confirmed track."""
-    shortest: float = 0.03
-    """m that a confirmed track must cover."""
-
-
 class Confirmation:
     """Joins candidates of successive images to tracks, and confirms a track that has `count` of
     them."""
@@ -72,11 +55,20 @@ class Confirmation:
     """Most tracks kept; the oldest go first."""
     MISSED = 3
     """Images in a row in which a track may find no candidate."""
+    SLOWEST, FASTEST = 0.25, 3.5
+    """Slowest and fastest ball (m/s)."""
+    TOWARDS = -0.15
+    """Greatest x velocity (m/s): negative, towards the near edge."""
+    GATE = 0.015
+    """Greatest distance of a candidate from where the track expects it (m)."""
+    SPREAD = 0.008
+    """Largest rms residual of a confirmed track (m)."""
+    SHORTEST = 0.03
+    """Shortest way that a confirmed track must cover (m)."""
 
-    def __init__(self, count: int, rolling: Rolling | None = None) -> None:
+    def __init__(self, count: int) -> None:
         """`count` consistent detections, at least 3, confirm a ball."""
         self._count = max(3, count)
-        self._rolling = rolling or Rolling()
         self._tracks: list[list[tuple[float, float, float]]] = []
         self._missed: list[int] = []
 
@@ -121,17 +113,14 @@ class Confirmation:
         step = candidate[0] - t
         vx, vy = (candidate[1] - x) / step, (candidate[2] - y) / step
         speed = float(np.hypot(vx, vy))
-        if (
-            not self._rolling.slowest <= speed <= self._rolling.fastest
-            or vx > self._rolling.towards
-        ):
+        if not self.SLOWEST <= speed <= self.FASTEST or vx > self.TOWARDS:
             return float("inf")
         if len(track) == 1:
             return speed * step
         fit = _line(np.array(track[-6:]))
         expected = fit[0] + fit[1] * candidate[0]
         away = float(np.hypot(candidate[1] - expected[0], candidate[2] - expected[1]))
-        return away if away <= self._rolling.gate else float("inf")
+        return away if away <= self.GATE else float("inf")
 
     def _confirmed(self, track: list[tuple[float, float, float]]) -> BallTrack | None:
         if len(track) < self._count or self._missed[self._tracks.index(track)]:
@@ -142,7 +131,7 @@ class Confirmation:
             np.sqrt(np.mean(np.sum((rows[:, 1:] - offset - rows[:, :1] * velocity) ** 2, axis=1)))
         )
         way = float(np.hypot(*(rows[-1, 1:] - rows[0, 1:])))
-        if residual > self._rolling.spread or way < self._rolling.shortest:
+        if residual > self.SPREAD or way < self.SHORTEST:
             return None
         return BallTrack(rows[:, 0], rows[:, 1:], residual)
 
@@ -159,7 +148,7 @@ def _line(rows: Array) -> tuple[Array, Array]:
 # --- Searching -----------------------------------------------------------------------------------
 
 LEARN_EVERY = 10
-"""The stored background learns from every so many images."""
+"""The stored background learns from every tenth image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,13 +156,13 @@ class LocateSpecification(Specification):
     """When a ball counts as located, and how accurately (s, m)."""
 
     timeout: float = 5.0
-    """s after which no ball is an error."""
+    """Time after which it is an error that no ball was found (s)."""
     confirmations: float = 4.0
     """Consistent detections that confirm a ball."""
     rate: float = 0.0
     """Images/s; 0: the camera's usual rate."""
     image_timeout: float = 0.8
-    """s without an image after which the camera counts as dead."""
+    """Time without an image after which the camera counts as dead (s)."""
     within: float = 0.0
     """m that the last place may be beside the ball's path, which the tracker measures: it gives
     the verdict. 0: the scatter of the places (`max_residual`) judges at once."""

@@ -31,7 +31,7 @@ ROUNDEST_FILL = 0.55
 """Least share of its bounding box that a candidate fills. A disc fills pi/4, a streaked one more;
 scattered pixels and slanting stripes less."""
 FASTEST = 3.5
-"""m/s, the fastest ball that is looked for."""
+"""Speed of the fastest ball that is looked for (m/s)."""
 
 
 class BallDetector(Protocol):
@@ -250,13 +250,11 @@ class FixedThreshold(_WholeTable):
     """Finds all that is brighter than one grey level. Cheapest, needs no background; fails where
     the light is uneven or changes."""
 
-    def __init__(self, view: TableView, level: float = 160.0) -> None:
-        super().__init__(view)
-        self._level = level
+    LEVEL = 160.0
 
     def detect(self, pixels: Pixels) -> Array:
         """Return candidates, accurate to about half a pixel."""
-        mask = cv2.threshold(self.half(pixels), self._level, 255, cv2.THRESH_BINARY)[1]
+        mask = cv2.threshold(self.half(pixels), self.LEVEL, 255, cv2.THRESH_BINARY)[1]
         return self.blobs(np.asarray(mask, np.uint8))
 
 

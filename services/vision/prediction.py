@@ -190,7 +190,7 @@ class LeastSquares:
     1999), so no moment has to be guessed, and the cost per place never grows."""
 
     MOMENTS = np.array([0.0, 0.02, 0.04, 0.06, 0.08, 0.10, 0.13, 0.16, 0.20, 0.26])
-    """s after the first place at which sliding may end."""
+    """When sliding may end, after the first place (s)."""
 
     def __init__(self, surface: Surface, rolling_sigma: float | None = None) -> None:
         """`rolling_sigma`: 0 treats the surface's rolling deceleration as known; None uses its
@@ -341,11 +341,11 @@ class Kalman:
     """
 
     FADE = 0.10
-    """s, time constant of the sliding deceleration."""
+    """Time constant of the sliding deceleration (s)."""
     SLIDING_NOISE = 1.2
     """m/s^2 per root s, noise that drives the sliding deceleration; it decreases with time."""
     VELOCITY_NOISE = 0.002
-    """m/s per root s: an uneven table."""
+    """Random change of the speed by an uneven table (m/s per root s)."""
 
     def __init__(self, surface: Surface) -> None:
         self._surface = surface

@@ -28,7 +28,7 @@ class TableView:
     height: float
     radius: float
     exposure: float
-    """s, exposure time of an image."""
+    """Exposure time of an image (s)."""
 
     @classmethod
     def of(cls, cell: Mapping[str, Any], optics: Optics) -> TableView:

@@ -17,11 +17,11 @@ from petrobot.services.vision.prediction import ExitWay, PredictedExit, Predicto
 from petrobot.services.vision.specification import Specification
 
 HIDDEN = 0.20
-"""m before the near edge in which arm and cup may hide the ball."""
+"""Distance before the near edge in which arm and cup may hide the ball (m)."""
 SPREAD_PX = 5.0
-"""px around the expected place in which the ball is searched."""
+"""Radius around the expected place in which the ball is searched (px)."""
 GROWTH_PX = 4.0
-"""px by which that grows with each image in which the ball was not seen."""
+"""Growth of that radius with each image in which the ball was not seen (px)."""
 OTHERWISE = 5
 """Images in a row that predict another exit than over the near edge, after which the ball is given
 up."""
@@ -41,22 +41,22 @@ class TrackSpecification(Specification):
     rate: float = 0.0
     """Images/s; 0: the camera's usual rate."""
     image_timeout: float = 0.5
-    """s without an image after which the camera counts as dead."""
+    """Time without an image after which the camera counts as dead (s)."""
     contrast: float = BallWindow.CONTRAST
     """Grey levels by which a ball must be brighter than the table."""
     lost_after: float = 0.20
-    """s without a sight of a ball that should be in plain view."""
+    """Time without a sight of a ball that should be in plain view (s)."""
     lead: float = 0.45
-    """s before the ball leaves; from then on predictions are judged."""
+    """Time before the ball leaves from which on predictions are judged (s)."""
     place_within: float = 0.0
     """m along the near edge that they may be off where the last sights show that the ball left,
     else FAILURE `off`. 0: they are compared with the last prediction."""
     time_within: float = 0.0
     """s that they may be off when it left, else FAILURE `off`; given with `place_within`."""
     max_time_spread: float = 0.010
-    """s by which they may differ from the last prediction, else FAILURE `unsteady`."""
+    """Greatest difference in time from the last prediction (s), else FAILURE `unsteady`."""
     max_place_spread: float = 0.008
-    """m along the near edge, the same."""
+    """The same along the near edge (m)."""
 
     def __post_init__(self) -> None:
         """Raise ValueError if only one of the two limits is given."""
@@ -70,12 +70,12 @@ class TrackSpecification(Specification):
 
     @property
     def most_place(self) -> float:
-        """m that predictions may be off along the near edge."""
+        """Greatest error of predictions along the near edge (m)."""
         return self.place_within or self.max_place_spread
 
     @property
     def most_time(self) -> float:
-        """s that they may be off."""
+        """Greatest error of predictions in time (s)."""
         return self.time_within or self.max_time_spread
 
 
@@ -133,7 +133,7 @@ class _Chase:
         self._sights: list[tuple[float, float, float]] = []
         """Time (s) and place (m) of each sight."""
         self._latencies: list[float] = []
-        """s from the middle of an exposure to the set point that it led to."""
+        """Time from the middle of an exposure to the set point that it led to (s)."""
         self._images = self._seen = self._misses = self._otherwise = 0
         self._seen_at = 0.0
         self._located = (0.0, 0.0, 0.0)

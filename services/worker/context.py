@@ -190,7 +190,7 @@ class RunContext:
         return Wait(ready, None if timeout is None else self._clock() + timeout)
 
     def sleep(self, seconds: float) -> Wait:
-        """Awaitable: returns after so many seconds of the cell's clock."""
+        """Awaitable: returns after this number of seconds of the cell's clock."""
         return Wait(never, self._clock() + seconds)
 
     def publish(self, stream: str, values: Sequence[float]) -> None:

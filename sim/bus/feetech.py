@@ -19,7 +19,7 @@ STEPS: Final = 4096
 NO_LOAD_SPEED: Final = 3400.0
 """steps/s at full duty without load: 50 turns a minute at 7.4 V (data sheet)."""
 STALL_TORQUE: Final = 3.35
-"""N m at full duty."""
+"""Torque at full duty (N m)."""
 FULL_DUTY_ERROR: Final = STALL_TORQUE / 17.8 / (2 * math.pi) * STEPS
 """Position error (steps) with full duty at the default coefficient P = 32."""
 FRICTION: Final = 0.052 / STALL_TORQUE

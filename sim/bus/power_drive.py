@@ -86,7 +86,7 @@ class PowerDrive(CanopenNode, ABC):
 
     @abstractmethod
     def ramp_down(self, deceleration: float) -> None:
-        """Come to rest at so many rad/s^2."""
+        """Come to rest at this deceleration (rad/s^2)."""
 
     @abstractmethod
     def cut_power(self) -> None:

@@ -27,13 +27,13 @@ DASHBOARD_PORT: Final = 29999
 PROGRAM_PORT: Final = 30002
 PORTS: Final = (RTDE_PORT, DASHBOARD_PORT, PROGRAM_PORT)
 STEP: Final = 0.002
-"""s between two cycles of the joints."""
+"""Time between two cycles of the joints (s)."""
 TOP_SPEED: Final = 3.14
-"""rad/s of each joint."""
+"""Greatest speed of each joint (rad/s)."""
 TOP_ACCELERATION: Final = 25.0
 """rad/s^2 of each joint."""
 SUDDEN: Final = 0.35
-"""rad between set point and joint beyond which the controller stops protectively."""
+"""Distance of a joint from its set point that causes a protective stop (rad)."""
 POWER_OFF, IDLE, RUNNING = 3, 5, 7
 NORMAL, PROTECTIVE, EMERGENCY = 1, 3, 7
 MODES = {POWER_OFF: "POWER_OFF", IDLE: "IDLE", RUNNING: "RUNNING"}
@@ -108,6 +108,7 @@ class UrController:
         """Registers that the program writes, by name."""
         self.now = 0.0
         self._target = list(q)
+        self._text = ""
         self._silent, self._beat, self._patience = 0.0, -1, 0.1
         self._clients: list[_Rtde] = []
         self._due_mode: tuple[float, int] | None = None
@@ -217,7 +218,7 @@ class UrController:
     # Program and dashboard
 
     def _load(self, data: bytes) -> bytes:
-        text = self._text = getattr(self, "_text", "") + data.decode("utf-8", "replace")
+        text = self._text = self._text + data.decode("utf-8", "replace")
         if re.search(r"^end\s*$", text, re.MULTILINE):
             self._text = ""
             if self.robot_mode == RUNNING and self.safety_mode == NORMAL:

@@ -63,7 +63,7 @@ class TableMotion:
         self._slip = (slip_x / slip, slip_y / slip) if slip > 0.0 else (0.0, 0.0)
         self._sliding = model.friction * model.gravity
         self.rolls_after = slip / (self._sliding * (1.0 + 1.0 / model.inertia_factor))
-        """s until sliding ends."""
+        """Time until sliding ends (s)."""
         t = self.rolls_after
         self._q = self._slide_position(t)
         self._u = self._slide_velocity(t)
@@ -74,7 +74,7 @@ class TableMotion:
         self.rests_after = t + (
             speed / self._deceleration if self._deceleration > 0.0 else math.inf
         )
-        """s until the ball lies still."""
+        """Time until the ball lies still (s)."""
 
     def _slide_position(self, t: float) -> tuple[float, float]:
         half = 0.5 * self._sliding * t * t
@@ -175,7 +175,7 @@ class UnevenMotion:
             if vx == vy == 0.0 and not steep:
                 break
         self.rests_after = _STEP * (len(self._path) - 1)
-        """s until the ball lies still, or until the path is not known any further."""
+        """Time until the ball lies still, or until the path is not known any further (s)."""
 
     def state(self, t: float) -> BallState:
         """Return the state `t` >= 0 seconds after the start."""
@@ -210,7 +210,7 @@ class UnevenMotion:
 _STEP = 0.001
 """s."""
 _LONGEST = 12.0
-"""s, more than a ball is left on the table."""
+"""A time longer than a ball is left on the table (s)."""
 
 
 def _first_root(c: float, b: float, a: float, until: float) -> float:

@@ -49,7 +49,7 @@ Flags = tuple[bool, bool, bool, bool]
 _TOUCH = 1e-5
 """m; a smaller gap counts as contact."""
 _EDGE = 0.001
-"""m, radius of the edges of the cup's walls: that of Bullet's boxes."""
+"""Radius of the edges of the cup's walls (m): that of Bullet's boxes."""
 _BOUNCE = 0.05
 """m/s; slower impacts do not rebound. Bullet's threshold is set to the same."""
 _PRESSED = 0.3

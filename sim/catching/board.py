@@ -24,9 +24,9 @@ from petrobot.sim.catching.truth import read_toml, read_truth
 CELL = Path(__file__).parents[2] / "services" / "cell.toml"
 
 PLACEMENT = 0.0003
-"""m, standard deviation of where the board really lies around the measured place."""
+"""Standard deviation of where the board really lies around the measured place (m)."""
 DIRECTION = 0.0005
-"""rad, the same for its direction."""
+"""The same for its direction (rad)."""
 LAID = (
     (0.20, -0.24, 1.6),
     (0.20, 0.20, 1.5),

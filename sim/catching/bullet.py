@@ -45,7 +45,7 @@ from petrobot.sim.catching.truth import CupTruth, TableTruth, Vector
 _ANVIL = 1000.0
 """kg, mass of the cup."""
 _HULL_MARGIN = 0.001
-"""m by which Bullet enlarges a cylinder of a URDF in all directions."""
+"""How much Bullet enlarges a cylinder of a URDF in all directions (m)."""
 Quaternion = tuple[float, float, float, float]
 _LEAST_MASS = 1e-9
 """kg, for links whose mass the publications leave out."""

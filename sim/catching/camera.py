@@ -35,7 +35,7 @@ LIGHT_DIRECTION = np.array([-0.25, 0.35, 0.90]) / np.linalg.norm([-0.25, 0.35, 0
 """Direction to the lamp, base frame."""
 _TO_LAMP: Sequence[float] = LIGHT_DIRECTION.tolist()
 BRIDGE_HEIGHT = 0.15
-"""m above the table."""
+"""Height above the table (m)."""
 BRIDGE_GREY = 40.0
 LENS_STEPS = 6
 """Steps of the fixed-point inverse of the distortion."""
@@ -56,9 +56,9 @@ class CameraView:
     distortion: Sequence[float] | None = None
     """k1 k2 p1 p2."""
     table_top: float | None = None
-    """m, height of the table top."""
+    """Height of the table top (m)."""
     near_edge: float | None = None
-    """m, x of the near edge."""
+    """x of the near edge (m)."""
     light_gradient: Sequence[float] = (-0.50, 0.10)
     """Relative change of the light from one side of the image to the other, along u and v: the far
     end is dimmer."""
@@ -351,9 +351,7 @@ class PinholeCamera:
         least, most = self._noise_range
         return math.floor(grey) + least >= 0 and math.ceil(grey) + most <= 255
 
-    def render_board(
-        self, pose: ArrayLike, board: Chessboard | None = None, light: float = 1.0
-    ) -> Picture:
+    def render_board(self, pose: ArrayLike, board: Chessboard | None = None) -> Picture:
         """Return one image of a calibration board held at `pose` (4, 4), board frame to base frame;
         nothing else in view."""
         board = board or Chessboard()
@@ -380,7 +378,7 @@ class PinholeCamera:
             picture[box] = np.where(
                 seen, np.clip(np.rint(grey), 0, 255).astype(np.uint8), picture[box]
             )
-        return self._expose(picture, light, None)
+        return self._expose(picture, 1.0, None)
 
     def _expose(self, picture: Picture, light: float, glaring: Sequence[Box] | None) -> Picture:
         """Add light and noise to the whole image; the generator chooses a window of the noise

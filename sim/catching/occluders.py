@@ -30,7 +30,7 @@ SUBPIXEL_BITS = 4
 """OpenCV draws polygons with corners in fractions of a pixel: sixteenths."""
 _SUBPIXELS = float(1 << SUBPIXEL_BITS)
 _SOFT = 2
-"""px by which a smooth edge may reach beyond its corners."""
+"""How far a smooth edge may reach beyond its corners (px)."""
 _STRETCH = 1.5
 """Factor larger than the stretch of the lens around any point in view."""
 CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 13)[:-1]) for f in (np.cos, np.sin)], axis=-1)

@@ -32,14 +32,14 @@ from petrobot.sim.catching.world import motion_on_table
 _ITERATIONS = 14
 _DAMPING = 1e-7
 _STRIDE = 0.5
-"""rad, greatest change of a joint in an iteration."""
+"""Greatest change of a joint in an iteration (rad)."""
 _WRIST_GUESSES = (0.0, 1.3, -1.3)
 """rad, turns of joint 4 (and back of joint 6) from which poses are searched until the ball is found
 reachable."""
 _NORM = 6.0
 """Exponent of the norm of travel times that approximates their maximum."""
 _PLACE = 1e-3
-"""m and rad within which a pose counts as found."""
+"""Distance and angle within which a pose counts as found (m, rad)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class OracleVerdict:
     pose: Vector | None
     """(6,) rad, the best catching pose found."""
     at: float
-    """s after release at which the ball reaches it."""
+    """When the ball reaches the pose, after its release (s)."""
 
 
 _NEVER = OracleVerdict(False, -math.inf, None, math.inf)

@@ -23,7 +23,7 @@ BULLET, PORTABLE = BACK_ENDS = ("bullet", "portable")
 PORTABLE_VERSION: Final = 2
 """Counts up whenever the portable back end gives other results."""
 TABLE_TOP: Final = 0.030
-"""m, thickness of the table top."""
+"""Thickness of the table top (m)."""
 
 
 class ArmDynamics(Protocol):

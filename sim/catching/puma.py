@@ -88,11 +88,6 @@ class ArmPlant:
         self._held(_REST)
         self._stepped(0.001, _REST, self._bias)
 
-    @property
-    def braked(self) -> tuple[bool, ...]:
-        """Which brakes are engaged."""
-        return tuple(self._braked)
-
     def brake(self, joint: int) -> None:
         """Engage the brake of a joint (0 to 5) and switch its torque off."""
         self.tau[joint] = 0.0

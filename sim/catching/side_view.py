@@ -10,7 +10,7 @@ from typing import Any
 from petrobot.sim.catching.puma_model import Frame3
 
 SCALE = 320.0
-"""px per m."""
+"""Pixels of a metre."""
 LEFT, RIGHT, TOP, BOTTOM = -0.50, 2.40, 1.32, -0.12
 """What is seen (m): to the right from LEFT to RIGHT, up from BOTTOM to TOP."""
 ASIDE, UP = 0.30, 0.22

@@ -25,7 +25,7 @@ class Throw:
 
     n: int
     delay: float
-    """s from "ready" to the release."""
+    """Time from "ready" to the release (s)."""
     speed: float
     start: BallState
     exit_y: float

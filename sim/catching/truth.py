@@ -108,7 +108,7 @@ class Truth:
     light_drift: float
     light_period: float
     image_latency: float
-    """s, in addition to the camera's own readout."""
+    """Delay in addition to the camera's own readout (s)."""
     arm_speed: float
     scatter: Scatter
     settings: Mapping[str, Any]

@@ -23,19 +23,19 @@ from petrobot.sim.catching.thrower import Throw
 from petrobot.sim.catching.truth import Truth
 
 _HAND_SPEED = 3.0
-"""m/s, faster than the arm can carry the cup."""
+"""A speed faster than the arm can carry the cup (m/s)."""
 _AHEAD = 0.005
-"""s, a little more than a tick: surfaces that can meet within it are near."""
+"""A little more than a tick (s): surfaces that can meet within it are near."""
 _GAIN = 1.0
-"""m/s, more than a falling ball gains until it must be checked again."""
+"""More speed than a falling ball gains until it must be checked again (m/s)."""
 _SETTLED = 0.05
-"""s for which a ball must lie still in an almost standing cup before it counts as at rest."""
+"""How long a ball lies still in an almost standing cup until it counts as at rest (s)."""
 _CREEP = 0.005
-"""m/s (and tenths of rad/s) up to which a cup almost stands: an arm that settles."""
+"""Speed up to which a cup almost stands (m/s, tenths of rad/s): an arm that settles."""
 _STIRRED, _TILTED = 1e-4, 2e-4
-"""m and rad by which a cup must have moved before its ball no longer counts as at rest in it."""
+"""How far a cup must move until its ball no longer counts as at rest in it (m, rad)."""
 _FLAT_SPEED = 0.02
-"""m/s of vertical speed below which a ball on the table has stopped bouncing."""
+"""Vertical speed below which a ball on the table has stopped bouncing (m/s)."""
 
 
 CupPose = Callable[[], Frame3]
@@ -408,7 +408,7 @@ class SecondBall:
 
 
 _FALLS = 0.25
-"""s in which a ball falls from the table to well below the cup."""
+"""Time in which a ball falls from the table to well below the cup (s)."""
 
 
 def motion_on_table(

@@ -36,9 +36,9 @@ _STATUSWORD, _POSITION, _VELOCITY, _TORQUE, _VOLTAGE, _MAX_SPEED, _TARGET = (
     )
 )
 _LONGEST: Final = 0.1
-"""s between two set points above which the slope limit allows no larger step."""
+"""Time between two set points above which the slope limit allows no larger step (s)."""
 _AT_REST: Final = 0.05
-"""rad/s below which a wheel counts as being at rest after a fault."""
+"""Speed below which a wheel counts as being at rest after a fault (rad/s)."""
 _TURN: Final = 2.0 * math.pi
 _HALF, _WHOLE = 1 << 31, 1 << 32
 

@@ -16,13 +16,13 @@ Square = tuple[int, int]
 """Column and row: the square reaches from 2 i to 2 i + 2 m in x and from 2 j to 2 j + 2 m in y."""
 
 SQUARE: Final = 2.0
-"""m, side of a square."""
+"""Side of a square (m)."""
 RADIUS: Final = 1.0
-"""m, radius of an arc's centre line."""
+"""Radius of an arc's centre line (m)."""
 HALF_WIDTH: Final = 0.025
-"""m, half the track's width."""
+"""Half the track's width (m)."""
 BAR_LENGTH, BAR_WIDTH = 0.50, 0.05
-"""m, of the T's crossbar."""
+"""Length and width of the T's crossbar (m)."""
 BAR_MARGIN: Final = 0.25
 """m between the crossbar and the end of its square: without paint of one colour all around, it
 would not be a T."""

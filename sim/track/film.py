@@ -29,7 +29,7 @@ Picture = NDArray[np.uint8]
 
 ROVER_FILE: Final = Path(__file__).parents[2] / "services" / "mobile" / "rover.toml"
 WIDTH: Final = 640
-"""px, greater side of the film."""
+"""Greater side of the film (px)."""
 _PATH, _ROVER, _REFLECTOR = (15, 72, 217), (230, 120, 30), (59, 212, 255)
 """Blue, green, red."""
 _PANEL: Final = (225, 225, 225)

@@ -21,16 +21,16 @@ FINE: Final = 0.005
 """m, side of a cell of the fine picture: a tenth of the track's width; edges are smoothed over one
 cell."""
 COARSE: Final = 0.010
-"""m, of the coarse picture, in which two by two cells are averaged."""
+"""Side of a cell of the coarse picture (m), in which two by two cells are averaged."""
 MARGIN: Final = 2
 """Squares around the board: what the camera sees of the hall while the rover is within 1 m of the
 board."""
 SLACK: Final = 0.4
-"""m that the rover may move before a window is copied again."""
+"""How far the rover may move before a window is copied again (m)."""
 _SIDE: Final = round(SQUARE / FINE)
 _RATIO: Final = round(COARSE / FINE)
 ORIGIN: Final = -MARGIN * SQUARE
-"""m, x and y of the outer corners of the pictures' first cells."""
+"""x and y of the outer corners of the pictures' first cells (m)."""
 
 
 class Floor:
@@ -74,7 +74,7 @@ class FloorWindow:
         self.cell = cell
         self.part = np.zeros((0, 0), np.uint8)
         self.x = self.y = math.nan
-        """m, outer corner of the part's first cell."""
+        """Outer corner of the part's first cell (m)."""
         self._half = math.ceil((reach + SLACK) / cell)
         self._middle = math.nan, math.nan
         self._version = -1

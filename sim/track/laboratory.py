@@ -248,7 +248,7 @@ def _check_speed(speed: object, rover: RoverTruth) -> None:
 
 
 _WATCH: Final = 0.02
-"""s between two looks of the referee: 1 cm at 0.5 m/s."""
+"""Time between two looks of the referee (s): 1 cm at 0.5 m/s."""
 
 
 def make_laboratory(directory: Directory, name: str) -> TrackLaboratory:

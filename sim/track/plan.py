@@ -20,7 +20,7 @@ from petrobot.sim.track.elements import (
 )
 
 WIDTH_PX: Final = 720
-"""px, width of the drawing at its natural size."""
+"""Width of the drawing at its natural size (px)."""
 PATH_COLOURS: Final = ("#d9480f", "#1c7ed6", "#2b8a3e", "#862e9c", "#c2255c", "#0b7285")
 """One colour for each run drawn; dashes also distinguish them."""
 _DASHES: Final = ("", "0.25 0.1", "0.1 0.08", "0.4 0.1 0.1 0.1", "0.02 0.08", "0.6 0.1")

@@ -19,23 +19,23 @@ from petrobot.sim.track.course import BOARD, Gap, Near, Track
 from petrobot.sim.track.elements import SQUARE, FloorPose
 
 LEFT: Final = 0.30
-"""m off the centre line at which the track counts as left."""
+"""Distance from the centre line at which the track counts as left (m)."""
 REGAINED: Final = 0.10
-"""m off the centre line within which it counts as regained."""
+"""Distance from the centre line within which the track counts as regained (m)."""
 IN_TIME: Final = 1.0
-"""m behind an interruption within which the track must be regained."""
+"""Distance behind an interruption within which the track must be regained (m)."""
 BEFORE_END, BEYOND_END, ASIDE_END = 0.10, 0.30, 0.30
-"""m before and beyond the T's far side, and to the side of it, where the rover must stop."""
+"""Where the rover must stop: before, beyond and beside the T's far side (m)."""
 STANDING: Final = 0.01
-"""m/s below which the rover counts as standing ..."""
+"""Speed below which the rover counts as standing (m/s)."""
 STANDING_FOR: Final = 0.5
-"""... for so many seconds."""
+"""How long it must be that slow to count as standing (s)."""
 DEPARTED: Final = 0.01
-"""m from where it was put down at which the clock starts."""
+"""Distance from where it was put down at which the clock starts (m)."""
 OFF_BOARD: Final = 1.0
-"""m beyond the board's edge at which a person stops the rover."""
+"""Distance beyond the board's edge at which a person stops the rover (m)."""
 ROW_PERIOD: Final = 0.2
-"""s between two rows of the path, at first."""
+"""Time between two rows of the path, at first (s)."""
 MOST_ROWS: Final = 5_000
 """Most rows of the path: the score of a rover that stands for hours fits into a message, too."""
 _BEHIND, _AHEAD = 0.6, 1.2

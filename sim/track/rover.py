@@ -17,14 +17,14 @@ from petrobot.sim.track.elements import FloorPose
 from petrobot.sim.track.truth import RoverTruth
 
 SLOT: Final = 0.02
-"""s between two draws of slip and two updates of the battery, whatever happens in between."""
+"""Time between two draws of slip and two updates of the battery (s)."""
 _DRAWN: Final = 256
 """Slips drawn at a time."""
 
 _CAUGHT_UP: Final = 1e-6
-"""rad/s from its set point at which a wheel has caught up."""
+"""Difference from its set point at which a wheel has caught up (rad/s)."""
 _STUCK: Final = 0.01
-"""rad/s below which a wheel that is to stand sticks by dry friction: 1 mm/s."""
+"""Speed below which a wheel that is to stand sticks by dry friction (rad/s): 1 mm/s."""
 
 
 class Wheel:
@@ -34,10 +34,10 @@ class Wheel:
         self.radius = radius
         self.lag = lag
         self.target = 0.0
-        """rad/s, set point of its motor."""
+        """Set point of its motor (rad/s)."""
         self.speed = 0.0
         self.angle = 0.0
-        """rad, turned since the beginning; the encoder counts this."""
+        """Angle turned since the beginning (rad); the encoder counts this."""
         self.braked = True
 
     def turn(self, dt: float, brake_lag: float) -> float:
@@ -77,7 +77,7 @@ class RoverBody:
         for wheel, true in zip(self.wheels, truth.wheels, strict=True):
             wheel.radius, wheel.lag, wheel.speed = true.radius, true.lag, 0.0
         self.speed = self.turn = 0.0
-        """m/s along the heading and rad/s of the body, averaged over the last motion."""
+        """Speed along the heading (m/s) and turn (rad/s), averaged over the last motion."""
         self._slips = np.zeros((0, 2)).tolist()
         self._slip = [0.0, 0.0]
         self._slot = self._placed = self.now
@@ -101,7 +101,7 @@ class RoverBody:
 
     @property
     def top_speed(self) -> float:
-        """rad/s that a wheel reaches with the present voltage."""
+        """Speed that a wheel reaches with the present voltage (rad/s)."""
         return self.truth.top_speed * self.voltage / self.truth.nominal_voltage
 
     def move_to(self, now: float) -> None:

@@ -38,7 +38,7 @@ class RoverTruth:
     """Left and right."""
     track_width: float
     top_speed: float
-    """rad/s of a wheel at `nominal_voltage`."""
+    """Greatest speed of a wheel at `nominal_voltage` (rad/s)."""
     nominal_voltage: float
     acceleration: float
     encoder_counts: int
@@ -58,7 +58,7 @@ class SensorTruth:
 
     forward: float
     below: float
-    """m by which the sensor is below the reflectors' centres."""
+    """How far the sensor is below the reflectors' centres (m)."""
     half_angle: float
     range: float
     fan: float

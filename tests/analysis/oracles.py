@@ -83,23 +83,20 @@ def pm4py_markings(text: str, net: Net) -> set[tuple[int, ...]]:
 
 def storm_share(text: str, label: str) -> float:
     """Return the long-run share of time in states with a label, by Storm, from a .drn text."""
+    return _storm(text, f'LRA=? [ "{label}" ]')
+
+
+def storm_time(text: str, label: str) -> float:
+    """Return the mean time (s) until a state with a label, by Storm, from a .drn text."""
+    return _storm(text, f'T=? [ F "{label}" ]')
+
+
+def _storm(text: str, asked: str) -> float:
     import stormpy  # type: ignore[import-not-found]
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "chain.drn"
         path.write_text(text, encoding="utf-8")
         model: Any = stormpy.build_model_from_drn(str(path))
-    (formula,) = stormpy.parse_properties(f'LRA=? [ "{label}" ]')
-    return float(stormpy.model_checking(model, formula).at(model.initial_states[0]))
-
-
-def storm_time(text: str, label: str) -> float:
-    """Return the mean time (s) until a state with a label, by Storm, from a .drn text."""
-    import stormpy
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "chain.drn"
-        path.write_text(text, encoding="utf-8")
-        model: Any = stormpy.build_model_from_drn(str(path))
-    (formula,) = stormpy.parse_properties(f'T=? [ F "{label}" ]')
+    (formula,) = stormpy.parse_properties(asked)
     return float(stormpy.model_checking(model, formula).at(model.initial_states[0]))

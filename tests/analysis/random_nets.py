@@ -1,13 +1,15 @@
-"""Small random nets with everything the firing rule supports, and the simplest possible state
-space."""
+"""Small random nets with everything the firing rule supports, and oracles for their state spaces
+and their chains."""
 
 from __future__ import annotations
 
 from collections import deque
 
+import numpy as np
 from hypothesis import strategies as st
 
-from petrobot.coordinator.analysis.time.gspn import Gspn
+from petrobot.coordinator.analysis.time.gspn import Chain, Gspn, Values
+from petrobot.coordinator.analysis.time.markov import Generator, poisson_weights
 from petrobot.coordinator.task.net import Marking, Net
 
 Weights = dict[str, int]
@@ -126,3 +128,20 @@ def gspns(draw: st.DrawFn, *, tokens: int = 2) -> Gspn:
         arcs[name] = ({names[a]: 1}, {names[b]: 1})
     initial = dict.fromkeys(names, 0) | {names[0]: draw(st.integers(1, tokens))}
     return Gspn.of(Net.build(initial, arcs), rates, weights=weights, servers=servers)
+
+
+def transient(chain: Chain, times: list[float]) -> Values:
+    """Return the probabilities of the markings at the given times (s), shape (times, n).
+
+    By uniformisation; vanishing markings have probability 0.
+    """
+    made = Generator.of(chain)
+    jumps = [poisson_weights(made.rate * t) for t in times]
+    out = np.zeros((len(times), chain.n))
+    p = made.start
+    for k in range(max(low + len(w) for low, w in jumps)):
+        for i, (low, weight) in enumerate(jumps):
+            if low <= k < low + len(weight):
+                out[i, made.tangible] += weight[k - low] * p
+        p = made.matrix @ p
+    return out

@@ -20,12 +20,10 @@ from petrobot.coordinator.analysis.time.markov import (
     Generator,
     long_run,
     poisson_weights,
-    transient,
 )
 from petrobot.coordinator.analysis.time.sensitivity import (
     reliability_slopes,
     reward_slopes,
-    throughput_slopes,
     time_slopes,
 )
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
@@ -33,7 +31,7 @@ from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.task.file import load
 from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import KANBAN_RATES, kanban, queue, repairman, stages
-from tests.analysis.random_nets import gspns
+from tests.analysis.random_nets import gspns, transient
 
 
 def test_a_queue_with_one_server() -> None:
@@ -237,7 +235,7 @@ def test_throughput_derivatives_against_differences(gspn: Gspn, data: st.DataObj
     more, less = (
         long_run(Chain.of(bumped(gspn, name, f), space=chain.space)) for f in (1 + step, 1 - step)
     )
-    slope = throughput_slopes(run, what)[name]
+    slope = reward_slopes(run, impulse={what: 1.0})[name]
     change = (more.throughput[what] - less.throughput[what]) / (2 * step)
     assert slope.derivative * slope.value == pytest.approx(change, rel=1e-4, abs=1e-6)
     slope = reward_slopes(run, tokens)[name]
@@ -291,7 +289,7 @@ def test_the_long_run_mixes_the_reachable_components() -> None:
     ] == pytest.approx(0.25)
     assert run.throughput["to"] == pytest.approx(0.75 * 2 / 3)
     with pytest.raises(ValueError, match="several bottom components"):
-        throughput_slopes(run, "to")
+        reward_slopes(run, impulse={"to": 1.0})
 
 
 def test_large_components_by_gauss_seidel_agree_with_elimination() -> None:
@@ -300,7 +298,7 @@ def test_large_components_by_gauss_seidel_agree_with_elimination() -> None:
     p = 0.97 ** np.arange(700.0)
     p /= p.sum()
     assert np.allclose(run.probability, p, atol=1e-12)
-    slope = throughput_slopes(run, "serve")["arrive"]
+    slope = reward_slopes(run, impulse={"serve": 1.0})["arrive"]
     more, less = (
         long_run(Chain.of(Gspn.of(queue(699), {"arrive": a, "serve": 1.0})))
         for a in (0.9701, 0.9699)

@@ -18,19 +18,18 @@ from petrobot.coordinator.analysis.net.deadlocks import (
 )
 from petrobot.coordinator.analysis.net.space import explore
 from petrobot.coordinator.analysis.net.structure import (
+    Lyapunov,
     Vector,
     conflict_sets,
     exclusive_places,
     incidence,
-    invariant_basis,
     is_strictly_conservative,
-    linear_bound,
     lyapunov,
     place_bounds,
     place_semiflows,
     transition_semiflows,
 )
-from petrobot.coordinator.task.net import Net
+from petrobot.coordinator.task.net import Marking, Net
 from tests.analysis.generators import kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets, state_machines
 
@@ -40,6 +39,28 @@ def dense(vector: Vector, size: int) -> np.ndarray:
     for i, n in vector.items():
         out[i] = n
     return out
+
+
+def linear_bound(net: Net, place: int) -> int | None:
+    """Return an upper bound of the tokens of a place by the state equation, or None if it has none.
+
+    A linear program: maximise M(p) over all M = M0 + C x >= 0 with x >= 0. The true maximum may be
+    smaller, never larger. Capacities are constraints; inhibitors and priorities are left out.
+    """
+    from scipy.optimize import linprog
+
+    C = incidence(net).astype(float)
+    start = np.array(net.initial, dtype=float)
+    limited = [p for p, limit in enumerate(net.capacity) if limit is not None]
+    room = [max(net.capacity[p] or 0, net.initial[p]) - net.initial[p] for p in limited]
+    A, b = np.vstack([-C, C[limited]]), np.concatenate([start, np.array(room, dtype=float)])
+    found = linprog(-C[place], A_ub=A, b_ub=b, method="highs")
+    # 1e-6: the solver's optimum may be a rounding error below a whole number.
+    return int(np.floor(start[place] - found.fun + 1e-6)) if found.status == 0 else None
+
+
+def weighted(function: Lyapunov, marking: Marking) -> int:
+    return sum(w * marking[p] for p, w in function.weights.items())
 
 
 @settings(max_examples=40, deadline=None)
@@ -77,17 +98,6 @@ def test_every_minimal_support_is_found(net: Net) -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(nets())
-def test_basis_spans_the_left_kernel(net: Net) -> None:
-    C = incidence(net)
-    basis = invariant_basis([{t: int(v) for t, v in enumerate(row) if v} for row in C])
-    vectors = np.array([dense(y, len(C)) for y in basis]).reshape(len(basis), len(C))
-    assert not (vectors @ C).any()
-    assert len(basis) == len(C) - np.linalg.matrix_rank(C)
-    assert len(basis) == (np.linalg.matrix_rank(vectors) if basis else 0)
-
-
-@settings(max_examples=40, deadline=None)
-@given(nets())
 def test_bounds_are_never_below_reachable_tokens(net: Net) -> None:
     found = brute_force(net, 200)
     assume(found is not None and found)
@@ -110,7 +120,7 @@ def test_a_lyapunov_function_never_grows_and_proves_boundedness(net: Net) -> Non
     )
     space = explore(net)
     assert space.complete
-    value = np.array([function.value(space.marking(i)) for i in range(len(space))])
+    value = np.array([weighted(function, space.marking(i)) for i in range(len(space))])
     drift = value[space.target] - value[space.source]
     assert (drift <= 0).all()
     assert not function.conserved or not drift.any()
@@ -137,7 +147,7 @@ def test_kanban_is_conservative() -> None:
     assert flows.complete and len(flows.vectors) == 6 and flows.covers(16)
     assert place_bounds(net, flows) == [3] * 16
     function = lyapunov(net)
-    assert function is not None and function.conserved and function.value(net.initial) == 18
+    assert function is not None and function.conserved and weighted(function, net.initial) == 18
     assert not is_strictly_conservative(philosophers(3)) and is_strictly_conservative(net)
     assert {frozenset(x.values()) for x in transition_semiflows(net).vectors} == {frozenset({1})}
 

@@ -17,7 +17,7 @@ from petrobot.coordinator.analysis.execution.chain import chain_of
 from petrobot.coordinator.analysis.execution.progress import progress_of
 from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.net.ends_net import EndsNet, ends_net
-from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
+from petrobot.coordinator.analysis.net.ordinary import OrdinaryView, contended
 from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.analysis.report import analyse
 from petrobot.coordinator.analysis.time.completion import Completion, completion
@@ -26,7 +26,7 @@ from petrobot.coordinator.analysis.time.markov import visits_before
 from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
 from petrobot.coordinator.analysis.time.measures import read_measure, value_of
 from petrobot.coordinator.analysis.time.simulate import simulate
-from petrobot.coordinator.analysis.time.stochastic import StochasticView, contended, stochastic_view
+from petrobot.coordinator.analysis.time.stochastic import StochasticView, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.analysis.time.whatif import change_task, read_change
 from petrobot.coordinator.task import (
@@ -221,7 +221,8 @@ def test_a_preempting_event_races_with_the_run() -> None:
     assert done.mean == pytest.approx(1 / (1 / 2 + 1 / 3))
     transient = (done.h > 0) & ~done.goal
     flow = visits_before(done.chain, transient)[done.chain.source] * done.chain.probability
-    hits = [done.chain.gspn.net.transition_index[case] for case in view.cases["caught"]]
+    numbers = done.chain.gspn.net.transition_index
+    hits = [numbers[case] for case, name in view.origin.items() if name == "caught"]
     assert flow[np.isin(done.chain.label, hits)].sum() == pytest.approx(2 / 5)
     assert not done.chain.space.bounds[done.chain.space.net.place_index["act.begin"]] > 1
     steady = replace(

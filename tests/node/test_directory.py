@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from petrobot.services.comm.location_file import (
-    MEMORY_CALLS,
     Directory,
     DirectoryError,
     load,
@@ -87,14 +86,14 @@ def test_a_valid_file() -> None:
         and d.where("beat") == "vision"
         and d.where("eye") == "vision"
     )
-    assert d.alternatives("find") == ("look", "look_twice") and d.alternatives("nothing") == ()
-    assert d.offers("vision") == ("look", "look_twice", *MEMORY_CALLS) and d.offers("world") == (
-        "throw",
-    )
+    assert {a.name: a.node for a in d.actions.values() if a.task == "find"} == {
+        "look": "vision",
+        "look_twice": "vision",
+    }
     assert d.devices["eye"].config == {"source": "sim"}
     assert d.actions["look"].orphan_time == 1.0 and d.actions["add"].orphan_time is None
     assert d.actions["look"].deadline == 5.0 and d.actions["look_twice"].at_once
-    assert d.local("secret") and not d.local("memory.put") and not d.local("look")
+    assert d.services["secret"].local and not d.services["memory"].local
     assert d.address("motion") == ("127.0.0.1", 7302) and d.nodes["world"].sim
     assert d.file(d.parameters["cell"]) == Path("cell/cell.toml")
 

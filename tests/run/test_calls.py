@@ -237,7 +237,7 @@ def test_runs_that_a_node_still_knows_are_acknowledged_or_stopped() -> None:
     first.say(1.0, m.Accept(WORK), done(WORK))
     bench = Bench(epoch=2)
     for step in first.steps:
-        bench.executor.relive(step.time, step)
+        bench.executor.replay(step.time, step)
     bench.link(2.0, "n1", [WORK, "m/work#7", "m/prepare", "other/work#1"])
     bench.executor.adopt(2.0)
     bench.go(2.1)

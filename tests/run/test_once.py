@@ -80,7 +80,7 @@ class World:
             self.epoch += 1
             self.bench = Bench(epoch=self.epoch)
             for step in self.journal:
-                self.bench.executor.relive(step.time, step)
+                self.bench.executor.replay(step.time, step)
             for seen in (self.bench.steps, self.bench.fired, self.bench.records):
                 seen.clear()
             self.bench.now = self.now

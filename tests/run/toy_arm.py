@@ -216,7 +216,7 @@ class Bench:
         still knows."""
         bench = Bench(on_resume=on_resume, epoch=2)
         for step in self.steps:
-            bench.executor.relive(step.time, step)
+            bench.executor.replay(step.time, step)
         bench.records.clear()
         bench.fired.clear()
         bench.now = now

@@ -61,8 +61,8 @@ EQUAL = 1e-7
 """Tolerance of our sweeps with which all measures are as precise as Storm's by default (1e-6)."""
 CAPACITY = 15
 """Largest number of tokens in one place, as given to Storm: more than any of these nets reaches."""
-NEEDS = {"numba": "numba", "snakes": "snakes", "pm4py": "pm4py", "storm": "stormpy"}
-"""Packages that the engines and the other tools need."""
+NEEDS = {"snakes": "snakes", "pm4py": "pm4py", "storm": "stormpy"}
+"""Packages that the other tools need."""
 
 
 def timed(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -190,16 +190,14 @@ def storm_jani(model: Any) -> Any:
 # Stochastic.
 
 
-def firings_ours(name: str, engine: str) -> dict[str, Any]:
-    """Simulate Kanban-2 with one of our engines."""
+def firings_ours(name: str) -> dict[str, Any]:
+    """Simulate Kanban-2 with ours."""
     import numpy as np
 
     from petrobot.coordinator.analysis.time.gspn import Gspn
     from petrobot.coordinator.analysis.time.simulate import simulate
 
-    gspn, count = Gspn.of(kanban(2), KANBAN_RATES), 10_000_000 if engine == "numba" else 1_500_000
-    if engine == "numba":
-        simulate(gspn, np.random.default_rng(1), replicas=2, horizon=5.0, engine="numba")
+    gspn = Gspn.of(kanban(2), KANBAN_RATES)
 
     def work() -> dict[str, Any]:
         seen = simulate(
@@ -207,8 +205,7 @@ def firings_ours(name: str, engine: str) -> dict[str, Any]:
             np.random.default_rng(1),
             replicas=2000,
             horizon=2500.0,
-            firings=count,
-            engine=engine,  # type: ignore[arg-type]
+            firings=1_500_000,
         )
         return {"firings": seen.firings}
 
@@ -336,7 +333,7 @@ def one(measure: str, name: str, engine: str) -> None:
 def measured(measure: str, name: str, engine: str = "") -> dict[str, Any] | None:
     """Run one measurement in a process of its own. Return None if its tool is not installed or it
     failed; both are printed."""
-    tool = NEEDS.get(measure.rpartition("-")[2]) or NEEDS.get(engine)
+    tool = NEEDS.get(measure.rpartition("-")[2])
     if tool and find_spec(tool) is None:
         print(f"{measure} {name}: {tool} is not installed, skipped")
         return None
@@ -402,12 +399,8 @@ def bench_stochastic(quick: bool) -> None:
     """Measure firings, long-run figures and completion."""
     tell("stochastic simulation of kanban-2 (ratio: how many times slower than numpy)")
     reference = None
-    for what, measure, engine in (
-        ("numpy", "firings", "numpy"),
-        ("numba", "firings", "numba"),
-        ("SNAKES token game", "firings-snakes", ""),
-    ):
-        said = measured(measure, "kanban-2", engine)
+    for what, measure in (("numpy", "firings"), ("SNAKES token game", "firings-snakes")):
+        said = measured(measure, "kanban-2")
         if said:
             reference = reference or said["firings"] / said["seconds"]
             line(what, said, "firings", reference)

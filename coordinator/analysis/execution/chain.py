@@ -261,7 +261,7 @@ class _Builder:
             raise NoEstimate(f"no estimate for {', '.join(lacking)}")
 
     def result(self, stages: int) -> ExecutionChain:
-        """Return the chain with so many phases in a duration. Raises NoEstimate and TooLarge."""
+        """Return the chain with `stages` phases in a duration. Raises NoEstimate and TooLarge."""
         self.stages = stages
         self.draws: dict[tuple[str, str], Draw] = {}
         self.number: dict[tuple[int, tuple[Clock, ...]], int] = {}

@@ -51,7 +51,6 @@ class Coverability:
     bounded: bool | None
     bounds: tuple[int | None, ...]
     reason: str
-    nodes: int
     complete: bool
     prefix: tuple[str, ...] = ()
     pump: tuple[str, ...] = ()
@@ -82,7 +81,7 @@ def coverability(
         names = ", ".join(net.places[p] for p in unproven)
         unknown = tuple(b if n not in unproven else None for n, b in enumerate(proven))
         return Coverability(
-            None, unknown, f"no bound is known of the inhibited place {names}", 0, False
+            None, unknown, f"no bound is known of the inhibited place {names}", False
         )
     plain = _complemented(net, limits, proven)
     effort = min(effort, TOKENS // len(plain.places) + 1) if plain.places else effort
@@ -91,7 +90,7 @@ def coverability(
     unbounded, ranked = tree.omega is not None, len(set(net.priority)) > 1
     if not complete and not unbounded:
         reason = f"the coverability tree exceeds {effort} nodes"
-        return Coverability(None, tuple(proven), reason, len(tree.nodes), False)
+        return Coverability(None, tuple(proven), reason, False)
     found = tree.bounds() if complete else tuple(proven)
     prefix, pump, grows = tree.witness(net)
     never = (
@@ -101,18 +100,14 @@ def coverability(
     )
     if unbounded and ranked:
         reason = "unbounded without its priorities; with them it may be bounded"
-        return Coverability(
-            None, found, reason, len(tree.nodes), complete, prefix, pump, grows, never
-        )
+        return Coverability(None, found, reason, complete, prefix, pump, grows, never)
     reason = (
         f"{', '.join(grows)} can grow without end"
         if unbounded
         else "no marking covers one of its ancestors"
     )
     exact = complete and not ranked
-    return Coverability(
-        not unbounded, found, reason, len(tree.nodes), complete, prefix, pump, grows, never, exact
-    )
+    return Coverability(not unbounded, found, reason, complete, prefix, pump, grows, never, exact)
 
 
 def _complemented(net: Net, limits: Sequence[dict[int, int]], bounds: Sequence[int | None]) -> Net:

@@ -39,9 +39,9 @@ def minimal_siphons(net: Net, effort: int = SIPHON_EFFORT) -> PlaceSets:
     return _closed_sets(net, _masks(net, "consume"), _masks(net, "produce"), effort)
 
 
-def minimal_traps(net: Net, effort: int = SIPHON_EFFORT) -> PlaceSets:
+def minimal_traps(net: Net) -> PlaceSets:
     """Return the minimal non-empty traps: the siphons of the net with all arcs reversed."""
-    return _closed_sets(net, _masks(net, "produce"), _masks(net, "consume"), effort)
+    return _closed_sets(net, _masks(net, "produce"), _masks(net, "consume"), SIPHON_EFFORT)
 
 
 def largest_trap(net: Net, within: frozenset[int]) -> frozenset[int]:
@@ -80,16 +80,14 @@ def _largest_closed(
         inside -= open_places
 
 
-def controlled_siphons(
-    net: Net, effort: int = SIPHON_EFFORT, found: PlaceSets | None = None
-) -> bool | None:
+def controlled_siphons(net: Net, found: PlaceSets | None = None) -> bool | None:
     """Return whether every minimal siphon contains an initially marked trap (Commoner's condition).
 
-    None if the effort ran out first. `found` passes minimal siphons that are already known. In a
-    net with arc weights of 1 and without inhibitors, capacities and priorities, True rules out
-    dead markings.
+    None if the search for siphons was cut short. `found` passes minimal siphons that are already
+    known. In a net with arc weights of 1 and without inhibitors, capacities and priorities, True
+    rules out dead markings.
     """
-    found = found or minimal_siphons(net, effort)
+    found = found or minimal_siphons(net)
     if any(not any(net.initial[p] for p in largest_trap(net, siphon)) for siphon in found.sets):
         return False
     return True if found.complete else None

@@ -440,7 +440,7 @@ def judged(
     Progress stays unknown here, because the execution graph judges it. Parameters as of `examine`.
     """
     if in_haste and cover is None:
-        cover = Coverability(None, (None,) * len(space.net.places), space.reason, 0, False)
+        cover = Coverability(None, (None,) * len(space.net.places), space.reason, False)
     proven, bounded, _, _ = boundedness(space, cover)
     held = n.held(space)
     seen = tuple(int(np.max(tokens, initial=0)) for tokens in held)

@@ -318,20 +318,3 @@ class Column:
             values.resize(self.length, refcheck=False)
         self.values = values.view()
         return values[: self.length]
-
-
-def joined(parts: list[NDArray[Any]], length: int) -> NDArray[Any]:
-    """Return the parts one after the other, cut to a length.
-
-    Each part is released as soon as it is copied, so the peak memory is about one copy.
-    """
-    whole = np.empty(length, dtype=parts[0].dtype)
-    at = 0
-    parts.reverse()
-    while parts:
-        part = parts.pop()
-        kept = part[: length - at]
-        whole[at : at + len(kept)] = kept
-        at += len(kept)
-    parts.append(whole)
-    return whole

@@ -5,13 +5,19 @@ Its ordinary net is `Task.net` (docs/semantics.md, section 8).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from petrobot.coordinator.analysis.net.structure import (
+    exclusive_places,
+    place_bounds,
+    place_semiflows,
+)
 from petrobot.coordinator.task import End, Kind, Task
 from petrobot.coordinator.task.conditions import Expression
 from petrobot.coordinator.task.net import Marking
@@ -89,13 +95,25 @@ class OrdinaryView:
             if p.kind is Kind.ACTION
         }
 
-    @cached_property
-    def run_starts(self) -> frozenset[str]:
-        """The transitions that take a run from the runs place."""
-        net = self.task.net
-        place = net.place_index[self.task.runs_place] if self.task.runs_place else -1
-        return frozenset(
-            name
-            for name, changes in zip(net.transitions, net.compiled.changes, strict=True)
-            if dict(changes).get(place, 0) < 0
-        )
+
+def contended(task: Task, devices: Mapping[str, str]) -> frozenset[str]:
+    """Return the devices for which runs may have to wait for each other: the place invariants
+    exclude neither that several runs of one place are active, nor that two places are marked
+    together. `devices` gives the device of each action that has one."""
+    if not devices:
+        return frozenset()
+    flat, net = task.flat, task.flat.net
+    flows = place_semiflows(net)
+    users: dict[str, list[int]] = {}
+    for place, bound in zip(flat.places.values(), place_bounds(net, flows), strict=True):
+        if place.kind is Kind.ACTION:
+            used = {devices.get(a, "") for a in task.primitive_task_of(place.name).alternatives}
+            most = place.most_active if bound is None else min(bound, place.most_active)
+            for device in used - {""}:
+                users.setdefault(device, []).extend([net.place_index[place.name]] * most)
+    never = exclusive_places(net, flows)
+    return frozenset(
+        device
+        for device, places in users.items()
+        if any(pair not in never for pair in combinations(sorted(places), 2))
+    )

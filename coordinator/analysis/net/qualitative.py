@@ -77,15 +77,6 @@ class Qualitative:
     home_states: int | None
     """Number of markings that can be reached from every reachable marking; None if unknown."""
 
-    @property
-    def dead_transitions(self) -> tuple[str, ...]:
-        """Transitions that never fire."""
-        return tuple(
-            t
-            for t, level in zip(self.space.net.transitions, self.levels, strict=True)
-            if level == 0
-        )
-
 
 def examine(
     space: Space,
@@ -101,7 +92,7 @@ def examine(
     """
     graph = Graph(len(space), space.source, space.target, space.row, rooted=True)
     if in_haste and cover is None:
-        cover = Coverability(None, (None,) * len(space.net.places), space.reason, 0, False)
+        cover = Coverability(None, (None,) * len(space.net.places), space.reason, False)
     bounds, bounded, safe, cover = boundedness(space, cover)
     dead = space.dead
     settled = space.complete or len(dead) or in_haste

@@ -103,11 +103,6 @@ class Space:
         """Number of edges found, even if the edges themselves were not kept."""
         return int(self.row[-1])
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the arrays."""
-        return self.words.nbytes + self.row.nbytes + self.target.nbytes + self.label.nbytes
-
     def marking(self, i: int) -> Marking:
         """Return marking number i."""
         return self.layout.unpack(self.layout.join_many(self.words[i : i + 1])[0])

@@ -60,9 +60,9 @@ def place_semiflows(net: Net, effort: int = EFFORT) -> Semiflows:
     return _semiflows(rows, effort)
 
 
-def transition_semiflows(net: Net, effort: int = EFFORT) -> Semiflows:
+def transition_semiflows(net: Net) -> Semiflows:
     """Return the minimal x >= 0 with C x = 0: firing counts that reproduce a marking."""
-    return _semiflows([dict(changes) for changes in net.compiled.changes], effort)
+    return _semiflows([dict(changes) for changes in net.compiled.changes], EFFORT)
 
 
 def _semiflows(rows: Sequence[Vector], effort: int) -> Semiflows:
@@ -152,27 +152,6 @@ def _minimal_supports(
     ]
 
 
-def invariant_basis(rows: Sequence[Vector]) -> list[Vector]:
-    """Return an integer basis of all combinations of the rows that give zero (any signs).
-
-    Sparse Gaussian elimination without fractions.
-    """
-    work = [(dict(row), {i: 1}) for i, row in enumerate(rows)]
-    basis, pivots = [], list[tuple[int, Vector, Vector]]()
-    for rest, y in work:
-        for column, pivot_rest, pivot_y in pivots:
-            if column in rest:
-                u, v = pivot_rest[column], -rest[column]
-                rest, y = _combined(rest, u, pivot_rest, v), _combined(y, u, pivot_y, v)
-        shared = gcd(*rest.values(), *y.values())
-        rest, y = {i: n // shared for i, n in rest.items()}, {i: n // shared for i, n in y.items()}
-        if rest:
-            pivots.append((min(rest), rest, y))
-        else:
-            basis.append(y)
-    return basis
-
-
 def place_bounds(net: Net, flows: Semiflows | None = None) -> list[int | None]:
     """Return upper bounds of the tokens by place, from P-semiflows and capacities; None if unknown.
 
@@ -207,24 +186,6 @@ def implied_places(flows: Semiflows, bounds: Sequence[int | None]) -> frozenset[
     return frozenset(place for place, _ in pivots)
 
 
-def linear_bound(net: Net, place: int) -> int | None:
-    """Return an upper bound of the tokens of a place by the state equation, or None if it has none.
-
-    A linear program: maximise M(p) over all M = M0 + C x >= 0 with x >= 0. The true maximum may be
-    smaller, never larger. Capacities are constraints; inhibitors and priorities are left out.
-    """
-    from scipy.optimize import linprog
-
-    C = incidence(net).astype(float)
-    start = np.array(net.initial, dtype=float)
-    limited = [p for p, limit in enumerate(net.capacity) if limit is not None]
-    room = [max(net.capacity[p] or 0, net.initial[p]) - net.initial[p] for p in limited]
-    A, b = np.vstack([-C, C[limited]]), np.concatenate([start, np.array(room, dtype=float)])
-    found = linprog(-C[place], A_ub=A, b_ub=b, method="highs")
-    # 1e-6: the solver's optimum may be a rounding error below a whole number.
-    return int(np.floor(start[place] - found.fun + 1e-6)) if found.status == 0 else None
-
-
 @dataclass(frozen=True, slots=True)
 class Lyapunov:
     """A linear Lyapunov function y.M of a net: y > 0 and y^T C <= 0, so no firing increases y.M.
@@ -235,10 +196,6 @@ class Lyapunov:
     weights: Vector
     conserved: bool
     """Whether y^T C = 0: the net is conservative."""
-
-    def value(self, marking: Sequence[int]) -> int:
-        """Return y.M."""
-        return sum(w * marking[p] for p, w in self.weights.items())
 
 
 def lyapunov(net: Net) -> Lyapunov | None:

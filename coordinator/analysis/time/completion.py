@@ -31,7 +31,6 @@ class Completion:
 
     chain: Chain
     goal: Mask
-    plan: SolveOrder = field(repr=False)
     h: Values = field(repr=False)
     """Probability of completing, from each marking."""
     y: Values = field(repr=False)
@@ -74,7 +73,7 @@ def completion(chain: Chain, goal: Mask) -> Completion:
         for x, b in ((h, arrive), (y, s * h), (z, 2 * s * s * h + 2 * s * _apply(chain, value, y)))
     )
     h[goal] = 1.0
-    return Completion(chain, goal, plan, h, y, z, residual)
+    return Completion(chain, goal, h, y, z, residual)
 
 
 def _apply(chain: Chain, value: Values, x: Values) -> Values:

@@ -1,4 +1,4 @@
-"""The long run of a GSPN (throughput, mean tokens, utilisation) and its transient behaviour.
+"""The long run of a GSPN (throughput, mean tokens, utilisation), and its uniformised chain.
 
 In the long run the chain stays in one of the bottom components of its graph. Seen from the initial
 marking, the long run is the mixture of their stationary vectors, weighted with the probabilities of
@@ -149,7 +149,6 @@ def visits_before(chain: Chain, transient: Any, start: Values | None = None) -> 
 class Generator:
     """The chain over tangible markings only, uniformised: P = I + Q / rate, Q its generator."""
 
-    chain: Chain
     tangible: Index
     matrix: Any
     """P transposed (sparse), so that one step is matrix @ p."""
@@ -179,7 +178,7 @@ class Generator:
         scaled = csr_array(flows / fastest)
         stay = eye_array(len(tangible), format="csr")
         stay.data = 1.0 - total / fastest
-        return cls(chain, tangible, csr_array((scaled + stay).T), fastest, start)
+        return cls(tangible, csr_array((scaled + stay).T), fastest, start)
 
 
 def _jumps(chain: Chain) -> Any:
@@ -246,15 +245,16 @@ def _without_cycles(chain: Chain, step: Any) -> Any:
     return cleaned
 
 
-def poisson_weights(mean: float, epsilon: float = 1e-13) -> tuple[int, Values]:
+def poisson_weights(mean: float) -> tuple[int, Values]:
     """Return (first k, probabilities from there on) of a Poisson distribution.
 
-    Less than `epsilon` is left out on both sides. Starting at the mode and multiplying outwards
+    Less than 1e-13 is left out on both sides. Starting at the mode and multiplying outwards
     avoids overflow and underflow of mean^k / k!. Source: B. L. Fox, P. W. Glynn, Computing Poisson
     probabilities, Commun. ACM 31 (1988).
     """
     if mean == 0:
         return 0, np.ones(1)
+    epsilon = 1e-13
     reach = ceil(sqrt(mean) * sqrt(-2 * log(epsilon)) + 10 - log(epsilon))
     low, high = max(0, int(mean) - reach), int(mean) + reach + 10
     k = np.arange(low, high + 1)
@@ -266,20 +266,3 @@ def poisson_weights(mean: float, epsilon: float = 1e-13) -> tuple[int, Values]:
     weight[k > mode], weight[k < mode] = up, down[::-1]
     total: Values = weight / weight.sum()
     return low, total
-
-
-def transient(chain: Chain, times: list[float], *, generator: Generator | None = None) -> Values:
-    """Return the probabilities of the markings at the given times (s), shape (times, n).
-
-    By uniformisation; vanishing markings have probability 0.
-    """
-    made = generator or Generator.of(chain)
-    jumps = [poisson_weights(made.rate * t) for t in times]
-    out = np.zeros((len(times), chain.n))
-    p = made.start
-    for k in range(max(low + len(w) for low, w in jumps)):
-        for i, (low, weight) in enumerate(jumps):
-            if low <= k < low + len(weight):
-                out[i, made.tangible] += weight[k - low] * p
-        p = made.matrix @ p
-    return out

@@ -14,11 +14,8 @@ of the 90 % quantile says by how much.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, exp, sqrt
-
-import numpy as np
 
 STAGES = 64
 """Default limit of the stages of one duration."""
@@ -124,28 +121,8 @@ def fit(mean: float, variance: float, *, stages: int = STAGES, shift: float = 0.
     return PhaseType((ErlangBranch(p, wanted - 1, rate), ErlangBranch(1 - p, wanted, rate)), shift)
 
 
-def fit_samples(
-    durations: Sequence[float], *, stages: int = STAGES, shifted: bool = False
-) -> tuple[PhaseType, float]:
-    """Fit measured durations (s) by mean and variance.
-
-    Return the distribution and the relative error of its 90 % quantile. With `shifted` the shortest
-    duration becomes a fixed shift, minus (mean - shortest) / n, because the shortest of n
-    observations overestimates the true minimum. Raises ValueError for fewer than two positive
-    durations.
-    """
-    sample = np.asarray(durations, dtype=float)
-    if len(sample) < 2 or sample.min() <= 0:
-        raise ValueError("expected at least two positive durations to fit a distribution")
-    mean, variance = float(sample.mean()), float(sample.var(ddof=1))
-    gap = (mean - float(sample.min())) / len(sample)
-    shift = max(0.0, float(sample.min()) - gap) if shifted else 0.0
-    fitted = fit(mean, variance, stages=stages, shift=min(shift, mean * (1 - 1e-9)))
-    return fitted, fitted.error_at_90(float(np.quantile(sample, 0.9)))
-
-
-def gamma_quantile(mean: float, variance: float, q: float = 0.9) -> float:
-    """Return the quantile (s) of the gamma distribution with this mean (s) and variance (s^2).
+def gamma_quantile(mean: float, variance: float) -> float:
+    """Return the 90 % quantile (s) of the gamma distribution with this mean (s) and variance (s^2).
 
     Declared estimates give only mean and cv; the gamma distribution is their reference.
     """
@@ -154,4 +131,4 @@ def gamma_quantile(mean: float, variance: float, q: float = 0.9) -> float:
     from scipy.special import gammaincinv
 
     shape = mean**2 / variance
-    return float(gammaincinv(shape, q)) * variance / mean
+    return float(gammaincinv(shape, 0.9)) * variance / mean

@@ -41,7 +41,6 @@ class Slope:
     branch to another changes the number by the difference of their derivatives.
     """
 
-    transition: str
     value: float
     """The rate (1/s) or weight."""
     derivative: float
@@ -56,9 +55,7 @@ def slopes_of(chain: Chain, by_edge: Values, whole: float) -> dict[str, Slope]:
     for t, name in enumerate(gspn.net.transitions):
         rate = gspn.rate[t]
         value = rate if rate is not None else gspn.weight[t]
-        out[name] = Slope(
-            name, value, float(logs[t] / value), float(logs[t] / whole) if whole else 0.0
-        )
+        out[name] = Slope(value, float(logs[t] / value), float(logs[t] / whole) if whole else 0.0)
     return out
 
 
@@ -103,11 +100,6 @@ def _flow(done: Completion) -> Values:
     visits = np.where(_transient(done), _visits(done), 0.0)
     out: Values = visits[done.chain.source] * done.chain.probability
     return out
-
-
-def throughput_slopes(run: LongRun, transition: str) -> dict[str, Slope]:
-    """Return the derivatives of the throughput of one transition (1/s), by transition."""
-    return reward_slopes(run, impulse={transition: 1.0})
 
 
 def reward_slopes(

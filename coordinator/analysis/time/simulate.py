@@ -7,10 +7,9 @@ them by one firing. The random generator is passed in; the same generator gives 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import sqrt
 from statistics import NormalDist
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from petrobot.coordinator.analysis.net.columns import concession
 from petrobot.coordinator.analysis.net.graph import Mask
 from petrobot.coordinator.analysis.net.pack import Tokens
 from petrobot.coordinator.analysis.time.gspn import Gspn, Values
-from petrobot.coordinator.task.net import Marking, Net
+from petrobot.coordinator.task.net import Marking
 
 Stop = Callable[[Tokens], Mask]
 """From tokens of shape (places, replicas) to which replicas have reached their goal, shape
@@ -106,7 +105,6 @@ class _Replicas:
         self.levels = [
             [t for t, own in enumerate(net.priority) if own == level] for level in levels
         ]
-        self.timed = np.array([r is not None for r in gspn.rate])
         self.tokens = np.repeat(np.array(net.initial, dtype=np.int64)[:, None], count, axis=1)
 
     def amounts(self) -> tuple[Values, Mask]:
@@ -152,7 +150,6 @@ def simulate(
     firings: int = 10_000_000,
     confidence: float = 0.95,
     progress: Callable[[int, float], None] | None = None,
-    engine: Literal["numpy", "numba"] = "numpy",
 ) -> Simulation:
     """Play replicas from the initial marking until `horizon` (s), or until they rest in a marking
     of `goal` or `lost`: these end, too, but without having reached the goal.
@@ -160,20 +157,11 @@ def simulate(
     All replicas together fire at most `firings` times. Throughput and mean tokens count from
     `warmup` (s) on. Without a horizon a goal is required; replicas that are dead before it count as
     not completed. `progress` is called with (firings, share of replicas still played). Ctrl-C ends
-    the simulation; its result is then marked as not complete.
-
-    The engine "numba" (an optional extra) needs a horizon and does not support goals. It draws
-    random numbers in another order, so its results differ from those of "numpy" within their
-    intervals. Raises ValueError for a missing horizon or goal, ImportError without numba.
+    the simulation; its result is then marked as not complete. Raises ValueError
+    for a missing horizon or goal.
     """
     if goal is None and not horizon < np.inf:
         raise ValueError("a simulation needs a horizon (s) or a goal")
-    if engine == "numba":
-        if goal is not None or lost is not None or not horizon < np.inf:
-            raise ValueError(
-                "the engine 'numba' plays to a horizon; take the engine 'numpy' for a goal"
-            )
-        return _compiled(gspn, random, replicas, horizon, warmup, firings, confidence, progress)
     play = _Play(gspn, random, replicas, horizon, warmup, goal, lost)
     try:
         while len(play.alive) and play.fired < firings:
@@ -183,79 +171,6 @@ def simulate(
     except KeyboardInterrupt:
         play.interrupted = True
     return play.result(confidence)
-
-
-def _compiled(
-    gspn: Gspn,
-    random: np.random.Generator,
-    replicas: int,
-    horizon: float,
-    warmup: float,
-    firings: int,
-    confidence: float,
-    progress: Callable[[int, float], None] | None,
-) -> Simulation:
-    """Play replicas one after the other with the compiled loop."""
-    from petrobot.coordinator.analysis.time.simulate_kernel import Tables, play
-    from petrobot.services.host.numba_kernels import plain
-
-    if plain(play) is play:
-        raise ImportError(
-            "the engine 'numba' needs numba: install petrobot[fast], or take the engine 'numpy'"
-        )
-    tables, initial = Tables.of(gspn), np.array(gspn.net.initial, dtype=np.int64)
-    fires = np.zeros((replicas, len(gspn.net.transitions)))
-    area = np.zeros((replicas, len(gspn.net.places)))
-    observed = np.zeros(replicas)
-    done = fired = 0
-    try:
-        while done < replicas and fired < firings:
-            more, observed[done] = play(
-                initial, tables, random, horizon, warmup, firings - fired, fires[done], area[done]
-            )
-            fired, done = fired + more, done + 1
-            if progress and done % 100 == 0:
-                progress(fired, 1 - done / replicas)
-    except KeyboardInterrupt:
-        pass
-    seen = observed > 0
-    complete = done == replicas and fired < firings
-    return _summed(
-        gspn, fires[seen].T, area[seen].T, observed[seen], fired, replicas, complete, confidence
-    )
-
-
-def _summed(
-    gspn: Gspn,
-    fires: Values,
-    area: Values,
-    observed: Values,
-    fired: int,
-    replicas: int,
-    complete: bool,
-    confidence: float,
-) -> Simulation:
-    """Return estimates from firing counts (transitions, n), areas under the tokens in token
-    seconds (places, n), and observed times in s (n,)."""
-    net = gspn.net
-    rates = fires / observed if len(observed) else np.full((len(net.transitions), 1), np.nan)
-    tokens = area / observed if len(observed) else np.full((len(net.places), 1), np.nan)
-    return Simulation(
-        replicas,
-        fired,
-        {
-            name: IntervalEstimate.of(row, confidence)
-            for name, row in zip(net.transitions, rates, strict=True)
-        },
-        {
-            name: IntervalEstimate.of(row, confidence)
-            for name, row in zip(net.places, tokens, strict=True)
-        },
-        None,
-        None,
-        np.zeros(0),
-        complete,
-    )
 
 
 class _Play:
@@ -342,25 +257,28 @@ class _Play:
         seen = self.observed > 0
         complete = not len(self.alive) and not self.interrupted
         fires, area = self.fires[:, seen], self.area[:, seen]
-        bare = _summed(
-            self.state.gspn,
-            fires,
-            area,
-            self.observed[seen],
-            self.fired,
-            self.count,
-            complete,
-            confidence,
-        )
+        gspn, observed = self.state.gspn, self.observed[seen]
+        rates = fires / observed if len(observed) else np.full((len(fires), 1), np.nan)
+        tokens = area / observed if len(observed) else np.full((len(area), 1), np.nan)
         times = np.sort(self.reached[~np.isnan(self.reached)])
         judged = self.count - len(self.alive)
-        return replace(
-            bare,
-            completed=IntervalEstimate.share(len(times), judged, confidence)
+        return Simulation(
+            self.count,
+            self.fired,
+            {
+                name: IntervalEstimate.of(row, confidence)
+                for name, row in zip(gspn.net.transitions, rates, strict=True)
+            },
+            {
+                name: IntervalEstimate.of(row, confidence)
+                for name, row in zip(gspn.net.places, tokens, strict=True)
+            },
+            IntervalEstimate.share(len(times), judged, confidence)
             if self.goal is not None and judged
             else None,
-            time=IntervalEstimate.of(times, confidence) if len(times) else None,
-            times=times,
+            IntervalEstimate.of(times, confidence) if len(times) else None,
+            times,
+            complete,
         )
 
 
@@ -379,17 +297,3 @@ def goal_by_marking(predicate: Callable[[Marking], bool]) -> Stop:
         return out
 
     return stop
-
-
-def token_game(net: Net, random: np.random.Generator, firings: int) -> tuple[list[str], Marking]:
-    """Return a random firing sequence and its last marking; enabled transitions are equally
-    likely."""
-    marking, played = net.initial, []
-    for _ in range(firings):
-        enabled = net.enabled(marking)
-        if not enabled:
-            break
-        t = enabled[int(random.integers(len(enabled)))]
-        marking = net.fire(marking, t)
-        played.append(net.transitions[t])
-    return played, marking

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from petrobot.coordinator.analysis.net.graph import Graph
-from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
+from petrobot.coordinator.analysis.net.ordinary import OrdinaryView, contended
 from petrobot.coordinator.analysis.net.structure import (
     exclusive_places,
     place_bounds,
@@ -90,29 +90,6 @@ STAGES = 8
 markings, so it is small."""
 
 Weights = dict[str, int]
-
-
-def contended(task: Task, devices: Mapping[str, str]) -> frozenset[str]:
-    """Return the devices for which runs may have to wait for each other: the place invariants
-    exclude neither that several runs of one place are active, nor that two places are marked
-    together. `devices` gives the device of each action that has one."""
-    if not devices:
-        return frozenset()
-    flat, net = task.flat, task.flat.net
-    flows = place_semiflows(net)
-    users: dict[str, list[int]] = {}
-    for place, bound in zip(flat.places.values(), place_bounds(net, flows), strict=True):
-        if place.kind is Kind.ACTION:
-            used = {devices.get(a, "") for a in task.primitive_task_of(place.name).alternatives}
-            most = place.most_active if bound is None else min(bound, place.most_active)
-            for device in used - {""}:
-                users.setdefault(device, []).extend([net.place_index[place.name]] * most)
-    never = exclusive_places(net, flows)
-    return frozenset(
-        device
-        for device, places in users.items()
-        if any(pair not in never for pair in combinations(sorted(places), 2))
-    )
 
 
 KEPT, LOST = "preempted", "lost"
@@ -283,14 +260,6 @@ class StochasticView:
             if case in self.sources:
                 out.setdefault(self.sources[case], {})[name] = None
         return {source: tuple(names) for source, names in out.items()}
-
-    @cached_property
-    def cases(self) -> dict[str, tuple[str, ...]]:
-        """By transition of the task: its cases in the GSPN."""
-        out: dict[str, list[str]] = {}
-        for case, name in self.origin.items():
-            out.setdefault(name, []).append(case)
-        return {name: tuple(cases) for name, cases in out.items()}
 
 
 def stochastic_view(
@@ -799,7 +768,7 @@ class _Derivation:
         return entries
 
     def _may_hold(self, place: str, tokens: int) -> bool:
-        """Return whether the place invariants allow so many tokens in a place."""
+        """Return whether the place invariants allow this number of tokens in a place."""
         bound = self.bounds[place]
         return bound is None or bound >= tokens
 

@@ -162,11 +162,11 @@ def mean_interval(times: Values, level: float = EQUIVALENCE) -> tuple[float, flo
     return middle - half, middle + half
 
 
-def quantile_interval(times: Values, q: float, level: float = EQUIVALENCE) -> tuple[float, float]:
+def quantile_interval(times: Values, q: float) -> tuple[float, float]:
     """Return an interval of a quantile between two order statistics, whose ranks are binomial."""
     ordered, n = np.sort(times), len(times)
-    low = int(binom.ppf((1 - level) / 2, n, q))
-    high = int(binom.ppf((1 + level) / 2, n, q)) + 1
+    low = int(binom.ppf((1 - EQUIVALENCE) / 2, n, q))
+    high = int(binom.ppf((1 + EQUIVALENCE) / 2, n, q)) + 1
     return (float(ordered[low - 1]) if low >= 1 else -math.inf), (
         float(ordered[high - 1]) if high <= n else math.inf
     )

@@ -11,8 +11,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from petrobot.coordinator.analysis.net.ordinary import contended
 from petrobot.coordinator.analysis.time.measured import is_cause
-from petrobot.coordinator.analysis.time.stochastic import contended
 from petrobot.coordinator.learning.estimate import CENSORED as CENSORED_CAUSE
 from petrobot.coordinator.learning.estimate import Tally
 from petrobot.coordinator.learning.estimates_file import (

@@ -68,7 +68,7 @@ def compare(
             f"the two campaigns have {'one' if pairs.one else 'no'} trial in common, a comparison "
             "needs two: run them with the same --seed, --block and --regime"
         )
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1)
     shares = {
         "R_goal": lambda row: row.trial is not None and row.trial.goals > 0,
         "P_complete": lambda row: row.trial is not None and row.trial.completed,
@@ -187,7 +187,7 @@ def objectives(task: Task, rows: Sequence[TrialRow], weighting: Weighting) -> di
 
 
 def objective_intervals(
-    task: Task, rows: Sequence[TrialRow], weighting: Weighting, seed: int = 1
+    task: Task, rows: Sequence[TrialRow], weighting: Weighting
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the 95 % intervals of the mean J over the primitive tasks with alternatives, and of J
     of the task: percentiles of a bootstrap over whole trials, so the dependence of R and C counts.
@@ -199,7 +199,7 @@ def objective_intervals(
     """
     if len(rows) < 2:
         return (nan, nan), (nan, nan)
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1)
     weights = random.multinomial(
         len(rows) + 4, np.full(len(rows) + 4, 1 / (len(rows) + 4)), REPLICATES
     )

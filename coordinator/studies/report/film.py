@@ -31,9 +31,9 @@ from petrobot.services.comm.lockstep.party import TICK
 Picture = NDArray[np.uint8]
 FORMATS = (".webp", ".gif", ".png")
 FLIGHT = 0.4
-"""s of a token's way to a transition and on to the next place."""
+"""Duration of a token's way to a transition and on to the next place (s)."""
 SAME = 1e-3
-"""s by which the times of two firings may differ: a journal rounds them."""
+"""Greatest difference of the times of two firings (s): a journal rounds them."""
 
 
 class NoFilmError(ValueError):

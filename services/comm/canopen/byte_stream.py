@@ -15,7 +15,6 @@ Classic CAN only.
 from __future__ import annotations
 
 import contextlib
-import errno
 import ipaddress
 import select
 import socket
@@ -38,7 +37,6 @@ ERROR: Final = 1 << 29
 ID_MASK: Final = (1 << 29) - 1
 BACKLOG: Final = 256 * 1024
 _HEAD: Final = struct.Struct(">IB")
-_GONE: Final = (errno.ECONNRESET, errno.EPIPE, errno.ENOTCONN, errno.EBADF)
 
 
 class StreamFormatError(ConnectionError):

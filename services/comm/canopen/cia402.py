@@ -86,9 +86,6 @@ class OperationMode(IntEnum):
         return 1 << (self.value - 1)
 
 
-SUPPORTED_MODES: Final = OperationMode.CYCLIC_SYNCHRONOUS_POSITION.bit
-"""Object 6502h of a drive that supports only cyclic synchronous position mode."""
-
 DEVICE_TYPE: Final = 0x0002_0192
 """Object 1000h of a servo drive (profile 402)."""
 

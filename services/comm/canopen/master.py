@@ -47,8 +47,7 @@ heartbeat (0.25 s at most here) and stop quickly (0.8 s at most), then their bra
 SETTLE: Final = 0.05
 """Time that nodes get after a reset of their communication (s)."""
 
-_U8, _U16, _U32, _I8 = (
-    DataType.UNSIGNED8,
+_U16, _U32, _I8 = (
     DataType.UNSIGNED16,
     DataType.UNSIGNED32,
     DataType.INTEGER8,
@@ -87,7 +86,7 @@ class Supervision:
     meanwhile."""
 
     silent_cycles: int
-    """A drive counts as lost after so many cycles without its TPDO."""
+    """Cycles without its TPDO after which a drive counts as lost."""
     patience: float
     """A node counts as lost after so long without a heartbeat (s)."""
     old_emergencies: bool = False

@@ -187,19 +187,6 @@ class Directory:
         except DirectoryError:
             return endpoint
 
-    def offers(self, node: str) -> tuple[str, ...]:
-        """Return the names of all actions and services that a node offers."""
-        actions = [a.name for a in self.actions.values() if a.node == node]
-        for service in self.services.values():
-            if service.node == node:
-                actions += MEMORY_CALLS if service.name == MEMORY else [service.name]
-        return tuple(actions)
-
-    def alternatives(self, task: str) -> tuple[str, ...]:
-        """Return the primitive actions that implement a primitive task, in the order of the
-        file."""
-        return tuple(a.name for a in self.actions.values() if a.task == task)
-
     def without_actions(self, node: str) -> frozenset[str]:
         """Return the devices of a node that no action uses: a button, a light barrier."""
         used = {action.device for action in self.actions.values()}
@@ -223,11 +210,6 @@ class Directory:
     def laboratory(self) -> str:
         """Return the simulated node, empty when there is none."""
         return next((n.name for n in self.nodes.values() if n.sim), "")
-
-    def local(self, service: str) -> bool:
-        """Return whether only callers of the same host may call this service."""
-        key = MEMORY if service in MEMORY_CALLS else service
-        return key in self.services and self.services[key].local
 
     def file(self, path: str) -> Path:
         """Return a path from services.toml, relative to it. A file that is missing there but comes

@@ -41,7 +41,7 @@ from petrobot.services.comm.protocol.wire import (
 )
 
 STALE_AFTER: Final = 3
-"""A set point is too old after so many periods."""
+"""Age of a set point from which it is too old (periods)."""
 
 _OPEN: Final = ConnectionState.OPEN  # looked up once: members of an Enum class are slow to find
 _DRIFT: Final = 1e-4
