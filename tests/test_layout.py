@@ -420,6 +420,7 @@ def test_every_mutation_still_finds_its_text() -> None:
         ("services.worker.process", ("numpy", "scipy", "asyncio")),
         ("services.__main__", ("numpy", "scipy")),
         ("coordinator.operator.prepare", ("scipy", "aiohttp", "rich")),
+        ("coordinator.operator.start_from", ("numpy", "scipy", "aiohttp", "rich")),
         ("coordinator.studies.report.campaign_page", ("scipy",)),
         ("coordinator.cli", ("numpy", "scipy", "asyncio", "rich", "aiohttp")),
     ],
