@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from tools.proof.mutations import MUTATIONS
+from tools.proof.mutations import COPIED, MUTATIONS
 
 pytestmark = pytest.mark.once
 
@@ -401,6 +401,13 @@ def test_every_test_asserts_something() -> None:
 def test_the_rule_of_assertions_tells_functions_apart(source: str, asserting: bool) -> None:
     """What the rule above takes for an assertion."""
     assert asserts(ast.parse(source)) is asserting
+
+
+def test_mutations_are_judged_in_a_copy_of_all_that_tests_read() -> None:
+    """Else tests fail there for want of a folder, and every fault counts as noticed."""
+    texts = [path.read_text(encoding="utf-8") for path in TESTS]
+    read = {name for text in texts for name in re.findall(r'\bROOT / "([\w.]+)"', text)}
+    assert {name for name in read if (ROOT / name).exists()} <= set(COPIED)
 
 
 def test_every_mutation_still_finds_its_text() -> None:
