@@ -55,7 +55,7 @@ RAISED = [
 
 def with_constructors() -> set[str]:
     """Return the exception classes of the package whose `__init__` is their own."""
-    classes = [n for *_, tree in parsed() for n in ast.walk(tree) if isinstance(n, ast.ClassDef)]
+    classes = [n for *_, nodes in parsed() for n in nodes if isinstance(n, ast.ClassDef)]
     errors = {name for name, one in vars(builtins).items() if isinstance(one, type)}
     errors = {name for name in errors if issubclass(getattr(builtins, name), BaseException)}
     while new := {c.name for c in classes if errors & {ast.unparse(b) for b in c.bases}} - errors:

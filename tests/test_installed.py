@@ -33,8 +33,6 @@ COMMANDS = [
     for line in block.splitlines()
     if line.startswith(("petrobot ", "cd "))
 ]
-STAY = ("petrobot up", "petrobot serve --up")
-"""Commands that run until Ctrl-C."""
 ENDS = {"petrobot resume last": (0, 1)}
 """Exit codes where they are not 0 alone: `resume` of a finished run repeats how it ended."""
 FOREIGN = 'raise ImportError("the wrong package was imported")\n'
@@ -113,22 +111,25 @@ def test_every_command_of_the_readme(installed: Installed) -> None:
     _try(installed, COMMANDS[0])
     services_file(installed.folder)  # from now on on ports that no other test uses
     user = replace(installed)
-    with _staying(installed, "petrobot up"):
-        limit = Limit("the nodes")
-        while installed.run("petrobot nodes").returncode and limit.left():
-            time.sleep(0.2)
-        _try(installed, "petrobot run catch_ball --runs 1 --no-page --quiet")
-        for command in COMMANDS[1:]:
-            if command.startswith("cd "):
-                user.folder = (user.folder / command.removeprefix("cd ")).resolve()
-                if user.folder != installed.folder:
-                    on_free_port(user.folder)
-            elif command not in STAY:
-                _try(user, command)
-    with _staying(installed, "petrobot serve --up") as page:
-        limit = Limit("the page")
-        while "http://" not in page.read_text(encoding="utf-8") and limit.left():
-            time.sleep(0.1)
+    for command in COMMANDS[1:]:
+        if command.startswith("cd "):
+            user.folder = (user.folder / command.removeprefix("cd ")).resolve()
+            if user.folder != installed.folder:
+                on_free_port(user.folder)
+        elif command == "petrobot up":
+            with _staying(installed, command):
+                limit = Limit("the nodes")
+                while installed.run("petrobot nodes").returncode and limit.left():
+                    time.sleep(0.2)
+                _try(installed, "petrobot nodes")
+                _try(installed, "petrobot run catch_ball --runs 1 --no-page --quiet")
+        elif command == "petrobot serve --up":
+            with _staying(installed, command) as page:
+                limit = Limit("the page")
+                while "http://" not in page.read_text(encoding="utf-8") and limit.left():
+                    time.sleep(0.1)
+        elif command != "petrobot nodes":  # tried while they were up
+            _try(user, command)
 
 
 def _try(installed: Installed, command: str) -> None:

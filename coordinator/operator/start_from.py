@@ -27,7 +27,6 @@ from petrobot.coordinator.engine import (
     to_plain,
 )
 from petrobot.coordinator.launch import Setting
-from petrobot.coordinator.learning.session import fixed_by_user, session_of
 from petrobot.coordinator.operator.history import task_of
 from petrobot.coordinator.run.folder import still_there
 from petrobot.coordinator.run.interfaces import FirstAlternative, Observer
@@ -153,6 +152,9 @@ def departing(
     EstimatesError.
     """
     then = journal.header
+    # Here, because it imports numpy: `petrobot log` reads a run and starts none.
+    from petrobot.coordinator.learning.session import fixed_by_user, session_of
+
     session = session_of(task, then)
     if session is not None:
         _bring(session.selector, journal, engine, departure.record)

@@ -13,8 +13,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-import numpy as np
-
 from petrobot.coordinator.engine import Engine, Mode
 from petrobot.coordinator.engine.instructions import (
     CancelRun,
@@ -257,6 +255,8 @@ class Executor:
                 choose.key,
                 *self.selector.choose(choose.of, choose.key, offered, self.state.variables),
             )
+        import numpy as np  # here, because most commands import this module and draw nothing
+
         draw = np.random.default_rng([self.seed, *choose.key.encode()]).random() * sum(
             choose.weights
         )

@@ -202,8 +202,8 @@ def nobody_listens(port: int) -> Iterator[None]:
 
 
 @pytest_asyncio.fixture(scope="session", loop_scope="session")
-async def browser() -> AsyncIterator[Browser]:
-    """Headless Chromium, one for all tests; each test closes its windows."""
+async def _chromium() -> AsyncIterator[Browser]:
+    """Headless Chromium, one for all tests."""
     if browser_missing():
         pytest.fail(browser_missing())
     from playwright.async_api import async_playwright
@@ -215,8 +215,9 @@ async def browser() -> AsyncIterator[Browser]:
 
 
 @pytest_asyncio.fixture(loop_scope="session")
-async def _windows_are_closed(browser: Browser) -> AsyncIterator[None]:
-    """Close all windows, so that none of them paints during the next test."""
-    yield
-    for context in browser.contexts:
+async def browser(_chromium: Browser) -> AsyncIterator[Browser]:
+    """The browser. Its windows are closed after each test: one that is left open paints during all
+    later tests of this process."""
+    yield _chromium
+    for context in _chromium.contexts:
         await context.close()

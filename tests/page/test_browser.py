@@ -51,8 +51,6 @@ from tests.page.steps import (
     take_controls,
 )
 
-pytestmark = pytest.mark.usefixtures("_windows_are_closed")
-
 
 async def test_a_new_user_draws_runs_and_understands(
     browser: Browser, page: Page, stage: Stage, shots: Path, faults: Watch

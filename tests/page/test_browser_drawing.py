@@ -31,8 +31,6 @@ from tests.page.steps import (
     settled,
 )
 
-pytestmark = pytest.mark.usefixtures("_windows_are_closed")
-
 
 async def test_drawing_by_keyboard_alone(browser: Browser, page: Page, faults: Watch) -> None:
     """Places, transitions, arcs, names, undo and redo, copy, move and delete work without a mouse,

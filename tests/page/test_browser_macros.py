@@ -22,7 +22,6 @@ from playwright.async_api import Page as Tab
 
 from tests.page.steps import element, hold_controls, opened
 
-pytestmark = pytest.mark.usefixtures("_windows_are_closed")
 NET = "Task net"
 BRANCH = ("pick_failed", "put_failed", "cleared", "stuck")
 

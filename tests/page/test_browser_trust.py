@@ -24,7 +24,6 @@ from playwright.async_api import Page as Tab
 
 from tests.page.steps import SIZE, Watch, element, opened, start_mission
 
-pytestmark = pytest.mark.usefixtures("_windows_are_closed")
 Mangle = Callable[[str], str | bytes]
 
 

@@ -37,7 +37,6 @@ from playwright.async_api import Page as Tab
 
 from tests.page.steps import element, settled
 
-pytestmark = pytest.mark.usefixtures("_windows_are_closed")
 DRAWING = "Drawing of the task"
 SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks" / "catch_ball.toml"
 expect.set_options(timeout=PATIENCE_MS)

@@ -3,7 +3,6 @@ package runs without PyBullet, and that records of two back ends are never mixed
 
 from __future__ import annotations
 
-import ast
 import json
 import subprocess
 import sys
@@ -23,6 +22,7 @@ from petrobot.sim.catching.laboratory import make_laboratory
 from petrobot.sim.catching.physics import BULLET, PORTABLE, PORTABLE_VERSION, choose, version
 from petrobot.sim.catching.truth import LABORATORY_FILE, LaboratoryError
 from tests.sim.conftest import needs_bullet
+from tests.test_layout import imports, parsed
 
 ROOT = Path(__file__).parents[2]
 NOW = f"portable {PORTABLE_VERSION}"
@@ -110,20 +110,12 @@ def test_old_records_count_as_bullets() -> None:
 
 
 def test_only_one_module_imports_pybullet() -> None:
-    found = []
-    for folder in ("coordinator", "services", "sim"):
-        for file in sorted((ROOT / folder).rglob("*.py")):
-            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-                names = (
-                    [alias.name for alias in node.names]
-                    if isinstance(node, ast.Import)
-                    else [str(node.module), *(alias.name for alias in node.names)]
-                    if isinstance(node, ast.ImportFrom)
-                    else []
-                )
-                if any(name.startswith("pybullet") for name in names):
-                    found.append(str(file.relative_to(ROOT)))
-    assert found == ["sim/catching/bullet.py"]
+    found = [
+        name
+        for name, path, nodes in parsed()
+        if any(target.startswith("pybullet") for _, target in imports(name, path, nodes))
+    ]
+    assert found == ["sim.catching.bullet"]
 
 
 @pytest.mark.processes

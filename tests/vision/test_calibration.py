@@ -3,7 +3,9 @@ alone; files and command."""
 
 from __future__ import annotations
 
+from contextlib import redirect_stdout
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +33,7 @@ from petrobot.services.vision.calibration_file import (
     read_views,
 )
 from petrobot.services.vision.optics import Array, Optics
-from petrobot.sim.catching.board import HELD, LAID, board_views, save_board_views
+from petrobot.sim.catching.board import HELD, LAID, board_views
 from petrobot.sim.catching.camera import PinholeCamera
 from tests.vision.bench import nominal_optics
 from tests.vision.test_optics import drawn_optics
@@ -51,13 +53,14 @@ def table_error(found: Optics, camera: PinholeCamera | Optics) -> Array:
 
 
 @pytest.fixture(scope="module")
-def folder(
-    cell: dict[str, Any], pinhole: PinholeCamera, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    """Take board images with the simulated camera, as an operator would."""
-    pinhole.reseed(np.random.default_rng(21))
-    place = tmp_path_factory.mktemp("views")
-    save_board_views(place, cell, pinhole, np.random.default_rng(22))
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Take board images with the simulated camera, as an operator would, and calibrate from them
+    (`made.toml`)."""
+    place = tmp_path_factory.mktemp("views") / "views"
+    made = place.with_name("made.toml")
+    with redirect_stdout(StringIO()) as said:
+        assert main(["calibrate", "--views", str(place), "--simulated", "--output", str(made)]) == 0
+    assert "board seen whole in" in said.getvalue() and str(made) in said.getvalue()
     return place
 
 
@@ -67,8 +70,9 @@ def views(folder: Path) -> Views:
 
 
 @pytest.fixture(scope="module")
-def found(views: Views) -> Calibration:
-    return calibrate(views, Board())
+def found(folder: Path) -> Calibration:
+    made = folder.with_name("made.toml")
+    return parse_calibration(made.read_text(encoding="utf-8"), made.name)
 
 
 def test_rendered_boards_give_the_true_camera(
@@ -185,7 +189,9 @@ def test_corners_come_in_the_boards_order_whichever_way_it_lies(pinhole: Pinhole
         assert np.abs(corners - wanted).max() < 1.0
 
 
-def test_file_round_trip(found: Calibration) -> None:
+def test_file_round_trip(cell: dict[str, Any]) -> None:
+    corners, poses = synthetic_corners(drawn_optics(cell, 0), np.random.default_rng(0), 0.1, 0.001)
+    found = adjust(corners, poses, Board(), (640, 480))
     again = parse_calibration(calibration_text(found), "calibration.toml")
     assert np.allclose(again.optics.rotation, found.optics.rotation, atol=1e-9)
     assert again.optics.focal == pytest.approx(found.optics.focal, abs=1e-8)
@@ -298,30 +304,28 @@ def test_measured_places_differ_from_true_ones(
 
 
 def test_shipped_calibration_is_what_the_command_makes(
-    tmp_path: Path, pinhole: PinholeCamera, capsys: pytest.CaptureFixture[str]
+    found: Calibration, pinhole: PinholeCamera
 ) -> None:
-    """`--simulated` takes all images first and then calibrates; it never overwrites an existing
-    file. The shipped file was made in this way while the accuracies of corners and places were
-    still constants; it stays, as all recorded runs in lock step used it."""
+    """`--simulated` takes all images first and then calibrates. The shipped file was made in this
+    way while the accuracies of corners and places were still constants; it stays, as all recorded
+    runs in lock step used it."""
+    shipped = parse_calibration(DEFAULT.read_text(encoding="utf-8"), DEFAULT.name)
+    apart = table_error(found.optics, shipped.optics)
+    assert float(np.sqrt(np.mean(apart**2))) < found.table_sigma
+    assert table_error(found.optics, pinhole).max() < 1e-3
+
+
+def test_the_command_overwrites_nothing(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     views, made = tmp_path / "views", tmp_path / "made.toml"
     told = ["calibrate", "--views", str(views), "--simulated", "--output", str(made)]
     assert main([*told, "--source", "capture:0"]) == 2
     assert "leave one out" in capsys.readouterr().err and not views.exists()
-    assert main(told) == 0
-    found, shipped = (
-        parse_calibration(f.read_text(encoding="utf-8"), f.name) for f in (made, DEFAULT)
-    )
-    apart = table_error(found.optics, shipped.optics)
-    assert float(np.sqrt(np.mean(apart**2))) < found.table_sigma
-    assert table_error(found.optics, pinhole).max() < 1e-3
-    said = capsys.readouterr().out
-    assert "board seen whole in" in said and str(made) in said
-    assert main(told) == 2
-    assert f"{views} is not empty" in capsys.readouterr().err
-    assert (
-        main(["calibrate", "--views", str(views), "--output", str(tmp_path / "nowhere" / "c.toml")])
-        == 2
-    )
+    assert main(["calibrate", "--views", str(folder), "--simulated", "--output", str(made)]) == 2
+    assert f"{folder} is not empty" in capsys.readouterr().err and not made.exists()
+    nowhere = ["--output", str(tmp_path / "nowhere" / "c.toml")]
+    assert main(["calibrate", "--views", str(folder), *nowhere]) == 2
     assert "nowhere/c.toml: folder" in capsys.readouterr().err
 
 

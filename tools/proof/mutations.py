@@ -26,7 +26,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 COPIED = (
-    *("coordinator", "services", "sim", "src", "tests", "tools", "docs"),
+    *("coordinator", "services", "sim", "src", "tests", "tools", "docs", "examples", "experiments"),
     *("pyproject.toml", "services.toml", "README.md", "CHANGELOG.md", "LICENSE"),
     *("Makefile", "constraints.txt"),
 )

@@ -12,21 +12,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from operator import itemgetter
-from typing import Any, get_args
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any, get_args
 
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.lockstep.party import TICK, Envelope, Party, Posted
 from petrobot.services.comm.protocol.codec import decode, encode
 from petrobot.services.comm.protocol.messages import Message
-from petrobot.services.comm.protocol.plain import SCALARS, NotPlainError, copy_array, plain
+from petrobot.services.comm.protocol.plain import (
+    SCALARS,
+    NotPlainError,
+    copy_array,
+    is_numpy,
+    plain,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 _MESSAGES = frozenset(get_args(Message))
 _FLAT = frozenset((float, int, str, bytes, bool))
 _FRAMES = frozenset((Frame,))
-_DTYPES = (np.dtype("u1"), np.dtype("<f8"))
+_DTYPES = ("|u1", "<f8")
 _MOST_DIMENSIONS = 4
 _ORDER = itemgetter(0, 1, 2)
 
@@ -87,7 +93,7 @@ def as_received(channel: str, body: Any) -> Any:
         return body
     elif kind in _MESSAGES:
         return decode(encode(body))
-    if isinstance(body, np.ndarray):
+    if is_numpy(body, "ndarray"):
         return body if _frozen(body) else copy_array(body)
     if isinstance(body, (tuple, list)):
         return tuple(as_received(channel, item) for item in body)
@@ -103,7 +109,7 @@ def _frozen(array: NDArray[Any]) -> bool:
     no party can change it."""
     flags = array.flags
     locked = not flags.writeable and flags.owndata and flags.c_contiguous
-    return locked and array.dtype in _DTYPES and array.ndim <= _MOST_DIMENSIONS
+    return locked and array.dtype.str in _DTYPES and array.ndim <= _MOST_DIMENSIONS
 
 
 class LocalParties:
