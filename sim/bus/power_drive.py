@@ -265,7 +265,8 @@ class DriveBus(Generic[AnyDrive]):
         frames: list[Frame] = []
         for node in self._nodes:
             if node.outbox:
-                frames += node.drain()
+                frames += node.outbox
+                node.outbox.clear()
         return frames
 
     def power(self, closed: bool) -> None:
