@@ -106,8 +106,8 @@ class CoordinatorParty:
             if now >= caller.soonest:
                 caller.advance(now)
                 caller.due()  # keeps `soonest` up to date
-            if notices := caller.notices():
-                mission.take(now, node, notices)
+            if caller.has_news:
+                mission.take(now, node, caller.notices())
         if self._waiting.since is not None and now >= self._waiting.since + self._patience:
             self._give_up(now)
         mission.advance(now)

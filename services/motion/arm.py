@@ -153,7 +153,7 @@ class Arm(Driver):
         self._paused = False
         self._leased_until = 0.0
         self._after_stop = ""
-        self._commanded: deque[Sequence[float]] = deque(maxlen=LAG_CYCLES + 1)
+        self._commanded: deque[tuple[float, ...]] = deque(maxlen=LAG_CYCLES + 1)
         self._off_path = 0.0
         self._measured = [0.0] * JOINTS
         self._measured_speed = [0.0] * JOINTS
@@ -424,20 +424,8 @@ class Arm(Driver):
         """
         if self._mode == "off" or not self._commanded:
             return 0.0
-        least, before, measured = math.inf, None, self._measured
-        for q in self._commanded:
-            if q is before:  # The arm stands: the same tuple was commanded again.
-                continue
-            before, farthest = q, 0.0
-            for a, b in zip(q, measured, strict=True):
-                off = a - b if a > b else b - a
-                if off > farthest:
-                    farthest = off
-                    if off >= least:  # Usually the first joint decides.
-                        break
-            else:
-                least = farthest
-        return least
+        # A set, since an arm that stands is commanded to the same pose again and again.
+        return min(map(self._off_by, set(self._commanded)))
 
     def _lost(self) -> bool:
         """Return whether the measured joints are too far from every pose of that path; usually the

@@ -94,8 +94,10 @@ class JointDriveLink:
         self.max_speed = 0.0
         self.error_code = 0
         self.controlword = 0
-        self._asked = 0.2 * node  # Spread the reads of the six drives.
-        self._reading = False
+        self.asked = 0.2 * node  # Spread the reads of the six drives.
+        """When its greatest speed was read last (s)."""
+        self.reading = False
+        """Whether that is being read."""
         self._taken = b""
         self._rpdo = canopen.RPDO1_BASE + node
         self._sent: tuple[int, float, Frame] | None = None
@@ -130,19 +132,19 @@ class JointDriveLink:
             self.max_speed = from_units(self.sdo.results[ObjectIndex.MAX_SPEED, 0])
         return wrong
 
-    def ask_speed(self, now: float, hurry: bool) -> list[Frame]:
-        """Read the drive's greatest speed again when it is due, more often in a hurry: drives may
-        slow down by themselves."""
-        if self._reading:
+    def ask_speed(self, now: float, poll: float) -> list[Frame]:
+        """Read the drive's greatest speed again `poll` s after the last time: drives may slow down
+        by themselves."""
+        if self.reading:
             if self.sdo.busy:
                 return self.sdo.advance(now)
-            self._reading = False
+            self.reading = False
             self.max_speed = from_units(
                 self.sdo.results.get((ObjectIndex.MAX_SPEED, 0), to_units(self.max_speed))
             )
-        if now - self._asked < (LIMITED_POLL if hurry else SPEED_POLL):
+        if now - self.asked < poll:
             return []
-        self._asked, self._reading = now, True
+        self.asked, self.reading = now, True
         self.sdo.begin([Transfer(ObjectIndex.MAX_SPEED, 0, _U32)])
         return self.sdo.advance(now)
 
@@ -168,23 +170,21 @@ class JointDriveLink:
     def frame(self, target: float, wanted: bool, resetting: bool) -> Frame:
         """Return the RPDO: the controlword that leads to the state that the master wants, and the
         target position (rad)."""
-        if wanted and self.state is DriveState.OPERATION_ENABLED:
+        if wanted and self.state is _ENABLED:
             self._power.stopping = 0
-            self.controlword = _GO_ON
+            word = _GO_ON
         else:
-            self.controlword = self._power.word(self.state, wanted, resetting)
-        return self._frame(self.controlword, target)
-
-    def _frame(self, controlword: int, target: float) -> Frame:
-        """Return the RPDO; the same object as before while neither value has changed."""
-        sent = self._sent
-        if sent is None or target != sent[1] or controlword != sent[0]:
-            frame = Frame(self._rpdo, _RPDO.pack(controlword, to_units(target)))
-            self._sent = sent = controlword, target, frame
-        return sent[2]
+            word = self._power.word(self.state, wanted, resetting)
+        self.controlword, sent = word, self._sent
+        if sent is not None and target == sent[1] and word == sent[0]:
+            return sent[2]  # the same object while neither value has changed
+        frame = Frame(self._rpdo, _RPDO.pack(word, to_units(target)))
+        self._sent = word, target, frame
+        return frame
 
 
-_GO_ON: Final = ENABLING[DriveState.OPERATION_ENABLED].word
+_ENABLED: Final = DriveState.OPERATION_ENABLED
+_GO_ON: Final = ENABLING[_ENABLED].word
 """Controlword for a drive that follows its set points."""
 
 
@@ -248,11 +248,10 @@ class DriveMaster(CanopenMaster[JointDriveLink]):
         targets = self.positions if self._dry_run else targets
         frames = super().advance(now, targets)
         if not configuring:
-            hurry = self.limited
+            poll = LIMITED_POLL if self.limited else SPEED_POLL
             for drive in self.drives:
-                asked = drive.ask_speed(now, hurry)
-                if asked:
-                    frames += asked
+                if drive.reading or now - drive.asked >= poll:
+                    frames += drive.ask_speed(now, poll)
         return frames
 
     def _take_inputs(self, data: bytes) -> None:

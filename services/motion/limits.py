@@ -64,10 +64,10 @@ def within(q: Six, lower: Six, upper: Six) -> bool:
 
 
 @kernel
-def ball_clear(x: float, z: float, radius: float, solids: Solids) -> bool:
+def ball_clear(x: float, z: float, radius: float, ahead: float, above: float, floor: float) -> bool:
     """Return whether a sphere on the forearm is clear of table and floor."""
-    ahead, _, above, _, floor, _, _, _ = solids
-    return (x + radius <= ahead or z - radius >= above) and z - radius >= floor
+    low = z - radius
+    return (x + radius <= ahead or low >= above) and low >= floor
 
 
 @kernel
@@ -76,12 +76,13 @@ def forearm_clear(elbow: Point, wrist: Point, radii: Radii, solids: Solids) -> b
     floor and pedestal."""
     thick, hand = radii
     (ex, _, ez), (x, y, z) = elbow, wrist
-    _, _, _, _, _, pedestal, beside, _ = solids
+    ahead, _, above, _, floor, pedestal, beside, _ = solids
+    along, up = x - ex, z - ez
     return (
-        ball_clear(ex, ez, thick, solids)
-        and ball_clear(ex + 0.5 * (x - ex), ez + 0.5 * (z - ez), thick, solids)
-        and ball_clear(ex + 0.75 * (x - ex), ez + 0.75 * (z - ez), thick, solids)
-        and ball_clear(x, z, hand, solids)
+        ball_clear(ex, ez, thick, ahead, above, floor)
+        and ball_clear(ex + 0.5 * along, ez + 0.5 * up, thick, ahead, above, floor)
+        and ball_clear(ex + 0.75 * along, ez + 0.75 * up, thick, ahead, above, floor)
+        and ball_clear(x, z, hand, ahead, above, floor)
         and (z >= pedestal or x * x + y * y >= beside * beside)
     )
 

@@ -283,24 +283,21 @@ class LockstepNode:
 
     def receive(self, now: float, envelope: Envelope) -> None:
         """Take an envelope that is due. Raises CellError if code that is called hangs."""
-        self._guarded(lambda: self._receive(now, envelope))
-
-    def _receive(self, now: float, envelope: Envelope) -> None:
         self._now = now
         if envelope.channel == "call":
             self._heard = True
-            self._receive_message(now, envelope, envelope.body)
-        elif envelope.target in self._ports:
+            self._guarded(self._receive_message, now, envelope, envelope.body)
+        elif envelope.target in self._ports:  # A port only keeps it: no code of users is called.
             self._ports[envelope.target].receive(envelope)
 
     def advance(self, now: float) -> None:
         """Do all that is due. Raises CellError if code that is called hangs."""
-        self._guarded(lambda: self._advance(now))
+        self._guarded(self._advance, now)
 
-    def _guarded(self, step: Callable[[], None]) -> None:
+    def _guarded(self, step: Callable[..., None], *arguments: Any) -> None:
         self._watchdog.begin()
         try:
-            step()
+            step(*arguments)
         except Hung as fault:  # in a driver or a service; an action would have ended its own run
             raise CellError(f"node {self.name}: {describe(fault)}") from fault
         finally:

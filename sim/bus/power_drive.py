@@ -243,7 +243,7 @@ class DriveBus(Generic[AnyDrive]):
         """Process one frame of the master."""
         cob_id = frame.id
         target = self._own.get(cob_id & 0x7F)
-        if target is not None and target.rpdo.cob_id == cob_id and target.rpdo.on:
+        if target is not None and (rpdo := target.rpdo).cob_id == cob_id and rpdo.on:
             target.take_rpdo(now, frame.data)
         elif cob_id == SYNC_ID:
             self._sync(now)
@@ -265,7 +265,8 @@ class DriveBus(Generic[AnyDrive]):
         frames: list[Frame] = []
         for node in self._nodes:
             if node.outbox:
-                frames += node.drain()
+                frames += node.outbox
+                node.outbox.clear()
         return frames
 
     def power(self, closed: bool) -> None:

@@ -57,29 +57,24 @@ def held(drive: Six, bias: Six, hold: Six) -> bool:
 
 
 @kernel
-def _row(row: Six, t: Six) -> float:
-    return (
-        row[0] * t[0]
-        + row[1] * t[1]
-        + row[2] * t[2]
-        + row[3] * t[3]
-        + row[4] * t[4]
-        + row[5] * t[5]
-    )
-
-
-@kernel
 def pushed(dt: float, speed: Six, inverse: Matrix, t: Six) -> Six:
     """Return the speeds (rad/s) after `dt` (s) under torques `t` (N m), by the inverse of the mass
     matrix."""
-    return (
-        speed[0] + dt * _row(inverse[0], t),
-        speed[1] + dt * _row(inverse[1], t),
-        speed[2] + dt * _row(inverse[2], t),
-        speed[3] + dt * _row(inverse[3], t),
-        speed[4] + dt * _row(inverse[4], t),
-        speed[5] + dt * _row(inverse[5], t),
-    )
+    t0, t1, t2, t3, t4, t5 = t
+    v0, v1, v2, v3, v4, v5 = speed
+    a, b, c, d, e, f = inverse[0]
+    v0 += dt * (a * t0 + b * t1 + c * t2 + d * t3 + e * t4 + f * t5)
+    a, b, c, d, e, f = inverse[1]
+    v1 += dt * (a * t0 + b * t1 + c * t2 + d * t3 + e * t4 + f * t5)
+    a, b, c, d, e, f = inverse[2]
+    v2 += dt * (a * t0 + b * t1 + c * t2 + d * t3 + e * t4 + f * t5)
+    a, b, c, d, e, f = inverse[3]
+    v3 += dt * (a * t0 + b * t1 + c * t2 + d * t3 + e * t4 + f * t5)
+    a, b, c, d, e, f = inverse[4]
+    v4 += dt * (a * t0 + b * t1 + c * t2 + d * t3 + e * t4 + f * t5)
+    a, b, c, d, e, f = inverse[5]
+    v5 += dt * (a * t0 + b * t1 + c * t2 + d * t3 + e * t4 + f * t5)
+    return v0, v1, v2, v3, v4, v5
 
 
 @kernel
@@ -112,9 +107,10 @@ def rubbed(dt: float, speed: Six, inverse: Matrix, before: Six, hold: Six) -> tu
     v0, v1, v2, v3, v4, v5 = speed
     for f, last, row in zip(friction, before, inverse):  # noqa: B905 - numba knows no strict zip
         if f != last:
-            push = dt * (f - last)  # The matrix is symmetric: a row is a column.
-            v0, v1, v2 = v0 + push * row[0], v1 + push * row[1], v2 + push * row[2]
-            v3, v4, v5 = v3 + push * row[3], v4 + push * row[4], v5 + push * row[5]
+            push = dt * (f - last)
+            r0, r1, r2, r3, r4, r5 = row  # The matrix is symmetric: a row is a column.
+            v0, v1, v2 = v0 + push * r0, v1 + push * r1, v2 + push * r2
+            v3, v4, v5 = v3 + push * r3, v4 + push * r4, v5 + push * r5
     return friction, (v0, v1, v2, v3, v4, v5)
 
 

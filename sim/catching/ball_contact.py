@@ -45,6 +45,8 @@ Impulses = tuple[Impulse, Impulse, Impulse, Impulse]
 """One for each surface: table, nearest wall of the cup, the next wall, bottom of the cup."""
 Flags = tuple[bool, bool, bool, bool]
 """One for each surface."""
+Gaps = tuple[float, float, float, float]
+"""One for each surface (m)."""
 
 _TOUCH = 1e-5
 """m; a smaller gap counts as contact."""
@@ -457,15 +459,13 @@ def stepped_ball(
             p[1] + drift[1] * left,
             p[2] + drift[2] * left - 0.5 * fall * left * left,
         )
-        soonest = left
+        soonest, gaps = left, _gaps(end, after, near, numbers)
         for on in range(4):
-            if not near[on]:
-                gap = contact_at(on, end, after, numbers)[0]
-                if gap < 0.0:
-                    s = _impact_time(on, p, drift, fall, at, left, before, after, gap, numbers)
-                    soonest = min(soonest, s)
+            if gaps[on] < 0.0:
+                s = _impact_time(on, p, drift, fall, at, left, before, after, gaps[on], numbers)
+                soonest = min(soonest, s)
         if soonest >= left:
-            end, near = _out(end, after, numbers)
+            end, near = _out(end, after, near, gaps, numbers)
             return end, then, near, guess if at == 0.0 else none
         s = soonest
         p = (p[0] + drift[0] * s, p[1] + drift[1] * s, p[2] + drift[2] * s - 0.5 * fall * s * s)
@@ -485,19 +485,42 @@ def stepped_ball(
             pressed[2] and near[2],
             pressed[3] and near[3],
         )
-    p, near = _out(p, after, numbers)
+    everywhere = (True, True, True, True)
+    p, near = _out(p, after, everywhere, (0.0, 0.0, 0.0, 0.0), numbers)
     return p, ball, near, none
 
 
 @kernel
-def _out(p: Triple, cup: Cup, numbers: Sequence[float]) -> tuple[Triple, Flags]:
+def _gaps(p: Triple, cup: Cup, near: Flags, numbers: Sequence[float]) -> Gaps:
+    """Return the gaps to the surfaces that are not `near`, 0 for the others. The next wall is never
+    nearer than the nearest one: if that is out of reach, its gap counts for both."""
+    table = 0.0 if near[0] else contact_at(0, p, cup, numbers)[0]
+    wall = 0.0 if near[1] else contact_at(1, p, cup, numbers)[0]
+    following = wall
+    if near[2]:
+        following = 0.0
+    elif wall <= 2.0 * _TOUCH:
+        following = contact_at(2, p, cup, numbers)[0]
+    bottom = 0.0 if near[3] else contact_at(3, p, cup, numbers)[0]
+    return table, wall, following, bottom
+
+
+@kernel
+def _out(
+    p: Triple, cup: Cup, near: Flags, gaps: Gaps, numbers: Sequence[float]
+) -> tuple[Triple, Flags]:
     """Return where the ball is at the end of a step, and which surfaces it touches. It is moved out
-    of what it still overlaps, by some micrometres where a surface is curved or the cup turns."""
+    of what it still overlaps, by some micrometres where a surface is curved or the cup turns.
+    `gaps`: those at `p` to the surfaces that were not `near`."""
     one = two = three = four = False
+    moved = False
     for _ in range(2):
-        moved = False
+        again, moved = moved, False
         for on in range(4):
-            gap, nx, ny, nz = contact_at(on, p, cup, numbers)
+            if near[on] or again or moved:
+                gap, nx, ny, nz = contact_at(on, p, cup, numbers)
+            else:
+                gap, nx, ny, nz = gaps[on], 0.0, 0.0, 0.0
             if gap < 0.0:
                 p = (p[0] - gap * nx, p[1] - gap * ny, p[2] - gap * nz)
                 moved = True

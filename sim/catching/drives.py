@@ -206,18 +206,12 @@ class ServoDrive(PowerDrive):
         ):
             super().sync(now)
             return
-        self._synced = now
+        self.on_sync(now)
         servo = self.servo
-        servo.aim(self._target())
-        if not servo.standing:
-            self.stir()
         usual = self.powered and not servo.limited and self._error_since is None
-        said = word, q, torque = (
-            RUNNING if usual else self.statusword(),
-            self.plant.q[self.joint],
-            self._torque,
-        )
-        frame = self._tpdo_frame
+        word = RUNNING if usual else self.statusword()
+        q, torque, frame = self.plant.q[self.joint], self._torque, self._tpdo_frame
+        said = word, q, torque
         if frame is None or said != self._said:
             self._said, self._shown = said, None
             data = self.tpdo.layout.pack(
@@ -246,8 +240,9 @@ class ServoDrive(PowerDrive):
         """Take a new set point."""
         self._synced = now
         if self.state is _ENABLED:
-            self.servo.aim(self._target())
-            if not self.servo.standing:
+            servo = self.servo
+            servo.aim(self._target())
+            if not servo.standing:
                 self.stir()
 
     def repeat(self, now: float, answer: Frame) -> None:
@@ -320,12 +315,8 @@ class ServoDrive(PowerDrive):
         servo = self.servo
         self._torque = tau = servo.torque(q, qd, dt)
         if state is _ENABLED:
-            late = now - self._synced > self._sync_patience + 1e-9
-            if (
-                late
-                or self._error_since is not None
-                or not -self._window <= servo.error <= self._window
-            ):
+            late, window = now - self._synced > self._sync_patience + 1e-9, self._window
+            if late or self._error_since is not None or not -window <= servo.error <= window:
                 self._watch(now, late)
         elif state is DriveState.FAULT_REACTION_ACTIVE and servo.ramped_down and abs(qd) < 0.02:
             self.ramp_ended()
@@ -391,7 +382,7 @@ class ArmBus(DriveBus[ServoDrive]):
         if self._echoes and frames == self._heard and self._resting:
             for drive, echo in zip(self.drives, self._echoes, strict=True):
                 drive.repeat(now, echo)
-            self._rests_until = min([drive.waits_until for drive in self.drives])
+            self._rests_until = self._awaited()
             return
         resting, self._odd, self._echoes = self._resting, False, ()
         for frame in frames:
@@ -406,7 +397,12 @@ class ArmBus(DriveBus[ServoDrive]):
 
     def _sync(self, now: float) -> None:
         super()._sync(now)
-        self._rests_until = min([drive.waits_until for drive in self.drives])
+        if self._resting:
+            self._rests_until = self._awaited()
+
+    def _awaited(self) -> float:
+        """Return when the first drive misses SYNC (s)."""
+        return min([drive.waits_until for drive in self.drives])
 
     def _spread(self, now: float, frame: Frame) -> None:
         self._odd = True
@@ -429,6 +425,7 @@ class ArmBus(DriveBus[ServoDrive]):
         plant.step(dt, tau)
         if not (moving or self._stirred or tau != before or any(plant.qd)):
             self._resting = all(drive.settled for drive in self.drives)
+            self._rests_until = self._awaited()
 
     def _stir(self) -> None:
         self._resting, self._stirred = False, True

@@ -67,10 +67,10 @@ def twist(
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     o, p = before.origin, after.origin
     wx = wy = wz = 0.0
-    for a, b in zip(before[:3], after[:3], strict=True):
-        wx += a[1] * b[2] - a[2] * b[1]
-        wy += a[2] * b[0] - a[0] * b[2]
-        wz += a[0] * b[1] - a[1] * b[0]
+    for (ax, ay, az), (bx, by, bz) in zip(before[:3], after[:3], strict=True):
+        wx += ay * bz - az * by
+        wy += az * bx - ax * bz
+        wz += ax * by - ay * bx
     half = 0.5 / dt
     return ((p[0] - o[0]) / dt, (p[1] - o[1]) / dt, (p[2] - o[2]) / dt), (
         wx * half,

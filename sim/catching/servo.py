@@ -50,6 +50,7 @@ class JointServo:
 
     def __init__(self, rating: DriveRating, q: float) -> None:
         self.rating = rating
+        self._most, self._inertia = rating.torque, rating.inertia
         self._stiffness = rating.inertia * VELOCITY_GAIN
         self._integration = self._stiffness * INTEGRAL_GAIN
         self.limit = rating.speed
@@ -104,14 +105,13 @@ class JointServo:
         elif not self.standing:
             self._interpolate(dt)
         self.error = error = self.reference - q
-        rating = self.rating
-        most = rating.torque
+        most, integral = self._most, self._integral
         wanted = self.velocity + POSITION_GAIN * error - qd
-        tau = rating.inertia * self._acceleration + self._stiffness * wanted + self._integral
+        tau = self._inertia * self._acceleration + self._stiffness * wanted + integral
         if not -most < tau < most:
             return math.copysign(most, tau)
         if not self.standing or not -DEAD_BAND < error < DEAD_BAND:
-            self._integral += self._integration * wanted * dt
+            self._integral = integral + self._integration * wanted * dt
         return tau
 
     @property

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from petrobot.sim.catching.ball import BallModel, BallState, TableMotion, fly
+from petrobot.sim.catching.ball_contact import contact_at, numbers_of
 from petrobot.sim.catching.physics import BACK_ENDS, BULLET, PORTABLE, BallContact, ball_contact
 from petrobot.sim.catching.puma_model import Frame3, twist
 from petrobot.sim.catching.site import Site
@@ -374,3 +375,22 @@ def test_twist_is_the_velocity_between_frames(rotation: Vector, rates: list[floa
     found = twist(before, after, dt)
     assert found[0] == pytest.approx(velocity.tolist(), abs=1e-9)
     assert found[1] == pytest.approx(spin.tolist(), abs=1e-3)
+
+
+@pytest.mark.parametrize("radius", [0.025, 0.04])
+def test_the_next_wall_is_never_nearer_than_the_nearest_one(site: Site, radius: float) -> None:
+    """So the portable back end does not ask for it where the nearest one is out of reach."""
+    truth = site.truth("A")
+    cup = replace(truth.cup, radius=radius)
+    model = BallModel.of(site.cell["ball"], truth.settings["ball"]["friction"])
+    wall = float(site.cell["cup"]["wall"])
+    numbers = numbers_of(model, truth.table, cup, wall, truth.settings)
+    upright = ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+    rng = np.random.default_rng(1)
+    reach = radius + wall + 0.03
+    for x, y, z in rng.uniform(
+        (-reach, -reach, -cup.depth - 0.03), (reach, reach, 0.03), (4000, 3)
+    ):
+        nearest, following = (contact_at(on, (x, y, z), upright, numbers)[0] for on in (1, 2))
+        if nearest > 0.0:
+            assert following > nearest - 1e-12

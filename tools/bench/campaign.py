@@ -2,14 +2,18 @@
 lock-step cell with the same seeds, alternating.
 
     python -m tools.bench.campaign [--trials N] [--rounds N]
+    python -m tools.bench.campaign --against ../older   the bare cell beside another checkout's
 
-The first round of each fills caches and is not counted.
+The first round of each fills caches and is not counted. The other checkout has its own `.venv`; its
+bench may be in `tests/bench`. Both run in turns, each time in a new process.
 """
 
 from __future__ import annotations
 
 import argparse
 import statistics
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -38,6 +42,25 @@ def block(bench: LoadedPlan, seed: int, trials: int) -> float:
     return time.process_time() - begun
 
 
+def told(python: Path | str, folder: Path) -> float:
+    """Return the CPU seconds of a trial in a bare cell that the bench of a checkout prints."""
+    where = "tools" if (folder / "tools" / "bench").exists() else "tests"
+    command = [str(python), "-m", f"{where}.bench.campaign", "--rounds", "1"]
+    text = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+    (line,) = (line for line in text.splitlines() if line.startswith("bare cell"))
+    return float(line.split()[2])
+
+
+def against(older: Path, rounds: int) -> None:
+    """Print how many times faster the bare cell is than that of another checkout."""
+    ratios = []
+    for _ in range(rounds):
+        before, now = told(older.resolve() / ".venv/bin/python", older), told(sys.executable, ROOT)
+        ratios.append(before / now)
+        print(f"older {before:.4f}, now {now:.4f} CPU s a trial, {before / now:.3f} times as fast")
+    print(f"median {statistics.median(ratios):.3f}")
+
+
 def main() -> None:
     """Print both and their ratio."""
     parser = argparse.ArgumentParser(
@@ -49,7 +72,11 @@ def main() -> None:
     parser.add_argument(
         "--rounds", type=int, default=3, metavar="N", help="that count (%(default)s)"
     )
+    parser.add_argument("--against", type=Path, metavar="FOLDER", help="another checkout")
     options = parser.parse_args()
+    if options.against is not None:
+        against(options.against, options.rounds)
+        return
     bench = LoadedPlan.of(
         CampaignPlan(
             str(task_path("catch_ball")),

@@ -52,6 +52,7 @@ _U16, _U32, _I8 = (
     DataType.UNSIGNED32,
     DataType.INTEGER8,
 )
+_FAULT: Final = DriveState.FAULT  # An enumeration's members are slow to look up.
 _MOVING: Final = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 
 
@@ -443,25 +444,24 @@ class CanopenMaster(Generic[Link]):
     def _supervise(self, now: float) -> None:
         """Check for silence and lost heartbeats, and for the end of starting and of a reset."""
         lost = self._manner.silent_cycles + 1
+        answered = True
         for axis, drive in enumerate(self.drives):
-            drive.silent += 1
-            if drive.silent == lost:
+            drive.silent = silent = drive.silent + 1
+            if silent == lost:
                 self._report(Trouble("bus", axis, 0, f"{self.names[axis]}: the drive is silent"))
-            if (
-                drive.state is DriveState.FAULT
-                and not self._resetting
-                and drive.spoken
-                and drive.silent <= 1
-            ):
+            if silent > 1 or not drive.spoken:
+                answered = False
+            elif drive.state is _FAULT and not self._resetting:
                 self._fault(axis, drive.error_code)
-        if all(drive.spoken and drive.silent <= 1 for drive in self.drives):
+        if answered:
             self._seen = now
         patience = self._manner.patience
-        for node, heard in self._heard.items():
-            if now - heard > patience and self._needed(node):
-                self._report(
-                    Trouble("bus", self._axis.get(node), 0, f"node {node} is not operational")
-                )
+        if now - min(self._heard.values()) > patience:
+            for node, heard in self._heard.items():
+                if now - heard > patience and self._needed(node):
+                    self._report(
+                        Trouble("bus", self._axis.get(node), 0, f"node {node} is not operational")
+                    )
         if self.phase is MasterPhase.STARTING and all(drive.spoken for drive in self.drives):
             self.phase = MasterPhase.RUNNING
         if self._resetting and self.enabled:

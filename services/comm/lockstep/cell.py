@@ -151,17 +151,17 @@ class LocalParties:
             party.advance(now)
             for envelope in party.drain():
                 posted = self._post(tick, name, envelope)
-                if envelope.party in self._parties:
-                    self.deliver(tick, posted)
-                else:
+                if posted is not None:
                     outside.append(posted)
         return outside
 
     def deliver(self, sent: int, posted: Posted) -> None:
         """Put an envelope that was sent at tick `sent` into the inbox of its party."""
         due, sequence, envelope = posted
-        inbox = self._inboxes[envelope.party]
-        one = sent, envelope.source, sequence, envelope
+        self._put(due, (sent, envelope.source, sequence, envelope))
+
+    def _put(self, due: int, one: _Due) -> None:
+        inbox = self._inboxes[one[3].party]
         if due in inbox:
             inbox[due].append(one)
         else:
@@ -180,7 +180,8 @@ class LocalParties:
                 f"{owner} and {party} both send as {source}; an endpoint belongs to one party"
             )
 
-    def _post(self, tick: int, sender: str, envelope: Envelope) -> Posted:
+    def _post(self, tick: int, sender: str, envelope: Envelope) -> Posted | None:
+        """Put an envelope into the inbox of its party; return it if that is in another process."""
         party, source, target, channel, sent = envelope
         if self._owners.get(source) != sender:
             self.own(source, sender)
@@ -198,7 +199,11 @@ class LocalParties:
             envelope = Envelope(party, source, target, channel, body)
         sequence = self._sequences.get(source, 0)
         self._sequences[source] = sequence + 1
-        return Posted(tick + self._delays.ticks(envelope), sequence, envelope)
+        due = tick + self._delays.ticks(envelope)
+        if party not in self._parties:
+            return Posted(due, sequence, envelope)
+        self._put(due, (tick, source, sequence, envelope))
+        return None
 
 
 class LockStepCell:
