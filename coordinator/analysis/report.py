@@ -36,6 +36,7 @@ from petrobot.coordinator.analysis.net.space import (
     explore,
 )
 from petrobot.coordinator.analysis.net.structure import (
+    Lyapunov,
     Semiflows,
     conflict_sets,
     exclusive_places,
@@ -82,24 +83,34 @@ class StructureReport:
         """Minimal traps."""
         return minimal_traps(self.net)
 
+    @cached_property
+    def function(self) -> Lyapunov:
+        """Whether the net is bounded from every marking, and conservative."""
+        return lyapunov(self.net)
+
     def gaps(self) -> list[str]:
-        """Return what was not enumerated in full, in words."""
+        """Return what was not found in full, in words."""
         parts = {
             "place invariants": self.place_flows.complete,
             "transition invariants": self.transition_flows.complete,
             "siphons": self.siphons.complete,
             "traps": self.traps.complete,
         }
-        return [
+        listed = [
             f"{part}: those found; whether there are more is unknown within the limit"
             for part, complete in parts.items()
             if not complete
         ]
+        judged = {
+            "structurally bounded": self.function.bounded,
+            "conservative": self.function.conservative,
+        }
+        open_ = [what for what, holds in judged.items() if holds is None]
+        return [*listed, *(f"{what}: unknown within the limit" for what in open_)]
 
     def to_json(self) -> dict[str, Any]:
         """Return plain data, with places and transitions by name."""
         places, transitions = self.net.places, self.net.transitions
-        function = lyapunov(self.net)
         return {
             "p_invariants": [
                 {places[p]: n for p, n in sorted(y.items())} for y in self.place_flows.vectors
@@ -113,11 +124,11 @@ class StructureReport:
             "traps": [sorted(places[p] for p in s) for s in self.traps.sets],
             "siphons_complete": self.siphons.complete and self.traps.complete,
             "siphons_controlled": controlled_siphons(self.net, found=self.siphons),
-            "structurally_bounded": function is not None,
-            "conservative": function is not None and function.conserved,
+            "structurally_bounded": self.function.bounded,
+            "conservative": self.function.conservative,
             "strictly_conservative": is_strictly_conservative(self.net),
-            "lyapunov": {places[p]: n for p, n in sorted(function.weights.items())}
-            if function
+            "lyapunov": {places[p]: n for p, n in sorted(self.function.weights.items())}
+            if self.function.weights is not None
             else None,
             "conflicts": [[transitions[t] for t in group] for group in conflict_sets(self.net)],
             "exclusive_places": sorted(
