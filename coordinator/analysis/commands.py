@@ -378,7 +378,8 @@ def simulate_command(
                 firings=firings,
                 progress=progress,
             )
-            return _simulated(model.name, seen, (*view.assumptions, assumed(cell)))
+            notes = (*(f"doubtful: {text}" for text in view.doubts), *view.assumptions)
+            return _simulated(model.name, seen, (*notes, assumed(cell)))
         subject, name, notes = _subject(model, rates, "gspn")
         assert isinstance(subject, Gspn)
         gspn = change_gspn(subject, wanted)

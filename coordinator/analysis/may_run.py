@@ -71,22 +71,6 @@ class Budget:
 BUDGET = Budget()
 """The budget of `petrobot check`, `run` and the page. `petrobot analyse` has limits of its own."""
 
-WORDS: Mapping[str, str] = {
-    "bounded": "Tokens stay bounded",
-    "safe": "Never two tokens in a place",
-    "deadlock_free": "Never stuck before its end",
-    "quasi_live": "Every transition can fire",
-    "live": "Every transition can fire again, whatever happened",
-    "proper": "Ready for the next mission, whatever happened",
-    "reversible": "Can come back to its beginning",
-    "one_run_each": "One run at a time in each action place",
-    "returned": "Every resource is back at the end",
-    "sound": "Can end properly from everywhere",
-    "stable": "Comes back to its nominal flow after errors",
-    "controllable": "Every error can be recovered from",
-}
-"""A sentence for each verdict that needs to be true."""
-
 
 @dataclass(frozen=True, slots=True)
 class MayRun:

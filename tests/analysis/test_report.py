@@ -174,7 +174,7 @@ def test_the_catching_task_in_one_analysis() -> None:
     assert data["execution"]["complete"] and refused == {"safe", *mended}
     assert {k for k, v in data["mended"].items() if v["holds"]} == mended
     fault = next(r for r in data["recoveries"] if r["error_exit"] == "move_failed")
-    assert fault["probability"] == pytest.approx(1 - 0.05**4) and fault["runs_lost"] == [1, 1]
+    assert fault["probability"] == pytest.approx(1 - 0.05**4) and fault["goals_lost"] == [1, 1]
     text = found.text()
     assert (
         "stable" in text
