@@ -369,7 +369,8 @@ def simulate_command(
             view = stochastic_view(
                 model, measured, stages=stages, timer_stages=stages, devices=devices_of(cell)
             )
-            gspn, notes = view.gspn, (*view.assumptions, assumed(cell))
+            doubts = (f"doubtful: {text}" for text in view.doubts)
+            gspn, notes = view.gspn, (*doubts, *view.assumptions, assumed(cell))
             goal = goal_by_marking(lambda m: view.ended(m) is Status.SUCCESS)
             lost = goal_by_marking(lambda m: view.ended(m) is Status.ERROR)
         else:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from math import sqrt
 from typing import Any
 
 import numpy as np
 
+from petrobot.coordinator.analysis.execution.chain import played
 from petrobot.coordinator.analysis.execution.graph import STEPS, TooManyValues, in_words
 from petrobot.coordinator.analysis.execution.progress import (
     NAMES,
@@ -36,6 +38,7 @@ from petrobot.coordinator.analysis.net.space import (
     explore,
 )
 from petrobot.coordinator.analysis.net.structure import (
+    Lyapunov,
     Semiflows,
     conflict_sets,
     exclusive_places,
@@ -50,7 +53,7 @@ from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.analysis.time.markov import LongRun, long_run
 from petrobot.coordinator.analysis.time.measured import Measured
 from petrobot.coordinator.analysis.time.stochastic import STAGES, stochastic_view
-from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
+from petrobot.coordinator.analysis.time.task_forecast import MATTERS, TIME, Forecast, forecast
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.net import Marking, Net
 from petrobot.coordinator.task.wording import COLUMNS, wrapped
@@ -82,24 +85,34 @@ class StructureReport:
         """Minimal traps."""
         return minimal_traps(self.net)
 
+    @cached_property
+    def function(self) -> Lyapunov:
+        """Whether the net is bounded from every marking, and conservative."""
+        return lyapunov(self.net)
+
     def gaps(self) -> list[str]:
-        """Return what was not enumerated in full, in words."""
+        """Return what was not found in full, in words."""
         parts = {
             "place invariants": self.place_flows.complete,
             "transition invariants": self.transition_flows.complete,
             "siphons": self.siphons.complete,
             "traps": self.traps.complete,
         }
-        return [
+        listed = [
             f"{part}: those found; whether there are more is unknown within the limit"
             for part, complete in parts.items()
             if not complete
         ]
+        judged = {
+            "structurally bounded": self.function.bounded,
+            "conservative": self.function.conservative,
+        }
+        open_ = [what for what, holds in judged.items() if holds is None]
+        return [*listed, *(f"{what}: unknown within the limit" for what in open_)]
 
     def to_json(self) -> dict[str, Any]:
         """Return plain data, with places and transitions by name."""
         places, transitions = self.net.places, self.net.transitions
-        function = lyapunov(self.net)
         return {
             "p_invariants": [
                 {places[p]: n for p, n in sorted(y.items())} for y in self.place_flows.vectors
@@ -113,11 +126,11 @@ class StructureReport:
             "traps": [sorted(places[p] for p in s) for s in self.traps.sets],
             "siphons_complete": self.siphons.complete and self.traps.complete,
             "siphons_controlled": controlled_siphons(self.net, found=self.siphons),
-            "structurally_bounded": function is not None,
-            "conservative": function is not None and function.conserved,
+            "structurally_bounded": self.function.bounded,
+            "conservative": self.function.conservative,
             "strictly_conservative": is_strictly_conservative(self.net),
-            "lyapunov": {places[p]: n for p, n in sorted(function.weights.items())}
-            if function
+            "lyapunov": {places[p]: n for p, n in sorted(self.function.weights.items())}
+            if self.function.weights is not None
             else None,
             "conflicts": [[transitions[t] for t in group] for group in conflict_sets(self.net)],
             "exclusive_places": sorted(
@@ -678,29 +691,46 @@ def _doubts(
     devices: Mapping[str, str] | None,
 ) -> list[str]:
     """Compare a forecast with the execution graph as a Markov chain, which follows the engine in
-    everything but durations. Return which figures differ and what only one of the two assumes;
-    where there is no such chain, add a note.
-
-    Both get as many phases for a duration as the chain can have, so only what they say about the
-    order of events can differ.
+    everything but durations, and with missions played on it, whose durations are not divided into
+    phases. Return which figures differ and what only one side assumes; add a note where one of the
+    two comparisons cannot be made.
     """
+    doubts, failed = list(found.view.doubts), dict[str, str]()
+    there: Mapping[str, Callable[[Progress], list[str]]] = {
+        "the execution graph": partial(_as_chain, found, measured, stages, limits, devices),
+        "missions with exact times": partial(_as_played, found, measured, stages),
+    }
+    for what, compared in there.items():
+        try:
+            if progress is None or not progress.x.complete:
+                raise ValueError("the execution graph is not complete")
+            doubts += compared(progress)
+        except (ValueError, ArithmeticError, MemoryError) as why:
+            if INTERRUPTED in str(why):
+                raise KeyboardInterrupt from why
+            failed.setdefault(_why(why), what)
+    notes += [f"the forecast was not compared with {there}: {why}" for why, there in failed.items()]
+    return doubts
+
+
+def _as_chain(
+    found: Forecast,
+    measured: Measured | None,
+    stages: int,
+    limits: SearchLimits | None,
+    devices: Mapping[str, str] | None,
+    progress: Progress,
+) -> list[str]:
+    """Return which figures the execution graph has otherwise. Both get as many phases for a
+    duration as the chain can have, so only what they say about the order of events can differ.
+    Raises ValueError."""
     view = found.view
-    try:
-        if progress is None or not progress.x.complete:
-            raise ValueError("it is not complete")
-        if isinstance(chain := progress.chain, str):
-            raise ValueError(chain)
-        few = chain.stages
-        if (few, few) != (stages, STAGES):
-            same = stochastic_view(
-                view.task, measured, stages=few, timer_stages=few, devices=devices
-            )
-            found = forecast(same, limits=limits)
-    except (ValueError, ArithmeticError, MemoryError) as why:
-        if INTERRUPTED in str(why):
-            raise KeyboardInterrupt from why
-        notes.append(f"the forecast was not compared with the execution graph: {_why(why)}")
-        return list(view.doubts)
+    if isinstance(chain := progress.chain, str):
+        raise ValueError(chain)
+    few = chain.stages
+    if (few, few) != (stages, STAGES):
+        same = stochastic_view(view.task, measured, stages=few, timer_stages=few, devices=devices)
+        found = forecast(same, limits=limits)
     exact = chain.figures
     off = [
         f"{name} {value:.6g} here, {exact[name]:.6g} there"
@@ -708,17 +738,38 @@ def _doubts(
         if abs(value - exact[name]) > AGREE * max(abs(value), abs(exact[name]))
     ]
     if not off:
-        return list(view.doubts)
+        return []
     # What both assume explains no difference.
     ours = [a for a in view.assumptions if a not in chain.assumptions]
     ours.append("conflicts that neither priority nor weight decides are drawn")
     theirs = [a for a in chain.assumptions if a not in view.assumptions]
     there = f"; there: {'; '.join(theirs)}" if theirs else ""
     return [
-        *view.doubts,
         f"the execution graph has other figures (both with at most {few} "
         f"phase{'s' * (few > 1)} for a duration): {', '.join(off)}. "
-        f"Assumed here: {'; '.join(ours)}{there}",
+        f"Assumed here: {'; '.join(ours)}{there}"
+    ]
+
+
+def _as_played(
+    found: Forecast, measured: Measured | None, stages: int, progress: Progress
+) -> list[str]:
+    """Return which figures missions with exact times have otherwise, if by more than MATTERS and
+    five standard errors, and the execution graph as a chain does not tell them right either: what
+    phases do. Raises NoEstimate, TooLarge and OutOfTime."""
+    plays, off, chain = played(progress.x, measured), list[str](), progress.chain
+    for name, value in found.figures.items():
+        mean, error = plays.figures[name]
+        if 0 < value < 1 and name != TIME:  # a share near 1 may have no miss in so few missions
+            error = max(error, sqrt(value * (1 - value) / plays.missions))
+        known = (value,) if isinstance(chain, str) else (value, chain.figures[name])
+        if all(abs(one - mean) > max(5 * error, MATTERS * abs(mean)) for one in known):
+            off.append(f"{name} {value:.6g} here, {mean:.6g} there (standard error {error:.2g})")
+    if not off:
+        return []
+    return [
+        f"{plays.missions} missions of the execution graph with exact times have other figures: "
+        f"{', '.join(off)}. Here a timer or a duration has at most {stages} phases"
     ]
 
 
@@ -798,7 +849,7 @@ def _recovery(r: Recovery, odds: Odds) -> Mapping[str, Any]:
         "while_another_is_handled": not r.alone,
         "probability": p,
         "mean_time": time if p else None,
-        "runs_lost": r.lost,
+        "goals_lost": r.lost,
         "strategy": list(r.strategy),
     }
 
@@ -851,7 +902,7 @@ def _recovery_lines(found: Sequence[Recovery], odds: Odds) -> list[str]:
     if not found:
         return []
     wide = max(14, *(len(r.name) for r in found))
-    heads = ("back", "sure", "probability", "mean time", "further errors", "runs lost", "by")
+    heads = ("back", "sure", "probability", "mean time", "further errors", "goals lost", "way back")
     lines = ["", f"{'error exits':{wide + 2}}{_columns(heads)}"]
     for alone, title in ((True, ""), (False, "only while another error is being handled:")):
         rows = [r for r in found if r.alone is alone]
@@ -872,7 +923,7 @@ def _recovery_lines(found: Sequence[Recovery], odds: Odds) -> list[str]:
 
 
 def _columns(texts: Sequence[str]) -> str:
-    widths = (5, 5, 11, 9, 16, 9, 0)
+    widths = (5, 5, 11, 9, 16, 10, 0)
     return "".join(f" {text:{w}}" for text, w in zip(texts, widths, strict=True)).rstrip()
 
 
@@ -892,7 +943,9 @@ def _recovery_row(name: str, r: Recovery, odds: Odds) -> list[str]:
         "-" if r.lost is None else " to ".join(str(n) for n in dict.fromkeys(r.lost)),
     )
     line = name + _columns((*row, path))
-    return [line] if len(line) <= COLUMNS else [name + _columns((*row, "")), f"{'':8}by {path}"]
+    if len(line) <= COLUMNS:
+        return [line]
+    return [name + _columns((*row, "")), f"{'':8}way back: {path}"]
 
 
 def _probability(p: float) -> str:

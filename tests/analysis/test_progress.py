@@ -23,7 +23,7 @@ from petrobot.coordinator.analysis.report import analyse
 from petrobot.coordinator.analysis.time.measured import Measured
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
-from petrobot.coordinator.task import Estimate, Status, Task
+from petrobot.coordinator.task import Estimate, Kind, Status, Task
 from petrobot.coordinator.task.conditions import parse
 from petrobot.coordinator.task.file import load
 from petrobot.coordinator.task.net import Net
@@ -363,6 +363,44 @@ def test_the_cause_of_a_dead_end_names_the_variable_without_a_value() -> None:
     found = judged(unset).deadlock_free
     assert found.reason == "stuck with go seen: large has a false condition (n > 5): n has no value"
     assert found.details[-1] == "next is barred by seen, which holds 1"
+
+
+def test_what_only_listens_is_not_what_is_stuck() -> None:
+    """The cause is the part that the preempting transition lost, not that it could do so again."""
+    task = make_task(
+        "parts=2 done watch=1 move! fix!",
+        {
+            "go": {"in": "parts", "out": "move"},
+            "n": {"in": "move:normal", "out": "done"},
+            "e": {"in": "move:error", "out": "parts"},
+            "low_now": {"in": "move:preempt=none watch", "out": "fix", "event": "low"},
+            "charged": {"in": "fix:normal", "out": "watch"},
+            "ce": {"in": "fix:error", "out": "watch"},
+        },
+        "low",
+        final="done == 2",
+    )
+    watch = replace(task.places["watch"], kind=Kind.PLAIN, listen=True)
+    found = judged(replace(task, places={**task.places, "watch": watch})).deadlock_free
+    assert found.reason.endswith("the end asks for done == 2 (it holds 1)")
+    assert found.details[0] == "done: only `n` can fill it, but `low_now` took move"
+
+
+def test_a_condition_that_is_never_true_is_why_a_transition_never_fires() -> None:
+    task = make_task(
+        "parts=1 look! other",
+        {
+            "next": {"in": "parts", "out": "look", "sets": (("n", parse("2")),)},
+            "far": {"in": "look:normal", "out": "other", "when": "n == 3"},
+            "near": {"in": "look:normal", "when": "n != 3"},
+            "lost": {"in": "look:error"},
+        },
+        final="parts == 0",
+        variables={"n": 0},
+    )
+    assert judged(task).quasi_live.reason == (
+        "far can never fire: its condition (n == 3) is never true: n is only ever 0 or 2"
+    )
 
 
 def test_free_resources_are_not_what_is_stuck() -> None:

@@ -4,12 +4,17 @@ input."""
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import count, product
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from hypothesis import assume, example, given, settings
+from hypothesis import strategies as st
 
 from petrobot.coordinator.analysis.commands import (
     analyse_command,
@@ -25,6 +30,7 @@ from petrobot.coordinator.analysis.formats.netfile import (
     unit_rates,
 )
 from petrobot.coordinator.analysis.formats.pnml import write_pnml
+from petrobot.coordinator.analysis.limits import OutOfTime, until
 from petrobot.coordinator.analysis.net.picture import graph_svg
 from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
@@ -32,10 +38,12 @@ from petrobot.coordinator.analysis.report import Analysis, analyse, heat, missin
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
-from petrobot.coordinator.task import Estimate, Status
+from petrobot.coordinator.task import Estimate, Status, Task
 from petrobot.coordinator.task.file import load, loads
 from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import KANBAN_RATES, kanban, philosophers, queue
+from tests.analysis.random_nets import nets
+from tests.analysis.test_execution_graph import COMMON, whole_tasks
 
 GOOD = """
 schema = 1
@@ -166,7 +174,7 @@ def test_the_catching_task_in_one_analysis() -> None:
     assert data["execution"]["complete"] and refused == {"safe", *mended}
     assert {k for k, v in data["mended"].items() if v["holds"]} == mended
     fault = next(r for r in data["recoveries"] if r["error_exit"] == "move_failed")
-    assert fault["probability"] == pytest.approx(1 - 0.05**4) and fault["runs_lost"] == [1, 1]
+    assert fault["probability"] == pytest.approx(1 - 0.05**4) and fault["goals_lost"] == [1, 1]
     text = found.text()
     assert (
         "stable" in text
@@ -347,3 +355,34 @@ def test_rates_files() -> None:
 def test_missing_files_give_one_line(tmp_path: Path) -> None:
     outcome = analyse_command(tmp_path / "missing.pnml", load)
     assert outcome.code == 2 and "\n" not in outcome.text and "missing.pnml" in outcome.text
+
+
+def answers(data: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], bool]]:
+    """Yield each answer yes or no in the data of an analysis, with its keys."""
+    if path == ("recoveries",):
+        data = {f"{one['error_exit']} {one['cause']}": one for one in data}
+    for key, value in data.items() if isinstance(data, dict) else ():
+        if isinstance(value, bool) and "complete" not in key:
+            yield (*path, key), value
+        yield from answers(value, (*path, key))
+
+
+@settings(COMMON, max_examples=6)
+@given(st.one_of(nets(), whole_tasks()))
+@example(kanban(1))
+@example(Net.build({"one": 2, "pair": 0}, {"join": ({"one": 2}, {"pair": 1})}))
+def test_an_answer_that_a_limit_leaves_open_is_never_no(model: Net | Task) -> None:
+    """Whatever ends an analysis early, what it answers is what the whole analysis answers."""
+    limits = SearchLimits(states=3_000)
+    whole = analyse(model, limits=limits, steps=3_000)
+    open_ = whole.progress is not None and not whole.progress.x.complete
+    assume(whole.qualitative.space.complete and not open_ and not whole.unjudged)
+    known = dict(answers(whole.to_json()))
+    for states, steps, seconds in product((1, 20, 3_000), (1, 20, 3_000), (1.0, 20.0, 1e9)):
+        try:
+            with until(seconds, count().__next__):
+                part = analyse(model, limits=SearchLimits(states=states), steps=steps)
+                found = list(answers(part.to_json()))
+        except OutOfTime:
+            continue
+        assert [one for one in found if known[one[0]] is not one[1]] == []

@@ -12,7 +12,12 @@ import pytest
 from hypothesis import assume, event, example, given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.analysis.execution.chain import ExecutionChain, TooLarge, chain_of
+from petrobot.coordinator.analysis.execution.chain import (
+    ExecutionChain,
+    TooLarge,
+    chain_of,
+    played,
+)
 from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, execute
 from petrobot.coordinator.analysis.may_run import BUDGET, may_run
 from petrobot.coordinator.analysis.net.space import SearchLimits
@@ -584,6 +589,57 @@ def test_a_figure_that_the_execution_graph_contradicts_is_doubtful() -> None:
     assert "mean time (s) " in doubt and "conflicts that neither priority nor weight" in doubt
     assert "doubtful: " in found.text()
     assert found.to_json(structure=False)["forecast"]["doubts"] == list(found.doubts)
+
+
+EXACT = {
+    "two tokens put down at once": ("two = { tokens = 2 }\n", ("a", "two", 1.5), ("b", "two", 1.5)),
+    "two branches": ("x = { tokens = 1 }\ny = { tokens = 1 }\n", ("a", "x", 1.5), ("b", "y", 1.5)),
+    "a short and a long one": (
+        "x = { tokens = 1 }\ny = { tokens = 1 }\n",
+        ("a", "x", 1.0),
+        ("b", "y", 1.5),
+    ),
+    "one after the other": ("x = { tokens = 1 }\ny = {}\n", ("a,y", "x", 0.5), ("b", "y", 1.0)),
+}
+"""Places, and two transitions: what they give, what they take, and their time. All end at 1.5 s."""
+
+
+@pytest.mark.parametrize("kind", EXACT)
+def test_a_figure_that_few_phases_change_is_doubtful(kind: str) -> None:
+    """Timers are fixed times in the engine: of two that begin together, the mean of the later one
+    is longer by phases."""
+    places, *moves = EXACT[kind]
+    task = loads(
+        'schema = 1\n[task]\nname = "t"\nfinal = "a == 1 and b == 1"\n[places]\n'
+        f"{places}a = {{}}\nb = {{}}\n[transitions]\n"
+        + "".join(
+            arcs(f"t{i}", take, give, f", after = {s}") for i, (give, take, s) in enumerate(moves)
+        ),
+        "t.toml",
+    )
+    world = Clock(Engine(task), np.random.default_rng(1))
+    world.play()
+    assert (world.ended, world.now) == (Status.SUCCESS, 1.5)
+    x = execute(task)
+    assert played(x).figures["mean time (s)"] == pytest.approx((1.5, 0.0))
+    doubts = [text for text in analyse(task, view="gspn").doubts if "exact times" in text]
+    assert len(doubts) == (kind != "one after the other")
+    assert all(" 1.5 there (standard error 0)" in text for text in doubts)
+
+
+@settings(COMMON, max_examples=5)
+@given(tasks())
+def test_missions_on_the_graph_have_the_figures_of_its_chain(task: Task) -> None:
+    """All times are exponential, so phases change nothing."""
+    assume(all(t.after is None for t in task.transitions.values()))
+    x = execute(task, limit=STEPS)
+    assume(x.complete and not x.livelocks)
+    exact, plays = chain_of(x).figures, played(x)
+    for name, (mean, error) in plays.figures.items():
+        p = exact[name]
+        share = sqrt(p * (1 - p) / plays.missions) if 0 < p < 1 and "time" not in name else 0.0
+        if not np.isnan(p):
+            assert abs(mean - p) <= 5 * max(error, share) + 1e-6, name
 
 
 def test_a_refused_task_has_no_odds() -> None:

@@ -209,11 +209,13 @@ def _near(t: CompiledTransition, ended: set[str], marking: Sequence[int]) -> boo
 
 
 def _at_rest(draft: Draft, t: CompiledTransition) -> bool:
-    """Whether all tokens that the transition could take now are free resources."""
+    """Whether all tokens that the transition could take now may be left at the end: free resources,
+    and what only listens."""
     net, places = draft.compiled.net, tuple(draft.compiled.task.places.values())
     there = [p for p, _ in t.needs if draft.marking[p]]
     return all(
-        places[p].kind is Kind.RESOURCE and draft.marking[p] == net.initial[p] for p in there
+        places[p].listen or (places[p].kind is Kind.RESOURCE and draft.marking[p] == net.initial[p])
+        for p in there
     )
 
 

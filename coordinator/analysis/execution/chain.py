@@ -7,14 +7,20 @@ come after an exponential wait. Choices, draws and stops take no time. The numbe
 causes by which runs end among them, are those of the stochastic view (`time.measured`). What a
 run writes is not measured: values that lead to different firings are equally likely, unless the
 frequency of a condition was measured.
+
+`played` plays missions on the same states with clocks that are not divided into phases: a timer
+takes exactly its time, and a declared duration of cv 0 always the same. So it shows what the few
+phases of the chain, and of the stochastic view, do to a figure.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
+from math import inf, sqrt
+from random import Random
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +64,11 @@ STAGES = 8
 BAD = (Status.FAILURE, Status.ERROR)
 FIXED = 1e-9
 """Seconds for a timer of 0 s."""
+UNDIVIDED = 1_000_000
+"""Phases of a duration that is not divided; one with so many is fixed."""
+MISSIONS, MOVES, ENOUGH = 2_000, 60_000, 100
+"""The most missions that are played, the most changes of a state in all of them, which take about a
+second, and the fewest missions that tell something."""
 
 Clock = tuple[str, int, float]
 """What ends (a status, followed by the action where actions of a place end by different causes;
@@ -69,7 +80,8 @@ NEVER: Clock = ("never", 1, 0.0)
 
 
 class TooLarge(ValueError):  # noqa: N818 - a limit of the analysis
-    """The chain has more than SIZE states, even with one phase for each duration."""
+    """The chain has more than SIZE states, even with one phase for each duration, or missions have
+    too many changes of a state."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,6 +242,24 @@ def chain_of(
     return builder.result(stages) if stages > 1 else coarse
 
 
+@dataclass(frozen=True, slots=True)
+class Played:
+    """What missions gave that were played with undivided clocks."""
+
+    missions: int
+    figures: dict[str, tuple[float, float]]
+    """Those of `ExecutionChain.figures`, each with its standard error."""
+
+
+def played(x: ExecutionGraph, measured: Measured | None = None, *, seed: int = 1) -> Played:
+    """Play missions on a complete execution graph.
+
+    Raises NoEstimate for what has neither a measured nor a declared number, and TooLarge if so
+    few as ENOUGH missions have more than MOVES changes.
+    """
+    return _Builder(x, measured or Measured(), 0).played(Random(seed))
+
+
 class _Builder:
     """Finds the states of the chain, breadth first from the first one."""
 
@@ -357,6 +387,78 @@ class _Builder:
                 p *= share
             yield p, tuple(clock for _, clock in combination)
 
+    # --- missions with undivided clocks ----------------------------------------------------------
+
+    def played(self, random: Random) -> Played:
+        """Play missions until there are enough of them, or they have had enough changes."""
+        self.stages, self.draws, task = UNDIVIDED, {}, self.task
+        ended, moves = list[tuple[bool, float, int, bool]](), 0
+        while len(ended) < MISSIONS and moves < MOVES:
+            keep_time("missions with exact times")
+            done, more = self.mission(random, MOVES - moves)
+            moves += more
+            ended += [done] if done is not None else []
+        if len(ended) < ENOUGH:
+            raise TooLarge(f"{ENOUGH} missions have more than {MOVES} changes of a state")
+        samples = {"P_complete": [float(final) for final, *_ in ended]}
+        if task.goal_transitions and task.runs_place:
+            runs = task.net.initial[task.net.place_index[task.runs_place]]
+            samples |= {"R_goal": [met / runs for _, _, met, _ in ended]} if runs else {}
+        samples["R_conj"] = [float(final and not spoilt) for final, _, _, spoilt in ended]
+        samples["mean time (s)"] = [time for final, time, *_ in ended if final]
+        return Played(len(ended), {name: _mean(some) for name, some in samples.items()})
+
+    def mission(
+        self, random: Random, most: int
+    ) -> tuple[tuple[bool, float, int, bool] | None, int]:
+        """Play one mission; return (whether it reached `final`, its time (s), the goals that it
+        met, whether some run did not end with SUCCESS) and its changes. None if it has more than
+        `most`."""
+        x, goals = self.x, self.task.goal_transitions
+        i, now, spoilt, met = 0, 0.0, False, sum(f in goals for f in self.x.first)
+        clocks = [self.lasts(0, slot, random) for slot in self.plan(0).slots]
+        for moves in range(most):
+            after, what, outcomes = self.first_of(self.plan(i), clocks, random)
+            # In a bottom component the mission has ended, or repeats a part for ever.
+            if not outcomes or x.graph.bottom[x.graph.components[i]]:
+                return (bool(x.final[i]), now, met, spoilt), moves
+            (one,) = random.choices(outcomes, [o.share for o in outcomes])
+            spoilt |= one.spoils or what.partition(" ")[0] in BAD
+            now += after
+            met += sum(f in goals for f in self.fired(one))
+            i, left = one.state, [(ends, time - after) for ends, time in clocks]
+            clocks = [
+                left[one.kept[k]]
+                if k < len(one.kept) and one.kept[k] >= 0
+                else self.lasts(i, slot, random)
+                for k, slot in enumerate(self.plan(i).slots)
+            ]
+        return None, most
+
+    def first_of(
+        self, plan: _Plan, clocks: list[tuple[str, float]], random: Random
+    ) -> tuple[float, str, Sequence[_Outcome]]:
+        """Return what comes first: after how long (s), what its clock says, and its outcomes; none
+        if nothing can come. Of clocks that end together the first one does."""
+        if plan.at_once:
+            return 0.0, "", plan.at_once
+        after, said, outcomes = inf, "", list[_Outcome]()
+        for k, (what, left) in enumerate(clocks):
+            if left < after and (found := plan.ends.get((k, what))):
+                after, said, outcomes = left, what, found
+        for rate, one in plan.events:
+            if (wait := random.expovariate(rate)) < after:
+                after, said, outcomes = wait, "", [one]
+        return max(after, 0.0), said, outcomes
+
+    def lasts(self, state: int, slot: tuple[str, str], random: Random) -> tuple[str, float]:
+        """Return how a run or a timer that starts will end, and after how long (s)."""
+        draw = self.first(self.x.states[state], slot)
+        ((what, stages, rate),) = random.choices([c for _, c in draw], [p for p, _ in draw])
+        if not rate:
+            return what, inf
+        return what, stages / rate if stages == UNDIVIDED else random.gammavariate(stages, 1 / rate)
+
     # --- the numbers ---------------------------------------------------------------------------
 
     def first(self, state: State, slot: tuple[str, str]) -> Draw:
@@ -434,7 +536,8 @@ class _Builder:
         return self.plans[i]
 
     def slots(self, state: State) -> tuple[tuple[str, str], ...]:
-        """Return what has a clock in a state, in an order that does not depend on ids."""
+        """Return what has a clock in a state, in an order that does not depend on ids. Timers are
+        in the order of the file: that in which those that were armed together elapse."""
         if state.mode is Mode.FINISHED:
             return ()
         drawn = {name for _, name in self.causes}
@@ -444,8 +547,9 @@ class _Builder:
             for run in state.tokens.get(place, ())
             if run.phase in ACTIVE
         ]
-        armed = sorted(n for n, t in state.timers.items() if not t.elapsed and n not in drawn)
-        timers = [("timer", name) for name in armed]
+        armed = [n for n, t in state.timers.items() if not t.elapsed and n not in drawn]
+        index = self.x.engine.compiled.net.transition_index
+        timers = [("timer", name) for name in sorted(armed, key=index.__getitem__)]
         return (*runs, *timers)
 
     def _plan(self, i: int) -> _Plan:
@@ -651,3 +755,12 @@ class _Builder:
             for r in said
         )
         return _Outcome(j, edge, kept, spoils=spoils)
+
+
+def _mean(sample: list[float]) -> tuple[float, float]:
+    """Return the mean of a sample, and its standard error; nan for an empty one."""
+    n = len(sample)
+    if not n:
+        return float("nan"), 0.0
+    mean = sum(sample) / n
+    return mean, sqrt(sum((value - mean) ** 2 for value in sample) / n / n)

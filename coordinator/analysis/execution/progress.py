@@ -18,8 +18,10 @@ from the graph as a Markov chain (`chain.py`).
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -47,9 +49,10 @@ from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
 from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
 from petrobot.coordinator.engine import AddTokens, Begin, Engine, Policy, RemoveTokens
-from petrobot.coordinator.task import Kind
+from petrobot.coordinator.task import Kind, Value
 from petrobot.coordinator.task.compiled import Arcs
 from petrobot.coordinator.task.compiled_task import CompiledTransition
+from petrobot.coordinator.task.conditions import ConditionFault
 
 FAIR = "every awaited event comes at some time, and a run may always end in each of its ways"
 """What progress needs of the world."""
@@ -323,11 +326,43 @@ class Progress:
                 empty.append(f"{net.places[p]}, which {own}")
         if empty:
             return f"it needs {' and '.join(empty)}"
+        if false := self._never_true(t):
+            return false
         if always:
             text = f"in every state at rest it {' and '.join(sorted(always))}"
             return text + self._first_takers(t, idle)
         needs = ", ".join(net.places[p] for p, _ in t.needs)
         return f"the tokens that it needs ({needs}) are never there together"
+
+    def _never_true(self, t: CompiledTransition) -> str:
+        """Return that its condition is false for all values that its variables ever have; empty if
+        it is not, or if that is not known because a run tells or writes some of them."""
+        task = self.x.engine.compiled.task
+        names = sorted(t.when.names & set(task.variables)) if t.when is not None else []
+        told = {name for place in task.places.values() for name in place.out.values()}
+        if t.when is None or not names or told.intersection(names):
+            return ""
+        if t.when.names - set(names) - set(task.parameters):
+            return ""
+        base, values = dict(self.x.states[0].variables), list[dict[Value, None]]()
+        for name in names:
+            seen = {task.variables[name].initial: None}
+            seen |= dict.fromkeys(state.variables.get(name) for state in self.x.states)
+            for u in task.transitions.values():
+                for written, e in u.sets:
+                    if written == name and e.names:
+                        return ""
+                    seen |= {e.value({}): None} if written == name else {}
+            values.append(seen)
+        for chosen in product(*values):
+            with suppress(ConditionFault):
+                if t.when.holds(base | dict(zip(names, chosen, strict=True))):
+                    return ""
+        only = (
+            f"{name} is only ever {' or '.join(map(repr, seen))}"
+            for name, seen in zip(names, values, strict=True)
+        )
+        return f"its condition ({t.when}) is never true: {' and '.join(only)}"
 
     def _first_takers(self, t: CompiledTransition, idle: set[int]) -> str:
         """Return which other transitions take the tokens that come into a place which is empty

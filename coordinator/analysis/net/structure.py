@@ -9,10 +9,10 @@ sections V to VII.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from math import gcd
+from math import gcd, lcm
 
 import numpy as np
 from numpy.typing import NDArray
@@ -188,68 +188,109 @@ def implied_places(flows: Semiflows, bounds: Sequence[int | None]) -> frozenset[
 
 @dataclass(frozen=True, slots=True)
 class Lyapunov:
-    """A linear Lyapunov function y.M of a net: y > 0 and y^T C <= 0, so no firing increases y.M.
+    """What is known of a linear Lyapunov function y.M of a net: y > 0 and y^T C <= 0, so no firing
+    increases y.M.
 
-    The inequality was checked in integers, not in floating point.
+    All three answers were checked in integers, not in floating point.
     """
 
-    weights: Vector
-    conserved: bool
-    """Whether y^T C = 0: the net is conservative."""
+    weights: Vector | None
+    """Such a y; None if none was found."""
+    bounded: bool | None
+    """Whether there is such a y: the net is bounded from every initial marking. None: unknown."""
+    conservative: bool | None
+    """Whether there is one with y^T C = 0. None: unknown."""
 
 
-def lyapunov(net: Net) -> Lyapunov | None:
-    """Return a positive integer y with y^T C <= 0, or None if none was found.
+def lyapunov(net: Net) -> Lyapunov:
+    """Return a positive integer y with y^T C <= 0, or whether it is known that there is none.
 
-    Such a y proves that the net is bounded from every initial marking. Three ways, in this order:
-    the sum of all P-semiflows if they cover the places; the sum of the minimal y >= 0 with
-    y^T C <= 0 if their enumeration stays small (each transition gets a slack row, which turns the
-    inequality into an equation); a linear program whose solution is rounded to fractions and
-    checked exactly.
+    Three ways, in this order: the sum of all P-semiflows if they cover the places; the sum of the
+    minimal y >= 0 with y^T C <= 0 if their enumeration stays small (each transition gets a slack
+    row, which turns the inequality into an equation); linear programs for y and for firing counts
+    that exclude it, whose solutions are rounded to fractions and checked exactly.
     """
     flows = place_semiflows(net)
     if flows.covers(len(net.places)):
         total: Vector = {}
         for y in flows.vectors:
             total = _combined(total, 1, y, 1)
-        return Lyapunov(total, True)
+        return Lyapunov(total, True, True)
     rows: list[Vector] = [{} for _ in net.places]
     for t, changes in enumerate(net.compiled.changes):
         for p, change in changes:
             rows[p][t] = change
     slack: list[Vector] = [{t: 1} for t in range(len(net.transitions))]
     falling = _semiflows(rows + slack, SMALL_EFFORT)
+    weights: Vector | None
     if falling.complete:
-        places = len(net.places)
-        sums = {p: sum(y.get(p, 0) for y in falling.vectors) for p in range(places)}
-        return (
-            _exact(net, np.array([float(sums[p]) for p in range(places)]))
-            if all(sums.values())
-            else None
-        )
+        weights = {p: sum(y.get(p, 0) for y in falling.vectors) for p in range(len(net.places))}
+        bounded: bool | None = all(weights.values())
+        weights = weights if bounded else None
+    else:
+        weights = _programmed(net, conserved=False)
+        bounded = True if weights else False if _grows(net, 0.0) else None
+    if bounded is False or flows.complete:
+        return Lyapunov(weights, bounded, False)
+    if kept := _programmed(net, conserved=True):
+        return Lyapunov(kept, True, True)
+    return Lyapunov(weights, bounded, False if _grows(net, -1.0) else None)
+
+
+def _programmed(net: Net, *, conserved: bool) -> Vector | None:
+    """Return a positive integer y with y^T C <= 0, or y^T C = 0, by a linear program; None if none
+    was found."""
     from scipy.optimize import linprog
 
-    C = incidence(net).astype(float)
-    n = len(net.places)
-    found = linprog(
-        np.ones(n), A_ub=C.T, b_ub=np.zeros(C.shape[1]), bounds=[(1, None)] * n, method="highs"
-    )
-    return _exact(net, found.x) if found.status == 0 else None
-
-
-def _exact(net: Net, y: NDArray[np.float64]) -> Lyapunov | None:
-    """Return integer weights close to a multiple of y with y^T C <= 0 exactly, or None.
-
-    Fractions with small denominators are tried first, since the weights of real nets are small.
-    """
-    for largest in (1, 12, 1000, 10**6):
-        near = [Fraction(float(v)).limit_denominator(largest) for v in y]
-        scale = int(np.lcm.reduce([f.denominator for f in near])) if near else 1
-        weights = {p: int(f * scale) for p, f in enumerate(near)}
-        drift = [sum(weights[p] * c for p, c in changes) for changes in net.compiled.changes]
-        if all(w > 0 for w in weights.values()) and all(d <= 0 for d in drift):
-            return Lyapunov(weights, not any(drift))
+    if overtime():
+        return None
+    n, rows = len(net.places), incidence(net).astype(float).T
+    zero = np.zeros(len(rows))
+    part = {"A_eq": rows, "b_eq": zero} if conserved else {"A_ub": rows, "b_ub": zero}
+    found = linprog(np.ones(n), **part, bounds=[(1, None)] * n, method="highs")
+    for y in _rounded(found.x) if found.status == 0 else ():
+        drift = [sum(y.get(p, 0) * c for p, c in changes) for changes in net.compiled.changes]
+        if (
+            len(y) == n
+            and min(y.values()) > 0
+            and max(drift) <= 0
+            and not (conserved and any(drift))
+        ):
+            return y
     return None
+
+
+def _grows(net: Net, least: float) -> bool:
+    """Return whether firing counts x >= `least` were found with C x >= 0 and C x not 0.
+
+    With x >= 0 there is no y > 0 with y^T C <= 0, and with x of any sign none with y^T C = 0:
+    y^T (C x) would be positive. Without such an x there is such a y (lemmas of Farkas and Stiemke).
+    """
+    from scipy.optimize import linprog
+
+    if overtime():
+        return False
+    C = incidence(net).astype(float)
+    n = C.shape[1]
+    found = linprog(
+        -C.sum(axis=0), A_ub=-C, b_ub=np.zeros(len(C)), bounds=[(least, 1.0)] * n, method="highs"
+    )
+    for x in _rounded(found.x) if found.status == 0 else ():
+        gain: Vector = {}
+        for t, count in x.items():
+            gain = _combined(gain, 1, dict(net.compiled.changes[t]), count)
+        if gain and min(gain.values()) > 0 and (least < 0 or min(x.values()) > 0):
+            return True
+    return False
+
+
+def _rounded(values: NDArray[np.float64]) -> Iterator[Vector]:
+    """Yield integer vectors that are close to a multiple of the values: first those by fractions
+    with small denominators, since the weights of real nets are small."""
+    for largest in (1, 12, 1000, 10**6):
+        near = [Fraction(float(v)).limit_denominator(largest) for v in values]
+        scale = lcm(*(f.denominator for f in near))
+        yield {i: int(f * scale) for i, f in enumerate(near) if f}
 
 
 def is_strictly_conservative(net: Net) -> bool:

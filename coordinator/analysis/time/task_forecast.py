@@ -44,7 +44,9 @@ from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.net import Marking
 
 MATTERS = 0.01
-"""Share of the time of a mission run above which an error of a fit is reported."""
+"""Share of the time of a mission run, or of a figure, above which an error of a fit is reported."""
+TIME = "mean time (s)"
+"""Name of the mean time to completion among the figures."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +98,7 @@ class Forecast:
             "P_complete": self.completion_probability,
             **({} if goal is None else {"R_goal": goal}),
             "R_conj": self.conjunctive_reliability,
-            "mean time (s)": self.done.mean,
+            TIME: self.done.mean,
         }
 
     @property
