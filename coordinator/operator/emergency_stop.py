@@ -58,7 +58,7 @@ class Stopped:
     bus: str = ""
     """What was done on the bus instead of the node."""
     note: str = ""
-    """Further report of the node: that the stop is not stored on its disk."""
+    """Further report of the node: that the stop is not stored, or not cleared, on its disk."""
     latch: str = ""
     """What was stored or cleared on disk instead of the node."""
     cleared: bool = False

@@ -432,7 +432,8 @@ class Node:
                 why = self._stops.clear(keys)
                 self.callee.stops = self._stops.cleared
                 if why:
-                    self.callee.answer(now, command.id, False, {"cause": "latched", "text": why})
+                    note = f"NOT CLEARED: {why}; its devices stay stopped"
+                    self.callee.answer(now, command.id, False, {"answers": {}, "note": note})
                     return
             self._commands[command.id] = _Commanded(command.verb, now + ANSWER_WITHIN, set(keys))
             for key in keys:
