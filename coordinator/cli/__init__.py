@@ -10,6 +10,9 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+
+from petrobot.services.host.emergency_latch import uptime
 
 EXIT_CODES = """\
 exit codes:
@@ -124,7 +127,7 @@ PLAIN = (
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
     try:
-        code = _main(list(sys.argv[1:] if argv is None else argv))
+        code = _main(list(argv), uptime()) if argv is not None else _main(sys.argv[1:], _begun())
         sys.stdout.flush()
         return code
     except KeyboardInterrupt:  # also while modules are imported: that takes longest
@@ -140,7 +143,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         return PIPE_CLOSED
 
 
-def _main(arguments: list[str]) -> int:
+def _begun() -> float:
+    """Return when this process was started (`uptime`): Python may have been frozen before it read
+    its first line. A program that was started by `exec` counts from the start of its shell."""
+    fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+    return int(fields[19]) / os.sysconf("SC_CLK_TCK")
+
+
+def _main(arguments: list[str], ordered: float) -> int:
     if arguments[:1] == ["--version"]:
         from importlib.metadata import version  # slower to import than all the rest here
 
@@ -149,7 +159,7 @@ def _main(arguments: list[str]) -> int:
     known = {command.name: command for command in COMMANDS}
     if not arguments or arguments[0] not in known:
         return _overview(arguments)
-    return _dispatch(known[arguments[0]], arguments[1:])
+    return _dispatch(known[arguments[0]], arguments[1:], ordered)
 
 
 def _overview(arguments: Sequence[str]) -> int:
@@ -175,7 +185,7 @@ def _overview(arguments: Sequence[str]) -> int:
     return 2
 
 
-def _dispatch(command: Subcommand, arguments: Sequence[str]) -> int:
+def _dispatch(command: Subcommand, arguments: Sequence[str], ordered: float) -> int:
     module = importlib.import_module(f"petrobot.coordinator.cli.{command.module or command.name}")
     codes = SHORT_EXIT_CODES if command.name in PLAIN else EXIT_CODES
     parser = argparse.ArgumentParser(
@@ -189,6 +199,7 @@ def _dispatch(command: Subcommand, arguments: Sequence[str]) -> int:
         options = parser.parse_args(arguments)
     except SystemExit as leaving:
         return int(leaving.code or 0)
+    options.ordered = ordered
     if level := getattr(options, "log_level", None):
         from petrobot.coordinator.cli.options import log_to_stderr
 

@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     def make(observers: Sequence[Observer]) -> RunSession:
         from petrobot.coordinator.operator.prepare import resume
 
-        return resume(found, observers)
+        return resume(found, observers, options.ordered)
 
     return conduct(make, options, mode, resumed=True)
 

@@ -470,6 +470,7 @@ def _request(task: Task, directory: Directory, options: argparse.Namespace) -> R
         durable=options.durable,
         mock=options.mock,
         nodes=nodes,
+        ordered=options.ordered,
     )
 
 

@@ -58,11 +58,11 @@ class Stopped:
     bus: str = ""
     """What was done on the bus instead of the node."""
     note: str = ""
-    """Further report of the node: that the stop is not stored on its disk."""
+    """Further report of the node: that the stop is not stored, or not cleared, on its disk."""
     latch: str = ""
     """What was stored or cleared on disk instead of the node."""
     cleared: bool = False
-    """Whether the stop of a node that is not running was cleared on its disk."""
+    """Whether the stop of a node that does not answer was cleared on its disk."""
 
     @property
     def answered(self) -> bool:
@@ -266,7 +266,7 @@ async def _latch(directory: Directory, node: str) -> str:
 
 
 async def _unlatch(directory: Directory, node: str) -> tuple[str, bool]:
-    """Clear the stop of a node that is not running on its disk; return what was done, and whether
+    """Clear the stop of a node that does not answer on its disk; return what was done, and whether
     the stop is cleared."""
     if node not in await asyncio.to_thread(still_stopped, directory):
         return "", False
@@ -276,8 +276,8 @@ async def _unlatch(directory: Directory, node: str) -> tuple[str, bool]:
     except LatchError as fault:
         return f"not cleared: {fault}", False
     return (
-        "it is not running; its stop is cleared on disk, so its devices accept orders when it is "
-        "started",
+        "it does not answer; its stop is cleared on disk, so its devices accept orders once it "
+        "runs",
         True,
     )
 

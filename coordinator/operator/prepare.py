@@ -7,6 +7,7 @@ continues a run whose coordinator died. `coordinator/operator/session.py` leads 
 from __future__ import annotations
 
 import asyncio
+import math
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -102,6 +103,9 @@ class RunRequest:
     """File of scripted actions."""
     nodes: str = ONE_PROCESS
     """Kind of lock-step cell: ONE_PROCESS, LAUNCHED or JOINED."""
+    ordered: float = math.inf
+    """When the operator ordered it (`uptime`): in real time it does not start if an emergency stop
+    was cleared since. Infinity: after everything."""
 
 
 def prepare(
@@ -192,10 +196,12 @@ def prepare_from(
     return made
 
 
-def resume(found: Recorded, observers: Sequence[Observer] = ()) -> RunSession:
+def resume(
+    found: Recorded, observers: Sequence[Observer] = (), ordered: float = math.inf
+) -> RunSession:
     """Continue a run whose coordinator was killed. A lock-step cell that ended with its coordinator
     is built again from its seed; nodes that wait for their coordinator are joined. `observers` see
-    the recorded steps, too.
+    the recorded steps, too. `ordered` as for `RunRequest`.
 
     Raises EstimatesError, RequestError, JournalError, ReplayError, KeyFileError.
     """
@@ -226,7 +232,9 @@ def resume(found: Recorded, observers: Sequence[Observer] = ()) -> RunSession:
     if lockstep:
         member, party = lockstep_member(found.directory, mission, None, begin)
         return LockstepSession(party, selector, learning, folder, member=member, resumed=True)
-    return RealtimeSession(found.directory, mission, selector, learning, folder, begin=begin)
+    return RealtimeSession(
+        found.directory, mission, selector, learning, folder, begin=begin, ordered=ordered
+    )
 
 
 def _physics(directory: Directory) -> str:
@@ -289,7 +297,9 @@ def _new(
     try:
         if not lockstep:
             mission = realtime_mission(directory, setting, identity, store)
-            return RealtimeSession(directory, mission, selector, learning, folder, observers)
+            return RealtimeSession(
+                directory, mission, selector, learning, folder, observers, ordered=request.ordered
+            )
         if request.nodes == ONE_PROCESS:
             cell, party = lockstep_cell(directory, setting, script, store)
             return LockstepSession(

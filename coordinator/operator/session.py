@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import shutil
 import signal
 import threading
@@ -114,8 +115,8 @@ class RunSession(ABC):
 
     @abstractmethod
     async def connect(self) -> None:
-        """Connect to every node. Raises UnreachableError (only in real time: in lock step the cell
-        forms when it is led)."""
+        """Connect to every node. Raises UnreachableError, or MissionError for an order from before
+        an emergency stop (only in real time: in lock step the cell forms when it is led)."""
 
     async def lead(self, watch: Watch | None = None) -> None:
         """Run it to its end; even if it fails, what was learned is saved and the journal is closed.
@@ -231,10 +232,11 @@ class RealtimeSession(RunSession):
         observers: Sequence[Observer] = (),
         *,
         begin: Callable[[float], None] | None = None,
+        ordered: float = math.inf,
     ) -> None:
-        """`begin` makes a resumed mission continue."""
+        """`begin` makes a resumed mission continue; `ordered` as for `RunRequest`."""
         super().__init__(mission, selector, learning, folder, observers, resumed=begin is not None)
-        self.shell = RealtimeMission(mission, directory, credentials_of(directory))
+        self.shell = RealtimeMission(mission, directory, credentials_of(directory), ordered)
         self._begin = begin or mission.start
 
     def _attended(self) -> Shell:

@@ -39,6 +39,7 @@ from petrobot.coordinator.run.recording import ReplayError
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import TaskFileError, loads
 from petrobot.services.comm.location_file import Directory, DirectoryError
+from petrobot.services.host.emergency_latch import uptime
 
 _log = logging.getLogger(__package__)
 
@@ -49,6 +50,10 @@ LOOK, PATIENCE = 2.0, 1.5
 LAST_WORDS = 10.0
 """Time for a run to end when the station closes (s)."""
 FAULTS_TOLD = 3
+TICK, STOOD_STILL = 0.1, 0.5
+"""Time between two ticks, and the delay of one from which this process counts as frozen (s)."""
+ARREARS = 2.0
+"""Time after that in which commands are read that may have been given meanwhile (s)."""
 OVER = frozenset({"success", "failure", "error", "aborted", "stopped"})
 """States of a mission run that has ended."""
 
@@ -82,6 +87,10 @@ class Station:
         """Why nothing may start: the emergency stop that is not cleared; empty without one."""
         self._going: asyncio.Task[None] | None = None
         self._looking = asyncio.get_running_loop().create_task(self._look())
+        self._ticked = uptime()
+        self._frozen = (0.0, 0.0)
+        """From when to when this process was frozen the last time (`uptime`)."""
+        self._tick()
         self.feed.replace(
             mission={"id": "", "state": "idle", "mode": "realtime", "starts": True, "file": ""}
         )
@@ -89,6 +98,7 @@ class Station:
     async def close(self) -> None:
         """Abort the active run and close."""
         self._looking.cancel()
+        self._ticking.cancel()
         await asyncio.gather(self._looking, self._apart.close(), return_exceptions=True)
         going, run = self._going, self._run
         if going is None or run is None or run.operation is None:
@@ -201,7 +211,24 @@ class Station:
     def _tell_file(self) -> None:
         self.feed.emit("mission", mission={"file": self._loaded, "revision": self._revision})
 
+    def _tick(self) -> None:
+        self._notice_frozen()
+        self._ticking = asyncio.get_running_loop().call_later(TICK, self._tick)
+
+    def _notice_frozen(self) -> None:
+        before, self._ticked = self._ticked, uptime()
+        if self._ticked - before > TICK + STOOD_STILL:
+            self._frozen = (before, self._ticked)
+
+    def _ordered(self) -> float:
+        """Return when a command that has just been read was given (`uptime`): if this process was
+        frozen until now, perhaps already when that began."""
+        self._notice_frozen()
+        since, until = self._frozen
+        return since if self._ticked - until < ARREARS else self._ticked
+
     async def _start(self, who: str, data: Mapping[str, Any]) -> Answer:
+        ordered = self._ordered()
         if self._going is not None and self.feed.state["mission"]["state"] in OVER:
             # It is only closing its connections.
             await asyncio.wait({self._going}, timeout=LAST_WORDS)
@@ -211,7 +238,7 @@ class Station:
             return refusal("stopped", "the emergency stop is active; clear it first")
         self._starting = True  # No other start may come in between.
         try:
-            return await self._started(who, data)
+            return await self._started(data, ordered)
         finally:
             self._starting = False
 
@@ -224,7 +251,7 @@ class Station:
             f"{mission['id'] or 'a mission run'} is active; abort it, or wait for its end",
         )
 
-    async def _started(self, who: str, data: Mapping[str, Any]) -> Answer:
+    async def _started(self, data: Mapping[str, Any], ordered: float) -> Answer:
         if data.get("from") is not None:
             return await self._started_from(data)
         name = str(data.get("task") or self._loaded)
@@ -248,7 +275,7 @@ class Station:
         if name != self._loaded:
             self._forget(name)
         self._revision = text.revision
-        request = self._own(read_start(task, data, self._estimates))
+        request = replace(self._own(read_start(task, data, self._estimates)), ordered=ordered)
         if request.mode == LOCKSTEP:
             run = await asyncio.to_thread(prepare, request, task, text.text, self.directory)
         else:
@@ -258,6 +285,9 @@ class Station:
         except UnreachableError as fault:
             await run.abandon()
             return {**refusal("unreachable", str(fault)), "nodes": list(fault.nodes)}
+        except MissionError as fault:
+            await run.abandon()
+            return refusal("stopped", str(fault))
         return self._follow(run)
 
     async def _started_from(self, data: Mapping[str, Any]) -> Answer:

@@ -152,7 +152,7 @@ class Executor:
                 self._abort_if_latched(now, node, notice.outcome)
                 self._queue.extend(self.dispatch.late(now, notice.outcome))
             elif isinstance(notice, Welcome):
-                process, stops = split_boot(notice.boot)
+                process, stops, _ = split_boot(notice.boot)
                 self.dispatch.back(now, node, process, notice.runs)
                 if stops != self.callers[node].stops:
                     self._abort(now, node)

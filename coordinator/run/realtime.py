@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,8 +15,9 @@ from petrobot.coordinator.run.mission import Mission, MissionError, Stage
 from petrobot.services.comm.calls.caller import Notice, PeerLost
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.location_file import Directory
-from petrobot.services.comm.protocol.messages import COORDINATOR, Welcome
+from petrobot.services.comm.protocol.messages import COORDINATOR, Welcome, split_boot
 from petrobot.services.comm.tls.credentials import Credentials, credentials
+from petrobot.services.host.emergency_latch import uptime
 
 PERIOD: Final = 0.05
 """Time between two checks (s)."""
@@ -61,6 +63,9 @@ LEAVE: Final = 2.5
 """How long to wait for a lost node, so that it can be sent BYE (s): a little longer than it keeps
 the leases of a coordinator that left without BYE (`services.comm.calls.callee.Retention.lease`)."""
 
+TRANSIT: Final = 0.1
+"""Longest time that a WELCOME needs on a busy host (s): an order right after the clearing of an
+emergency stop must not count as older. No operator gives and clears a stop in this time."""
 KEY_CODES: Final = ("key_needed", "no_key_here", "no_key_there", "wrong_key")
 """Refusals (docs/protocol.md) of a peer with another key than the node's."""
 
@@ -82,9 +87,18 @@ class RealtimeMission:
     it by timers."""
 
     def __init__(
-        self, mission: Mission, directory: Directory, proves: Credentials | None = None
+        self,
+        mission: Mission,
+        directory: Directory,
+        proves: Credentials | None = None,
+        ordered: float = math.inf,
     ) -> None:
+        """`ordered`: when the operator ordered the run (`uptime`); infinity: after everything."""
         self.mission = mission
+        self._ordered = ordered
+        self._missed: list[str] | None = []
+        """Nodes that cleared an emergency stop after that; None once all nodes are connected: from
+        then on the callers count the stops."""
         self._loop = asyncio.get_running_loop()
         self._over = asyncio.Event()
         self._closed = False
@@ -107,7 +121,8 @@ class RealtimeMission:
         }
 
     async def connect(self, timeout: float = 5.0) -> None:
-        """Connect to every node. Raises UnreachableError with those that cannot be reached."""
+        """Connect to every node. Raises UnreachableError with those that cannot be reached, and
+        MissionError if an emergency stop was given and cleared after the run was ordered."""
         for client in self.clients.values():
             client.start()
         reached = await asyncio.gather(
@@ -115,9 +130,15 @@ class RealtimeMission:
         )
         missing = [name for name, up in zip(self.clients, reached, strict=True) if not up]
         if missing:
-            raise UnreachableError(missing, "; ".join(self._missed(missing)))
+            raise UnreachableError(missing, "; ".join(self._unreached(missing)))
+        missed, self._missed = self._missed, None
+        if missed:
+            raise MissionError(
+                f"{', '.join(missed)}: an emergency stop was cleared after this was ordered, so "
+                "nothing was started; if the cell is safe, order it again"
+            )
 
-    def _missed(self, missing: Sequence[str]) -> Iterator[str]:
+    def _unreached(self, missing: Sequence[str]) -> Iterator[str]:
         """Return why nodes cannot be reached and what to do. Nodes that run and refuse us do not
         have to be started."""
         source = quote(os.path.normpath(self.mission.executor.directory.source))
@@ -218,6 +239,10 @@ class RealtimeMission:
                     self._lost_at[node] = self._loop.time()
                 elif isinstance(notice, Welcome):
                     self._lost_at.pop(node, None)
+                    # Durations, not clocks: that of this process counts also while it is frozen.
+                    since = split_boot(notice.boot)[2]
+                    if self._missed is not None and uptime() - self._ordered > since + TRANSIT:
+                        self._missed.append(node)
             if not self._closed:
                 self._guarded(lambda now: self.mission.take(now, node, notices))
 

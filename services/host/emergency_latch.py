@@ -6,8 +6,9 @@ commands (`*`: all). The node writes it, and checks it before each run on a devi
 per second. `petrobot estop` writes it for a node of its own host that does not answer. A file that
 cannot be read or understood counts as `*`: in doubt, devices stay stopped.
 
-Beside it another file counts the stops that were cleared. It stays, so that a caller that was
-frozen from before a stop until after it was cleared is still known to have missed it.
+Beside it another file counts the stops that were cleared, and says when the last one was. It
+stays, so that a caller that was frozen from before a stop until after it was cleared is still known
+to have missed it.
 
 The file is in `$PETROBOT_STATE`; else in `.petrobot` beside services.toml; else, if that cannot be
 written, in a folder of the user (`$XDG_STATE_HOME` or `~/.local/state`). A file in any of these
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
@@ -53,9 +55,10 @@ class Latch:
         return self._write(".stopped", sorted(self.stopped() | set(devices)))
 
     @property
-    def cleared(self) -> int:
-        """How many stops were cleared; files that cannot be read do not count."""
-        return max(_number(path.with_suffix(".cleared")) for path in self.paths)
+    def cleared(self) -> tuple[int, float]:
+        """How many stops were cleared, and when the last one was (`uptime`). Files that cannot be
+        read do not count."""
+        return max(_cleared(path.with_suffix(".cleared")) for path in self.paths)
 
     def _write(self, suffix: str, lines: list[str]) -> Path:
         """Write a file in the first folder in which that is possible, and return it."""
@@ -75,7 +78,7 @@ class Latch:
         stopped = self.stopped()
         left = (set(all_devices) if ALL in stopped else set(stopped)) - set(devices)
         if stopped:  # Counted first: a stop that is not counted must not be cleared.
-            self._write(".cleared", [str(self.cleared + 1)])
+            self._write(".cleared", [str(self.cleared[0] + 1), str(uptime())])
         if left:
             self.stop(left)
         for path in self.paths:
@@ -116,11 +119,19 @@ def _read(path: Path) -> frozenset[str]:
     return frozenset(names) or frozenset({ALL})
 
 
-def _number(path: Path) -> int:
+def uptime() -> float:
+    """How long this host has been up, with the time in which it was suspended (s). It is the same
+    for all processes, and does not jump."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+def _cleared(path: Path) -> tuple[int, float]:
     try:
-        return int(path.read_text(encoding="ascii"))
+        number, *at = path.read_text(encoding="ascii").split()
+        # A time after now is of before the last boot, which was at 0.
+        return int(number), next((then for then in map(float, at) if then <= uptime()), 0.0)
     except (OSError, ValueError):
-        return 0
+        return 0, 0.0
 
 
 def _write(path: Path, names: list[str]) -> None:

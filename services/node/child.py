@@ -300,6 +300,7 @@ class Child:
         await self._forked.wait()
         if self._keeper:
             await until_ended(self._keeper)
+            self._code = self.code  # so it is reaped, though nobody may ask for it
         else:
             self._code = -signal.SIGKILL
             self._killed = self._killed or "its fork server ended, or could not fork it"

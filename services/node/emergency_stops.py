@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Iterable, Sequence
 
-from petrobot.services.host.emergency_latch import ALL, Latch, LatchError
+from petrobot.services.host.emergency_latch import ALL, Latch, LatchError, uptime
 from petrobot.services.worker.remote import EMERGENCY_STOP, NODE_SILENT
 
 _log = logging.getLogger(__name__)
@@ -77,8 +77,12 @@ class EmergencyStops:
         self._devices = tuple(devices)
         self._latch = latch
         self._stopped: set[str] = set()
-        self.cleared = 0 if latch is None else latch.cleared
-        """How many stops were cleared. A caller that knows of fewer slept through one."""
+        self.cleared, self._cleared_at = (0, 0.0) if latch is None else latch.cleared
+        """How many stops were cleared, and when the last one was. A caller that knows of fewer
+        slept through one."""
+        self._counted = dict.fromkeys(self._devices, self.cleared)
+        """How many stops were cleared when each device was last stopped or cleared by this node: if
+        the latch says more, another process has cleared it."""
 
     def __contains__(self, device: str) -> bool:
         return device in self._stopped
@@ -88,26 +92,36 @@ class EmergencyStops:
         """Devices in emergency stop."""
         return tuple(sorted(self._stopped))
 
+    def since_cleared(self) -> float:
+        """Return the time since the last stop was cleared (s)."""
+        return uptime() - self._cleared_at
+
     def at_start(self) -> list[str]:
         """Return the devices that start in emergency stop: those of the latch, or all of them if
         the latch cannot be kept, because then one may have been lost."""
         unsure = self._latch is not None and not self._latch.kept
-        return self._add(self._devices) if unsure else self.look(0.0)
+        return self._add(self._devices) if unsure else self.look(0.0)[0]
 
-    def look(self, now: float) -> list[str]:
-        """Return the devices that the latch has stopped since the last call."""
+    def look(self, now: float) -> tuple[list[str], list[str]]:
+        """Return the devices that the latch has stopped since the last call, and those that another
+        process has cleared, because this one did not answer: this one, or a process of the device,
+        may have seen the stop before."""
         if self._latch is None:
-            return []
+            return [], []
         self.due = now + LOOK if self._devices else NEVER
-        self.cleared = max(self.cleared, self._latch.cleared)
+        self._count(*self._latch.cleared)  # before the devices: that is the order of clearing
         stopped = self._latch.stopped()
-        return (
-            self._add(d for d in self._devices if d in stopped or ALL in stopped) if stopped else []
-        )
+        on_disk = [d for d in self._devices if d in stopped or ALL in stopped]
+        freed = [d for d, n in self._counted.items() if n < self.cleared and d not in on_disk]
+        self._stopped.difference_update(freed)
+        self._counted |= dict.fromkeys(freed, self.cleared)
+        return self._add(on_disk), freed
 
     def stop(self, devices: Collection[str]) -> str:
         """Stop these devices. Return why that could not be stored on disk; empty if it was."""
         self._add(devices)
+        if self._latch is not None:  # a clearing that has already begun does not mean this stop
+            self._counted |= dict.fromkeys(devices, self._latch.cleared[0])
         try:
             if self._latch is not None and devices:
                 self._latch.stop(devices)
@@ -127,10 +141,16 @@ class EmergencyStops:
                 self._latch.clear(devices, self._devices)
         except LatchError as fault:
             return str(fault)
-        cleared = self.cleared + (not self._stopped.isdisjoint(devices))
-        self.cleared = max(cleared, self._latch.cleared if self._latch is not None else 0)
+        if not self._stopped.isdisjoint(devices):
+            self._count(self.cleared + 1, uptime())
+        if self._latch is not None:
+            self._count(*self._latch.cleared)
         self._stopped.difference_update(devices)
+        self._counted = dict.fromkeys(self._devices, self.cleared)
         return ""
+
+    def _count(self, cleared: int, at: float) -> None:
+        self.cleared, self._cleared_at = max((self.cleared, self._cleared_at), (cleared, at))
 
     def _add(self, devices: Iterable[str]) -> list[str]:
         fresh = [device for device in devices if device not in self._stopped]

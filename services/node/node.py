@@ -239,6 +239,8 @@ class Node:
         )
         self._stop_places(0.0, self._stops.at_start())
         self.callee.stops = self._stops.cleared
+        if latch is not None:  # lock step knows no time but its own
+            self.callee.since_cleared = self._stops.since_cleared
 
     def _offers(self, waiting: Mapping[str, ActionEntry]) -> dict[str, Offer]:
         offers = {
@@ -430,7 +432,8 @@ class Node:
                 why = self._stops.clear(keys)
                 self.callee.stops = self._stops.cleared
                 if why:
-                    self.callee.answer(now, command.id, False, {"cause": "latched", "text": why})
+                    note = f"NOT CLEARED: {why}; its devices stay stopped"
+                    self.callee.answer(now, command.id, False, {"answers": {}, "note": note})
                     return
             self._commands[command.id] = _Commanded(command.verb, now + ANSWER_WITHIN, set(keys))
             for key in keys:
@@ -455,11 +458,14 @@ class Node:
             self.places[key].command(now, Command("", EMERGENCY_STOP))
 
     def _look_for_stops(self, now: float) -> None:
-        """Stop what the latch on disk says; it may have been set and cleared while this process
-        was frozen."""
-        if fresh := self._stops.look(now):
+        """Stop and free what the latch on disk says; it may have been set and cleared while this
+        process was frozen."""
+        fresh, freed = self._stops.look(now)
+        if fresh:
             self._stop_places(now, fresh)
             self._tell_of_stop(now)
+        for key in freed:
+            self.places[key].command(now, Command("", CLEAR_EMERGENCY))
         self.callee.stops = self._stops.cleared
 
     def _tell_of_stop(self, now: float) -> None:

@@ -16,6 +16,7 @@ from petrobot.services.comm.streams.stream import Incoming, StreamReceiver
 from petrobot.services.comm.tls.credentials import credentials
 from petrobot.services.host.whole_file import write_whole
 from petrobot.services.worker.context import Draws, checked
+from petrobot.services.worker.remote import EMERGENCY_STOP
 from petrobot.services.worker.setpoints import SetpointReceiver
 
 if TYPE_CHECKING:
@@ -178,6 +179,14 @@ class ProcessPorts(DevicePorts):
         """Read the set points that arrived."""
         if self._receiver is not None:
             self._receiver.poll()
+
+    def withhold(self, cause: str) -> None:
+        """Let the driver see no set point while its device is stopped for this cause; after an
+        emergency stop none of a run from before either. Call this after `poll`."""
+        for setpoint in self._setpoints.values():
+            setpoint.withdraw()
+        if self._receiver is not None and cause == EMERGENCY_STOP:
+            self._receiver.bar()
 
     @property
     def busy(self) -> bool:

@@ -169,6 +169,8 @@ class DeviceLoop:
                 self._watch(now, self._guard)
         self._take_commands(now)
         self._ports.poll()
+        if self._cyclic.barred:
+            self._ports.withhold(self._cyclic.barred)
         state = self._cyclic.step(now)
         if self._worker is not None:
             published = plain(state.state, "state")

@@ -219,6 +219,8 @@ class Worker:
             now = time.monotonic()
             if self._guard is not None and now >= self._guard.due:
                 self._watch(now, self._guard)
+            if self._ports is not None and self._barred:
+                self._ports.withhold(self._barred)
             self._advance(now)
             while self._calls and self._may_begin():
                 self._advance(time.monotonic())

@@ -38,6 +38,8 @@ class LinkFault(Enum):
     FROZEN = "frozen"
     CUT = "cut off"
     """Its cable is cut: no byte arrives, and no message that the connection has ended."""
+    DEAF = "deaf"
+    """Only what is sent to it is lost; what it sends arrives."""
 
 
 class Cable:
@@ -48,13 +50,18 @@ class Cable:
         self._listener = socket.create_server((HOST, 0))
         self.port = int(self._listener.getsockname()[1])
         self._wake, self._stop = socket.socketpair()
-        self._cut = False
+        self._cut = self._deaf = False
         self._thread = threading.Thread(target=self._carry)
         self._thread.start()
 
     def cut(self) -> None:
         """Stop relaying; both connections stay open."""
         self._cut = True
+        self._wake.send(b"x")
+
+    def deafen(self) -> None:
+        """Drop what the client sends, and accept no further connection."""
+        self._deaf = True
         self._wake.send(b"x")
 
     def close(self) -> None:
@@ -72,6 +79,9 @@ class Cable:
                 elif one in pairs:
                     self._pass_on(one, pairs)
             waiting = [self._stop] if self._cut else [self._stop, self._listener, *pairs]
+            if self._deaf:
+                near = [one for one in pairs if one.getsockname()[1] == self.port]
+                waiting = [one for one in waiting if one not in (self._listener, *near)]
             ready, _, _ = select.select(waiting, [], [])
         for one in (*pairs, self._listener, self._stop):
             one.close()
@@ -106,6 +116,8 @@ def inflict(fault: LinkFault, process: subprocess.Popen[str], cable: Cable) -> N
     """Cause the fault in the process, or in the cable to it."""
     if fault is LinkFault.CUT:
         cable.cut()
+    elif fault is LinkFault.DEAF:
+        cable.deafen()
     else:
         process.send_signal(signal.SIGKILL if fault is LinkFault.KILLED else signal.SIGSTOP)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -92,13 +93,18 @@ def test_a_call_names_the_stops_that_its_caller_knows_of() -> None:
 @pytest.mark.parametrize(
     ("boot", "parts"),
     [
-        ("n1", ("n1", 0)),
-        ("n1+12", ("n1", 12)),
-        ("a+b in lock step", ("a+b in lock step", 0)),
-        ("", ("", 0)),
+        ("n1", ("n1", 0, math.inf)),
+        ("n1+12", ("n1", 12, math.inf)),
+        ("n1+12/0.250000", ("n1", 12, 0.25)),
+        ("a+b in lock step", ("a+b in lock step", 0, math.inf)),
+        ("n1+12/soon", ("n1+12/soon", 0, math.inf)),
+        ("n1+1/1e400", ("n1+1/1e400", 0, math.inf)),
+        ("", ("", 0, math.inf)),
     ],
 )
-def test_a_boot_is_a_process_and_a_number_of_stops(boot: str, parts: tuple[str, int]) -> None:
+def test_a_boot_is_a_process_and_a_number_of_stops(
+    boot: str, parts: tuple[str, int, float]
+) -> None:
     assert m.split_boot(boot) == parts and m.boot_text(*parts) == boot
 
 

@@ -66,6 +66,7 @@ class Told:
         (LinkFault.KILLED, ("hung up", "broke")),
         (LinkFault.FROZEN, ("silent",)),
         (LinkFault.CUT, ("silent",)),
+        (LinkFault.DEAF, ("hung up", "broke")),
     ],
     ids=lambda one: one.value if isinstance(one, LinkFault) else "",
 )
@@ -189,7 +190,9 @@ def poll_until(
         assert watch.now < end, "the condition did not become true in time"
 
 
-@pytest.mark.parametrize("fault", LinkFault, ids=lambda one: one.value)
+@pytest.mark.parametrize(
+    "fault", [LinkFault.KILLED, LinkFault.FROZEN, LinkFault.CUT], ids=lambda one: one.value
+)
 @pytest.mark.parametrize("period", [0.004, 0.04])
 def test_no_set_point_older_than_three_periods_is_valid_when_its_sender_is_lost(
     fault: LinkFault, period: float

@@ -24,14 +24,21 @@ TEXT = """\
 schema = 1
 nodes.left = { host = "127.0.0.1", port = 7001 }
 actions.ask = { run = "asked:ask", task = "ask", node = "left" }
+actions.draw = { run = "asked:draw", task = "draw", node = "left" }
 """
 CODE = """\
 import os
+import random
+import uuid
 from pathlib import Path
+import numpy as np
 from petrobot import success
 
 def ask(ctx):
     return success(setting=os.environ.get("SETTING", ""), folder=str(Path.cwd()))
+
+def draw(ctx):
+    return success(python=random.random(), numpy=float(np.random.rand()), uuid=str(uuid.uuid4()))
 """
 
 
@@ -49,11 +56,11 @@ class Started:
         if any(isinstance(item, list) and item[0] == READY for item in items):
             self.ready.set()
 
-    async def ask(self) -> dict[str, object]:
+    async def ask(self, action: str = "ask") -> dict[str, object]:
         """Wait until it is ready, call its action, and end it; return the values."""
         async with asyncio.timeout(PATIENCE):
             await self.ready.wait()
-            self.child.give(Call("1", "ask", {}))
+            self.child.give(Call("1", action, {}))
             await until(lambda: self.results, "the result")
             assert self.results[0].status == "success", self.results
             self.child.leave()
@@ -89,6 +96,24 @@ async def test_a_worker_and_its_keeper(folder: Path) -> None:
     assert parent(keeper) == os.getpid() and keeper != fork_server()._process.pid
     assert (await started.ask())["setting"] == ""
     assert not alive(worker) and not Path(f"/proc/{keeper}").exists()
+
+
+async def test_what_has_ended_leaves_no_zombie(folder: Path) -> None:
+    """Nobody may ask how a process ended: a worker whose driver died is not wanted any more."""
+    started = Started(folder)
+    async with asyncio.timeout(PATIENCE):
+        await started.ready.wait()
+        keeper = parent(started.child.pid)
+        started.child.kill()
+        await started.over.wait()
+    assert not Path(f"/proc/{keeper}").exists()
+
+
+async def test_no_two_workers_draw_the_same_numbers(folder: Path) -> None:
+    """They are copies of one process, which must not have begun to draw."""
+    drawn = [await Started(folder).ask("draw") for _ in range(2)]
+    assert drawn[0].keys() == drawn[1].keys()
+    assert all(drawn[0][kind] != drawn[1][kind] for kind in drawn[0])
 
 
 async def test_a_process_has_the_environment_of_its_start(

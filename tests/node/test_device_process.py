@@ -114,6 +114,8 @@ class Ports:
 
     def poll(self) -> None: ...
 
+    def withhold(self, cause: str) -> None: ...
+
     def raised(self) -> list[tuple[str, dict[str, Any]]]:
         return []
 

@@ -285,3 +285,50 @@ async def test_a_stop_is_cleared_while_its_node_does_not_run(tmp_path: Path) -> 
     assert (await finished(petrobot("estop", "--clear", *services)))[0] == 3, (
         "nobody there, and nothing to clear"
     )
+
+
+async def test_estop_says_that_a_stop_cannot_be_cleared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the clearing cannot be counted, the node answers, and its devices stay stopped."""
+    monkeypatch.setenv("PETROBOT_STATE", str(tmp_path / "state"))
+    (tmp_path / "state" / "left.cleared").mkdir(parents=True)
+    nodes = Nodes(tmp_path, "left", "right")
+    command = ["estop", "--services", str(nodes.file), "--journal", str(tmp_path)]
+    try:
+        assert await asyncio.to_thread(main, command) == 0
+        capsys.readouterr()
+        assert await asyncio.to_thread(main, [*command, "--clear"]) == 3
+        out = capsys.readouterr().out
+        assert "NOT CLEARED: " in out and "its devices stay stopped" in out, out
+        assert "NO ANSWER" not in out and "right        eye          cleared" in out, out
+        async with operator_of(nodes.directory, "left") as operator:
+            assert (await operator.call("go", to=1.0)).cause == "emergency_stop"
+    finally:
+        nodes.stop()
+
+
+async def test_a_stop_of_a_frozen_node_is_cleared_for_its_driver_too(tmp_path: Path) -> None:
+    """The process of its cyclic driver has seen the stop, the node has not: when it continues, the
+    device accepts orders, as the command said."""
+    nodes = Nodes(tmp_path, "left", "right")
+    command = ["estop", "--services", str(nodes.file), "--journal", str(tmp_path)]
+    try:
+        async with operator_of(nodes.directory, "left") as operator:
+            await pids(operator, "left", "slide")
+        node = nodes.processes["left"].pid
+        os.kill(node, signal.SIGSTOP)
+        assert await asyncio.to_thread(main, command) == 3
+        log = tmp_path / "left.log"
+        limit = Limit("the driver to see the stop")
+        while "emergency" not in log.read_text() and limit.left():
+            await beat(0.05)
+        assert await asyncio.to_thread(main, [*command, "--clear"]) == 0
+        os.kill(node, signal.SIGCONT)
+        async with operator_of(nodes.directory, "left") as operator:
+            limit = Limit("the driver to know of the clearing")
+            while (moved := await operator.call("go", to=0.1)).cause and limit.left():
+                await beat(0.05)
+        assert moved.status == "success", moved
+    finally:
+        nodes.stop()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.services.host.emergency_latch import ALL, STATE, Latch, LatchError, latch_of
+from petrobot.services.host.emergency_latch import ALL, STATE, Latch, LatchError, latch_of, uptime
 from petrobot.services.node.emergency_stops import LOOK, NEVER, EmergencyStops
 
 DEVICES = ("arm", "camera", "gripper")
@@ -94,7 +94,8 @@ def test_a_latch_of_another_process_is_seen_at_the_next_check(tmp_path: Path) ->
     stops = EmergencyStops(DEVICES, latch(tmp_path))
     assert stops.at_start() == [] and stops.due == LOOK
     latch(tmp_path).stop([ALL])
-    assert stops.look(1.0) == list(DEVICES) and stops.look(2.0) == [] and stops.due == 2.0 + LOOK
+    assert stops.look(1.0) == (list(DEVICES), []) and stops.due == 1.0 + LOOK
+    assert stops.look(2.0) == ([], [])
     assert EmergencyStops(DEVICES).due == NEVER
 
 
@@ -121,9 +122,50 @@ def test_cleared_stops_are_counted_and_the_count_stays(tmp_path: Path) -> None:
     assert stops.clear(["arm"]) == "" and stops.clear(["arm"]) == "" and stops.cleared == 1
     latch(tmp_path).stop([ALL])
     latch(tmp_path).clear(DEVICES, DEVICES)
-    assert stops.look(1.0) == [] and stops.cleared == 2
+    assert stops.look(1.0) == ([], list(DEVICES)) and stops.cleared == 2
     assert EmergencyStops(DEVICES, latch(tmp_path)).cleared == 2
     assert [path.name for path in tmp_path.rglob("*.*")] == ["motion.cleared"]
+
+
+def test_a_stop_that_another_process_has_cleared_is_cleared(tmp_path: Path) -> None:
+    """Also one that only the processes of the devices have seen, but none that was given while it
+    was being cleared, and none whose file is only gone."""
+    stops, other = EmergencyStops(DEVICES, latch(tmp_path)), latch(tmp_path)
+    stops.stop(DEVICES)
+    other.clear(["arm"], DEVICES)
+    assert stops.look(1.0) == ([], ["arm"]) and [*stops.names] == ["camera", "gripper"]
+    other.clear(DEVICES, DEVICES)
+    assert stops.look(2.0)[1] == list(DEVICES) and [*stops.names] == []
+    other.stop([ALL])
+    other.clear(DEVICES, DEVICES)
+    assert stops.look(3.0) == ([], list(DEVICES)) and stops.look(4.0) == ([], [])
+    other.stop([ALL])
+    counted = other.paths[0].with_suffix(".cleared")
+    counted.write_text(f"{other.cleared[0] + 1}\n")  # as far as the other process has come
+    stops.stop(DEVICES)
+    for path in other.paths:
+        path.unlink(missing_ok=True)
+    assert stops.look(5.0) == ([], []) and [*stops.names] == [*DEVICES]
+    counted.unlink()
+    assert stops.look(6.0) == ([], []) and [*stops.names] == [*DEVICES]
+
+
+@pytest.mark.parametrize(
+    ("text", "known"),
+    [("2\n1.5\n", (2, 1.5)), ("2\n", (2, 0.0)), (f"2\n{1e12}\n", (2, 0.0)), ("?", (0, 0.0))],
+    ids=["now", "without a time", "before the last boot", "unreadable"],
+)
+def test_when_the_last_stop_was_cleared(
+    tmp_path: Path, text: str, known: tuple[int, float]
+) -> None:
+    """What is not known counts as long ago, but not before this host was booted."""
+    one = latch(tmp_path)
+    one.stop([ALL])
+    one.clear(DEVICES, DEVICES)
+    path = one.paths[0].with_suffix(".cleared")
+    assert one.cleared[0] == 1 and 0.0 <= uptime() - one.cleared[1] < 60.0
+    path.write_text(text)
+    assert one.cleared == known
 
 
 def test_a_stop_that_cannot_be_counted_is_not_cleared(tmp_path: Path) -> None:

@@ -9,21 +9,28 @@ import os
 import random
 import signal
 import subprocess
+import urllib.error
+import urllib.request
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.launch import local_programs
 from petrobot.coordinator.operator.run_address import ADDRESS_FILE
+from petrobot.coordinator.operator.station import ARREARS, STOOD_STILL
+from petrobot.coordinator.run.realtime import TRANSIT
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.services.comm.location_file import load
+from petrobot.services.host.emergency_latch import latch_of
 from tests.chaos.shuttle_cell import moves, shuttle_services
 from tests.security.test_estop import finished, petrobot
 from tests.waiting import beat, until
 
 pytestmark = pytest.mark.processes
+PATIENCE = 60.0
 TASK = """\
 schema = 1
 [task]
@@ -86,12 +93,25 @@ class Turns:
         self._services = ["--services", str(folder / "services.toml")]
         self._journal = ["--journal", str(folder / "runs")]
 
-    def start(self, pause: float) -> subprocess.Popen[str]:
-        """Start a run with this pause before each turn (s)."""
+    def task(self, pause: float) -> Path:
+        """Write the task, with this pause before each turn (s)."""
         task = self.folder / "turns.toml"
         task.write_text(TASK.format(pause=pause), encoding="utf-8")
-        options = ["--runs", "100000", "--no-page", "--quiet"]
-        return petrobot("run", str(task), *options, *self._services, *self._journal)
+        return task
+
+    def start(self, pause: float, *more: str) -> subprocess.Popen[str]:
+        """Start a run with this pause before each turn (s)."""
+        options = ["--runs", "100000", "--no-page", "--quiet", *more]
+        return petrobot("run", str(self.task(pause)), *options, *self._services, *self._journal)
+
+    def resume(self, run: Path) -> subprocess.Popen[str]:
+        """Resume a run."""
+        return petrobot("resume", str(run), "--no-page", "--quiet")
+
+    def serve(self) -> subprocess.Popen[str]:
+        """Serve the page."""
+        options = ["--tasks", str(self.folder), "--page-port", "0"]
+        return petrobot("serve", *options, *self._services, *self._journal)
 
     def begun(self) -> int:
         """Count the runs that have moved a hand."""
@@ -104,8 +124,11 @@ class Turns:
 
     async def estop(self, *options: str) -> None:
         """Give `petrobot estop`, whose devices all obey."""
-        command = ["estop", *options, *self._services, *self._journal]
-        assert await asyncio.to_thread(main, command) == 0
+        assert await asyncio.to_thread(main, self.estop_command(*options)) == 0
+
+    def estop_command(self, *options: str) -> list[str]:
+        """The command line of `petrobot estop`."""
+        return ["estop", *options, *self._services, *self._journal]
 
     async def restart_nodes(self) -> None:
         """Kill both nodes, and wait until they are ready again."""
@@ -132,6 +155,31 @@ class Turns:
 
         await until(published, "a coordinator that is connected")
         return found[0]
+
+
+def page_address(page: subprocess.Popen[str]) -> str:
+    """Wait until the page is served, and return its address with the token."""
+    assert page.stdout is not None
+    return next(line.split()[1] for line in page.stdout if line.startswith("page: "))
+
+
+async def give(address: str, verb: str, **data: object) -> dict[str, Any]:
+    """Give a command to a page, as a script does."""
+    base, _, token = address.partition("/?token=")
+    request = urllib.request.Request(
+        f"{base}/api/command",
+        json.dumps({"name": "test", "verb": verb, "data": data}).encode(),
+        {"Authorization": f"Bearer {token}", "Content-Type": "application/json"},
+    )
+
+    def ask() -> dict[str, Any]:
+        try:
+            with urllib.request.urlopen(request, timeout=PATIENCE) as answer:
+                return json.loads(answer.read())  # type: ignore[no-any-return]
+        except urllib.error.HTTPError as refused:
+            return json.loads(refused.read())  # type: ignore[no-any-return]
+
+    return await asyncio.to_thread(ask)
 
 
 @pytest.fixture
@@ -173,6 +221,96 @@ async def test_what_was_frozen_before_a_stop_moves_nothing_after_it_is_cleared(
             coordinator.communicate()
 
 
+@pytest.mark.parametrize("command", ["run", "resume"])
+async def test_an_order_from_before_a_stop_moves_nothing_after_it_is_cleared(
+    turns: Turns, command: str
+) -> None:
+    """The coordinator is frozen before it has reached any node, even before it is Python. The
+    operator must order it again, and then it moves."""
+    run = Path()
+    if command == "resume":
+        coordinator = turns.start(1.5)
+        run = await turns.connected(coordinator)
+        coordinator.kill()
+        coordinator.communicate()
+
+    def order() -> subprocess.Popen[str]:
+        return turns.resume(run) if command == "resume" else turns.start(0.02)
+
+    for moment in (0.0, 0.1, 0.3):
+        coordinator = order()
+        try:
+            await beat(moment)
+            coordinator.send_signal(signal.SIGSTOP)
+            await turns.estop()
+            await beat(2 * TRANSIT)  # no person is quicker
+            await turns.estop("--clear")
+            coordinator.send_signal(signal.SIGCONT)
+            code, out, err = await finished(coordinator)
+            assert (code, turns.begun()) == (1, 0), out + err
+            assert "order it again" in err
+        finally:
+            coordinator.kill()
+            coordinator.communicate()
+    coordinator = order()
+    try:
+        await turns.moving()
+    finally:
+        coordinator.kill()
+        coordinator.communicate()
+
+
+async def test_a_start_that_a_frozen_page_reads_after_a_stop_moves_nothing(turns: Turns) -> None:
+    """It was pressed while the page's process was frozen, or just before."""
+    turns.task(0.02)
+    page = turns.serve()
+    try:
+        address = await asyncio.to_thread(page_address, page)
+        assert (await give(address, "take_controls"))["ok"]
+        page.send_signal(signal.SIGSTOP)
+        pressed = asyncio.create_task(give(address, "start", task="turns"))
+        await beat(2 * TRANSIT)
+        await turns.estop()
+        await beat(STOOD_STILL)
+        await turns.estop("--clear")
+        page.send_signal(signal.SIGCONT)
+        answer = await pressed
+        assert (answer["ok"], answer["code"], turns.begun()) == (False, "stopped", 0), answer
+        assert "order it again" in answer["text"]
+        await beat(ARREARS)
+        answer = await give(address, "start", task="turns")
+        assert answer["ok"], answer
+        await turns.moving()
+    finally:
+        page.kill()
+        page.communicate()
+
+
+async def test_nodes_that_start_after_a_stop_was_cleared_know_when(tmp_path: Path) -> None:
+    """Here they did not run: the stop and its clearing are on disk."""
+    turns = Turns(tmp_path, Supervisor([], tmp_path / "logs"))
+    directory = load(shuttle_services(tmp_path, fetch=0.03, carry=0.03))
+    coordinator = turns.start(0.02, "--up")
+    try:
+        coordinator.send_signal(signal.SIGSTOP)
+        assert await asyncio.to_thread(main, turns.estop_command()) == 3
+        await beat(2 * TRANSIT)
+        await turns.estop("--clear")
+        assert latch_of(directory.source, "left").cleared[0] == 1
+        coordinator.send_signal(signal.SIGCONT)
+        code, out, err = await finished(coordinator)
+        assert (code, turns.begun()) == (1, 0), out + err
+    finally:
+        coordinator.kill()
+        coordinator.communicate()
+    coordinator = turns.start(0.02, "--up")
+    try:
+        await turns.moving()
+    finally:
+        coordinator.terminate()
+        coordinator.communicate()
+
+
 async def test_a_run_that_is_resumed_after_the_stop_moves(turns: Turns) -> None:
     """Its coordinator was killed between two runs. To resume it is a decision of the operator."""
     coordinator = turns.start(1.5)
@@ -183,7 +321,7 @@ async def test_a_run_that_is_resumed_after_the_stop_moves(turns: Turns) -> None:
         await turns.estop()
         await turns.estop("--clear")
         assert turns.begun() == 0
-        coordinator = petrobot("resume", str(run), "--no-page", "--quiet")
+        coordinator = turns.resume(run)
         await turns.moving()
     finally:
         coordinator.kill()

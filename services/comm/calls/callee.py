@@ -25,6 +25,7 @@ perhaps even its id, is no longer kept).
 from __future__ import annotations
 
 import heapq
+import math
 from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -342,6 +343,8 @@ class Callee:
         self.boot = boot
         self.stops = 0
         """How many emergency stops of the node were cleared; WELCOME tells it."""
+        self.since_cleared: Callable[[], float] = lambda: math.inf
+        """Returns the time since the last one was cleared (s), which WELCOME tells, too."""
         self.offers: Mapping[str, Offer] = dict(offers)
         self.directory = directory
         self.events = EventBoard()
@@ -402,7 +405,7 @@ class Callee:
         runs = [id_ for id_, run in self._running.items() if run.peer == peer] + self._results.of(
             peer
         )
-        boot = boot_text(self.boot, self.stops)
+        boot = boot_text(self.boot, self.stops, self.since_cleared())
         return Welcome(version, self.name, boot, offers, tuple(runs), self.directory)
 
     def link_down(self, now: float, peer: str, *, leaves: bool = False) -> None:

@@ -582,7 +582,7 @@ class Caller:
     def link_up(self, now: float, welcome: m.Welcome) -> None:
         """The peer welcomed us: send pending calls again under their ids, or end them if it is
         another boot."""
-        process, stops = split_boot(welcome.boot)
+        process, stops, _ = split_boot(welcome.boot)
         same = process == self.boot
         if not self.boot:
             self.stops = stops

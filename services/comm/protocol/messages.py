@@ -10,6 +10,8 @@ four of these.
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -24,21 +26,24 @@ LATCHED: Final = "latched"
 """Value of such a result if the node's stop is not cleared, or its caller did not know of it."""
 STOPS: Final = "stops"
 """Value of a latched result: the number of cleared stops that its caller knows of from then on."""
+_BOOT: Final = re.compile(r"(.*)\+([0-9]{1,18})(?:/([0-9]{1,18}(?:\.[0-9]+)?))?", re.DOTALL)
 SEED: Final = "seed"
 """Verb and key of the COMMAND that tells the mission's seed to devices that no action uses."""
 
 
-def boot_text(process: str, stops: int) -> str:
+def boot_text(process: str, stops: int, since: float = math.inf) -> str:
     """Return the boot of a node: the random text of its process, and how many emergency stops were
     cleared on it, if any. A call to a device that names another number is refused, so a caller that
-    slept through a stop moves nothing."""
-    return f"{process}+{stops}" if stops else process
+    slept through a stop moves nothing. In WELCOME also the time since the last one was cleared (s):
+    an order that is older is not carried out."""
+    ago = "" if since == math.inf else f"/{since:.6f}"
+    return f"{process}+{stops}{ago}" if stops else process
 
 
-def split_boot(boot: str) -> tuple[str, int]:
+def split_boot(boot: str) -> tuple[str, int, float]:
     """Return what `boot_text` put together."""
-    process, plus, stops = boot.rpartition("+")
-    return (process, int(stops)) if plus and stops.isdecimal() else (boot, 0)
+    found = _BOOT.fullmatch(boot)
+    return (found[1], int(found[2]), float(found[3] or math.inf)) if found else (boot, 0, math.inf)
 
 
 class Executed(StrEnum):

@@ -93,17 +93,31 @@ class Inlet:
     fresh one.
     """
 
-    __slots__ = ("_lateness", "_limit", "_sink", "_until")
+    __slots__ = ("_barred", "_heard", "_lateness", "_limit", "_sink", "_until")
 
     def __init__(self, period: float, sink: Sink) -> None:
         self._limit = STALE_AFTER * period
         self._sink = sink
         self._lateness = Lateness()
         self._until = math.inf
+        self._heard = -math.inf
+        self._barred = False
+
+    def bar(self) -> None:
+        """Withdraw the value, and drop all that come until the sender has been silent for three
+        periods, as between two runs."""
+        self._barred = True
+        self._until = math.inf
+        self._sink.withdraw()
 
     def receive(self, now: float, messages: Sequence[Message]) -> None:
         """Handle what has arrived by `now`: the newest message counts, the others only improve the
         estimate of the delay."""
+        self._barred = self._barred and now - self._heard <= self._limit
+        if any(isinstance(message, SetPoint) for message in messages):
+            self._heard = now
+        if self._barred:
+            return
         newest: Message | None = None
         late = 0.0
         for message in messages:
@@ -410,6 +424,12 @@ class StreamReceiver:
                 self._wait(now, guest)
         if self._listener.fileno() in ready:
             self._admit(now)
+
+    def bar(self) -> None:
+        """Withdraw all values; those that the present senders go on to repeat do not count."""
+        for guest in self._guests.values():
+            if guest.inlet is not None:
+                guest.inlet.bar()
 
     def close(self) -> None:
         """Stop listening and end all streams."""
