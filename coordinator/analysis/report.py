@@ -231,6 +231,7 @@ class Analysis:
             for d in q.deadlocks
         ]
         levels, home = q.levels, q.home_states
+        free = named["deadlock_free"].holds
         if self.progress is not None:
             levels, home = self.progress.levels, self.progress.home_states
             stuck = [
@@ -241,9 +242,8 @@ class Analysis:
                     "details": list(d.verdict.details),
                     **d.witness.to_json(),
                 }
-                for d in self.progress.dead_ends
+                for d in (self.progress.dead_ends if free is False else ())
             ]
-        free = named["deadlock_free"].holds
         out: dict[str, Any] = {
             "name": self.name,
             "net": _sizes(self.net),
@@ -288,11 +288,12 @@ class Analysis:
         space = self.qualitative.space
         if not space.complete:
             return None
-        return (
-            space.most_tokens
-            if self.ends is None
-            else int(np.sum(self.ends.held(space), axis=0).max())
-        )
+        if self.ends is None:
+            return space.most_tokens
+        held = np.zeros(len(space), dtype=np.int64)
+        for p in range(len(self.ends.parts)):
+            held += self.ends.held(space, p)
+        return int(held.max())
 
     def _numbers(self) -> dict[str, Any]:
         if self.run is not None:
@@ -374,7 +375,8 @@ class Analysis:
                 for d in q.deadlocks[:SHOWN]
             ]
         else:
-            ends = self.progress.dead_ends
+            stuck = self.verdicts()["deadlock_free"].holds is False
+            ends = self.progress.dead_ends if stuck else ()
             several = len(ends) > 1 or any(d.count > 1 for d in ends)
             lines += [
                 f"  dead end       {d.count} x: {d.verdict.reason}" for d in ends[:SHOWN] if several
@@ -593,6 +595,9 @@ def _analyse_task(
                 shown = proven(n, found.space, ordinary)
     except KeyboardInterrupt:
         notes.append(CUT)
+    except (MemoryError, OutOfTime) as fault:  # what is known by now stays known
+        notes.append(FULL if isinstance(fault, MemoryError) else LATE)
+        why = notes[-1]
     judgement = Analysis(
         task.name,
         task.net,
