@@ -27,11 +27,12 @@ from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.task import Estimate, Status, Task
 from petrobot.coordinator.task.conditions import parse
-from petrobot.coordinator.task.file import load
+from petrobot.coordinator.task.file import load, loads
 from petrobot.coordinator.task.net import Net
 from tests.analysis.broken import with_button
 from tests.analysis.random_nets import state_machines
 from tests.engine.conftest import make_task
+from tests.engine.test_expansion import TRIES
 
 TASKS = Path(__file__).parents[2] / "coordinator" / "tasks"
 
@@ -599,6 +600,37 @@ def test_an_incomplete_graph_proves_nothing_but_still_refutes() -> None:
     assert {verdicts[name].holds for name in NAMES if name != "quasi_live"} == {None}
     unknown = judged(fine, 40).deadlock_free
     assert unknown.holds is None and "more than 40 stimuli and firings" in unknown.reason
+
+
+@pytest.mark.parametrize(
+    ("final", "told"),
+    [
+        (
+            "arm == 1",
+            ["with 1 run: proved: bounded, deadlock free", "with 2 runs: proved: "],
+        ),
+        ("arm == 1 and done == 0", ["with 1 run: not deadlock free: stuck with done: "]),
+    ],
+)
+def test_a_task_that_is_too_large_is_searched_with_fewer_runs(
+    final: str, told: Sequence[str]
+) -> None:
+    """The fault shows at the end of the last run only, far beyond the limit."""
+    task = seeded(cell=CELL.replace("parts=3", "parts=40")).task
+    task = replace(task, final=parse(f"parts == 0 and {final}"), runs_place="parts")
+    found = analyse(task, steps=300)
+    assert found.progress is not None and not found.progress.x.complete and not found.objections
+    assert [line[: len(words)] for line, words in zip(found.with_fewer, told, strict=True)] == told
+    assert set(found.with_fewer) <= set(found.to_json(structure=False)["notes"])
+    assert not analyse(task).fewer  # where the whole graph is known, it is not asked
+
+
+def test_a_path_tells_the_usual_reason() -> None:
+    """`tries` asks whether a run ended by an emergency stop. A run that did not is no such case."""
+    words = [end for _, end in execute(loads(TRIES)).names.ends["grasp"]]
+    errors = [text for text in words if text.startswith("error")]
+    assert words[0] == "success"
+    assert "reason 'other'" in errors[0] and "reason 'emergency_stop'" in errors[-1]
 
 
 def test_the_order_of_timers_is_kept() -> None:

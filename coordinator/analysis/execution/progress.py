@@ -306,7 +306,7 @@ class Progress:
         if not idle:
             return PropertyVerdict(True, "every transition can fire", assumption=self._fair)
         if not self.x.complete:
-            return self._unknown(f"not fired so far: {', '.join(t.name for t in idle)}")
+            return self._unknown(f"not fired so far: {few([t.name for t in idle])}")
         numbers = {compiled.net.transition_index[n] for c in never.values() for n in c}
         roots = [t for t in idle if not self._fed_by(t, numbers, t.needs)]
         # In a ring of transitions that wait for each other, name the one that lacks a token, not
@@ -314,7 +314,7 @@ class Progress:
         roots = roots or [t for t in idle if self._fed_by(t, numbers, t.plain)] or idle
         told = [f"{t.name} can never fire: {self._never(t, numbers)}" for t in roots]
         if others := [t.name for t in idle if t not in roots]:
-            told.append(f"and so neither can {', '.join(others)}")
+            told.append(f"and so neither can {few(others)}")
         return PropertyVerdict(False, "; ".join(told))
 
     def _fed_by(self, t: CompiledTransition, idle: set[int], needs: Arcs) -> bool:
