@@ -143,6 +143,10 @@ CERTAIN = 1e-9
 """A probability of completion that differs from 1 by less than this counts as 1."""
 BY_HAND = 20_000
 """The most stimuli and firings with the operator's tokens: as many as `petrobot check` tries."""
+MORE = "with more the same may happen, which was not searched to its end"
+"""What a fault with fewer runs means for the task."""
+FEWER = 2
+"""The most runs with which a task is searched whose execution graph is too large."""
 SHOWN = 20
 """The most entries of a list that the text shows."""
 VERDICT = 26
@@ -177,6 +181,9 @@ class Analysis:
     against them."""
     refused: bool = False
     """Whether the task may not run for a reason beyond these verdicts (`may_run`)."""
+    fewer: Mapping[int, Analysis] = field(default_factory=dict)
+    """Tasks only: by number of runs, the analyses with fewer of them, where the execution graph is
+    not complete."""
 
     @cached_property
     def by_hand(self) -> list[PropertyVerdict]:
@@ -190,7 +197,26 @@ class Analysis:
         p = self.progress
         waiting = p is not None and p.x.complete and p.view.error_exits and not p.recoveries
         late = (LATE,) if waiting and overtime() else ()
-        return tuple(dict.fromkeys((*self.notes, *late)))
+        return tuple(dict.fromkeys((*self.notes, *late, *self.with_fewer)))
+
+    @cached_property
+    def with_fewer(self) -> list[str]:
+        """What is known of the task with fewer runs, in sentences."""
+        told = []
+        for runs, one in self.fewer.items():
+            head = f"with {runs} run{'s' * (runs > 1)}"
+            for name, verdict in [*one.objections.items()][:1]:  # others often follow from it
+                steps = verdict.witness.steps if verdict.witness else ()
+                by = (f"by: {'; '.join(in_words(steps))}",) * bool(steps)
+                fault = f"{head}: not {_plain(name)}: {verdict.reason}"
+                told.append("; ".join((fault, MORE, *verdict.details, *by)))
+            verdicts = one.verdicts().items()
+            open_ = [_plain(name) for name, v in verdicts if v.holds is None]
+            if not one.objections:
+                shown = [_plain(name) for name, v in verdicts if v.holds and name != "safe"]
+                known = f"{head}: proved: {', '.join(shown) or 'nothing'}"
+                told.append(f"{known}; unknown: {', '.join(open_)}" if open_ else known)
+        return told
 
     @property
     def ok(self) -> bool:
@@ -244,6 +270,7 @@ class Analysis:
             for d in q.deadlocks
         ]
         levels, home = q.levels, q.home_states
+        free = named["deadlock_free"].holds
         if self.progress is not None:
             levels, home = self.progress.levels, self.progress.home_states
             stuck = [
@@ -254,9 +281,8 @@ class Analysis:
                     "details": list(d.verdict.details),
                     **d.witness.to_json(),
                 }
-                for d in self.progress.dead_ends
+                for d in (self.progress.dead_ends if free is False else ())
             ]
-        free = named["deadlock_free"].holds
         out: dict[str, Any] = {
             "name": self.name,
             "net": _sizes(self.net),
@@ -301,11 +327,12 @@ class Analysis:
         space = self.qualitative.space
         if not space.complete:
             return None
-        return (
-            space.most_tokens
-            if self.ends is None
-            else int(np.sum(self.ends.held(space), axis=0).max())
-        )
+        if self.ends is None:
+            return space.most_tokens
+        held = np.zeros(len(space), dtype=np.int64)
+        for p in range(len(self.ends.parts)):
+            held += self.ends.held(space, p)
+        return int(held.max())
 
     def _numbers(self) -> dict[str, Any]:
         if self.run is not None:
@@ -387,7 +414,8 @@ class Analysis:
                 for d in q.deadlocks[:SHOWN]
             ]
         else:
-            ends = self.progress.dead_ends
+            stuck = self.verdicts()["deadlock_free"].holds is False
+            ends = self.progress.dead_ends if stuck else ()
             several = len(ends) > 1 or any(d.count > 1 for d in ends)
             lines += [
                 f"  dead end       {d.count} x: {d.verdict.reason}" for d in ends[:SHOWN] if several
@@ -587,6 +615,7 @@ def _analyse_task(
     engine: EngineName,
     steps: int,
     devices: Mapping[str, str] | None,
+    fewer: bool = True,
 ) -> Analysis:
     ordinary, n, notes = OrdinaryView(task), ends_net(task), list[str]()
     found = _examined(n.net, limits, engine, notes, partial(judged, n))
@@ -606,6 +635,9 @@ def _analyse_task(
                 shown = proven(n, found.space, ordinary)
     except KeyboardInterrupt:
         notes.append(CUT)
+    except (MemoryError, OutOfTime) as fault:  # what is known by now stays known
+        notes.append(FULL if isinstance(fault, MemoryError) else LATE)
+        why = notes[-1]
     judgement = Analysis(
         task.name,
         task.net,
@@ -621,11 +653,37 @@ def _analyse_task(
         shown,
         n,
     )
+    if fewer and not (judgement.interrupted or judgement.objections):
+        smaller = _with_fewer_runs(task, progress, limits, engine, steps, devices)
+        judgement = replace(judgement, fewer=smaller)
     if view != "gspn" or judgement.interrupted:
         return judgement
     return with_forecast(
         judgement, task, measured=measured, stages=stages, limits=limits, devices=devices
     )
+
+
+def _with_fewer_runs(
+    task: Task,
+    progress: Progress | None,
+    limits: SearchLimits | None,
+    engine: EngineName,
+    steps: int,
+    devices: Mapping[str, str] | None,
+) -> dict[int, Analysis]:
+    """Return the analyses of a task with one run, then two, up to a fault or a graph that is too
+    large, within the same limits; empty if its own graph is complete or it does not count runs."""
+    found, place = dict[int, Analysis](), task.places.get(task.runs_place)
+    if place is None or overtime() or (progress is not None and progress.x.complete):
+        return found
+    for runs in range(1, min(place.tokens, FEWER + 1)):
+        places = {**task.places, place.name: replace(place, tokens=runs)}
+        smaller = replace(task, places=places)
+        one = _analyse_task(smaller, "", None, STAGES, limits, engine, steps, devices, fewer=False)
+        found[runs] = one
+        if one.objections or one.progress is None or not one.progress.x.complete:
+            break
+    return found
 
 
 def with_forecast(
@@ -852,6 +910,10 @@ def _recovery(r: Recovery, odds: Odds) -> Mapping[str, Any]:
         "goals_lost": r.lost,
         "strategy": list(r.strategy),
     }
+
+
+def _plain(name: str) -> str:
+    return name.replace("_", " ")
 
 
 def _word(holds: bool | None) -> str:

@@ -274,7 +274,11 @@ def _text(name: str, judged: MayRun, report: CheckReport, missing: list[str]) ->
     elif analysis is not None and analysis.interrupted:
         yield f"{name}: was not checked to its end (Ctrl-C)"
     else:
-        yield f"{name}: may run"
+        verdicts = {} if analysis is None else analysis.verdicts()
+        open_ = [one for key, one in verdicts.items() if key != "safe" and one.holds is None]
+        proved = [one for key, one in verdicts.items() if key != "safe" and one.holds is not None]
+        part = "not everything" if proved else "nothing"
+        yield f"{name}: may run{f', but {part} was proved' if open_ else ''}"
     if analysis is not None:
         yield from _summary(analysis)
         told += [*_reasons(analysis), *_notes(name, analysis)]
@@ -376,3 +380,5 @@ def _reasons(analysis: Analysis) -> Iterator[Told]:
             unknown.setdefault(verdict.reason, []).append(name.replace("_", " "))
     for why, names in unknown.items():
         yield Told(Severity.WARNING, f"{', '.join(names)}: {why}")
+    for text in analysis.with_fewer:
+        yield Told(Severity.WARNING, text)

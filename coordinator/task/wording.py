@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from enum import StrEnum
@@ -55,3 +55,14 @@ def wrapped(text: str, hang: int) -> str:
 def listed(words: Iterable[str]) -> str:
     """The words, sorted and separated by commas."""
     return ", ".join(sorted(words)) or "none"
+
+
+FEW = 6
+"""The most names of a long list that a sentence tells."""
+
+
+def few(words: Sequence[str]) -> str:
+    """The words separated by commas; of many the first few, and how many more there are."""
+    if len(words) <= FEW + 1:
+        return ", ".join(words)
+    return f"{', '.join(words[:FEW])} and {len(words) - FEW} more"

@@ -16,6 +16,7 @@ from petrobot.coordinator.analysis.report import Analysis, analyse
 from petrobot.coordinator.cli.analyse import picture, refused
 from petrobot.coordinator.task import End, Kind, Task, Transition
 from petrobot.coordinator.task.file import load
+from tests.engine.conftest import make_task
 
 TASKS = Path(__file__).parents[2] / "coordinator" / "tasks"
 LIMITS = SearchLimits(states=20_000)
@@ -71,6 +72,25 @@ VARIANTS: dict[str, Callable[[Task], Task]] = {
     "double_resource": double_resource,
     "leaking_token": leaking_token,
 }
+
+
+def with_button(task: Task, broken: str) -> Task:
+    """Add a branch that blinks whenever a button is pressed; its error goes to a place."""
+    net = {
+        "pressed": {"in": "idle", "out": "blink", "event": "button"},
+        "blinked": {"in": "blink:normal", "out": "idle"},
+        "dark": {"in": "blink:error", "out": broken},
+    }
+    loop = make_task("blink! idle=1", net, "button+")
+    idle, blink = loop.places["idle"], replace(loop.places["blink"], listen=True)
+    idle = replace(idle, kind=Kind.PLAIN, listen=True)
+    return replace(
+        task,
+        places={**task.places, "idle": idle, "blink": blink},
+        transitions={**task.transitions, **loop.transitions},
+        primitive_tasks={**task.primitive_tasks, **loop.primitive_tasks},
+        events={**task.events, **loop.events},
+    )
 
 
 def damaged(task: Task) -> Iterator[tuple[str, Task]]:

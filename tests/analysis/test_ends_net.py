@@ -3,6 +3,7 @@ every state at rest is a marking of N, and an N without dead ends proves that X 
 
 from __future__ import annotations
 
+import tracemalloc
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,10 +15,10 @@ from hypothesis import strategies as st
 
 from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, TooManyValues, execute
 from petrobot.coordinator.analysis.execution.names import MISSING
-from petrobot.coordinator.analysis.net.ends_net import EndsNet, ends_net, kind_of, proven
+from petrobot.coordinator.analysis.net.ends_net import EndsNet, ends_net, judged, kind_of, proven
 from petrobot.coordinator.analysis.net.graph import Graph
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
-from petrobot.coordinator.analysis.net.space import SearchLimits, Space, explore
+from petrobot.coordinator.analysis.net.space import JUDGED, SearchLimits, Space, explore
 from petrobot.coordinator.analysis.report import analyse
 from petrobot.coordinator.engine import Engine, Mode, Phase, Policy, State
 from petrobot.coordinator.task import Output, Task
@@ -26,6 +27,7 @@ from petrobot.coordinator.task.net import Marking
 from tests.analysis.broken import TASKS
 from tests.analysis.test_execution_graph import COMMON, LIMIT
 from tests.analysis.test_progress import STUCK
+from tests.engine.conftest import make_task
 from tests.engine.test_expansion import LISTEN, SETS, TRIES
 from tests.engine.test_properties import DEVICES, tasks
 
@@ -145,6 +147,29 @@ def test_n_proves_what_an_incomplete_execution_graph_cannot() -> None:
     shown = {name for name, verdict in verdicts.items() if "ends net" in verdict.reason}
     assert shown == {"deadlock_free", "one_run_each", "returned"}
     assert all(verdicts[name].holds for name in shown) and verdicts["sound"].holds is None
+
+
+def test_verdicts_of_a_net_of_many_places_take_the_memory_that_the_search_left() -> None:
+    """A search stops where the verdicts need the rest of the memory. A column of tokens for each
+    place would take many times that: a task has a hundred places, and a marking of it 30 bytes."""
+    steps = range(20)
+    net = {f"end{i}": {"in": f"do{i}:normal", "out": f"do{i + 1}"} for i in steps}
+    net |= {f"lost{i}": {"in": f"do{i}:error", "out": "go"} for i in steps}
+    places = "".join(f" do{i}!3" for i in steps)
+    net["begin"] = {"in": "go", "out": "do0"}
+    task = make_task(f"go=3 do20{places}", net, final="do20 == 3")
+    n = ends_net(task)
+    space = explore(n.net)
+    arrays = (space.words, space.row, space.target, space.label)
+    engine = sum(array.nbytes for array in arrays)
+    tracemalloc.start()
+    found = judged(n, space)
+    shown = proven(n, space, OrdinaryView(task))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(space) > 15_000 and len(n.net.places) > 60
+    assert found.most == 3 and shown["deadlock_free"].holds
+    assert engine + peak < JUDGED * engine
 
 
 @pytest.mark.parametrize("what", STUCK)

@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 from petrobot.coordinator.analysis.execution.causes import explain, settled
 from petrobot.coordinator.analysis.execution.chain import TooLarge, chain_of
 from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, TooManyValues, execute
+from petrobot.coordinator.analysis.execution.progress import progress_of
+from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.time.measured import NoEstimate
 from petrobot.coordinator.engine import (
     ArmTimer,
@@ -54,6 +56,7 @@ from petrobot.coordinator.task import (
 from petrobot.coordinator.task.conditions import parse
 from petrobot.coordinator.task.file import loads
 from petrobot.coordinator.task.validation import faults
+from tests.analysis.broken import with_button
 from tests.engine.test_expansion import LISTEN, SETS, TRIES
 from tests.engine.test_properties import DEVICES, tasks
 
@@ -379,6 +382,68 @@ def graph_and_engine_agree(task: Task, data: st.DataObject) -> None:
 @given(whole_tasks(), st.data())
 def test_every_play_of_the_engine_is_a_path(task: Task, data: st.DataObject) -> None:
     graph_and_engine_agree(task, data)
+
+
+def ends_by_search(x: ExecutionGraph) -> tuple[bool, bool]:
+    """Return whether an end can be reached from every state, and whether one with `final` can be
+    reached at all. The engine follows every stimulus once more, and a search begins in each state:
+    slow, but it shares nothing with the verdict."""
+    final, error = x.engine.compiled.task.final, x.engine.compiled.task.final_error
+    places = x.engine.compiled.net.places
+    calm, good, tired = [set[int]() for _ in x.states], set[int](), set[int]()
+    after = [set[int]() for _ in x.states]
+    for i, state in enumerate(x.states):
+        held = dict(zip(places, state.marking, strict=True))
+        if state.mode is Mode.FINISHED and final.holds(held):
+            good.add(i)
+        elif state.mode is Mode.FINISHED and error is not None and error.holds(held):
+            tired.add(i)
+        if i in x.livelocks:
+            continue
+        for cause in x.names.stimuli(state, x.orders[i]):
+            _, _, number, _ = x.follow(i, cause)
+            after[i].add(number)
+            said = cause.stimulus
+            if not (isinstance(said, RunEnded) and said.status is Status.ERROR):
+                calm[i].add(number)
+    everywhere = all(reached(i, after) & good or reached(i, calm) & tired for i in range(len(x)))
+    return everywhere, bool(good)
+
+
+def reached(first: int, after: list[set[int]]) -> set[int]:
+    known, todo = {first}, [first]
+    while todo:
+        new = after[todo.pop()] - known
+        known |= new
+        todo += new
+    return known
+
+
+@settings(COMMON, max_examples=60)
+@given(whole_tasks(), st.data())
+def test_sound_is_what_a_search_from_every_state_says(task: Task, data: st.DataObject) -> None:
+    kept = [p.name for p in task.places.values() if p.kind in (Kind.CONTROL, Kind.RESOURCE)]
+    assume(kept)
+    draw = data.draw
+    first, second = (
+        parse(f"{draw(st.sampled_from(kept))} {draw(st.sampled_from(signs))} {least}")
+        for signs, least in ((("==", "<=", ">="), draw(st.integers(0, 2))), ((">=",), 2))
+    )
+    forgets = replace(task.transitions[draw(st.sampled_from(sorted(task.transitions)))], outputs=())
+    task = replace(moved(task, transitions=[forgets]), final=first, final_error=second)
+    task = with_button(task, draw(st.sampled_from(kept)))
+    assume(not faults(task))
+    try:
+        found = progress_of(OrdinaryView(task), 300)
+    except TooManyValues:
+        assume(False)
+    x = found.x
+    assume(x.complete)
+    everywhere, once = ends_by_search(x)
+    event(f"an end from everywhere: {everywhere}, with `final`: {once}, stuck: {x.dead.any()}")
+    assert found.sound.holds is (everywhere and once)
+    if not everywhere and not x.dead.any() and not x.livelocks:
+        assert found.sound.witness is not None and found.sound.details
 
 
 ESTIMATES = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from petrobot.coordinator.analysis.execution.chain import chain_of
 from petrobot.coordinator.analysis.execution.graph import execute, in_words, with_operator
 from petrobot.coordinator.analysis.execution.progress import MENDED, NAMES, Progress, progress_of
+from petrobot.coordinator.analysis.limits import until
 from petrobot.coordinator.analysis.may_run import Budget, may_run
 from petrobot.coordinator.analysis.net.graph import Graph
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
@@ -25,10 +27,12 @@ from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.task import Estimate, Kind, Status, Task
 from petrobot.coordinator.task.conditions import parse
-from petrobot.coordinator.task.file import load
+from petrobot.coordinator.task.file import load, loads
 from petrobot.coordinator.task.net import Net
+from tests.analysis.broken import with_button
 from tests.analysis.random_nets import state_machines
 from tests.engine.conftest import make_task
+from tests.engine.test_expansion import TRIES
 
 TASKS = Path(__file__).parents[2] / "coordinator" / "tasks"
 
@@ -296,6 +300,54 @@ def test_a_dead_end_is_found_replayed_and_explained(what: str) -> None:
     assert not answer.ok and any("deadlock free" in line for line in answer.objections())
 
 
+@pytest.mark.parametrize("what", STUCK)
+def test_a_branch_that_listens_does_not_hide_what_is_stuck(what: str) -> None:
+    """Something can always fire, and where an error of the branch ends in `final_error`, an end can
+    be reached. Neither helps the task."""
+    case = STUCK[what]
+    task = with_button(case.task, "broken" if case.task.final_error else "idle")
+    task = replace(task, final_error=task.final_error and parse("broken > 0"))
+    found = judged(task)
+    assert found.deadlock_free.holds and found.sound.holds is False
+    lines = (found.sound.reason, *found.sound.details)
+    for words in case.told:
+        lack, empty, fate = words.partition(", which is empty: ")
+        # What still fires takes something, so only the rest of that sentence is told.
+        lack = lack.removeprefix("no transition takes what is left, and ").partition(", or for")[0]
+        assert any(lack in line for line in lines), lines
+        if empty:
+            assert f"{lack.rpartition(' ')[2]}: {fate}" in lines
+    assert ("; only a further error ends it" in lines[-1]) is bool(case.task.final_error)
+    answer = may_run(task, None, Budget())
+    assert not answer.ok and any("sound" in line for line in answer.objections())
+
+
+@pytest.mark.parametrize("broken", ["idle", "broken"])
+def test_a_branch_that_listens_is_not_a_fault(broken: str) -> None:
+    task = replace(seeded().task, final_error=parse("broken > 0"))
+    answer = may_run(with_button(task, broken), None, Budget())
+    assert answer.ok and not answer.objections()
+
+
+def test_giving_up_may_wait_for_a_person_or_for_runs_that_are_active() -> None:
+    """After an error `final` cannot be reached; the end needs the other run and the button."""
+    task = make_task(
+        "go=1 a! b! ready lost broken",
+        {
+            "begin": {"in": "go", "out": "a b"},
+            "good": {"in": "a:normal", "out": "ready"},
+            "bad": {"in": "a:error", "out": "lost"},
+            "done": {"in": "b:normal", "out": "ready"},
+            "gone": {"in": "b:error", "out": "lost"},
+            "seen": {"in": "lost", "event": "button", "out": "broken"},
+        },
+        "button",
+        final="ready == 2",
+        final_error=parse("broken > 0 and lost == 0"),
+    )
+    assert judged(task).sound.holds
+
+
 LEFT_BEHIND: dict[str, tuple[dict[str, dict[str, Any]], str, str]] = {
     "an internal event must come before the end": (
         {"good": {"in": "act:normal", "event": "spark"}},
@@ -530,7 +582,23 @@ def test_a_loop_that_never_ends_is_not_sound() -> None:
     )
     found = judged(task)
     assert found.deadlock_free.holds and found.sound.holds is False
-    assert found.sound.details == ("the task can continue for ever, but never reaches done == 1",)
+    assert found.sound.details == (
+        "the end asks for done == 1 (it holds 0)",
+        "done: nothing ever fills it",
+        "the task can continue for ever, but never reaches done == 1",
+    )
+
+
+@pytest.mark.parametrize("readings", range(12))
+def test_what_is_not_judged_in_time_is_unknown(readings: int) -> None:
+    """The time is used up at some reading of the clock, also in the middle of a verdict."""
+    found, whole = judged(seeded().task), judged(seeded().task).verdicts()
+    with until(float(readings), count().__next__):
+        verdicts = found.verdicts()
+    assert {name: v.holds for name, v in verdicts.items() if v.holds is not None}.items() <= {
+        name: v.holds for name, v in whole.items()
+    }.items()
+    assert verdicts["stable"].holds is None
 
 
 def test_a_task_that_can_only_give_up_is_not_sound() -> None:
@@ -570,6 +638,37 @@ def test_an_incomplete_graph_proves_nothing_but_still_refutes() -> None:
     assert {verdicts[name].holds for name in NAMES if name != "quasi_live"} == {None}
     unknown = judged(fine, 40).deadlock_free
     assert unknown.holds is None and "more than 40 stimuli and firings" in unknown.reason
+
+
+@pytest.mark.parametrize(
+    ("final", "told"),
+    [
+        (
+            "arm == 1",
+            ["with 1 run: proved: bounded, deadlock free", "with 2 runs: proved: "],
+        ),
+        ("arm == 1 and done == 0", ["with 1 run: not deadlock free: stuck with done: "]),
+    ],
+)
+def test_a_task_that_is_too_large_is_searched_with_fewer_runs(
+    final: str, told: Sequence[str]
+) -> None:
+    """The fault shows at the end of the last run only, far beyond the limit."""
+    task = seeded(cell=CELL.replace("parts=3", "parts=40")).task
+    task = replace(task, final=parse(f"parts == 0 and {final}"), runs_place="parts")
+    found = analyse(task, steps=300)
+    assert found.progress is not None and not found.progress.x.complete and not found.objections
+    assert [line[: len(words)] for line, words in zip(found.with_fewer, told, strict=True)] == told
+    assert set(found.with_fewer) <= set(found.to_json(structure=False)["notes"])
+    assert not analyse(task).fewer  # where the whole graph is known, it is not asked
+
+
+def test_a_path_tells_the_usual_reason() -> None:
+    """`tries` asks whether a run ended by an emergency stop. A run that did not is no such case."""
+    words = [end for _, end in execute(loads(TRIES)).names.ends["grasp"]]
+    errors = [text for text in words if text.startswith("error")]
+    assert words[0] == "success"
+    assert "reason 'other'" in errors[0] and "reason 'emergency_stop'" in errors[-1]
 
 
 def test_the_order_of_timers_is_kept() -> None:

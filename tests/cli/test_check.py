@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from petrobot.coordinator.analysis import may_run
 from petrobot.coordinator.cli import main
 
 HEAD = """schema = 1
@@ -72,6 +73,25 @@ def test_no_line_is_wider_than_a_terminal(
     _, lines = printed(tmp_path, capsys, text, command)
     assert len(lines) > 15
     assert all(len(line) <= 100 or " " not in line.strip() for line in lines)
+
+
+def test_what_was_not_proved_is_said_in_the_first_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(may_run, "BUDGET", may_run.Budget(markings=50, steps=100))
+    text = HEAD + 'lost = { in = ["look:error"], out = ["arm", "bin"] }\n'
+    for old, new in (
+        ("tokens = 2", "tokens = 90"),
+        ("arm == 1", "arm == 1 and bin == 0"),
+        ("[primitive", 'runs_place = "parts"\n[primitive'),
+        ("[transitions]", 'bin = { kind = "control" }\n[transitions]'),
+    ):
+        text = text.replace(old, new, 1)
+    code, lines = printed(tmp_path, capsys, text)
+    assert code == 0 and lines[0] == "parts.toml: may run, but not everything was proved"
+    told = " ".join(" ".join(lines).split())
+    assert "warning with 1 run: not deadlock free: stuck with bin: " in told
+    assert "by: the mission begins -> next; look ends in error -> lost" in told
 
 
 def test_notes_of_one_kind_are_told_once(

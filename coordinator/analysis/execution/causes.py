@@ -3,7 +3,7 @@ and which path should have returned it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -82,12 +82,18 @@ def _ended(at: State, place: str, i: int) -> str:
     return f"ended in {run.status}" if run is not None and run.phase is Phase.DONE else ""
 
 
-def explain(x: ExecutionGraph, state: int) -> Explanation:
-    """Return why nothing can happen any more in a settled state."""
+def explain(x: ExecutionGraph, state: int, still: Collection[str] = ()) -> Explanation:
+    """Return why nothing can happen any more in a settled state, or nothing but firings of `still`,
+    for ever; `short` is empty if no other token is stuck."""
     draft = Draft(x.engine.compiled, x.states[state])
-    ended = {r.place for r in x.states[state].runs() if r.phase is Phase.DONE}
-    firings = x.firings(state)
-    waiting = [t for t in x.engine.compiled.transitions if _near(t, ended, draft.marking)]
+    firings, transitions = x.firings(state), x.engine.compiled.transitions
+    stays, net = list(draft.marking), x.engine.compiled.net
+    for t in transitions:
+        for p, _ in (*net.consume[t.index], *net.produce[t.index]) if t.name in still else ():
+            stays[p] = 0
+    done = {r.place for r in x.states[state].runs() if r.phase is Phase.DONE}
+    ended = {place for place in done if stays[net.place_index[place]]}
+    waiting = [t for t in transitions if t.name not in still and _near(t, ended, stays)]
     missed, spent, left, gone = _asked(x, draft, firings)
     lacks = list[Lack]()
     for t in waiting if ended else [t for t in waiting if not _at_rest(draft, t)]:
@@ -102,6 +108,8 @@ def explain(x: ExecutionGraph, state: int) -> Explanation:
     if not lacks and ended:
         names = ", ".join(sorted(ended))
         return Explanation(f"no transition takes what ended in {names} that way", ())
+    if not lacks and still:
+        return Explanation("", (f"the end asks for {missed}", *gone))
     if not lacks:
         text = f"no transition takes what is left, and the end asks for {missed}"
         return Explanation(text, gone)
@@ -272,7 +280,7 @@ def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
     movers, carried = _carried(net, order[last:])
     held = [net.places[p] for p in sorted(carried) if draft.marking[p]]
     names = ", ".join(f"`{net.transitions[t]}`" for t in dict.fromkeys(movers))
-    if not _leads(net, carried, set(givers)):
+    if not _leads(net, carried, set(givers), place):
         if movers:
             return f"{taker}, never returned by {names}"
         return f"{taker}, and nothing that follows it returns it"
@@ -310,14 +318,15 @@ def _carried(net: Net, order: list[int]) -> tuple[list[int], set[int]]:
     return movers, carried
 
 
-def _leads(net: Net, places: set[int], givers: set[int]) -> bool:
-    """Return whether arcs lead from one of the places to a transition that fills the place."""
+def _leads(net: Net, places: set[int], givers: set[int], filled: int) -> bool:
+    """Return whether arcs lead from one of the places to a transition that fills the place, without
+    that place itself and, as in `_carried`, those that have tokens at the beginning."""
     reached = set(places)
     while True:
         fed = {t for t, arcs in enumerate(net.consume) if reached & {p for p, _ in arcs}}
         if fed & givers:
             return True
-        more = {p for t in fed for p, _ in net.produce[t]}
+        more = {p for t in fed for p, _ in net.produce[t] if p != filled and not net.initial[p]}
         if more <= reached:
             return False
         reached |= more

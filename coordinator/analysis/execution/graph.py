@@ -150,6 +150,18 @@ class ExecutionGraph:
         return mask
 
     @cached_property
+    def fails(self) -> Mask:
+        """Which edges are a run that ends in ERROR."""
+        some = np.array([step.fails for step in self.steps] or [False])
+        mask: Mask = some[self.label]
+        return mask
+
+    @cached_property
+    def calm(self) -> Graph:
+        """The states and the edges that are not a run which ends in ERROR."""
+        return Graph(len(self.states), self.source[~self.fails], self.target[~self.fails])
+
+    @cached_property
     def retries(self) -> tuple[tuple[str, ...], ...]:
         """Transitions that may be repeated for ever while every run ends in ERROR, by part of the
         graph that only another end of a run, an event or the operator leaves."""

@@ -295,7 +295,11 @@ class Names:
         read = {result: name for result, name in out.items() if name in self.known}
         statuses = [s for s in Status if s is not Status.FAILURE or place in self._status_read]
         reason = f"{place}.reason"
+        named = self._literals.get(reason, ())
         reasons = self.different(reason) if reason in self._values else [""]
+        # A reason that no condition names is the usual one, so a path should tell it.
+        reasons.sort(key=lambda r: r in named)
+        usual = None if reason in self._together else reasons[0]
         kinds = {name: self.task.variables[name].type for name in out.values()}
         asked = f"{place}.executed"
         done = self.different(asked) if asked in self._values else [Executed.YES.value]
@@ -307,7 +311,8 @@ class Names:
             for cause, was, *values in product(reasons, executed, *choices):
                 given = {r: v for r, v in zip(read, values, strict=True) if v is not MISSING}
                 told = [f"{read[r]} = {v!r}" for r, v in given.items()]
-                told += [f"{REASON}{cause!r}"] if len(reasons) > 1 else []
+                if len(reasons) > 1 and (status is Status.ERROR or cause != usual):
+                    told.append(f"{REASON}{cause!r}")
                 told += [f"executed = {was}"] if len(executed) > 1 else []
                 text = status.value + (f" with {', '.join(told)}" if told else "")
                 if status is not Status.ERROR:

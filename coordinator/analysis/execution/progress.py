@@ -48,11 +48,20 @@ from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
 from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
-from petrobot.coordinator.engine import AddTokens, Begin, Engine, Policy, RemoveTokens
+from petrobot.coordinator.engine import (
+    AddTokens,
+    Begin,
+    Engine,
+    Phase,
+    Policy,
+    RemoveTokens,
+    State,
+)
 from petrobot.coordinator.task import Kind, Value
 from petrobot.coordinator.task.compiled import Arcs
 from petrobot.coordinator.task.compiled_task import CompiledTransition
 from petrobot.coordinator.task.conditions import ConditionFault
+from petrobot.coordinator.task.wording import few
 
 FAIR = "every awaited event comes at some time, and a run may always end in each of its ways"
 """What progress needs of the world."""
@@ -251,24 +260,44 @@ class Progress:
 
     @cached_property
     def sound(self) -> PropertyVerdict:
-        """An end can be reached from everywhere, and not only by giving up."""
+        """From everywhere `final` can be reached, or the task can give up without a further error.
+
+        Giving up after an error that is yet to come does not count: that error may belong to a
+        branch that has nothing to do with what is stuck, and never comes if all goes well.
+        """
         x = self.x
         if overtime():
             return self._unknown("")
-        final = x.engine.compiled.task.final
-        good = x.final | x.given_up
+        final, tired = x.engine.compiled.task.final, x.graph.backward(x.given_up)
+        hopeless = f"the task can only give up: it never comes to {final}"
+        only_gives_up = x.complete and not x.final.any() and tired.all()
+        good = x.final.copy()
         good[x.expanded :] = True
-        lost = np.flatnonzero(~x.graph.backward(good))
-        if not len(lost) and x.complete and not x.final.any():
-            reason = f"the task can only give up: it never comes to {final}"
-            return self._no(reason, int(np.flatnonzero(x.given_up)[0]))
+        lost = np.flatnonzero(~(x.graph.backward(good) | x.calm.backward(x.given_up)))
+        if not len(lost) and only_gives_up:
+            return self._no(hopeless, int(np.flatnonzero(x.given_up)[0]))
         if not len(lost):
             return self._yes("an end can be reached from every state")
         first = int(lost[0])
         reason = f"from {left_over(x, first)} no designed end can be reached"
-        goes_on = f"the task can continue for ever, but never reaches {final}"
-        details = () if x.dead.any() or x.livelocks else (goes_on,)
-        return self._no(reason, first, details)
+        if x.dead.any() or x.livelocks:  # told by the verdict on deadlocks
+            return self._no(reason, first)
+        # Without a further error, a lost state leads to lost states only.
+        parts = x.calm.components
+        last = lost[x.calm.bottom[parts[lost]]]
+        inside = parts == parts[last[0]]
+        state = min(np.flatnonzero(inside).tolist(), key=lambda i: (_active(x.states[i]), i))
+        steps = np.unique(x.label[inside[x.source] & ~x.fails]).tolist()
+        still = {name for n in steps for name in x.steps[n].firings}
+        why = explain(x, state, still)
+        if why.short:
+            first, reason = state, f"stuck with {left_over(x, state)}: {why.short}"
+            goes_on = f"meanwhile {few(sorted(still))} can fire for ever"
+        else:
+            reason = hopeless if only_gives_up else reason
+            goes_on = f"the task can continue for ever, but never reaches {final}"
+        goes_on += "; only a further error ends it" * bool(tired[first])
+        return self._no(reason, first, (*why.details, goes_on))
 
     @cached_property
     def quasi_live(self) -> PropertyVerdict:
@@ -280,7 +309,7 @@ class Progress:
         if not idle:
             return PropertyVerdict(True, "every transition can fire", assumption=self._fair)
         if not self.x.complete:
-            return self._unknown(f"not fired so far: {', '.join(t.name for t in idle)}")
+            return self._unknown(f"not fired so far: {few([t.name for t in idle])}")
         numbers = {compiled.net.transition_index[n] for c in never.values() for n in c}
         roots = [t for t in idle if not self._fed_by(t, numbers, t.needs)]
         # In a ring of transitions that wait for each other, name the one that lacks a token, not
@@ -288,7 +317,7 @@ class Progress:
         roots = roots or [t for t in idle if self._fed_by(t, numbers, t.plain)] or idle
         told = [f"{t.name} can never fire: {self._never(t, numbers)}" for t in roots]
         if others := [t.name for t in idle if t not in roots]:
-            told.append(f"and so neither can {', '.join(others)}")
+            told.append(f"and so neither can {few(others)}")
         return PropertyVerdict(False, "; ".join(told))
 
     def _fed_by(self, t: CompiledTransition, idle: set[int], needs: Arcs) -> bool:
@@ -667,8 +696,15 @@ class Progress:
     # --- words -----------------------------------------------------------------------------------
 
     def verdicts(self) -> dict[str, PropertyVerdict]:
-        """Return all verdicts by name."""
-        return {name: getattr(self, name) for name in NAMES}
+        """Return all verdicts by name; unknown where the time is used up before one is judged."""
+        return {name: self._in_time(name) for name in NAMES}
+
+    def _in_time(self, name: str) -> PropertyVerdict:
+        try:
+            verdict: PropertyVerdict = getattr(self, name)
+        except OutOfTime:
+            return self._unknown("")
+        return verdict
 
     def size(self) -> dict[str, Any]:
         """Return the size of the graph as plain data."""
@@ -843,6 +879,11 @@ def contend(rivals: Sequence[str], over: Sequence[str]) -> str:
     """Say for which tokens transitions compete."""
     word = "both" if len(rivals) == 2 else "all"
     return f"{' and '.join(rivals)} may {word} want the last token of {' and '.join(over)}"
+
+
+def _active(state: State) -> int:
+    """Return how many runs of a state have not ended."""
+    return sum(run.phase is not Phase.DONE for run in state.runs())
 
 
 def _stuck(x: ExecutionGraph, state: int) -> PropertyVerdict:

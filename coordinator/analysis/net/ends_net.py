@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import chain, combinations, combinations_with_replacement, count, product
 from math import comb, prod
 from typing import Any
@@ -99,11 +100,16 @@ class EndsNet:
         """Return the marking of `task.net` that a marking of N stands for."""
         return tuple(sum(marking[p] for p in part) for part in self.parts)
 
-    def held(self, space: Space) -> list[NDArray[np.int64]]:
-        """Return the tokens of each place of `task.net` in each marking of N."""
-        return [
-            np.sum([space.tokens(p) for p in part], axis=0, dtype=np.int64) for part in self.parts
-        ]
+    def held(self, space: Space, place: int, at: slice = slice(None)) -> NDArray[np.int64]:
+        """Return the tokens of a place of `task.net` in the markings of N, or in some of them.
+
+        All places at once would take many times as much memory as the packed markings.
+        """
+        words, layout = space.words[at], space.layout
+        tokens = np.zeros(len(words), dtype=np.int64)
+        for p in self.parts[place]:
+            tokens += layout.tokens(words, p)
+        return tokens
 
 
 def ends_net(task: Task) -> EndsNet:
@@ -442,8 +448,7 @@ def judged(
     if in_haste and cover is None:
         cover = Coverability(None, (None,) * len(space.net.places), space.reason, False)
     proven, bounded, _, _ = boundedness(space, cover)
-    held = n.held(space)
-    seen = tuple(int(np.max(tokens, initial=0)) for tokens in held)
+    seen = tuple(int(np.max(n.held(space, p), initial=0)) for p in range(len(n.parts)))
     bounds: tuple[int | None, ...] = seen
     if not space.complete:
         sums = [[proven[p] for p in part] for part in n.parts]
@@ -469,7 +474,7 @@ def judged(
         bounds,
         highest if reached else None,
         bounded,
-        _safe(n, space, held, bounds),
+        _safe(n, space, seen, bounds),
         unknown,
         (),
         0,
@@ -493,13 +498,13 @@ def proven(n: EndsNet, space: Space, view: OrdinaryView) -> dict[str, PropertyVe
         found[name] = PropertyVerdict(True, text, assumption=FAIRNESS)
 
     flat, index = n.task, n.task.net.place_index
-    held = n.held(space)
+    held = partial(n.held, space)
     single = [p for p in flat.places.values() if p.kind is Kind.ACTION and p.servers is None]
-    if all(np.max(held[index[p.name]]) <= 1 for p in single):
+    if all(np.max(held(index[p.name])) <= 1 for p in single):
         holds("one_run_each", "no action place is entered while its run is active")
     final = view.where(flat.final, held, len(space))
     resources = [p for p in flat.places.values() if p.kind is Kind.RESOURCE]
-    if all((held[index[p.name]][final] == p.tokens).all() for p in resources):
+    if all((held(index[p.name])[final] == p.tokens).all() for p in resources):
         holds("returned", "every resource has its initial number of tokens at the end")
     if not n.left_out and not endless(flat):
         fires = np.array([name in n.origin for name in n.net.transitions] or [False])
@@ -534,11 +539,11 @@ def _grows(n: EndsNet, pump: Witness) -> PropertyVerdict:
 
 
 def _safe(
-    n: EndsNet, space: Space, held: Sequence[Any], bounds: tuple[int | None, ...]
+    n: EndsNet, space: Space, seen: Sequence[int], bounds: tuple[int | None, ...]
 ) -> PropertyVerdict:
-    for place, tokens in zip(n.task.net.places, held, strict=True):
-        if (most := int(np.max(tokens, initial=0))) > 1:
-            first = int(np.argmax(tokens > 1))
+    for p, (place, most) in enumerate(zip(n.task.net.places, seen, strict=True)):
+        if most > 1:
+            first = int(np.argmax(n.held(space, p) > 1))
             firings = tuple(n.origin[t] for t in space.path(first) if t in n.origin)
             shown = Witness(firings, _marked(n, n.projected(space.marking(first))))
             reason = f"{place} can hold {most} tokens"

@@ -5,7 +5,7 @@ Its ordinary net is `Task.net` (docs/semantics.md, section 8).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from petrobot.coordinator.analysis.net.space import BLOCK
 from petrobot.coordinator.analysis.net.structure import (
     exclusive_places,
     place_bounds,
@@ -47,21 +48,28 @@ class OrdinaryView:
         return self.is_final(marking) or self.is_final_error(marking)
 
     def where(
-        self, predicate: Expression | None, held: Sequence[NDArray[np.int64]], markings: int
+        self,
+        predicate: Expression | None,
+        held: Callable[[int, slice], NDArray[np.int64]],
+        markings: int,
     ) -> NDArray[np.bool_]:
-        """Return in which of `markings` markings a predicate holds; `held`: the tokens of each
-        place in each of them.
+        """Return in which of `markings` markings a predicate holds; `held`: the tokens of a place
+        in some of them.
 
-        It is evaluated once for each combination of tokens of the places that it reads: a task has
-        few of these and up to 100,000 markings.
+        It is evaluated once in each block for each combination of tokens of the places that it
+        reads: a task has few of these and up to millions of markings.
         """
         if predicate is None or not predicate.names:
             return np.full(markings, self._holds(predicate, ()))
         names = sorted(predicate.names)
-        read = np.array([held[self.task.net.place_index[name]] for name in names])
-        found, which = np.unique(read, axis=1, return_inverse=True)
-        values = (dict(zip(names, column, strict=True)) for column in found.T.tolist())
-        return np.array([predicate.holds(some) for some in values])[which.reshape(-1)]
+        holds = np.zeros(markings, dtype=np.bool_)
+        for start in range(0, markings, BLOCK):
+            at = slice(start, start + BLOCK)
+            read = np.array([held(self.task.net.place_index[name], at) for name in names])
+            found, which = np.unique(read, axis=1, return_inverse=True)
+            values = (dict(zip(names, column, strict=True)) for column in found.T.tolist())
+            holds[at] = np.array([predicate.holds(some) for some in values])[which.reshape(-1)]
+        return holds
 
     @cached_property
     def error_places(self) -> tuple[int, ...]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from petrobot.coordinator.task import Kind, Scope, Task
 from petrobot.coordinator.task.check.findings import Finding
 from petrobot.coordinator.task.instant_firings import endless
-from petrobot.coordinator.task.wording import Severity, listed
+from petrobot.coordinator.task.wording import Severity, few, listed
 
 
 def timeless_cycles(task: Task) -> Iterator[Finding]:
@@ -43,10 +43,9 @@ def never_marked(task: Task) -> Iterator[Finding]:
         idle = [t.name for t in task.transitions.values()
                 if t.name in now_able - able and not t.expanded_from]  # fmt: skip
         marked, able = now_marked, now_able
-        text = f"; so {listed(idle)} can never fire" if idle else ""
-        text += (
-            f", and {listed(empty)} {'stay' if len(empty) > 1 else 'stays'} empty" if empty else ""
-        )
+        text = f"; so {few(sorted(idle))} can never fire" if idle else ""
+        stay = "stay" if len(empty) > 1 else "stays"
+        text += f", and {few(sorted(empty))} {stay} empty" if empty else ""
         yield _never_marked(Severity.WARNING, place.name, text)
 
 
