@@ -9,13 +9,15 @@ import logging
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
+from itertools import islice, takewhile
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 _SERVICES = Path(__file__).parents[1]
-_OURS = (f"{_SERVICES}/worker/", f"{_SERVICES}/node/", f"{_SERVICES}/device.py")
+_OURS = tuple(f"{_SERVICES}/{each}" for each in ("worker/", "node/", "comm/", "device.py"))
 """Files whose frames are left out of the traceback that users see."""
 LONGEST = 2_000
 """Longest description (characters): an exception may quote all of the data that it is about."""
@@ -69,11 +71,27 @@ def words_of(fault: BaseException) -> str:
 def describe(fault: BaseException) -> str:
     """Return the type and message of an exception, and the last three lines of user code that it
     came through."""
-    frames = [
-        f for f in traceback.extract_tb(fault.__traceback__) if not f.filename.startswith(_OURS)
-    ][-3:]
-    places = " < ".join(f"{f.name} ({Path(f.filename).name}:{f.lineno})" for f in reversed(frames))
-    return f"{type(fault).__name__}: {words_of(fault)}" + (f" in {places}" if places else "")
+    steps = [step for step in traceback.walk_tb(fault.__traceback__) if not _is_ours(step[0])]
+    return f"{type(fault).__name__}: {words_of(fault)}{_places(steps[:-4:-1])}"
+
+
+def where(frame: FrameType) -> str:
+    """Return up to three lines of user code that led to a frame, as `describe` does."""
+    steps = takewhile(lambda step: not _is_ours(step[0]), traceback.walk_stack(frame))
+    return _places(islice(steps, 3))
+
+
+def _is_ours(frame: FrameType) -> bool:
+    return frame.f_code.co_filename.startswith(_OURS)
+
+
+def _places(steps: Iterable[tuple[FrameType, int]]) -> str:
+    """Return lines of code as text, the innermost first; empty if there are none."""
+    places = " < ".join(
+        f"{frame.f_code.co_name} ({Path(frame.f_code.co_filename).name}:{line})"
+        for frame, line in steps
+    )
+    return f" in {places}" if places else ""
 
 
 def log_fault(log: logging.Logger, fault: BaseException, text: str, *arguments: Any) -> None:
@@ -98,7 +116,7 @@ def _traceback(fault: BaseException) -> str:
     found: BaseException | None = fault
     while found is not None and len(parts) < CHAIN:
         place = found.__traceback__
-        while place is not None and place.tb_frame.f_code.co_filename.startswith(_OURS):
+        while place is not None and _is_ours(place.tb_frame):
             place = place.tb_next
         lines = traceback.format_tb(place or found.__traceback__, -FRAMES)
         parts.append(f"{''.join(lines)}{type(found).__name__}: {words_of(found)}")
