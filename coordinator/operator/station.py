@@ -258,6 +258,9 @@ class Station:
         except UnreachableError as fault:
             await run.abandon()
             return {**refusal("unreachable", str(fault)), "nodes": list(fault.nodes)}
+        except MissionError as fault:
+            await run.abandon()
+            return refusal("in_use", str(fault))
         return self._follow(run)
 
     async def _started_from(self, data: Mapping[str, Any]) -> Answer:

@@ -63,8 +63,7 @@ class Stage(Enum):
 
 
 class MissionError(Exception):
-    """A mission run could not be prepared or scored; the text says which service failed, and
-    why."""
+    """A mission run could not be prepared or scored; the text says what failed, and why."""
 
     def __init__(self, text: str, *, bad_input: bool = False) -> None:
         super().__init__(text)

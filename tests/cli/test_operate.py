@@ -24,6 +24,7 @@ from petrobot.coordinator.page import app_state
 from petrobot.coordinator.run.folder import JOURNAL, NoRunError
 from petrobot.coordinator.run.journal import read_journal
 from petrobot.coordinator.run.recording import remarks
+from tests.cli.cell import TASK
 from tests.cli.conftest import RUN, Terminal
 from tests.waiting import beat
 
@@ -41,6 +42,18 @@ async def test_pause_reaches_the_devices_and_continue_releases_them(petrobot: Te
     said = await petrobot("continue")
     assert said.code == 0 and "continues" in said.out
     await petrobot.until(lambda: not petrobot.arm.held)
+
+
+async def test_a_second_run_is_refused_while_the_first_has_its_device(petrobot: Terminal) -> None:
+    """It says which run has which device, and leaves no folder."""
+    await petrobot.working()
+    task = petrobot.folder / "reaching.toml"
+    task.write_text(TASK, encoding="utf-8")
+    services = str(petrobot.mission.executor.directory.source)
+    said = await petrobot("run", str(task), "--services", services, "--no-page", "--quiet")
+    assert said.code == 2 and f"in use: arm by {RUN}; wait until" in said.err, said
+    assert [path.name for path in petrobot.runs.iterdir()] == [RUN]
+    assert petrobot.arm.moving
 
 
 async def test_a_device_that_cannot_hold_says_so(petrobot: Terminal) -> None:
