@@ -10,8 +10,8 @@ Beside it another file counts the stops that were cleared. It stays, so that a c
 frozen from before a stop until after it was cleared is still known to have missed it.
 
 The file is in `$PETROBOT_STATE`; else in `.petrobot` beside services.toml; else, if that cannot be
-written, in a folder of the user (`$XDG_STATE_HOME` or `~/.local/state`). A file in any of these
-folders counts, and clearing clears all of them.
+written or is where petrobot is installed, in a folder of the user (`$XDG_STATE_HOME` or
+`~/.local/state`). A file in any of these folders counts, and clearing clears all of them.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ from petrobot.services.host.whole_file import make_folder, write_whole
 ALL: Final = "*"
 STATE: Final = "PETROBOT_STATE"
 FOLDER: Final = ".petrobot"
+INSTALLED = Path(__file__).parents[2].resolve()
+"""Folder of the installed package: the location file of its demo is in it."""
 
 
 class LatchError(OSError):
@@ -103,7 +105,8 @@ def latch_of(source: Path, node: str) -> Latch:
     source = source.resolve()
     home = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
     own = home / "petrobot" / hashlib.sha256(str(source).encode()).hexdigest()[:16]
-    return Latch(node, [source.parent / FOLDER, own])
+    folders = [source.parent / FOLDER, own]
+    return Latch(node, folders[::-1] if source.parent == INSTALLED else folders)
 
 
 def _read(path: Path) -> frozenset[str]:

@@ -565,7 +565,8 @@ class Runner:
         if refusal := self._refusing.refusal(run.sent_before):
             text = f"{text}; the driver refused a command: {refusal}"
         if TAKEN_WITHIN < (age := self._refusing.age) < inf:
-            text = f"{text}; the driver has published nothing for {age:.1f} s"
+            silent = f"the driver has published nothing for {age:.1f} s"
+            text = f"{text}; {silent} (does it block, or is its `period` not in seconds?)"
         return text.lstrip("; ")
 
     # --- end ----------------------------------------------------------------------------------

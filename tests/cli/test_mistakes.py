@@ -394,6 +394,11 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
         3,
         r"device axis: .*state.at: a Axis is not plain data, returned by `state` \(arm_bot.py:\d+",
     ),
+    (
+        [(CODE, "period = 0.01", "period = 10", "")],
+        1,
+        r"the driver has published nothing for \d.\d s \(does it block, or is its `period` not in",
+    ),
 ]
 """Mistakes that only a run shows, its exit code, and what its end says."""
 
@@ -411,7 +416,9 @@ ON_THE_LINE: list[tuple[list[str], str]] = [
     ([*RUN, "--set", "speed=1"], r"speed"),
     ([*RUN, "--use", "grip=grab"], r"grab.*grip"),
     ([*RUN, "--services", "cell.toml"], r"cell.toml: No such file"),
-    (["rum", "arm_bot.toml"], r"unknown command 'rum'"),
+    (["rum", "arm_bot.toml"], r"unknown command 'rum' \(did you mean 'run'\?\)"),
+    (["run", "arm_bot"], r"no task 'arm_bot': did you mean arm_bot.toml\?"),
+    (["show", TASK, "--out", "x.pdf"], r"--out x.pdf: expected a file .svg, found .pdf"),
     (
         ["new", "robot", "arm_bot", "--folder", ".."],
         r"named 'arm_bot' is there already|exists already",
@@ -504,7 +511,7 @@ def test_mistakes_between_files_are_reported(
 
 @pytest.mark.processes
 @pytest.mark.parametrize(
-    ("mistakes", "code", "pattern"), IN_THE_RUN, ids=["forgotten await", "step", "state"]
+    ("mistakes", "code", "pattern"), IN_THE_RUN, ids=["forgotten await", "step", "state", "period"]
 )
 def test_mistakes_that_a_run_shows_are_told_at_its_end(
     sound: dict[str, str],
