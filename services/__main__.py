@@ -96,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         memory = directory.nodes[options.name].worker_memory_mb << 20
         asyncio.run(serve(directory, options.name, text, mock=options.mock, memory=memory))
     except (DirectoryError, ScriptError, KeyNeededError, KeyFileError, OSError) as fault:
-        print(f"python -m petrobot.services {options.name}: {fault}", file=sys.stderr)
+        print(f"node {options.name}: {fault}", file=sys.stderr)
         return 2
     return 0
 
@@ -114,7 +114,7 @@ def _run_in_lockstep(directory: Directory, options: argparse.Namespace) -> int:
         party = LockstepNode(directory, options.name, substitutes=substitutes)
         run_member(directory, options.name, party, options.await_coordinator)
     except CellError as fault:
-        print(f"python -m petrobot.services {options.name}: {fault}", file=sys.stderr)
+        print(f"node {options.name}: {fault}", file=sys.stderr)
         return 3
     return 0
 

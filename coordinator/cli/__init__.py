@@ -181,7 +181,10 @@ def _overview(arguments: Sequence[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(text)
         return 0
-    print(f"petrobot: unknown command {arguments[0]!r}\n\n{text}", file=sys.stderr)
+    from petrobot.coordinator.task.wording import nearest
+
+    near = nearest(arguments[0], (command.name for command in COMMANDS))
+    print(f"petrobot: unknown command {arguments[0]!r}{near}\n\n{text}", file=sys.stderr)
     return 2
 
 

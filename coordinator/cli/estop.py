@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -13,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
-    SHIPPED_CELL,
     add_services_argument,
     load_directory,
+    tell_of_demo,
     write_json,
 )
 
@@ -72,13 +71,8 @@ def run(options: argparse.Namespace) -> int:
         Path(address.services) if address is not None and address.services else None
     )
     directory = load_directory(path)
-    if path is None and directory.source.resolve() == SHIPPED_CELL:
-        # The devices of the demo are stopped, too: who presses the button must not wait for this.
-        print(
-            "no services.toml in this folder and no active run: this concerns only the catching "
-            f"cell that comes with petrobot. For your robot give --services FILE, or {HARDWARE}",
-            file=sys.stderr,
-        )
+    # The devices of the demo are stopped, too: who presses the button must not wait for this.
+    tell_of_demo(path, directory, f", or {HARDWARE}")
     verb = CLEAR if options.clear else STOP
     begun = time.perf_counter()
     answers = asyncio.run(

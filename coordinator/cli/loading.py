@@ -117,9 +117,10 @@ def task_path(name: str) -> Path:
     if shipped.exists():
         return shipped
     known = ", ".join(sorted(p.stem for p in SHIPPED.glob("*.toml")))
-    raise CommandError(
-        2, f"no task {name!r}: give a .toml file, or a task that comes with petrobot: {known}"
-    )
+    text = f"give a .toml file, or a task that comes with petrobot: {known}"
+    if path.with_name(f"{path.name}.toml").is_file():
+        text = f"did you mean {name}.toml?"
+    raise CommandError(2, f"no task {name!r}: {text}")
 
 
 def own_tasks(directory: Directory) -> Path:
@@ -245,6 +246,17 @@ def load_directory(given: Path | None, dry_run: bool = False) -> Directory:
         if faults := code_faults(directory, read_code(directory), read_text(path)):
             raise CommandError(2, "\n".join(faults))
     return directory
+
+
+def tell_of_demo(given: Path | None, directory: Directory, remedy: str = "") -> None:
+    """Say that a command without a location file concerns the shipped cell, not the user's, and
+    what to do; `remedy` is added to it."""
+    if given is None and directory.source.resolve() == SHIPPED_CELL:
+        print(
+            "no services.toml in this folder: this concerns only the catching cell that comes with "
+            f"petrobot. For your robot give --services FILE{remedy}",
+            file=sys.stderr,
+        )
 
 
 def add_dry_run_argument(parser: argparse.ArgumentParser) -> None:

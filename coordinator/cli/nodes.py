@@ -8,7 +8,12 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from petrobot.coordinator.cli.loading import add_services_argument, load_directory, write_json
+from petrobot.coordinator.cli.loading import (
+    add_services_argument,
+    load_directory,
+    tell_of_demo,
+    write_json,
+)
 from petrobot.services.comm.tls.expiry import SOON
 from petrobot.services.host.command_line import number
 
@@ -38,6 +43,7 @@ def run(options: argparse.Namespace) -> int:
     from petrobot.coordinator.run.node_status import ask_all
 
     directory = load_directory(options.services)
+    tell_of_demo(options.services, directory)
     answers = asyncio.run(ask_all(directory, options.timeout))
     for node, devices in _stopped(directory, answers).items():
         answers[node]["stopped"] = devices

@@ -29,8 +29,8 @@ LONGEST_TABLE = 24
 WIDEST_TABLE = 9
 """Most columns of a table in the terminal; --json and the report show wider ones."""
 LAST_ERRORS = "last_errors"
-"""Key of the last actions that ended in ERROR in a result (`Mission.result`). They are printed as
-lines, not as a table."""
+"""Key of the actions that ended in ERROR in a result (`Mission.result`). They are printed as lines,
+not as a table."""
 
 
 @contextmanager
@@ -135,6 +135,24 @@ def _cell(key: str, value: Any) -> Text:
     return Text(str(value), style=COLOURS.get(str(value), "") if key == "status" else "")
 
 
+def _remarks(session: RunSession, result: Mapping[str, Any]) -> Iterator[str]:
+    """Say where to look for the reasons of errors, and what exit code 0 does not say."""
+    success = result["status"] == "success"
+    if session.folder is None and (not success or LAST_ERRORS in result):
+        yield (
+            "not kept; with --journal runs, `petrobot log` and `petrobot report` show what led "
+            "there"
+        )
+    elif LAST_ERRORS in result:
+        yield f"what led to the errors: petrobot log {session.folder}"
+    met, _, wanted = result.get("goals", "").partition(" of ")
+    if success and int(met or 0) < int(wanted or 0):
+        yield (
+            f"only {result['goals']} goals were met; the exit code is 0 because the task reached "
+            "its final marking"
+        )
+
+
 def give(session: RunSession, options: argparse.Namespace, timeline: Timeline | None) -> None:
     """Write the result beside the journal and where --json says, print it, and write the report."""
     result = session.result()
@@ -143,12 +161,8 @@ def give(session: RunSession, options: argparse.Namespace, timeline: Timeline | 
         write_json(options.json, result)
     if options.json != "-":
         print_result(result)
-        if session.folder is None and result["status"] != "success":
-            print(
-                "not kept; with --journal runs, `petrobot log` and `petrobot report` show "
-                "what led there",
-                file=sys.stderr,
-            )
+        for line in _remarks(session, result):
+            print(line, file=sys.stderr)
     if timeline is not None:
         from petrobot.coordinator.drawing import draw
         from petrobot.coordinator.studies.report import report_html

@@ -4,6 +4,7 @@ for their runs, and execute nothing twice."""
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
     from petrobot.coordinator.operator.session import RunSession
     from petrobot.coordinator.run.interfaces import Observer
+    from petrobot.coordinator.run.journal import Journal
 
 EXAMPLE = "petrobot resume last --json out.json"
 
@@ -56,6 +58,12 @@ def run(options: argparse.Namespace) -> int:
 
     if mode == "realtime":
         refuse_stopped(found.directory)
+        if later := later_run(found.journal):
+            print(
+                f"since {folder.name} was interrupted, {later} has used the same nodes: the "
+                "devices may not be as it left them",
+                file=sys.stderr,
+            )
 
     def make(observers: Sequence[Observer]) -> RunSession:
         from petrobot.coordinator.operator.prepare import resume
@@ -63,6 +71,25 @@ def run(options: argparse.Namespace) -> int:
         return resume(found, observers, options.ordered)
 
     return conduct(make, options, mode, resumed=True)
+
+
+def later_run(journal: Journal) -> str:
+    """Return the newest real-time run on the same nodes that was active after this one was
+    interrupted; empty if there is none."""
+    from petrobot.coordinator.run.folder import JOURNAL
+    from petrobot.coordinator.run.journal import JournalError, read_journal
+
+    own = journal.path
+    others = [path for path in own.parent.parent.glob(f"*/{JOURNAL}") if path != own]
+    changed = {path: path.stat().st_mtime for path in (own, *others)}
+    for path in sorted(others, key=lambda path: -changed[path]):
+        if changed[path] <= changed[own]:
+            break
+        with contextlib.suppress(JournalError, OSError):
+            then = read_journal(path).header
+            if all(then[key] == journal.header[key] for key in ("mode", "services")):
+                return path.parent.name
+    return ""
 
 
 def _result_of(path: Path) -> dict[str, Any] | None:

@@ -273,9 +273,13 @@ def run(options: argparse.Namespace) -> int:
         refuse_misplaced(directory, **where)
         refuse_arguments(task, options.task, directory, **where)
     request = _request(task, directory, options)
+    if not lockstep and not options.quiet:
+        nodes = ", ".join(directory.nodes)
+        print(f"checking {task.name}, then connecting to {nodes}", file=sys.stderr, flush=True)
     _warn(task, directory, options)
     if not lockstep:
         refuse_stopped(directory)
+        _tell_of_waiting(options)
     text = task_path(options.task).read_text(encoding="utf-8")
 
     def make(observers: Sequence[Observer]) -> RunSession:
@@ -421,6 +425,19 @@ def _warn(task: Task, directory: Directory, options: argparse.Namespace) -> None
         return
     for objection in may_run(task, cell_of(directory), BUDGET).objections():
         print(f"warning: {objection} (details: petrobot check {options.task})", file=sys.stderr)
+
+
+def _tell_of_waiting(options: argparse.Namespace) -> None:
+    """Say which run still waits for `resume`. The new one starts."""
+    from petrobot.coordinator.operator.run_address import waiting
+
+    folder = journal_folder(options)
+    for name in waiting(folder)[:1] if folder is not None else ():
+        print(
+            f"the coordinator of {name} has died: this is a new run; `petrobot resume {name}` "
+            "continues that one",
+            file=sys.stderr,
+        )
 
 
 def refuse_stopped(directory: Directory) -> None:

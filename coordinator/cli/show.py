@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         metavar="FILE",
         default="-",
-        help="where to write the SVG (default: standard output)",
+        help="where to write the SVG, a file .svg (default: standard output)",
     )
 
 
@@ -68,6 +68,9 @@ def run(options: argparse.Namespace) -> int:
     from petrobot.coordinator.cli.analyse import bounded_memory
 
     _refuse_idle(options)
+    if (suffix := Path(options.out).suffix) not in ("", ".svg"):
+        text = f"--out {options.out}: expected a file .svg, found {suffix}; drawings are SVG alone"
+        raise CommandError(2, text)
     drawn = _graph if options.graph else _gspn if options.view == "gspn" else _net
     try:
         with bounded_memory():

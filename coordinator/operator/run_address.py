@@ -67,6 +67,12 @@ def find_address(name: str | None = None, folder: Path = DEFAULT) -> RunAddress:
     return addresses[0]
 
 
+def waiting(folder: Path) -> list[str]:
+    """Return the runs whose coordinator has died, the newest first: they wait for `resume`."""
+    found = _newest_first(folder)
+    return [path.parent.name for path in found if _read(path) is None and path.exists()]
+
+
 def _refuse_dead(path: Path) -> None:
     """Raise NoRunError if the coordinator of a run has died: else it would have removed the
     file."""

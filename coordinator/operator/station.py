@@ -287,7 +287,7 @@ class Station:
             return {**refusal("unreachable", str(fault)), "nodes": list(fault.nodes)}
         except MissionError as fault:
             await run.abandon()
-            return refusal("stopped", str(fault))
+            return refusal("in_use" if fault.bad_input else "stopped", str(fault))
         return self._follow(run)
 
     async def _started_from(self, data: Mapping[str, Any]) -> Answer:

@@ -45,8 +45,6 @@ KEPT = 5_000
 """Least number of the newest cycles and runs that are kept, for a score and for verdicts that come
 late. A mission run may last for months."""
 SERVICE_DEADLINE = 20.0
-TOLD_ERRORS = 6
-"""How many of its last failed runs the result of a mission run that ended in ERROR names."""
 BAD_VALUE = "bad_value"
 """Key of the engine's report of a result that did not give a value, or one that does not fit."""
 VERDICTS = "verdicts"
@@ -65,8 +63,7 @@ class Stage(Enum):
 
 
 class MissionError(Exception):
-    """A mission run could not be prepared or scored; the text says which service failed, and
-    why."""
+    """A mission run could not be prepared or scored; the text says what failed, and why."""
 
     def __init__(self, text: str, *, bad_input: bool = False) -> None:
         super().__init__(text)
@@ -145,6 +142,8 @@ class MissionTally:
     """Runs that ended and were not cancelled."""
     failed: Counter[str] = field(default_factory=Counter)
     """Runs that ended in ERROR, by primitive task and cause."""
+    examples: dict[str, RunRecorded] = field(default_factory=dict)
+    """By the same key the last of them, in the order of their ends."""
     missing: int = 0
     """Values that a result lacked."""
     first_missing: str = ""
@@ -190,9 +189,8 @@ class MissionTally:
         return self.cycles[-1].number if self.cycles else 0
 
     def last_errors(self, directory: Directory) -> list[dict[str, Any]]:
-        """Return the last runs that ended in ERROR, in order: which action, on which node, and
-        why."""
-        failed = [record for record in self.runs if record.status is Status.ERROR][-TOLD_ERRORS:]
+        """Return for each primitive task and cause the last run that ended so, in order: which
+        action, on which node, and why."""
         return [
             {
                 "run": record.run,
@@ -202,7 +200,8 @@ class MissionTally:
                 "cause": record.cause,
                 "text": record.text,
             }
-            for record in failed
+            for key, record in self.examples.items()
+            if self.failed[key] > 0  # a verdict may have taken the last error of a cause away
         ]
 
     def happened(self, recovered: bool) -> str:
@@ -221,7 +220,11 @@ class MissionTally:
 
     def _judge(self, record: RunRecorded, count: int) -> None:
         if record.status is Status.ERROR and not record.cancelled:
-            self.failed[f"{record.primitive_task}: {record.cause or 'no cause'}"] += count
+            key = f"{record.primitive_task}: {record.cause or 'no cause'}"
+            self.failed[key] += count
+            if count > 0:
+                self.examples.pop(key, None)  # a later one goes to the end
+                self.examples[key] = record
 
     def _correct(self, corrected: Corrected) -> None:
         run, said = corrected.run, (corrected.status, corrected.cause, corrected.text)
@@ -351,11 +354,11 @@ class Mission:
 
     def result(self, mode: str, wall_s: float) -> dict[str, Any]:
         """Return the result as the command line writes it; the keys of the score stand beside the
-        general ones. A mission run that ended in ERROR also has `last_errors`: the last actions
-        that ended so, in order."""
+        general ones. `last_errors` says why actions ended in ERROR, also those that the task
+        recovered from."""
         finished = self.executor.finished
         failed = finished is None or finished.status is Status.ERROR
-        errors = self.tally.last_errors(self.executor.directory) if failed else []
+        errors = self.tally.last_errors(self.executor.directory)
         has_goal, met = bool(self.tally.goal_transitions), self.tally.goals
         recovered = not failed and (not has_goal or met >= self.runs)
         general = {

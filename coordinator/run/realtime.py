@@ -144,10 +144,11 @@ class RealtimeMission:
         source = quote(os.path.normpath(self.mission.executor.directory.source))
         refusing = [name for name in missing if self.clients[name].answered]
         if away := [name for name in missing if name not in refusing]:
-            yield (
-                f"no answer from {', '.join(map(self._tried, away))}; launch them with "
-                f"`petrobot up --services {source}`"
-            )
+            # Beside nodes that run, `up` would find their ports in use.
+            some = len(away) < len(self.clients)
+            commands = [f"node {name}" for name in away] if some else ["up"]
+            launch = ", ".join(f"`petrobot {command} --services {source}`" for command in commands)
+            yield f"no answer from {', '.join(map(self._tried, away))}; launch with {launch}"
         if refusing:
             keys = any(
                 code in self.clients[name].trouble for name in refusing for code in KEY_CODES

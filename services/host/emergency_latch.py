@@ -11,8 +11,8 @@ stays, so that a caller that was frozen from before a stop until after it was cl
 to have missed it.
 
 The file is in `$PETROBOT_STATE`; else in `.petrobot` beside services.toml; else, if that cannot be
-written, in a folder of the user (`$XDG_STATE_HOME` or `~/.local/state`). A file in any of these
-folders counts, and clearing clears all of them.
+written or is where petrobot is installed, in a folder of the user (`$XDG_STATE_HOME` or
+`~/.local/state`). A file in any of these folders counts, and clearing clears all of them.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ from petrobot.services.host.whole_file import make_folder, write_whole
 ALL: Final = "*"
 STATE: Final = "PETROBOT_STATE"
 FOLDER: Final = ".petrobot"
+INSTALLED = Path(__file__).parents[2].resolve()
+"""Folder of the installed package: the location file of its demo is in it."""
 
 
 class LatchError(OSError):
@@ -106,7 +108,8 @@ def latch_of(source: Path, node: str) -> Latch:
     source = source.resolve()
     home = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
     own = home / "petrobot" / hashlib.sha256(str(source).encode()).hexdigest()[:16]
-    return Latch(node, [source.parent / FOLDER, own])
+    folders = [source.parent / FOLDER, own]
+    return Latch(node, folders[::-1] if source.parent == INSTALLED else folders)
 
 
 def _read(path: Path) -> frozenset[str]:

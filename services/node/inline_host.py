@@ -22,7 +22,7 @@ from petrobot.services.comm.protocol.messages import (
 )
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import PICTURE, Driver, picture_of, stop_at_once
-from petrobot.services.worker.callables import describe
+from petrobot.services.worker.callables import describe, log_fault
 from petrobot.services.worker.context import Report
 from petrobot.services.worker.remote import (
     BARRED,
@@ -30,6 +30,7 @@ from petrobot.services.worker.remote import (
     EMERGENCY_STOP,
     CyclicDriver,
     DeviceCommand,
+    DeviceError,
     DirectDevice,
     RemoteDriver,
 )
@@ -103,9 +104,12 @@ class InlineHost:
         substitutes: Mapping[str, Callable[..., Any]] | None = None,
         virtual: bool = False,
         reseed: Callable[[int], None] | None = None,
+        device: str = "",
     ) -> None:
-        """`reseed` is called with the seed of each call, for the random draws of the driver."""
+        """`reseed` is called with the seed of each call, for the random draws of the driver.
+        `device` is its name, for messages."""
         self._actions = actions
+        self._device = f"device {device}: " if device else ""
         self._reseed = reseed
         self._driver = driver
         self._cyclic = CyclicDriver(driver) if driver is not None and driver.period else None
@@ -150,8 +154,9 @@ class InlineHost:
     def take(self, now: float, order: Order) -> None:
         """Take an order about a run."""
         if self.failed and isinstance(order, Call):
-            text = f"its device does not work: {self.failed}"
-            self._told.append(Outcome(order.id, Status.ERROR, {}, "not_ready", text, Executed.NO))
+            self._told.append(
+                Outcome(order.id, Status.ERROR, {}, "not_ready", self.failed, Executed.NO)
+            )
             return
         if self._reseed is not None and isinstance(order, Call):
             self._reseed(order.seed)
@@ -181,15 +186,19 @@ class InlineHost:
             self._fail(now, fault)
 
     def _fail(self, now: float, fault: Exception) -> None:
-        """End the runs of a driver that raised an exception, and try to stop its device."""
-        self.failed = f"its driver failed: {describe(fault)}"
-        _log.error("the driver of a device failed", exc_info=fault)
+        """End the runs of a driver that raised an exception, and try to stop its device. Raises
+        DeviceError if it was the driver's first step, and no run waits: its node does not start."""
+        self.failed = f"{self._device}its driver failed: {describe(fault)}"
+        log_fault(_log, fault, "%s", self.failed)
         driver, self._driver, self._cyclic = self._driver, None, None
+        starting = self._next_step is None and not self._runner.runs
         self._told += self._runner.reports()
         self._told += self._runner.give_up_all(now, "device_died", self.failed)
         if driver is not None:
             with contextlib.suppress(Exception):
                 stop_at_once(driver, now)
+            if driver.period and starting:
+                raise DeviceError(self.failed) from fault
 
     def _carry_out(
         self, now: float, verb: str, data: Mapping[str, Any] | None = None
@@ -252,7 +261,8 @@ class InlineHost:
         return self._cyclic is None and not self._told and self._runner.idle
 
     def advance(self, now: float) -> None:
-        """Advance the runs, then do the cycles of the driver that are due."""
+        """Advance the runs, then do the cycles of the driver that are due. Raises DeviceError if
+        the driver fails at the first one."""
         if self.failed:
             return
         try:
@@ -279,6 +289,8 @@ class InlineHost:
                 self._cyclic.take(now, command)
             self._driver.step(now)
             self._remote.expect(self._cyclic.state)
+            if self._next_step is None:
+                _ = self._remote.state  # later ones are made when an action reads them
             due += self._driver.period
         self._next_step = due
         self._runner.commands_taken(now)

@@ -42,6 +42,7 @@ from petrobot.services.node.node import GENERAL, Node
 from petrobot.services.node.ports import DevicePorts
 from petrobot.services.node.watchdog import Watchdog
 from petrobot.services.worker.callables import describe
+from petrobot.services.worker.remote import DeviceError
 from petrobot.services.worker.runner import Hung
 from petrobot.services.worker.setpoints import SetpointReceiver
 
@@ -277,6 +278,7 @@ class LockstepNode:
             substitutes=self._substitutes,
             virtual=True,
             reseed=reseed,
+            device=device,
         )
 
     # --- party --------------------------------------------------------------------------------
@@ -300,6 +302,8 @@ class LockstepNode:
             step(*arguments)
         except Hung as fault:  # in a driver or a service; an action would have ended its own run
             raise CellError(f"node {self.name}: {describe(fault)}") from fault
+        except DeviceError as fault:
+            raise CellError(f"node {self.name}: {fault}") from fault
         finally:
             self._watchdog.end()
 

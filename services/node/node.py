@@ -492,6 +492,7 @@ class Node:
                 if command.verb == "status":
                     data["emergency"] = list(self.stopped_in_emergency())
                     data["dry_run"] = self.directory.dry_run
+                    data["leases"] = self.callee.leases
                     data["events_dropped"] = dict(self.callee.events.dropped)
                 self.callee.answer(now, id_, held and not command.missing, data)
 

@@ -11,14 +11,15 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
+import signal
 import sys
 import threading
 import time
-import traceback
 import weakref
 from pathlib import Path
 from types import FrameType
 
+from petrobot.services.worker.callables import is_users
 from petrobot.services.worker.runner import Execution, Hung
 
 _log = logging.getLogger(__name__)
@@ -34,7 +35,9 @@ IDLE = 1e-3
 ATTEMPTS, AGAIN = 4, 2.0
 """How often the code is interrupted, and the processor time in between (s), since it may catch the
 exception. After that the process ends."""
-_SERVICES = str(Path(__file__).parents[1])
+WAKE = signal.SIGURG
+"""Signal that lets a call of the system return, so that the code that waits for it can be
+interrupted. By default a process ignores it."""
 _raise_in_thread = ctypes.pythonapi.PyThreadState_SetAsyncExc
 
 
@@ -59,6 +62,10 @@ class Watchdog:
                 target=_look_on, args=(weakref.ref(self), self._over), daemon=True
             )
             self._thread.start()
+            # Only the main thread runs handlers; another one is interrupted when its call returns.
+            main = threading.current_thread() is threading.main_thread()
+            if main and signal.getsignal(WAKE) is signal.SIG_DFL:
+                signal.signal(WAKE, lambda *_: None)
         self._watched = threading.get_ident()
         # The thread asks for its own clock: asking for that of an ended thread crashes the process.
         self._clock = time.pthread_getcpuclockid(self._watched)
@@ -100,9 +107,11 @@ class Watchdog:
         if attempts > ATTEMPTS:
             _log.critical("%s, and cannot be interrupted; the process ends", text)
             os._exit(3)
-        stack = "".join(traceback.format_stack(frame)) if frame is not None else ""
-        _log.error("%s; it is interrupted\n%s", text, stack)
+        _log.error("%s; it is interrupted", text)
         _raise_in_thread(ctypes.c_ulong(self._watched), ctypes.py_object(Hung))
+        # Raised at the thread's next line of Python: that of the signal's handler, if it waits in a
+        # call of the system (a sleep, the end of another program).
+        signal.pthread_kill(self._watched, WAKE)
 
 
 def _look_on(watchdog: weakref.ref[Watchdog], over: threading.Event) -> None:
@@ -116,9 +125,7 @@ def _described(frame: FrameType | None) -> str:
     line, whose = "", "its code"
     while frame is not None:
         code = frame.f_code
-        if not line and not (
-            code.co_filename.startswith(_SERVICES) and frame.f_globals.get("__name__") in _OWN
-        ):
+        if not line and is_users(frame):
             line = f"{code.co_name} ({code.co_filename}:{frame.f_lineno})"
         owner = frame.f_locals.get("self")
         if isinstance(owner, Execution):
@@ -134,18 +141,6 @@ def _compiles(frame: FrameType | None) -> bool:
             return True
         frame = frame.f_back
     return False
-
-
-_OWN = frozenset(
-    f"petrobot.services.{name}"
-    for name in (
-        "worker.runner",
-        "node.inline_host",
-        "node.node",
-        "node.lockstep",
-        "node.watchdog",
-    )
-)
 
 
 def _processor_time(clock: int) -> float:

@@ -6,16 +6,20 @@ from __future__ import annotations
 import dis
 import inspect
 import logging
+import os
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
+from itertools import islice, takewhile
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 _SERVICES = Path(__file__).parents[1]
-_OURS = (f"{_SERVICES}/worker/", f"{_SERVICES}/node/", f"{_SERVICES}/device.py")
+_OURS = tuple(f"{_SERVICES}/{each}" for each in ("worker/", "node/", "comm/", "device.py"))
+_LIBRARY = f"{Path(os.__file__).parent}/"
 """Files whose frames are left out of the traceback that users see."""
 LONGEST = 2_000
 """Longest description (characters): an exception may quote all of the data that it is about."""
@@ -69,11 +73,31 @@ def words_of(fault: BaseException) -> str:
 def describe(fault: BaseException) -> str:
     """Return the type and message of an exception, and the last three lines of user code that it
     came through."""
-    frames = [
-        f for f in traceback.extract_tb(fault.__traceback__) if not f.filename.startswith(_OURS)
-    ][-3:]
-    places = " < ".join(f"{f.name} ({Path(f.filename).name}:{f.lineno})" for f in reversed(frames))
-    return f"{type(fault).__name__}: {words_of(fault)}" + (f" in {places}" if places else "")
+    steps = [step for step in traceback.walk_tb(fault.__traceback__) if is_users(step[0])]
+    return f"{type(fault).__name__}: {words_of(fault)}{_places(steps[:-4:-1])}"
+
+
+def where(frame: FrameType) -> str:
+    """Return up to three lines of user code that led to a frame, as `describe` does."""
+    steps = takewhile(lambda step: is_users(step[0]), traceback.walk_stack(frame))
+    return _places(islice(steps, 3))
+
+
+def is_users(frame: FrameType) -> bool:
+    """Return whether a frame is of an action or a driver: neither of petrobot's machinery nor of
+    Python's own library."""
+    name = frame.f_code.co_filename
+    library = name.startswith(("<frozen ", _LIBRARY)) and "-packages/" not in name
+    return not (library or name.startswith(_OURS))
+
+
+def _places(steps: Iterable[tuple[FrameType, int]]) -> str:
+    """Return lines of code as text, the innermost first; empty if there are none."""
+    places = " < ".join(
+        f"{frame.f_code.co_name} ({Path(frame.f_code.co_filename).name}:{line})"
+        for frame, line in steps
+    )
+    return f" in {places}" if places else ""
 
 
 def log_fault(log: logging.Logger, fault: BaseException, text: str, *arguments: Any) -> None:
@@ -91,16 +115,15 @@ def log_fault(log: logging.Logger, fault: BaseException, text: str, *arguments: 
 def _traceback(fault: BaseException) -> str:
     """Return the traceback of an exception after those of the exceptions that led to it.
 
-    As Python prints them, but each from its first line of user code on, and its message as
+    As Python prints them, but only the lines of user code if there are any, and its message as
     `words_of` has it.
     """
     parts: list[str] = []
     found: BaseException | None = fault
     while found is not None and len(parts) < CHAIN:
-        place = found.__traceback__
-        while place is not None and place.tb_frame.f_code.co_filename.startswith(_OURS):
-            place = place.tb_next
-        lines = traceback.format_tb(place or found.__traceback__, -FRAMES)
+        every = list(traceback.walk_tb(found.__traceback__))
+        shown = [step for step in every if is_users(step[0])] or every
+        lines = traceback.StackSummary.extract(iter(shown[-FRAMES:])).format()
         parts.append(f"{''.join(lines)}{type(found).__name__}: {words_of(found)}")
         hidden = found.__suppress_context__
         found = found.__cause__ if found.__cause__ is not None or hidden else found.__context__

@@ -29,6 +29,7 @@ from petrobot.services.worker.remote import (
     NODE_SILENT,
     CyclicDriver,
     DeviceCommand,
+    DeviceError,
 )
 from petrobot.services.worker.runner import STOP_LIMIT
 
@@ -51,11 +52,6 @@ def take_priority() -> bool:
     except (PermissionError, OSError):
         return False
     return True
-
-
-class DeviceError(Exception):
-    """A driver raised an exception; the text says which and where. Its device was stopped if that
-    was possible."""
 
 
 class DeviceLoop:
@@ -92,7 +88,6 @@ class DeviceLoop:
         try:
             self._step_on()
         except Exception as fault:
-            _log.exception("the driver of a device failed; its process ends and is started again")
             self._stop_broken()
             raise DeviceError(f"its driver failed: {describe(fault)}") from fault
         finally:
@@ -173,13 +168,12 @@ class DeviceLoop:
             self._ports.withhold(self._cyclic.barred)
         state = self._cyclic.step(now)
         if self._worker is not None:
-            published = plain(state.state, "state")
             self._worker.send(
                 [
                     state.handled,
                     state.refused,
                     state.stopped,
-                    published,
+                    state.state,
                     state.refusal,
                     state.barred,
                 ]

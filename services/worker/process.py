@@ -43,14 +43,16 @@ from petrobot.services.node.emergency_stops import Guard
 from petrobot.services.node.inline_host import InlineHost
 from petrobot.services.node.ports import ProcessPorts
 from petrobot.services.scripted import load as load_script
-from petrobot.services.worker.device_process import (
-    DeviceError,
-    DeviceLoop,
-    take_priority,
-)
+from petrobot.services.worker.callables import log_fault
+from petrobot.services.worker.device_process import DeviceLoop, take_priority
 from petrobot.services.worker.outlets import Sent, StreamOutlets
 from petrobot.services.worker.pipe import Item, NewestLink, Permits, Pipe, keep_from_copies
-from petrobot.services.worker.remote import DeviceCommand, DeviceState, RemoteDriver
+from petrobot.services.worker.remote import (
+    DeviceCommand,
+    DeviceError,
+    DeviceState,
+    RemoteDriver,
+)
 
 LONGEST_PAUSE = 3600.0
 """Longest wait for the next message (s): `poll` takes no infinite one."""
@@ -176,6 +178,7 @@ class Worker:
             streams={s.name: s.period for s in directory.streams.values()},
             substitutes={name: script for name, script in scripted.items() if name in actions},
             reseed=reseed,
+            device=setup.device,
         )
         self._place.warm()
         self._one_by_one = not setup.device
@@ -392,7 +395,12 @@ def serve(
         worker.await_device()
         node.post([READY, {"period": None, "streams": streams, "fifo": False}])
         worker.run()
-    except (DirectoryError, DeviceError, OSError, ValueError) as fault:
+    except DeviceError as fault:
+        text = f"device {setup.device}: {fault}"
+        log_fault(_log, fault.__cause__ or fault, "%s", text)
+        node.post([FAILED, text])
+        sys.exit(1)
+    except (DirectoryError, OSError, ValueError) as fault:
         node.post([FAILED, str(fault)])
         sys.exit(1)
 

@@ -7,11 +7,12 @@ import contextlib
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from petrobot.services.comm.protocol.messages import EMERGENCY_STOP as EMERGENCY_STOP
 from petrobot.services.comm.protocol.messages import SEED
-from petrobot.services.comm.protocol.plain import plain
+from petrobot.services.comm.protocol.plain import NotPlainError, plain
 from petrobot.services.device import Driver, stop_at_once
 from petrobot.services.worker.callables import describe, words_of
 
@@ -28,6 +29,11 @@ NODE_IS_SILENT = (
 )
 BARRED: Mapping[str, str] = {EMERGENCY_STOP: IN_EMERGENCY, NODE_SILENT: NODE_IS_SILENT}
 """By cause of the end of its runs: why a device accepts no commands, in words."""
+
+
+class DeviceError(Exception):
+    """A driver raised an exception, the cause of this one; the text says which and where. Its
+    device was stopped if that was possible."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,14 +251,21 @@ class CyclicDriver:
         return self.state()
 
     def state(self) -> DeviceState:
-        """The state to publish."""
+        """The state to publish: plain data, also for actions in the same process. Raises
+        NotPlainError with the line of the driver's `state`."""
         number, why = self._refusal
         refused = why if number == self._handled else ""
         # A driver that computes with numpy answers with a numpy bool, which no message carries.
         stopped = bool(self.driver.stopped())
-        return DeviceState(
-            self._handled, refused, stopped, self.driver.state(), self._refusal, self.barred
-        )
+        try:
+            state = plain(self.driver.state(), "state")
+        except NotPlainError as fault:
+            code = getattr(self.driver.state, "__code__", None)
+            if code is None:
+                raise
+            place = f"{Path(code.co_filename).name}:{code.co_firstlineno}"
+            raise NotPlainError(f"{fault}, returned by `state` ({place})") from None
+        return DeviceState(self._handled, refused, stopped, state, self._refusal, self.barred)
 
     def forget(self) -> None:
         """Start again with the numbers of a new actions' end."""

@@ -24,6 +24,7 @@ from petrobot.services.worker.callables import (
     describe,
     from_outside,
     log_fault,
+    where,
 )
 from petrobot.services.worker.context import Report, RunContext, checked_result, never
 from petrobot.services.worker.outlets import Outlets
@@ -247,7 +248,8 @@ def _watch_unawaited() -> None:
 def _note_unawaited(raised: sys.UnraisableHookArgs) -> None:
     fault = raised.exc_value
     if _active is not None and isinstance(fault, RuntimeWarning) and "awaited" in str(fault):
-        _active.unawaited = str(fault)
+        # It is dropped where it was called, unless it was kept in a variable.
+        _active.unawaited = f"{fault}{where(sys._getframe(1))}"
     else:
         _usual_hook(raised)
 
@@ -511,7 +513,7 @@ class Runner:
             )
             return
         if run.unawaited and returned.status is not Status.ERROR:
-            text = f"{run.unawaited}, so it did nothing: write `await` before the call"
+            text = f"{run.unawaited}: it did nothing; write `await` before the call"
             self._give_up(now, run, "exception", self._with_refusal(run, text))
             return
         try:
@@ -563,7 +565,8 @@ class Runner:
         if refusal := self._refusing.refusal(run.sent_before):
             text = f"{text}; the driver refused a command: {refusal}"
         if TAKEN_WITHIN < (age := self._refusing.age) < inf:
-            text = f"{text}; the driver has published nothing for {age:.1f} s"
+            silent = f"the driver has published nothing for {age:.1f} s"
+            text = f"{text}; {silent} (does it block, or is its `period` not in seconds?)"
         return text.lstrip("; ")
 
     # --- end ----------------------------------------------------------------------------------

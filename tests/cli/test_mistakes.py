@@ -370,6 +370,38 @@ BOTH: list[tuple[list[Mistake], str]] = [
     ),
 ]
 
+HELPER = (
+    "async def close(ctx: Context[Remote]) -> None:\n    await ctx.sleep(0.3)\n\n\nasync def grip"
+)
+
+IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
+    (
+        [
+            (CODE, "async def grip", HELPER, ""),
+            (CODE, "  await ctx.sleep(0.3)\n    if", "  close(ctx)\n    if", ""),
+        ],
+        0,
+        r"error +grip#\d, grip on pc for grip: exception:.*'close' was never awaited in grip \("
+        r"arm_bot.py:\d+\): it did nothing.*only 0 of 3 goals were met; the exit code is 0 because",
+    ),
+    (
+        [(CODE, "if not self.paused:", "1 / 0\n        if not self.paused:", "")],
+        3,
+        r"node pc: device axis: its driver failed: ZeroDivisionError.* in step \(arm_bot.py:\d+\)",
+    ),
+    (
+        [(CODE, '{"at": self.at,', '{"at": self,', "")],
+        3,
+        r"device axis: .*state.at: a Axis is not plain data, returned by `state` \(arm_bot.py:\d+",
+    ),
+    (
+        [(CODE, "period = 0.01", "period = 10", "")],
+        1,
+        r"the driver has published nothing for \d.\d s \(does it block, or is its `period` not in",
+    ),
+]
+"""Mistakes that only a run shows, its exit code, and what its end says."""
+
 ON_THE_LINE: list[tuple[list[str], str]] = [
     (["run", "arm_bt.toml"], r"arm_bt.toml: file: cannot be read: No such file"),
     (["run", "armbot"], r"no task 'armbot': give a .toml file, or a task that comes with petrobot"),
@@ -384,7 +416,9 @@ ON_THE_LINE: list[tuple[list[str], str]] = [
     ([*RUN, "--set", "speed=1"], r"speed"),
     ([*RUN, "--use", "grip=grab"], r"grab.*grip"),
     ([*RUN, "--services", "cell.toml"], r"cell.toml: No such file"),
-    (["rum", "arm_bot.toml"], r"unknown command 'rum'"),
+    (["rum", "arm_bot.toml"], r"unknown command 'rum' \(did you mean 'run'\?\)"),
+    (["run", "arm_bot"], r"no task 'arm_bot': did you mean arm_bot.toml\?"),
+    (["show", TASK, "--out", "x.pdf"], r"--out x.pdf: expected a file .svg, found .pdf"),
     (
         ["new", "robot", "arm_bot", "--folder", ".."],
         r"named 'arm_bot' is there already|exists already",
@@ -396,6 +430,7 @@ ON_THE_LINE: list[tuple[list[str], str]] = [
 def _one_robot(monkeypatch: pytest.MonkeyPatch) -> None:
     """Modules are looked up beside the location file; remove those of earlier tests."""
     monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.delitem(sys.modules, "arm_bot", raising=False)
 
 
 @pytest.fixture(scope="session")
@@ -429,8 +464,8 @@ def expect(pattern: str, arguments: list[str], code: int | None = 2) -> None:
     """Check that the command prints this as one message without a traceback."""
     found, words = said(*arguments)
     assert code is None or found == code, words
-    lines = re.sub(r"\n {9,}", " ", words)  # the rest of a long line
-    assert re.search(pattern, lines.replace("\n        ", "; ")), words
+    lines = re.sub(r" *\n {9,}", " ", words)  # the rest of a long line
+    assert re.search(pattern, lines.replace("\n        ", "; "), re.DOTALL), words
     assert "Traceback" not in words, words
 
 
@@ -472,6 +507,23 @@ def test_mistakes_between_files_are_reported(
     damaged(sound, mistakes, tmp_path)
     monkeypatch.chdir(tmp_path)
     expect(pattern.replace("LINE", r"\d+"), CHECK)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    ("mistakes", "code", "pattern"), IN_THE_RUN, ids=["forgotten await", "step", "state", "period"]
+)
+def test_mistakes_that_a_run_shows_are_told_at_its_end(
+    sound: dict[str, str],
+    mistakes: list[Mistake],
+    code: int,
+    pattern: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    damaged(sound, mistakes, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    expect(pattern, RUN, code)
 
 
 @pytest.mark.processes

@@ -134,3 +134,11 @@ def test_the_log_of_a_node_is_printed_by_its_name(
     assert capsys.readouterr().out == "12:00 INFO run r1 started\nits last word\n"
     assert main(["log", "robots", "--services", services]) == 2
     assert "no run 'robots'" in capsys.readouterr().err
+
+
+def test_without_a_location_file_only_the_demo_is_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    main(["nodes", "--timeout", "0.1"])
+    assert "only the catching cell that comes with petrobot" in capsys.readouterr().err

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import stat
 import subprocess
 import time
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.cli import COMMANDS, main
+from petrobot.coordinator.cli.resume import later_run
 from petrobot.coordinator.engine import Mode
 from petrobot.coordinator.operator.run_address import (
     ADDRESS_FILE,
@@ -22,8 +24,9 @@ from petrobot.coordinator.operator.run_address import (
 )
 from petrobot.coordinator.page import app_state
 from petrobot.coordinator.run.folder import JOURNAL, NoRunError
-from petrobot.coordinator.run.journal import read_journal
+from petrobot.coordinator.run.journal import JournalWriter, read_journal
 from petrobot.coordinator.run.recording import remarks
+from tests.cli.cell import TASK
 from tests.cli.conftest import RUN, Terminal
 from tests.waiting import beat
 
@@ -41,6 +44,47 @@ async def test_pause_reaches_the_devices_and_continue_releases_them(petrobot: Te
     said = await petrobot("continue")
     assert said.code == 0 and "continues" in said.out
     await petrobot.until(lambda: not petrobot.arm.held)
+
+
+@pytest.mark.processes
+async def test_a_second_run_is_refused_while_the_first_has_its_device(petrobot: Terminal) -> None:
+    """It says which run has which device, and leaves no folder. It also names a run whose
+    coordinator was killed."""
+    await petrobot.working()
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    (petrobot.runs / "old-1").mkdir()
+    address = {"run": "old-1", "url": "", "token": "", "process": gone.pid}
+    (petrobot.runs / "old-1" / ADDRESS_FILE).write_text(json.dumps(address), encoding="utf-8")
+    task = petrobot.folder / "reaching.toml"
+    task.write_text(TASK, encoding="utf-8")
+    services = str(petrobot.mission.executor.directory.source)
+    said = await petrobot("run", str(task), "--services", services, "--no-page", "--quiet")
+    assert said.code == 2 and f"in use: arm by {RUN}; wait until" in said.err, said
+    assert "of old-1 has died: this is a new run; `petrobot resume old-1` continues" in said.err
+    assert {path.name for path in petrobot.runs.iterdir()} == {RUN, "old-1"}
+    assert petrobot.arm.moving
+
+
+@pytest.mark.parametrize(
+    ("mode", "services", "age", "told"),
+    [
+        ("realtime", "cell", 0.0, "other"),
+        ("realtime", "cell", 9.0, ""),
+        ("lockstep", "cell", 0.0, ""),
+        ("realtime", "another cell", 0.0, ""),
+    ],
+)
+def test_a_resume_names_the_run_that_has_used_the_devices_since(
+    mode: str, services: str, age: float, told: str, tmp_path: Path
+) -> None:
+    """`age`: how much older than the interrupted run the other one's last record is (s)."""
+    own, other = (tmp_path / name / JOURNAL for name in ("own", "other"))
+    JournalWriter(own, {"mode": "realtime", "services": "cell"}).close()
+    JournalWriter(other, {"mode": mode, "services": services}).close()
+    os.utime(own, (1_000.0, 1_000.0))
+    os.utime(other, (1_005.0 - age, 1_005.0 - age))
+    assert later_run(read_journal(own)) == told
 
 
 async def test_a_device_that_cannot_hold_says_so(petrobot: Terminal) -> None:
@@ -333,8 +377,6 @@ def test_only_the_owner_can_read_the_runs_address_which_is_removed_at_its_end(
     tmp_path: Path,
 ) -> None:
     """The token in the file permits every command."""
-    import os
-
     (tmp_path / "r").mkdir()
     (tmp_path / "r" / JOURNAL).touch()
     address = RunAddress("r", "http://127.0.0.1:1", "secret", os.getpid())

@@ -83,9 +83,7 @@ def test_a_node_whose_port_is_taken_touches_no_device(
         directory = directory_in(tmp_path, "127.0.0.1", port)
         assert main(["left", "--services", str(directory.source)]) == 2
     said = capsys.readouterr().err
-    assert said.startswith(
-        f"python -m petrobot.services left: {directory.source}: nodes.left.port: {port} is in use"
-    )
+    assert said.startswith(f"node left: {directory.source}: nodes.left.port: {port} is in use")
     assert said.count("\n") == 1
 
 

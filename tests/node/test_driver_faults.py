@@ -138,7 +138,7 @@ async def test_an_exception_of_a_driver_is_the_runs_error(
     assert FAULTS[name] in end.text and end.seconds < 14.0
     assert (await innocent).status == "success"
     log = node.log.read_text()
-    assert "Traceback" in log and FAULTS[name] in log
+    assert ", line " in log and FAULTS[name] in log
     await works(operator, name)
 
 
@@ -312,7 +312,7 @@ def test_a_driver_that_is_broken_from_the_beginning(tmp_path: Path, breaks: str)
     log = one.log.read_text()
     assert one.process.returncode == 2 and "ready" not in out
     assert FAULTS.get(breaks, f"nothing is right in {breaks}") in log.splitlines()[-1], log
-    assert "Traceback" in log
+    assert ", line " in log
     logged = next(line for line in log.splitlines() if " ERROR " in line)[:23]
     broke = datetime.strptime(logged, "%Y-%m-%d %H:%M:%S,%f").timestamp()
     assert one.log.stat().st_mtime - broke < START_LIMIT / 2

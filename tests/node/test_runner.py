@@ -122,7 +122,7 @@ ENDINGS: list[tuple[Any, dict[str, Any], str, str, str, str]] = [
         {},
         "error",
         "exception",
-        "coroutine 'naps' was never awaited, so it did nothing: write `await` before the call",
+        "coroutine 'naps' was never awaited in forgets_await (test_runner.py:",
         "yes",
     ),
     (forgets_await_and_fails, {}, "error", "lost", "", "yes"),

@@ -182,21 +182,21 @@ def test_an_arm_that_cannot_be_recovered_ends_the_task_in_error(catch_ball: Task
     assert sum(r.place == "recover_arm" for r in mission.tally.runs) == 4
 
 
-def test_a_given_up_run_lists_the_errors_of_its_actions(catch_ball: Task) -> None:
-    """The errors in order, the last one last; a run that reached its final marking has no such
-    list."""
+def test_a_result_says_once_why_actions_ended_in_error(catch_ball: Task) -> None:
+    """Each primitive task and cause once, the last one last; also if the task recovered."""
     lines = {"move_to_point": [failing("bad_arguments")], "recover_arm": [failing("drive_fault")]}
     mission, _ = run(catch_ball, lines)
     told = mission.result("lockstep", 0.0)["last_errors"]
-    assert [(e["primitive_task"], e["cause"]) for e in told] == [
-        ("move_to_point", "bad_arguments"),
-        *[("recover_arm", "drive_fault")] * 4,
+    assert [(e["run"], e["cause"]) for e in told] == [
+        ("move_to_point#1", "bad_arguments"),
+        ("recover_arm#4", "drive_fault"),
     ]
     where = mission.executor.directory.where
-    assert all(
-        e["node"] == where(e["action"]) and e["run"].startswith(e["primitive_task"]) for e in told
-    )
-    good, _ = run(catch_ball, {"move_to_point": [failing("bad_arguments"), GOOD, GOOD, GOOD]})
+    assert all(e["node"] == where(e["action"]) for e in told)
+    recovered, _ = run(catch_ball, {"move_to_point": [failing("bad_arguments"), GOOD, GOOD, GOOD]})
+    result = recovered.result("lockstep", 0.0)
+    assert (result["status"], len(result["last_errors"])) == ("success", 1)
+    good, _ = run(catch_ball, {})
     assert "last_errors" not in good.result("lockstep", 0.0)
 
 

@@ -55,7 +55,8 @@ async def test_nodes_that_do_not_run_must_be_launched_with_the_file_in_use(
 async def test_a_node_with_another_key_must_not_be_launched(
     catch_ball: Task, tmp_path: Path
 ) -> None:
-    """It runs, so its remedy is about the key; the others must still be launched."""
+    """It runs, so its remedy is about the key; the others must still be launched, each by itself:
+    `up` would find the port of the one that runs in use."""
     launch, _, refused = (await unreachable(catch_ball, tmp_path, "left")).partition(
         "; not let in by "
     )
@@ -64,6 +65,7 @@ async def test_a_node_with_another_key_must_not_be_launched(
     assert (
         launch.startswith("no answer from right at ")
         and "left at" not in launch
-        and "petrobot up" in launch
+        and "launch with `petrobot node right --services" in launch
+        and "petrobot up" not in launch
     )
     assert "petrobot up" not in await unreachable(catch_ball, tmp_path, *NAMES)

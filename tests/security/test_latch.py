@@ -105,6 +105,9 @@ def test_the_folders_of_the_latch(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.delenv(STATE, raising=False)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     beside, own = latch_of(tmp_path / "services.toml", "motion").paths
+    monkeypatch.setattr(f"{Latch.__module__}.INSTALLED", tmp_path.resolve())
+    installed = latch_of(tmp_path / "services.toml", "motion").paths
+    assert installed == (own, beside), "nothing is written into an installed package"
     assert beside == tmp_path.resolve() / ".petrobot" / "motion.stopped"
     assert own.is_relative_to(tmp_path / "state" / "petrobot") and own.name == "motion.stopped"
     monkeypatch.setenv(STATE, str(tmp_path / "given"))

@@ -419,6 +419,11 @@ class Callee:
                 self._running.watch_orphan(id_, now + run.orphan_time)
                 self.soonest = min(self.soonest, now + run.orphan_time)
 
+    @property
+    def leases(self) -> dict[str, str]:
+        """By device the connected caller whose orders it accepts."""
+        return self._peers.leases
+
     # Messages of callers.
 
     def receive(self, now: float, peer: str, message: Message) -> None:

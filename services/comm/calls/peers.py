@@ -184,6 +184,11 @@ class Peers:
         self._leases[device] = name
         return None
 
+    @property
+    def leases(self) -> dict[str, str]:
+        """By device the connected caller whose orders it accepts."""
+        return {device: name for device, name in self._leases.items() if self.is_up(name)}
+
     def _is_near(self, now: float, name: str) -> bool:
         peer = self._peers.get(name)
         return peer is not None and (peer.up or now < peer.down_at + self._lease_time)

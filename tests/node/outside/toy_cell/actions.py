@@ -376,18 +376,20 @@ async def order_directly(ctx: Context, *, send: list[dict[str, Any]], seconds: f
     return success()
 
 
-async def spin(ctx: Context, *, stubborn: bool = False) -> Result:
-    """Loop without end; if `stubborn`, ignore every interruption."""
+async def spin(ctx: Context, *, how: str = "loop") -> Result:
+    """Loop without end or wait for another `program`; if `stubborn`, ignore every interruption."""
     await ctx.sleep(0.02)
     while True:
         try:
-            turn_round()
+            turn_round(how)
         except BaseException:
-            if not stubborn:
+            if how != "stubborn":
                 raise
 
 
-def turn_round() -> None:
-    """Loop without end."""
+def turn_round(how: str) -> None:
+    """Loop without end, or wait for a program that does not end in time."""
+    if how == "program":
+        subprocess.run(["sleep", "60"], check=True)
     while True:
         pass
