@@ -12,7 +12,7 @@ from math import inf
 from typing import TYPE_CHECKING
 
 from petrobot.coordinator.task import Status, Task, Transition
-from petrobot.coordinator.task.check import CheckReport, Finding, Severity, check
+from petrobot.coordinator.task.check import CheckReport, Finding, Severity, check, in_file
 from petrobot.coordinator.task.validation import is_pulse
 from petrobot.coordinator.task.wording import listed, wrapped
 
@@ -130,11 +130,11 @@ def may_run(task: Task, cell: Cell | None = None, budget: Budget | None = None) 
     )
     if any(finding.code == "inconsistent" for finding in report.errors):
         return MayRun(task, report, None)
-    report = CheckReport((*report.findings, *_late(task)))
+    report = CheckReport(in_file(task, (*report.findings, *_late(task))))
     if budget is None:
         return MayRun(task, report, None)
     analysis = _search(task, budget, devices_of(cell))
-    report = _with_graph(report, analysis)
+    report = CheckReport(in_file(task, _with_graph(report, analysis).findings))
     return MayRun(task, report, replace(analysis, refused=not report.ok))
 
 
@@ -220,8 +220,10 @@ def _left_behind(places: tuple[str, ...], verdict: PropertyVerdict) -> Finding:
         "a run that ended is" if len(places) == 1 else f"ended runs of {' and '.join(places)} are"
     )
     text = f"the task can end with `final` while {what} still there: {verdict.reason}"
-    empty = " and ".join(f"{place} == 0" for place in places)
-    remedy = f"let `final` ask for `{empty}`, and give that end a transition that takes it"
+    remedy, inside = "give that end a transition that takes it", any("." in p for p in places)
+    if not inside:  # `final` knows the places of the task, not those of its subnets
+        empty = " and ".join(f"{place} == 0" for place in places)
+        remedy = f"let `final` ask for `{empty}`, and {remedy}"
     key, by = f"places.{places[0]}", path_lines(verdict.witness, "")
     details = (*verdict.details, *by)
     return Finding(Severity.WARNING, "left-behind", key, text, remedy, details=details)
