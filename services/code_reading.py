@@ -103,7 +103,7 @@ class _Code:
                  if isinstance(n, ast.Name)}  # fmt: skip
         found: set[ast.AST] = set()
         for node in self.nodes:
-            if isinstance(node, ast.Await | ast.Return):
+            if isinstance(node, ast.Await | ast.Return | ast.Yield):
                 found |= set(ast.walk(node))
             elif isinstance(node, ast.Lambda):
                 found |= set(ast.walk(node.body))
@@ -111,6 +111,10 @@ class _Code:
                 found |= {*node.args, *(k.value for k in node.keywords)}
             elif isinstance(node, ast.List | ast.Tuple | ast.Set):
                 found |= {*node.elts}
+            elif isinstance(node, ast.Dict):
+                found |= {*node.values}
+            elif isinstance(node, ast.DictComp):
+                found.add(node.value)
             elif isinstance(node, ast.ListComp | ast.SetComp | ast.GeneratorExp):
                 found.add(node.elt)
             elif isinstance(node, ast.Assign) and any(
@@ -123,8 +127,13 @@ class _Code:
     def kept(self) -> set[ast.AST]:
         """What is assigned to a name that is passed on: it may be awaited there."""
         passed = {n.id for n in self.awaited if isinstance(n, ast.Name)}
-        return {n.value for n in self.nodes if isinstance(n, ast.Assign)
-                and any(isinstance(t, ast.Name) and t.id in passed for t in n.targets)}  # fmt: skip
+        found = set[ast.AST]()
+        for node in self.nodes:
+            if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                if any(not isinstance(t, ast.Name) or t.id in passed for t in targets):
+                    found.add(node.value)
+        return found
 
     @cached_property
     def branched(self) -> set[ast.AST]:

@@ -823,6 +823,30 @@ def test_a_memory_that_is_on_a_node_is_no_mistake(
 
 
 @pytest.mark.processes
+def test_a_coroutine_that_is_passed_on_is_no_mistake(
+    sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    helper = "async def wink(ctx: Context[Remote]) -> bool:\n    return False\n\n\nasync def grip("
+    uses = """job = wink(ctx)
+    both: Any = [wink(ctx), wink(ctx)]
+    await job
+    for one in both:
+        await one
+    jobs = {n: wink(ctx) for n in (1, 2)}, {1: wink(ctx)}, [wink(ctx) for _ in (1, 2)]
+    ctx.device.job = wink(ctx)
+    late = wink(ctx)
+    print(late, jobs)
+"""
+    mistakes: list[Mistake] = [
+        (CODE, "async def grip(", helper, ""),
+        (CODE, "await ctx.sleep(0.3)\n", uses, ""),
+    ]
+    damaged(sound, mistakes, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    expect("^arm_bot.toml: may run", CHECK, 0)
+
+
+@pytest.mark.processes
 def test_a_class_that_cannot_be_hashed_is_read_like_any_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sound: dict[str, str]
 ) -> None:
