@@ -389,7 +389,8 @@ def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, An
         seen.doubtful.append((own.file, own.tree.lineno, text))  # type: ignore[attr-defined]
     found = {device: _faults_of_driver(thing, table) for device, table in tables.items()}
     dry = {"dry_run": True} if issubclass(thing, Driver) else {}
-    return {"keys": found, "dry_run": not faults_of_limits(thing, dry), **_plain(seen)}
+    moves = True if seen.streams else None  # set points may move a device without commands
+    return {"keys": found, "dry_run": not faults_of_limits(thing, dry, moves), **_plain(seen)}
 
 
 def _faults_of_driver(thing: type, table: Mapping[str, Any]) -> list[tuple[str, str]]:
