@@ -15,6 +15,7 @@ import ast
 import inspect
 import json
 import os
+import random
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -25,7 +26,7 @@ from typing import Any, get_type_hints
 
 from petrobot.services import action as actions
 from petrobot.services.comm.location_file import resolve
-from petrobot.services.device import Driver, Key, faults_of_keys, faults_of_limits
+from petrobot.services.device import LIMITS, Driver, Key, faults_of_keys, faults_of_limits, keys_of
 from petrobot.services.host.json_text import json_text
 
 AWAITED = frozenset(
@@ -41,6 +42,8 @@ METHODS = ("period", "state", "stop", "stopped", "hold", "release", "close")
 CYCLIC = ("command", "step")
 """Methods that a driver with a period needs in addition to `METHODS`."""
 CALLED_IN_CYCLE = ("step", "command", "state", "stop", "stopped", "hold", "release", "quick_stop")
+SLOW = 1.0
+"""Seconds between two steps of a driver above which its unit is probably mistaken."""
 _KINDS = {bool: "bool", int: "int", float: "float", str: "str", list: "list", dict: "dict"}
 
 
@@ -100,16 +103,36 @@ class _Code:
                  if isinstance(n, ast.Name)}  # fmt: skip
         found: set[ast.AST] = set()
         for node in self.nodes:
-            if isinstance(node, ast.Await | ast.Return):
+            if isinstance(node, ast.Await | ast.Return | ast.Yield):
                 found |= set(ast.walk(node))
             elif isinstance(node, ast.Lambda):
                 found |= set(ast.walk(node.body))
             elif isinstance(node, ast.Call):
                 found |= {*node.args, *(k.value for k in node.keywords)}
+            elif isinstance(node, ast.List | ast.Tuple | ast.Set):
+                found |= {*node.elts}
+            elif isinstance(node, ast.Dict):
+                found |= {*node.values}
+            elif isinstance(node, ast.DictComp):
+                found.add(node.value)
+            elif isinstance(node, ast.ListComp | ast.SetComp | ast.GeneratorExp):
+                found.add(node.elt)
             elif isinstance(node, ast.Assign) and any(
                 isinstance(t, ast.Name) and t.id in waits for t in node.targets
             ):
                 found.add(node.value)
+        return found
+
+    @cached_property
+    def kept(self) -> set[ast.AST]:
+        """What is assigned to a name that is passed on: it may be awaited there."""
+        passed = {n.id for n in self.awaited if isinstance(n, ast.Name)}
+        found = set[ast.AST]()
+        for node in self.nodes:
+            if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                if any(not isinstance(t, ast.Name) or t.id in passed for t in targets):
+                    found.add(node.value)
         return found
 
     @cached_property
@@ -162,7 +185,8 @@ def _source(thing: Any) -> _Code | None:
         )
         tree = _definitions(file)[thing.__name__, first]
         names = {**vars(sys.modules[thing.__module__]), **dict(_imported(tree))}
-        return _Code(tree, file, names)
+        near = os.path.relpath(file)
+        return _Code(tree, file if near.startswith("..") else near, names)
     except (OSError, TypeError, SyntaxError, KeyError, AttributeError):
         return None
 
@@ -208,8 +232,31 @@ def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
             seen.complete = False
         elif made is time.sleep and in_action:
             _sleeps(code, node, seen)
+        elif inspect.iscoroutinefunction(made) and node not in {*code.awaited, *code.kept}:
+            _unawaited(code, node, seen)
+        elif _draws_unseeded(made, node):
+            text = (
+                f"{ast.unparse(node.func)} does not use the seed: a run cannot be repeated; "
+                'draw from `ctx.random("purpose")`, in a driver `self.ports.random("purpose")`'
+            )
+            seen.doubtful.append((code.file, node.lineno, text))
         if isinstance(node.func, ast.Attribute):
             _method(code, node, node.func, seen)
+
+
+def _unawaited(code: _Code, node: ast.Call, seen: _Seen) -> None:
+    name = ast.unparse(node.func)
+    text = f"`{name}` does nothing without `await`; write `await {name}(...)`"
+    seen.faults.append((code.file, node.lineno, text))
+
+
+def _draws_unseeded(made: Any, node: ast.Call) -> bool:
+    """Return whether a call draws from the process's own generator, of `random` or of numpy."""
+    owner = getattr(made, "__self__", None)
+    if getattr(made, "__name__", "") == "default_rng":
+        return not node.args and not node.keywords
+    numpy = sys.modules.get("numpy.random")
+    return isinstance(owner, random.Random | getattr(numpy, "RandomState", random.Random))
 
 
 def _sleeps(code: _Code, node: ast.Call, seen: _Seen) -> None:
@@ -251,10 +298,7 @@ def _method(code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen) -
         if name == "call":
             seen.complete = False
         if name in AWAITED and not ports and node not in code.awaited:
-            text = (
-                f"`{owner}.{name}` does nothing without `await`; write `await {owner}.{name}(...)`"
-            )
-            seen.faults.append((code.file, node.lineno, text))
+            _unawaited(code, node, seen)
         if name in REMEMBERS and not ports and seen.memory is None:
             seen.memory = (code.file, node.lineno)
         if name == "command" and not ports and seen.commands is None and node not in code.branched:
@@ -339,8 +383,14 @@ def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, An
         _look(code, seen, in_action=False)
         if issubclass(thing, Driver) and thing.period is not None:
             _steps(code, seen)
+    period, own = getattr(thing, "period", None), _code(thing)
+    if isinstance(period, int | float) and period > SLOW and own is not None:
+        text = f"{thing.__name__}.period is {period:g} s between two steps; 0.01 would be 10 ms"
+        seen.doubtful.append((own.file, own.tree.lineno, text))  # type: ignore[attr-defined]
     found = {device: _faults_of_driver(thing, table) for device, table in tables.items()}
-    return {"keys": found, **_plain(seen)}
+    dry = {"dry_run": True} if issubclass(thing, Driver) else {}
+    moves = True if seen.streams else None  # set points may move a device without commands
+    return {"keys": found, "dry_run": not faults_of_limits(thing, dry, moves), **_plain(seen)}
 
 
 def _faults_of_driver(thing: type, table: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -363,8 +413,26 @@ def _faults_of_driver(thing: type, table: Mapping[str, Any]) -> list[tuple[str, 
     if declared and period is None and own and not _sets_period(thing):
         text = f"{thing.__name__} has `{own[-1]}` and no period: it is never called; write "
         keys.append(("driver", f"{text}`period = 0.01` (s between two steps) in the class"))
+    if unset := _unset(thing):
+        text = f"the constructor of {thing.__name__} does not call the one of Driver, so that "
+        text += f"{', '.join(unset)} would not be set; write `super().__init__(config, ports)`"
+        keys.append(("driver", f"{text}, or write `setup` instead"))
     check = faults_of_keys if issubclass(thing, Driver) else faults_of_limits
     return [*keys, *check(thing, table)]
+
+
+def _unset(thing: type) -> list[str]:
+    """Return what a constructor of its own leaves unset, of all that the driver uses."""
+    if not issubclass(thing, Driver) or thing.__init__ is Driver.__init__:
+        return []
+    nodes = [node for code in _reachable(thing) for node in code.nodes]
+    own = [n for n in nodes if isinstance(n, ast.Attribute) and ast.unparse(n.value) == "self"]
+    if any(isinstance(n, ast.Attribute) and n.attr in ("__init__", "limit") for n in nodes):
+        return []
+    stored = {n.attr for n in own if isinstance(n.ctx, ast.Store)}
+    wanted = [*keys_of(thing), *(n for n in LIMITS if n in thing.obeys)]
+    wanted += ["ports"] if any(n.attr == "ports" for n in own) else []
+    return [name for name in wanted if name not in stored]
 
 
 def _sets_period(thing: type) -> bool:

@@ -277,7 +277,7 @@ class Driver:
 
     def stopped(self) -> bool:
         """Return whether the device is known to stand still."""
-        return True
+        return not can_move(type(self))
 
     def hold(self, now: float) -> str:
         """Pause for the operator: answer "held", "cannot hold" or "stopped". A driver with "pause"
@@ -340,9 +340,18 @@ def faults_of_limits(
     moves = can_move(driver) if moves is None else moves
     foreign = not issubclass(driver, Driver) and not hasattr(driver, "obeys")
     obeys = getattr(driver, "obeys", ())
-    for name in sorted({*([obeys] if isinstance(obeys, str) else obeys)} - OBEYED):
+    if isinstance(obeys, str):
+        text = f"{driver.__name__}.obeys: expected a tuple, found {obeys!r:.60}; write"
+        faults.append(("driver", f'{text} obeys = ("{obeys.strip():.60}",)'))
+        obeys = (obeys,)
+    for name in sorted({*obeys} - OBEYED):
         text = f"{driver.__name__}.obeys: expected some of {', '.join(sorted(OBEYED))}"
         faults.append(("driver", f"{text}; found {name!r:.60}"))
+    has = _overridden(driver)
+    if can_move(driver) and (absent := {"stop", "stopped"} - has):
+        text = f"{driver.__name__} has {', '.join(sorted(has))}, but no {', '.join(sorted(absent))}"
+        text += ": after an emergency stop it could move on, and be reported as stopped; write both"
+        faults.append(("driver", f"{text} (if it never moves: `pass` and `return True`)"))
     for name in LIMITS:
         still = name == "dry_run" and not moves  # as in every dry run
         own = name in keys_of(driver) or (foreign and name != "dry_run")
@@ -371,8 +380,13 @@ def can_move(driver: type) -> bool:
     any other device, such as a button, does not move."""
     steps = getattr(driver, "step", Driver.step) is not Driver.step
     cyclic = steps or getattr(driver, "period", None) is not None
-    moving = ("command", "stop", "quick_stop")
-    return cyclic and any(getattr(driver, m, None) is not getattr(Driver, m, None) for m in moving)
+    return cyclic and not _overridden(driver).isdisjoint(("command", "stop", "quick_stop"))
+
+
+def _overridden(driver: type) -> set[str]:
+    """Return the methods with which a driver moves or stops its device."""
+    methods = ("command", "stop", "stopped", "quick_stop")
+    return {m for m in methods if getattr(driver, m, None) is not getattr(Driver, m, None)}
 
 
 def numbers(value: Any, count: int, name: str) -> list[float]:

@@ -6,13 +6,13 @@ answer, not in the question.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from math import inf
 from typing import TYPE_CHECKING
 
-from petrobot.coordinator.task import Status, Task, Transition
-from petrobot.coordinator.task.check import CheckReport, Finding, Severity, check
+from petrobot.coordinator.task import Input, Status, Task, Transition
+from petrobot.coordinator.task.check import CheckReport, Finding, Severity, check, in_file
 from petrobot.coordinator.task.validation import is_pulse
 from petrobot.coordinator.task.wording import listed, wrapped
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # the search needs numpy, which a command that only reads the
     from petrobot.coordinator.analysis.net.space import SearchLimits
     from petrobot.coordinator.analysis.net.verdict import PropertyVerdict
     from petrobot.coordinator.analysis.report import Analysis
+    from petrobot.coordinator.engine import State
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,11 +131,11 @@ def may_run(task: Task, cell: Cell | None = None, budget: Budget | None = None) 
     )
     if any(finding.code == "inconsistent" for finding in report.errors):
         return MayRun(task, report, None)
-    report = CheckReport((*report.findings, *_late(task)))
+    report = CheckReport(in_file(task, (*report.findings, *_late(task))))
     if budget is None:
         return MayRun(task, report, None)
     analysis = _search(task, budget, devices_of(cell))
-    report = _with_graph(report, analysis)
+    report = CheckReport(in_file(task, _with_graph(report, analysis).findings))
     return MayRun(task, report, replace(analysis, refused=not report.ok))
 
 
@@ -161,26 +162,30 @@ def _with_graph(report: CheckReport, analysis: Analysis) -> CheckReport:
 
 
 def _lost_pulses(x: ExecutionGraph) -> Iterator[Finding]:
-    """Transitions that miss a pulse while another branch holds a token that they need."""
+    """Transitions that miss a pulse while another branch holds a token that they need, or while
+    the place that listens for it is empty."""
     task, net = x.engine.compiled.task.flat, x.engine.compiled.net
+
+    def ready(state: State, needed: Iterable[Input]) -> bool:
+        return all(state.marking[net.place_index[a.place]] >= a.weight for a in needed)
+
     for t in task.transitions.values():
         pulses = [e for e in t.events if is_pulse(task.events[e])]
-        need = {a.place: a.weight for a in t.inputs}
-        for place in need if pulses else ():
-            others = {*need} - {place}
+        waiting = [u for u in task.transitions.values() if {*pulses} & {*u.events}]
+        for arc in t.inputs if pulses else ():
+            place, others = arc.place, [a for a in t.inputs if a.place != arc.place]
+            away = {a.place for a in others}
             takers = [
                 u.name
                 for u in task.transitions.values()
-                if place in _places(u) and others.isdisjoint(_places(u))
+                if place in _places(u)
+                and place not in {o.place for o in u.outputs}
+                and away.isdisjoint(_places(u))
             ]
-            lost = (
-                others
-                and takers
-                and any(
-                    state.marking[net.place_index[place]] < need[place]
-                    and all(state.marking[net.place_index[p]] >= need[p] for p in others)
-                    for state in x.states
-                )
+            lost = takers and (others or task.places[place].listen)
+            lost = lost and any(
+                ready(state, others) and not any(ready(state, u.inputs) for u in waiting)
+                for state in x.states
             )
             if lost:
                 text = (
@@ -220,8 +225,10 @@ def _left_behind(places: tuple[str, ...], verdict: PropertyVerdict) -> Finding:
         "a run that ended is" if len(places) == 1 else f"ended runs of {' and '.join(places)} are"
     )
     text = f"the task can end with `final` while {what} still there: {verdict.reason}"
-    empty = " and ".join(f"{place} == 0" for place in places)
-    remedy = f"let `final` ask for `{empty}`, and give that end a transition that takes it"
+    remedy, inside = "give that end a transition that takes it", any("." in p for p in places)
+    if not inside:  # `final` knows the places of the task, not those of its subnets
+        empty = " and ".join(f"{place} == 0" for place in places)
+        remedy = f"let `final` ask for `{empty}`, and {remedy}"
     key, by = f"places.{places[0]}", path_lines(verdict.witness, "")
     details = (*verdict.details, *by)
     return Finding(Severity.WARNING, "left-behind", key, text, remedy, details=details)

@@ -22,7 +22,7 @@ from petrobot.coordinator.cli.loading import (
     task_path,
     write_json,
 )
-from petrobot.coordinator.task.wording import Severity, wrapped
+from petrobot.coordinator.task.wording import Severity, listed, wrapped
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 EXAMPLE = "petrobot check catch_ball"
 NO_CELL = "no-cell"
 """Code of the finding that no location file was given."""
+NO_DRY_RUN = "no-dry-run"
+"""Code of the finding that drivers of the location file refuse a dry run."""
 PATIENCE = 2.0
 """Seconds that a node has to answer."""
 HANG = 8
@@ -108,7 +110,7 @@ def _checked(task: Task, services: Path | None) -> tuple[MayRun, CheckReport]:
 def _with_code(task: Task, directory: Directory, report: CheckReport) -> CheckReport:
     """Add findings about the code that the location file names. Raises CommandError for errors in
     that file."""
-    from petrobot.coordinator.task.check import CheckReport, Severity
+    from petrobot.coordinator.task.check import CheckReport, Finding, Severity, in_file
     from petrobot.coordinator.task.check.code import code_findings
     from petrobot.coordinator.task.check.completeness import EXTERNAL_WAIT, external_waits
     from petrobot.services.comm.location_file import read_text
@@ -124,15 +126,22 @@ def _with_code(task: Task, directory: Directory, report: CheckReport) -> CheckRe
         if action.run in code
     }
     args = {action.name: action.args for action in actions}
-    found = list(code_findings(task, by_action, args, directory.services))
+    drivers = {device.name: code.get(device.driver, {}) for device in directory.devices.values()}
+    raised, complete = _raised(task, directory, code)
+    found = list(
+        code_findings(task, by_action, args, directory.services, [*drivers.values()], raised)
+    )
+    if refused := [name for name, facts in drivers.items() if facts.get("dry_run") is False]:
+        text = f"--dry-run is refused: the drivers of {listed(refused)} do not obey it"
+        remedy = 'obey `self.dry_run` there, and add "dry_run" to `obeys`'
+        found.append(Finding(Severity.NOTE, NO_DRY_RUN, str(directory.source), text, remedy))
     errors = [f for f in found if f.severity is Severity.ERROR]
     warnings = [f for f in found if f.severity is not Severity.ERROR]
     known = [f for f in report.findings if f.code != EXTERNAL_WAIT]
     if len(known) < len(report.findings):  # now it is known which events the cell raises
-        raised, complete = _raised(task, directory, code)
         source = str(directory.source) if complete else None
         warnings += external_waits(task.flat, raised, source)
-    return CheckReport((*errors, *known, *warnings))
+    return CheckReport(in_file(task, (*errors, *known, *warnings)))
 
 
 def _raised(
@@ -244,7 +253,10 @@ def _lines(report: CheckReport, name: str) -> list[int | None]:
     from petrobot.coordinator.task.file.errors import key_lines, line_of
 
     lines = key_lines(task_path(name).read_text(encoding="utf-8"))
-    elsewhere = [f.code == NO_CELL or (f.code == "code" and ":" in f.key) for f in report.findings]
+    elsewhere = [
+        f.code in (NO_CELL, NO_DRY_RUN) or (f.code == "code" and ":" in f.key)
+        for f in report.findings
+    ]
     return [
         None if other else line_of(f.key, lines)
         for f, other in zip(report.findings, elsewhere, strict=True)

@@ -290,6 +290,7 @@ def refuse_arguments(
     """Refuse a task whose places give arguments that their actions do not have, or lack one: as far
     as the source shows it, which takes milliseconds. `petrobot check` imports the code and finds
     more."""
+    from petrobot.coordinator.task.check import in_file
     from petrobot.coordinator.task.check.code import argument_findings
     from petrobot.coordinator.task.file.errors import key_lines, line_of
     from petrobot.services.comm.location_file.host_checks import signatures
@@ -298,7 +299,7 @@ def refuse_arguments(
         return
     known = signatures(directory, everywhere=everywhere)
     args = {action.name: action.args for action in directory.actions.values()}
-    if found := list(argument_findings(task, known, args)):
+    if found := in_file(task, argument_findings(task, known, args)):
         lines = key_lines(task_path(name).read_text(encoding="utf-8"))
         told = (f"{name}:{line_of(f.key, lines)}: {f.key}: {f.text}; {f.remedy}" for f in found)
         raise CommandError(2, "\n".join(told))

@@ -38,6 +38,10 @@ class Button(Driver):
 class Deaf(Button):
     def command(self, now, body):
         pass
+    def stop(self, now):
+        pass
+    def stopped(self):
+        return True
 
 class Axis(Deaf):
     obeys = ("speed", "workspace", "dry_run")

@@ -44,7 +44,19 @@ IN_THE_TASK: list[Mistake] = [
     (TASK, "[task]", "[tsk]", r":LINE: tsk: unknown key.*did you mean 'task'\?"),
     (TASK, 'final = "parts == 0"', "", r":5: task.final: missing; give a text"),
     (TASK, '"parts == 0"', '"part == 0"', r":LINE: task.final: in 'part == 0'.*'part'.*parts"),
-    (TASK, '"parts == 0"', '"parts = 0"', r":LINE: task.final: .* at column 7: parts >>>= 0"),
+    (TASK, '"parts == 0"', '"parts = 0"', r":LINE: task.final: .* at column 7 of 'parts = 0'"),
+    (
+        TASK,
+        'name = "arm_bot"',
+        'name = "arm_bot',
+        r":LINE: TOML: the quote in column 8 is not closed; cl",
+    ),
+    (
+        TASK,
+        '"parts == 0"',
+        '"parts - 1 == 0"',
+        r":LINE: .*'-' has no meaning .*computes nothing; let",
+    ),
     (TASK, '"parts == 0"', "0", r":LINE: task.final: 0 is not a text; give a text"),
     (
         TASK,
@@ -179,6 +191,12 @@ IN_THE_CELL: list[Mistake] = [
         r":LINE: actions.move: calls ctx.command \(arm_bot.py:\d+\) and has no device; write",
     ),
     (CELL, "arm_bot:Axis", "armbot:Axis", r":LINE: .*no module 'armbot' on this host; install"),
+    (
+        CELL,
+        'arm_bot:Axis"',
+        "arm_bot:Axis",
+        r":LINE: not valid TOML: the quote in column 32 is not",
+    ),
     (CELL, "arm_bot:Axis", "arm_bot.Axis", r":LINE: .*write an import path \"module:Class\""),
     (CELL, "arm_bot:Axis", "arm_bot:move", r":LINE: .*is not a class; a driver is a class derived"),
     (
@@ -262,6 +280,50 @@ IN_THE_CODE: list[Mistake] = [
         "class Axis(Driver):",
         "class Axis:",
         r":LINE: .*Axis has no hold|close.*derive it from petrobot.Dr",
+    ),
+    (
+        CODE,
+        "    def stop(self, now: float) -> None:\n        self.goal = self.at\n",
+        "",
+        r":7: devices.axis.driver: Axis has command, stopped, but no stop: .* write both",
+    ),
+    (
+        CODE,
+        'obeys = ("speed", "workspace", "dry_run", "pause")',
+        'obeys = "speed"',
+        r":7: .*Axis.obeys: expected a tuple, found 'speed'; write obeys = \(\"speed\",\)",
+    ),
+    (
+        CODE,
+        "    def setup(self) -> None:\n",
+        "    def __init__(self, config: Any, ports: Any) -> None:\n",
+        r":7: .* Axis does not call the one of Driver, .* top_speed, length, .*or write `setup`",
+    ),
+    (
+        CODE,
+        "period = 0.01",
+        "period = 50",
+        r"arm_bot.py:\d+: Axis.period is 50 s between two steps",
+    ),
+    (
+        CODE,
+        'if ctx.random("grip").random()',
+        "import random\n    if random.random()",
+        r"arm_bot.py:\d+: random.random does not use the seed: .*draw from `ctx.random",
+    ),
+    (
+        CODE,
+        '"dry_run", "pause")',
+        '"pause")',
+        r"note    services.toml: --dry-run is refused: the drivers of axis do not obey it",
+    ),
+    (
+        CODE,
+        "async def grip(ctx: Context[Remote], *, slips: float = 0.2) -> Result:\n",
+        "async def settle(ctx: Context[Remote]) -> bool:\n    return False\n\n\n"
+        "async def grip(ctx: Context[Remote], *, slips: float = 0.2) -> Result:\n"
+        "    if not settle(ctx):\n        return success()\n",
+        r"arm_bot.py:\d+: `settle` does nothing without `await`; write `await settle",
     ),
     (CODE, "import Context, Driver,", "import Contxt, Driver,", r":LINE: .*'Contxt'|cannot import"),
     (
@@ -404,6 +466,7 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
 
 ON_THE_LINE: list[tuple[list[str], str]] = [
     (["run", "arm_bt.toml"], r"arm_bt.toml: file: cannot be read: No such file"),
+    (["check", "services.toml"], r"file: this is a location file, not a task; name the task"),
     (["run", "armbot"], r"no task 'armbot': give a .toml file, or a task that comes with petrobot"),
     (
         [*RUN, "--runs", "1000000000"],
@@ -477,6 +540,9 @@ WARNINGS = (
     "is dropped",
     "time.sleep in `step`",
     "time.sleep: while",
+    "period is 50",
+    "does not use the seed",
+    "--dry-run is refused",
 )
 
 
@@ -542,6 +608,140 @@ def test_mistakes_on_the_command_line_are_reported(
     expect(pattern, arguments)
 
 
+SUBNET: list[Mistake] = [  # used twice; an error in it has no branch
+    (
+        TASK,
+        'grip = { kind = "action", tries = 3, holds = "axis" }',
+        'grip = { kind = "macro", subnet = "hold", holds = "axis" }\n'
+        'again = { kind = "macro", subnet = "hold", holds = "axis" }',
+        "",
+    ),
+    (
+        TASK,
+        'out = ["carry"]',
+        'out = ["again"] }\nheld = { in = ["again:normal"], out = ["carry"]',
+        "",
+    ),
+    (
+        TASK,
+        'delivered = { in = ["carry:normal"] }\n',
+        """delivered = { in = ["carry:normal"] }
+
+[subnets.hold]
+entry = "begin"
+normal = "held"
+error = "lost"
+
+[subnets.hold.places]
+begin = {}
+close = { kind = "action", task = "grip" }
+held = {}
+lost = {}
+
+[subnets.hold.transitions]
+begun = { in = ["begin"], out = ["close"] }
+closed = { in = ["close:normal"], out = ["held"] }
+""",
+        "",
+    ),
+]
+NO_BRANCH = r"arm_bot.toml:44: subnets.hold.places.close: no outgoing arc `error`"
+USED = "await ctx.sleep(0.3)"
+
+REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
+    (
+        SUBNET,
+        rf"{NO_BRANCH}[^|]*add to \[subnets.hold.transitions\] one with in = \[\"close:error\"\]",
+        [
+            (
+                TASK,
+                'out = ["held"] }',
+                'out = ["held"] }\nx = { in = ["close:error"], out = ["lost"] }',
+                "",
+            )
+        ],
+    ),
+    (
+        SUBNET,
+        rf"{NO_BRANCH}[^|]*\[subnets.hold.errors\] to = ",
+        [
+            (
+                TASK,
+                "[subnets.hold.places]",
+                '[subnets.hold.errors]\nto = "lost"\n[subnets.hold.places]',
+                "",
+            )
+        ],
+    ),
+    (
+        [(TASK, '[errors]\nto = "broken"', "", "")],
+        r":23: places.fetch: no outgoing arc `error`[^|]*\[errors\] to = ",
+        [(TASK, "[places]", '[errors]\nto = "broken"\n[places]', "")],
+    ),
+    (
+        [(CODE, USED, 'ctx.raise_event("shut")', "")],
+        r"raises the event 'shut', which[^|]*declare \[events.shut\] by = \"grip\"",
+        [(TASK, "[places]", '[events.shut]\nby = "grip"\n[places]', "")],
+    ),
+    (
+        [(CODE, USED, 'ctx.publish("speed", [1.0])', "")],
+        r"the stream 'speed' is not declared; declare \[streams.speed\] in services.toml",
+        [(CELL, "[actions]", '[streams.speed]\nto = "axis"\nperiod = 0.05\n[actions]', "")],
+    ),
+    (
+        [(CODE, USED, 'await ctx.put("parts", 1)', "")],
+        r"memory is on no node; write \[services.memory\] node = \"pc\" in services.toml",
+        [(CELL, "[actions]", '[services.memory]\nnode = "pc"\n[actions]', "")],
+    ),
+    (
+        [(CODE, "*, to: float)", "*, to: float, fast: bool)", "")],
+        r":24: .*needs the argument 'fast'[^|]*here or in \[actions.move\]",
+        [(CELL, 'arm_bot:move"', 'arm_bot:move", args = { fast = true }', "")],
+    ),
+    (
+        [(TASK, '"carry:normal"] }', '"carry:normal"], set = { n = 1 } }', "")],
+        r"transitions.delivered.set.n: 'n' is not a variable; declare it in \[variables\]",
+        [(TASK, "[places]", '[variables]\nn = { type = "int" }\n[places]', "")],
+    ),
+    (
+        [(TASK, 'kind = "action", tries', 'task = "grip", tries', "")],
+        r"places.grip.kind: missing.*write kind = \"action\"",
+        [(TASK, 'task = "grip"', 'kind = "action", task = "grip"', "")],
+    ),
+    (
+        [(CODE, "    period = 0.01", "    # no period", "")],
+        r"Axis has `step` and no period[^|]*write `period = 0.01`",
+        [(CODE, "    # no period", "    period = 0.01", "")],
+    ),
+    (
+        [(CELL, 'move", device = "axis"', 'move", node = "pc"', "")],
+        r"actions.move: calls ctx.command .*write device = ",
+        [(CELL, 'move", node = "pc"', 'move", device = "axis"', "")],
+    ),
+]
+"""Mistakes, what is found with its remedy, and the remedy followed to the letter."""
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(("mistakes", "told", "mended"), REMEDIES, ids=lambda p: str(p)[-40:])
+def test_a_finding_disappears_with_its_remedy(
+    sound: dict[str, str],
+    mistakes: list[Mistake],
+    told: str,
+    mended: list[Mistake],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """And it is told once, however often a subnet is used."""
+    monkeypatch.chdir(tmp_path)
+    for edits, times in ((mistakes, 1), ([*mistakes, *mended], 0)):
+        damaged(sound, edits, tmp_path)
+        _, words = said(*CHECK)
+        lines = re.sub(r"\n +", " ", words)
+        assert len(re.findall(told, lines)) == times, words
+        assert not times or len(re.findall(told.partition("[^|]")[0], lines)) == 1, words
+
+
 CAMPAIGN = ["campaign", TASK, "--services", CELL, "--runs", "2", "--out", "out"]
 
 
@@ -595,16 +795,31 @@ def test_an_event_does_not_become_internal_by_its_declaration(tmp_path: Path) ->
 
 
 @pytest.mark.processes
+@pytest.mark.parametrize(
+    ("event", "told"),
+    [
+        ("buton", r"warning .*raises the event 'buton', .*did you mean 'button'"),
+        ("knob", r"note .*raises the event 'knob', which .* and nothing raises button"),
+    ],
+)
 def test_an_event_that_a_driver_misspells_is_told(
-    sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sound: dict[str, str],
+    event: str,
+    told: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Also that of a device without an action, such as a button."""
+    button = "class Button(Driver):\n    period = 0.1\n\n    def step(self, now: float) -> None:\n"
+    button += f'        self.ports.raise_event("{event}")\n\n\nclass Axis('
+    device = 'button = { node = "pc", driver = "arm_bot:Button" }\n\n[actions]'
     mistakes: list[Mistake] = [
         (TASK, "[errors]", '[events.button]\nscope = "external"\n\n[errors]', ""),
-        (CODE, "if not self.paused:", 'self.ports.raise_event("buton")\n        if True:', ""),
+        (CELL, "\n[actions]", device, ""),
+        (CODE, "class Axis(", button, ""),
     ]
     damaged(sound, mistakes, tmp_path)
     monkeypatch.chdir(tmp_path)
-    told = r"arm_bot.py:\d+: a driver raises the event 'buton', .*did you mean 'button'"
     expect(told, CHECK, 0)
 
 
@@ -657,6 +872,30 @@ def test_a_memory_that_is_on_a_node_is_no_mistake(
     monkeypatch.chdir(tmp_path)
     kept, mended = r"yes  .*, sound\n", r"only if repaired  live, proper, stable, controllable "
     expect(rf"^arm_bot.toml: may run\n  {kept}  {mended}", CHECK, 0)
+
+
+@pytest.mark.processes
+def test_a_coroutine_that_is_passed_on_is_no_mistake(
+    sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    helper = "async def wink(ctx: Context[Remote]) -> bool:\n    return False\n\n\nasync def grip("
+    uses = """job = wink(ctx)
+    both: Any = [wink(ctx), wink(ctx)]
+    await job
+    for one in both:
+        await one
+    jobs = {n: wink(ctx) for n in (1, 2)}, {1: wink(ctx)}, [wink(ctx) for _ in (1, 2)]
+    ctx.device.job = wink(ctx)
+    late = wink(ctx)
+    print(late, jobs)
+"""
+    mistakes: list[Mistake] = [
+        (CODE, "async def grip(", helper, ""),
+        (CODE, "await ctx.sleep(0.3)\n", uses, ""),
+    ]
+    damaged(sound, mistakes, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    expect("^arm_bot.toml: may run", CHECK, 0)
 
 
 @pytest.mark.processes

@@ -12,6 +12,7 @@ from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.check import Severity, check
 from petrobot.coordinator.task.check.conflicts import conflicts
 from petrobot.coordinator.task.conditions import parse
+from petrobot.coordinator.task.file import loads
 from tests.effort import calls
 
 Tasks = Callable[..., Task]
@@ -384,3 +385,44 @@ def test_final_error_at_the_start(task: Tasks) -> None:
         final_error=parse("x == 1"),
     )
     assert found(made)["final-at-start"].key == "task.final_error"
+
+
+NESTED = """schema = 1
+[task]
+name = "nested"
+final = "parts == 0"
+[primitive_tasks]
+work = { deadline = 1.0 }
+[places]
+parts = { kind = "control", tokens = 1 }
+one = { kind = "macro", subnet = "outer" }
+two = { kind = "macro", subnet = "outer" }
+never = { kind = "macro", subnet = "inner" }
+[transitions]
+start = { in = ["parts"], out = ["one"] }
+next = { in = ["one:normal"], out = ["two"] }
+done = { in = ["two:normal"] }
+lost = { in = ["never:normal"] }
+[subnets.outer]
+entry = "begin"
+normal = "end"
+places = { begin = {}, part = { kind = "macro", subnet = "inner" }, end = {} }
+[subnets.outer.transitions]
+enter = { in = ["begin"], out = ["part"] }
+leave = { in = ["part:normal"], out = ["end"] }
+[subnets.inner]
+entry = "begin"
+normal = "end"
+places = { begin = {}, work = { kind = "action" }, end = {} }
+[subnets.inner.transitions]
+enter = { in = ["begin"], out = ["work"] }
+leave = { in = ["work:normal"], out = ["end"] }
+"""
+
+
+def test_a_finding_about_a_subnet_is_told_once_and_one_about_a_use_at_its_macro_place() -> None:
+    found = {(f.code, f.key): f.remedy for f in check(loads(NESTED)).findings}
+    remedy = found.pop(("no-error-exit", "subnets.inner.places.work"))
+    assert 'add to [subnets.inner.transitions] one with in = ["work:error"]' in remedy
+    assert "[subnets.inner.errors] to" in remedy
+    assert [*found] == [("never-marked", "places.never.begin")]

@@ -317,3 +317,36 @@ def test_check_notes_a_pulse_that_another_branch_makes_the_task_lose(memory: str
             )
         ]
     )
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_check_notes_a_pulse_that_comes_while_nothing_listens_for_it(memory: str) -> None:
+    """The lamp is busy for a second after the button was pressed."""
+    task = loads(f"""schema = 1
+[task]
+name = "lamp"
+runs_place = "parts"
+final = "parts == 0"
+[errors]
+to = "broken"
+[events.button]
+{MEMORIES[memory]}
+[primitive_tasks]
+work = {{ deadline = 5.0 }}
+lamp = {{ deadline = 1.0 }}
+[places]
+parts = {{ kind = "control", tokens = 1 }}
+broken = {{}}
+work = {{ kind = "action" }}
+go = {{ tokens = 1, listen = true }}
+lamp = {{ kind = "action", listen = true }}
+[transitions]
+start = {{ in = ["parts"], out = ["work"] }}
+done = {{ in = ["work:normal"] }}
+pressed = {{ in = ["go"], out = ["lamp"], event = "button" }}
+calmed = {{ in = ["lamp:normal"], out = ["go"] }}
+""")
+    found = [f.text for f in may_run(task, None, BUDGET).report.findings if f.code == LOST]
+    assert [text.partition(",")[0] for text in found] == (
+        ["button is a pulse: if it comes while go is taken (by pressed)"] * (memory == "pulse")
+    )

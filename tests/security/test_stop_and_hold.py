@@ -41,6 +41,9 @@ class Stopping(Driver):
         """The stop routine."""
         self.did.append("stop")
 
+    def stopped(self) -> bool:
+        return True
+
 
 class QuickStopping(Stopping):
     """One with a quick stop."""

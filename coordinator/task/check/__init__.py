@@ -14,12 +14,12 @@ from petrobot.coordinator.task.check.completeness import (
     unoffered,
 )
 from petrobot.coordinator.task.check.conflicts import conflicts
-from petrobot.coordinator.task.check.findings import CheckReport, Finding
+from petrobot.coordinator.task.check.findings import CheckReport, Finding, in_file
 from petrobot.coordinator.task.check.flow import never_marked, odd_ends, timeless_cycles, unused
 from petrobot.coordinator.task.validation import faults
 from petrobot.coordinator.task.wording import Severity
 
-__all__ = ["CheckReport", "Finding", "Severity", "check"]
+__all__ = ["CheckReport", "Finding", "Severity", "check", "in_file"]
 
 _CHECKS: tuple[Callable[[Task], Iterator[Finding]], ...] = (
     uncovered_exits,
@@ -56,4 +56,4 @@ def check(
         found += unoffered(task, offers, source)
     if translates is not None:
         found += translating_others(task, translates, source)
-    return CheckReport(tuple(sorted(found, key=lambda f: _ORDER.index(f.severity))))
+    return CheckReport(in_file(task, sorted(found, key=lambda f: _ORDER.index(f.severity))))

@@ -7,7 +7,7 @@ Actions of other hosts are not known here and are left out.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 from petrobot.coordinator.task import Place, PrimitiveTask, Reference, Scope, Task
@@ -16,7 +16,7 @@ from petrobot.coordinator.task.wording import Severity, listed, nearest
 
 Code = Mapping[str, Mapping[str, Any]]
 """By action: parameters (name: type or empty), required, open, causes, values, complete, words,
-events, faults; `device`: the words of its driver."""
+events, faults; `device`: the same of its driver."""
 RUNTIME = (
     *("bad_arguments", "bad_result", "busy", "cancelled", "command_not_taken", "command_refused"),
     *("deadline", "device_died", "emergency_stop", "exception", "fenced", "hung", "import_failed"),
@@ -35,10 +35,16 @@ _FITS: Mapping[str, tuple[type, ...]] = {
 
 
 def code_findings(
-    task: Task, code: Code, args: Mapping[str, Mapping[str, Any]], services: Mapping[str, Any]
+    task: Task,
+    code: Code,
+    args: Mapping[str, Mapping[str, Any]],
+    services: Mapping[str, Any],
+    drivers: Collection[Mapping[str, Any]] = (),
+    raised: Collection[str] = (),
 ) -> Iterator[Finding]:
     """What does not fit. `args` are the arguments of each action in the location file, `services`
-    what else it offers by name."""
+    what else it offers by name, `drivers` what is known of the drivers of all its devices, and
+    `raised` the events that it is known to raise."""
     for key, service in (("prepare", task.prepare), ("score", task.score)):
         if service and service not in services and service not in args:
             text = f"there is no service {service!r}{nearest(service, services)}"
@@ -58,9 +64,8 @@ def code_findings(
     yield from _unraised(task, code)
     for action in used:
         yield from _events(task, action, code[action])
-    yield from _misspelt(task, [code[action].get("device", {}) for action in code])
+    yield from _undeclared(task, drivers, raised)
     actions = [code[action] for action in used]
-    drivers = [facts.get("device", {}) for facts in actions]
     for kind, severity, read in (
         ("faults", Severity.ERROR, actions),
         ("doubtful", Severity.WARNING, [*actions, *drivers]),
@@ -161,30 +166,37 @@ def _unraised(task: Task, code: Code) -> Iterator[Finding]:
             yield Finding(severity, "code", f"events.{name}.by", text, remedy)
 
 
-def _misspelt(task: Task, drivers: Iterable[Mapping[str, Any]]) -> Iterator[Finding]:
-    """Events that a driver raises and the task knows by a similar name. Others are those of other
-    tasks."""
-    raised = {name: tuple(place) for driver in drivers
+def _undeclared(
+    task: Task, drivers: Iterable[Mapping[str, Any]], raised: Collection[str]
+) -> Iterator[Finding]:
+    """Events that a driver raises and the task does not have, while the task has one that nothing
+    raises. Otherwise they are those of other tasks."""
+    silent = [e.name for e in task.events.values()
+              if e.scope is Scope.EXTERNAL and e.name not in raised]  # fmt: skip
+    places = {name: tuple(place) for driver in drivers
               for name, place in driver.get("events", {}).items()}  # fmt: skip
-    for name, (file, line) in sorted(raised.items()):
-        missing = [known for known in task.events if known not in raised]
-        if name not in task.events and (hint := nearest(name, missing)):
+    for name, (file, line) in sorted(places.items()) if silent else ():
+        if name not in task.events:
+            hint = nearest(name, silent)
             text = f"a driver raises the event {name!r}, which the task does not declare{hint}"
+            text += "" if hint else f", and nothing raises {listed(silent)}"
             remedy = f"correct the name, or declare [events.{name}]"
-            yield Finding(Severity.WARNING, "code", f"{file}:{line}", text, remedy)
+            severity = Severity.WARNING if hint else Severity.NOTE
+            yield Finding(severity, "code", f"{file}:{line}", text, remedy)
 
 
 def _events(task: Task, action: str, facts: Mapping[str, Any]) -> Iterator[Finding]:
     """Internal events that the action raises and the task does not know as such."""
     raisers = {p.name for p in task.primitive_tasks.values() if action in p.alternatives}
+    by = "by = " + " or ".join(f'"{name}"' for name in sorted(raisers))
     for name, (file, line) in facts.get("events", {}).items():
         event = task.events.get(name)
         if event is None:
             text = f"{action!r} raises the event {name!r}, which the task does not declare"
-            text, remedy = text + nearest(name, task.events), f"declare [events.{name}]"
+            text, remedy = text + nearest(name, task.events), f"declare [events.{name}] {by}"
         elif event.scope is not Scope.INTERNAL or event.by not in raisers:
             text = f"{action!r} raises the event {name!r}, but it is declared as another's"
-            remedy = f'write scope = "internal" and by = {listed(sorted(raisers))}'
+            remedy = f'write scope = "internal" and {by}'
         else:
             continue
         yield Finding(Severity.WARNING, "code", f"{file}:{line}", text, remedy)

@@ -51,9 +51,9 @@ def _written(place: Place, ways: Iterable[Transition]) -> bool:
 def _missing(place: Place, end: End) -> Finding:
     what = "success or failure" if end is End.NORMAL else "error"
     text = f"no outgoing arc `{end}`: the token of a run that ends with {what} would stay for ever"
-    remedy = f'add a transition with in = ["{place.name}:{end}"]'
+    remedy = f'add to [transitions] one with in = ["{place.name}:{end}"]'
     if end is End.ERROR:
-        remedy += ", or name a place for all errors: [errors] to = ..."
+        remedy += ", or name a place for all errors of this net: [errors] to = ..."
     return Finding(Severity.ERROR, f"no-{end}-exit", f"places.{place.name}", text, remedy)
 
 

@@ -3,11 +3,17 @@ it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
+from petrobot.coordinator.task import Kind, Place, Task
 from petrobot.coordinator.task.wording import Severity
+
+NEVER_MARKED = "never-marked"
+"""Code of the findings about places that never hold a token."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +59,59 @@ class CheckReport:
 
     def __str__(self) -> str:
         return "\n".join(str(f) for f in self.findings)
+
+
+def in_file(task: Task, found: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return findings about the flat task as findings about its file: what is true of every use of
+    a subnet is told once, with the keys and names that the subnet has there."""
+    flat = {_identity(finding): finding for finding in found}
+    uses = dict(_uses(task, "", task.places))
+    times = Counter(uses.values())
+    inside = {known: _in_subnet(task, uses, finding) for known, finding in flat.items()}
+    often = Counter(_identity(finding) for finding in inside.values())
+    told = dict[tuple[str, ...], Finding]()
+    for known, finding in inside.items():
+        _, _, subnet = finding.key.partition(".")
+        shared = often[_identity(finding)] == times[subnet.partition(".")[0]]
+        one = finding if shared else flat[known]
+        told.setdefault(_identity(one), one)
+    return tuple(told.values())
+
+
+def _identity(finding: Finding) -> tuple[str, ...]:
+    return finding.severity, finding.code, finding.key, finding.text
+
+
+def _uses(task: Task, prefix: str, places: Mapping[str, Place]) -> Iterator[tuple[str, str]]:
+    """Yield what the names of each use of a subnet begin with in the flat task, and the subnet."""
+    for place in places.values():
+        if place.kind is Kind.MACRO and place.subnet:
+            inner = f"{prefix}{place.name}."
+            yield inner, place.subnet
+            yield from _uses(task, inner, task.subnets[place.subnet].places)
+
+
+def _in_subnet(task: Task, uses: Mapping[str, str], finding: Finding) -> Finding:
+    """Return the finding with the names of the subnet that its key is in; the same if in none."""
+    table, _, name = finding.key.partition(".")
+    prefix = max((use for use in uses if name.startswith(use)), key=len, default="")
+    if not prefix or table not in ("places", "transitions"):
+        return finding
+    subnet, rest = uses[prefix], name.removeprefix(prefix)
+    if finding.code == NEVER_MARKED and rest == task.subnets[subnet].entry:
+        return finding  # not the subnet lacks an arc, but its macro place
+
+    def local(text: str) -> str:
+        text = re.sub(rf"(?<![\w.]){re.escape(prefix)}", "", text)
+        return re.sub(r"\[(errors|transitions)\]", rf"[subnets.{subnet}.\1]", text)
+
+    return replace(
+        finding,
+        key=f"subnets.{subnet}.{table}.{rest}",
+        text=local(finding.text),
+        remedy=local(finding.remedy),
+        witness=finding.witness and {local(n): value for n, value in finding.witness.items()},
+    )
 
 
 def _example(witness: Mapping[str, Any]) -> str:

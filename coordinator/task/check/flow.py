@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from petrobot.coordinator.task import Kind, Scope, Task
-from petrobot.coordinator.task.check.findings import Finding
+from petrobot.coordinator.task.check.findings import NEVER_MARKED, Finding
 from petrobot.coordinator.task.instant_firings import endless
 from petrobot.coordinator.task.wording import Severity, few, listed
 
@@ -51,7 +51,7 @@ def never_marked(task: Task) -> Iterator[Finding]:
 
 def _never_marked(severity: Severity, place: str, more: str) -> Finding:
     text, remedy = f"it never holds a token{more}", "give it tokens or an arc from a transition"
-    return Finding(severity, "never-marked", f"places.{place}", text, remedy)
+    return Finding(severity, NEVER_MARKED, f"places.{place}", text, remedy)
 
 
 def _reached(task: Task, marked: set[str]) -> tuple[set[str], set[str]]:

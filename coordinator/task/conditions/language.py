@@ -47,8 +47,7 @@ class ConditionError(ValueError):
         self.at = at
 
     def __str__(self) -> str:
-        before, after = self.source[: self.at], self.source[self.at :]
-        return f"{self.text} at column {self.at + 1}: {before}>>>{after}"
+        return f"{self.text} at column {self.at + 1} of {self.source!r}"
 
 
 class ConditionFault(Exception):  # noqa: N818 - not a bug: the values at hand give the condition no truth value
@@ -365,6 +364,9 @@ def _explain(sign: str) -> str:
         "&": "write and",
         "|": "write or",
         "!": "write not, or != to compare",
+        **dict.fromkeys(
+            "+-*/%", "it compares, and computes nothing; let an action return the number by `out`"
+        ),
     }
     if sign in "\"'":
         return "this string is not closed"

@@ -55,7 +55,16 @@ def syntax_fault(text: str, error: tomllib.TOMLDecodeError) -> tuple[Fault, int]
         return Fault(
             name, f"already written in line {first}", "drop one of the two, or rename it"
         ), line
+    if r"character '\n'" in str(error):
+        return Fault("TOML", _unclosed(text.splitlines()[line - 1]), "close it"), line
     return Fault("TOML", str(error), "see toml.io for the syntax"), line
+
+
+def _unclosed(line: str) -> str:
+    """Say which quote of a line of TOML is not closed."""
+    closed = re.compile(r"""\"[^\"]*\"|'[^']*'""")
+    opened = re.search("[\"']", closed.sub(lambda whole: " " * len(whole[0]), line))
+    return f"the quote in column {opened.start() + 1} is not closed" if opened else "a line ends"
 
 
 def _keys(text: str) -> Iterator[tuple[int, str]]:

@@ -227,6 +227,11 @@ def loads(text: str, source: str = "task", *, flat: bool = False) -> Task:
         raise TaskFileError(
             source, [Fault("TOML", "nested too deeply", "flatten it")], [0]
         ) from error
+    if "nodes" in data and "task" not in data:
+        remedy = "name the task: petrobot check TASK.toml finds the services.toml beside it"
+        raise TaskFileError(
+            source, [Fault("file", "this is a location file, not a task", remedy)], [0]
+        )
     faults: list[Fault] = []
     task = _task(Table(data, "", faults, flat))
     if not flat:

@@ -271,7 +271,16 @@ def _syntax_fault(text: str, source: str, why: str) -> str:
             f"{source}{line}: {name}: already written in line {first}; a name belongs to one "
             "table: remove one of the two or rename it"
         )
+    if place and r"character '\n'" in why:
+        why = _unclosed(text.splitlines()[int(place[1]) - 1])
     return f"{source}{line}: not valid TOML: {why}; correct this line"
+
+
+def _unclosed(line: str) -> str:
+    """Say which quote of a line of TOML is not closed (`coordinator.task.file.errors` does too)."""
+    closed = re.compile(r"""\"[^\"]*\"|'[^']*'""")
+    opened = re.search("[\"']", closed.sub(lambda whole: " " * len(whole[0]), line))
+    return f"the quote in column {opened.start() + 1} is not closed" if opened else "a line ends"
 
 
 def _check_top(data: Mapping[str, Any], faults: Faults) -> None:
