@@ -22,7 +22,15 @@ TOP_LEVEL = {"coordinator", "services", "sim"}
 
 STORED = tuple(
     f"coordinator.learning.{name}"
-    for name in ("estimates_file", "estimates_tables", "learner", "session", "propagation", "waits")
+    for name in (
+        "estimates_file",
+        "estimates_tables",
+        "learner",
+        "session",
+        "propagation",
+        "trial_tokens",
+        "waits",
+    )
 )
 """What learning keeps on disk and gets from runs; the rest of the room is pure."""
 

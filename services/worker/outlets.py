@@ -120,13 +120,19 @@ class StreamOutlets:
         self._streams = directory.streams
         self._credentials = credentials(directory, sender)
         self._outlets: dict[str, StreamSender] = {}
+        self._runs: dict[str, str] = {}
+        """By stream: the run whose values were sent last."""
         self._asked: dict[str, float] = {}
 
     def send(self, now: float, sent: Sent) -> bool:
         """Send a set point. Return True if the stream's address must be requested (again)."""
         outlet = self._outlets.get(sent.stream)
-        if outlet is not None and outlet.send(sent.values, sent.elapsed):
-            return False
+        if outlet is not None:
+            if outlet.up and self._runs.get(sent.stream) != sent.run:
+                outlet.withdraw()
+                self._runs[sent.stream] = sent.run
+            if outlet.send(sent.values, sent.elapsed):
+                return False
         if now < self._asked.get(sent.stream, -math.inf) + ASK_AGAIN:
             return False
         self._asked[sent.stream] = now

@@ -68,7 +68,8 @@ class ArmPlant:
         self._limit, self._viscous = _six(model.torque), _six(model.viscous)
         self._dry: list[float] = model.coulomb.tolist()
         self._ends = _six(model.lower), _six(model.upper)
-        self._braked = [True] * JOINTS
+        self.braked = [True] * JOINTS
+        """Which brakes are engaged."""
         self._hold = self._stick = _REST
         self._greatest = _six(model.speed)
         self._packs = hasattr(stepped_packed, "py_func")
@@ -91,14 +92,14 @@ class ArmPlant:
     def brake(self, joint: int) -> None:
         """Engage the brake of a joint (0 to 5) and switch its torque off."""
         self.tau[joint] = 0.0
-        self._braked[joint] = True
+        self.braked[joint] = True
         hold = self._dry[joint] + _BRAKE * self._limit[joint]
         self._hold, self._stick = _put(self._hold, joint, hold), _put(self._stick, joint, hold)
         self._pack()
 
     def release(self, joint: int) -> None:
         """Release the brake of a joint (0 to 5)."""
-        self._braked[joint] = False
+        self.braked[joint] = False
         self._hold = _put(self._hold, joint, self._dry[joint])
         self._stick = _put(self._stick, joint, _STICTION * self._dry[joint])
         self._pack()

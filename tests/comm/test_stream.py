@@ -52,6 +52,19 @@ def test_only_the_newest_value_is_delivered() -> None:
     assert sink.got == [((3.0,), 0.04), None, ((5.0,), 0.0)]
 
 
+def test_after_an_emergency_stop_values_count_once_their_sender_has_withdrawn() -> None:
+    """It does so before the first value of a run; silence alone does not make an old run a new
+    one."""
+    sink = RecordingSink()
+    inlet = Inlet(0.1, sink)
+    inlet.receive(1.0, [_point(1)])
+    inlet.bar()
+    for now in (1.1, 1.2, 9.0):
+        inlet.receive(now, [_point(2, elapsed=now - 1.0)])
+    inlet.receive(9.1, [_point(3, elapsed=8.1), m.Withdraw(), _point(4, elapsed=8.1)])
+    assert sink.got == [((1.0,), 0.0), None, ((4.0,), 0.0)]
+
+
 def test_a_delay_in_transit_is_part_of_the_age() -> None:
     sink = RecordingSink()
     inlet = Inlet(0.04, sink)

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from math import inf, sqrt
-from random import Random
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +59,8 @@ from petrobot.coordinator.task import Counts, Kind, Place, Status
 
 SIZE = 20_000
 """The most states of a chain; they take about a second."""
+T = TypeVar("T")
+
 STAGES = 8
 """The most phases of a duration; fewer where the chain would have more than SIZE states."""
 BAD = (Status.FAILURE, Status.ERROR)
@@ -257,7 +259,7 @@ def played(x: ExecutionGraph, measured: Measured | None = None, *, seed: int = 1
     Raises NoEstimate for what has neither a measured nor a declared number, and TooLarge if so
     few as ENOUGH missions have more than MOVES changes.
     """
-    return _Builder(x, measured or Measured(), 0).played(Random(seed))
+    return _Builder(x, measured or Measured(), 0).played(np.random.default_rng(seed))
 
 
 class _Builder:
@@ -389,7 +391,7 @@ class _Builder:
 
     # --- missions with undivided clocks ----------------------------------------------------------
 
-    def played(self, random: Random) -> Played:
+    def played(self, random: np.random.Generator) -> Played:
         """Play missions until there are enough of them, or they have had enough changes."""
         self.stages, self.draws, task = UNDIVIDED, {}, self.task
         ended, moves = list[tuple[bool, float, int, bool]](), 0
@@ -409,7 +411,7 @@ class _Builder:
         return Played(len(ended), {name: _mean(some) for name, some in samples.items()})
 
     def mission(
-        self, random: Random, most: int
+        self, random: np.random.Generator, most: int
     ) -> tuple[tuple[bool, float, int, bool] | None, int]:
         """Play one mission; return (whether it reached `final`, its time (s), the goals that it
         met, whether some run did not end with SUCCESS) and its changes. None if it has more than
@@ -422,7 +424,7 @@ class _Builder:
             # In a bottom component the mission has ended, or repeats a part for ever.
             if not outcomes or x.graph.bottom[x.graph.components[i]]:
                 return (bool(x.final[i]), now, met, spoilt), moves
-            (one,) = random.choices(outcomes, [o.share for o in outcomes])
+            one = _drawn(outcomes, [o.share for o in outcomes], random)
             spoilt |= one.spoils or what.partition(" ")[0] in BAD
             now += after
             met += sum(f in goals for f in self.fired(one))
@@ -436,7 +438,7 @@ class _Builder:
         return None, most
 
     def first_of(
-        self, plan: _Plan, clocks: list[tuple[str, float]], random: Random
+        self, plan: _Plan, clocks: list[tuple[str, float]], random: np.random.Generator
     ) -> tuple[float, str, Sequence[_Outcome]]:
         """Return what comes first: after how long (s), what its clock says, and its outcomes; none
         if nothing can come. Of clocks that end together the first one does."""
@@ -447,17 +449,19 @@ class _Builder:
             if left < after and (found := plan.ends.get((k, what))):
                 after, said, outcomes = left, what, found
         for rate, one in plan.events:
-            if (wait := random.expovariate(rate)) < after:
+            if (wait := random.exponential(1 / rate)) < after:
                 after, said, outcomes = wait, "", [one]
         return max(after, 0.0), said, outcomes
 
-    def lasts(self, state: int, slot: tuple[str, str], random: Random) -> tuple[str, float]:
+    def lasts(
+        self, state: int, slot: tuple[str, str], random: np.random.Generator
+    ) -> tuple[str, float]:
         """Return how a run or a timer that starts will end, and after how long (s)."""
         draw = self.first(self.x.states[state], slot)
-        ((what, stages, rate),) = random.choices([c for _, c in draw], [p for p, _ in draw])
+        what, stages, rate = _drawn([c for _, c in draw], [p for p, _ in draw], random)
         if not rate:
             return what, inf
-        return what, stages / rate if stages == UNDIVIDED else random.gammavariate(stages, 1 / rate)
+        return what, stages / rate if stages == UNDIVIDED else float(random.gamma(stages, 1 / rate))
 
     # --- the numbers ---------------------------------------------------------------------------
 
@@ -755,6 +759,16 @@ class _Builder:
             for r in said
         )
         return _Outcome(j, edge, kept, spoils=spoils)
+
+
+def _drawn(items: Sequence[T], shares: Sequence[float], random: np.random.Generator) -> T:
+    """Draw one item by shares, which need not sum to 1."""
+    left = random.random() * sum(shares)
+    for item, share in zip(items, shares, strict=True):
+        left -= share
+        if left < 0.0:
+            return item
+    return items[-1]
 
 
 def _mean(sample: list[float]) -> tuple[float, float]:

@@ -93,19 +93,18 @@ class Inlet:
     fresh one.
     """
 
-    __slots__ = ("_barred", "_heard", "_lateness", "_limit", "_sink", "_until")
+    __slots__ = ("_barred", "_lateness", "_limit", "_sink", "_until")
 
     def __init__(self, period: float, sink: Sink) -> None:
         self._limit = STALE_AFTER * period
         self._sink = sink
         self._lateness = Lateness()
         self._until = math.inf
-        self._heard = -math.inf
         self._barred = False
 
     def bar(self) -> None:
-        """Withdraw the value, and drop all that come until the sender has been silent for three
-        periods, as between two runs."""
+        """Withdraw the value, and drop all that come before the sender withdraws: it does so before
+        the first value of each run."""
         self._barred = True
         self._until = math.inf
         self._sink.withdraw()
@@ -113,18 +112,14 @@ class Inlet:
     def receive(self, now: float, messages: Sequence[Message]) -> None:
         """Handle what has arrived by `now`: the newest message counts, the others only improve the
         estimate of the delay."""
-        self._barred = self._barred and now - self._heard <= self._limit
-        if any(isinstance(message, SetPoint) for message in messages):
-            self._heard = now
-        if self._barred:
-            return
         newest: Message | None = None
         late = 0.0
         for message in messages:
             if isinstance(message, SetPoint):
-                newest, late = message, self._lateness.of(now, message.elapsed)
+                late = self._lateness.of(now, message.elapsed)
+                newest = None if self._barred else message
             elif isinstance(message, Withdraw):
-                newest = message
+                newest, self._barred = message, False
         if isinstance(newest, SetPoint) and late <= self._limit:
             self._until = now - late + self._limit
             self._sink.take(newest.values, newest.held + late)
@@ -271,7 +266,8 @@ class StreamSender:
         return sent
 
     def withdraw(self) -> None:
-        """Withdraw the last values."""
+        """Withdraw the last values; done before the first values of each run, too, so that the
+        receiver can tell them from those of a run from before an emergency stop."""
         line = self.advance()
         if line is not None:
             self._write(line, Withdraw())

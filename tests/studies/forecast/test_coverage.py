@@ -156,7 +156,9 @@ def by_missions(random: np.random.Generator, n: int, effect: float) -> list[Tria
     drawn.goal = drawn.goal & (mission < 2.0 - effect)
     trials = drawn.trials()
     for i, trial in enumerate(trials):
+        before = trials[i - 1] if i % 5 else None
         trial.k = i % 5 + 1
+        trial.begun = 0.0 if before is None else before.begun + max(0.0, before.time or 0.0)
     return trials
 
 
