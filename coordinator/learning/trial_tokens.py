@@ -95,6 +95,10 @@ class TrialTokens:
         if self._has_all(NOBODY):
             self.back = sorted(self._home)
             self._home.clear()
+        for done in touched:  # what is kept is as much as is on its way
+            if done != NOBODY and self._has_all(done):
+                self._borrowed.pop(done, None)
+                del self._live[done]
         return trial or self.begun
 
     def _take(self, place: int, runs: Sequence[str] = ()) -> int:

@@ -57,10 +57,9 @@ from petrobot.coordinator.engine import (
 from petrobot.coordinator.engine.state import ACTIVE
 from petrobot.coordinator.task import Counts, Kind, Place, Status
 
+T = TypeVar("T")
 SIZE = 20_000
 """The most states of a chain; they take about a second."""
-T = TypeVar("T")
-
 STAGES = 8
 """The most phases of a duration; fewer where the chain would have more than SIZE states."""
 BAD = (Status.FAILURE, Status.ERROR)
@@ -245,7 +244,7 @@ def chain_of(
 
 
 @dataclass(frozen=True, slots=True)
-class Played:
+class MissionFigures:
     """What missions gave that were played with undivided clocks."""
 
     missions: int
@@ -253,7 +252,7 @@ class Played:
     """Those of `ExecutionChain.figures`, each with its standard error."""
 
 
-def played(x: ExecutionGraph, measured: Measured | None = None, *, seed: int = 1) -> Played:
+def played(x: ExecutionGraph, measured: Measured | None = None, *, seed: int = 1) -> MissionFigures:
     """Play missions on a complete execution graph.
 
     Raises NoEstimate for what has neither a measured nor a declared number, and TooLarge if so
@@ -391,7 +390,7 @@ class _Builder:
 
     # --- missions with undivided clocks ----------------------------------------------------------
 
-    def played(self, random: np.random.Generator) -> Played:
+    def played(self, random: np.random.Generator) -> MissionFigures:
         """Play missions until there are enough of them, or they have had enough changes."""
         self.stages, self.draws, task = UNDIVIDED, {}, self.task
         ended, moves = list[tuple[bool, float, int, bool]](), 0
@@ -408,7 +407,7 @@ class _Builder:
             samples |= {"R_goal": [met / runs for _, _, met, _ in ended]} if runs else {}
         samples["R_conj"] = [float(final and not spoilt) for final, _, _, spoilt in ended]
         samples["mean time (s)"] = [time for final, time, *_ in ended if final]
-        return Played(len(ended), {name: _mean(some) for name, some in samples.items()})
+        return MissionFigures(len(ended), {name: _mean(some) for name, some in samples.items()})
 
     def mission(
         self, random: np.random.Generator, most: int

@@ -150,6 +150,8 @@ class TrialLog:
         self._ended_waits: list[Waited] = []
         """Waits that ended before the first trial began."""
         self.trials: list[Trial] = []
+        self._open: list[Trial] = []
+        """Trials that are not completed yet."""
         # By place: when its latest token entered. A transition is enabled from the latest of these
         # times over its input places.
         self._since = dict.fromkeys(self._net.places, 0.0)
@@ -203,12 +205,13 @@ class TrialLog:
         """Begin a trial if a token has left the runs place."""
         if len(self.trials) == self.tokens.begun:
             return
-        for trial in self.trials:
+        for trial in self._open:
             trial.completed |= not self.tokens.on_its_way(trial.k)
         if self.trials:
             self._note_waits(self._waits.cut(now))
         assert self._origin is not None
         self.trials.append(Trial(len(self.trials) + 1, round(now - self._origin, DIGITS)))
+        self._open = [*(trial for trial in self._open if not trial.completed), self.trials[-1]]
 
     def _note_waits(self, ended: list[Waited]) -> None:
         """Note waits in the latest trial, those from before the first one in the first one."""

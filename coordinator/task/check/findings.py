@@ -63,7 +63,7 @@ class CheckReport:
 
 def in_file(task: Task, found: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return findings about the flat task as findings about its file: what is true of every use of
-    a subnet is told once, with the keys and names that the subnet has there."""
+    a subnet is reported once, with the keys and names that the subnet has there."""
     flat = {_identity(finding): finding for finding in found}
     uses = dict(_uses(task, "", task.places))
     times = Counter(uses.values())

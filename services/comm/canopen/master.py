@@ -456,7 +456,7 @@ class CanopenMaster(Generic[Link]):
         if answered:
             self._seen = now
         patience = self._manner.patience
-        if now - min(self._heard.values()) > patience:
+        if now - min(self._heard.values(), default=now) > patience:
             for node, heard in self._heard.items():
                 if now - heard > patience and self._needed(node):
                     self._report(
