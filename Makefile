@@ -55,6 +55,7 @@ load: $(VENV)/.ready
 
 proof: $(VENV)/.ready
 	$(BIN)/python -m tools.proof
+	$(BIN)/pytest -n 2 -m proof
 
 bench: $(VENV)/.ready
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test,bench,fast,oracle]"

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import Any
 
-from tools.proof import catching, convergence, coverage, credit, learning, long_tests, physics
+from tools.proof import catching, convergence, coverage, credit, learning, physics
 from tools.proof.page import figures
 from tools.proof.proof import KEPT, ROOT, FigureProof
 
@@ -33,7 +33,6 @@ def proofs() -> list[FigureProof]:
         *physics.proofs(),
         *convergence.proofs(),
         *coverage.proofs(),
-        *long_tests.proofs(),
         *learning.proofs(),
         *credit.proofs(),
     ]
