@@ -1,5 +1,5 @@
-"""Processes of a cyclic device are killed, frozen or made to hang at random moments, under load:
-each time the device starts again and accepts runs."""
+"""Processes of a cyclic device are killed, frozen or made to hang at random moments, in the proofs
+under load: each time the device starts again and accepts runs."""
 
 from __future__ import annotations
 
@@ -118,49 +118,46 @@ async def storm(folder: Path, seed: int, kills: int, hows: tuple[str, ...] = KIL
     running = Nodes(folder, "left")
     node = running.processes["left"].pid
     try:
-        with load():
-            async with operator_of(running.directory, "left") as operator:
-                killed: set[int] = set()
-                number = -1
-                while sum(tally.kills.values()) < kills:
-                    number += 1
-                    chosen, how = chance.choice(VICTIMS), chance.choice(hows)
-                    chosen = ("driver",) if how == LOOP else chosen
-                    moment = chance.uniform(0.0, 0.4)
-                    limit = DEADLINE if how in HANGS and "actions" in chosen else None
-                    to = chance.uniform(-2.0, 2.0)
-                    moving = asyncio.create_task(
-                        operator.call("loop", after=moment)
-                        if how == LOOP
-                        else operator.call("go", limit, to=to, timeout=30.0)
+        async with operator_of(running.directory, "left") as operator:
+            killed: set[int] = set()
+            number = -1
+            while sum(tally.kills.values()) < kills:
+                number += 1
+                chosen, how = chance.choice(VICTIMS), chance.choice(hows)
+                chosen = ("driver",) if how == LOOP else chosen
+                moment = chance.uniform(0.0, 0.4)
+                limit = DEADLINE if how in HANGS and "actions" in chosen else None
+                to = chance.uniform(-2.0, 2.0)
+                moving = asyncio.create_task(
+                    operator.call("loop", after=moment)
+                    if how == LOOP
+                    else operator.call("go", limit, to=to, timeout=30.0)
+                )
+                await passing(moment)
+                killed |= await kill(operator, node, chance, tally, how, chosen)
+                end = await moving
+                if end.status != "success" and end.cause not in LINK:
+                    tally.ends.add((end.cause, end.executed))
+                    tally.told |= {end.text} if end.cause == "device_died" else set()
+                if chance.random() < WRONG_HASTE and sum(tally.kills.values()) < kills:
+                    continue
+                try:
+                    await operator.until(partial(up, operator, killed), RECOVERY)
+                except TimeoutError:
+                    tally.wedged.append(
+                        f"kill {number}: {(await operator.command('left', 'status')).data}"
                     )
-                    await passing(moment)
-                    killed |= await kill(operator, node, chance, tally, how, chosen)
-                    end = await moving
-                    if end.status != "success" and end.cause not in LINK:
-                        tally.ends.add((end.cause, end.executed))
-                        tally.told |= {end.text} if end.cause == "device_died" else set()
-                    if chance.random() < WRONG_HASTE and sum(tally.kills.values()) < kills:
+                    break
+                done = 0
+                while done < CALLS and len(tally.wedged) + tally.links < CALLS:
+                    end = await operator.call("go", to=0.1 * (done % 2), timeout=30.0)
+                    if end.cause in LINK:
+                        tally.links += 1
                         continue
-                    try:
-                        await operator.until(partial(up, operator, killed), RECOVERY)
-                    except TimeoutError:
-                        tally.wedged.append(
-                            f"kill {number}: {(await operator.command('left', 'status')).data}"
-                        )
-                        break
-                    done = 0
-                    while done < CALLS and len(tally.wedged) + tally.links < CALLS:
-                        end = await operator.call("go", to=0.1 * (done % 2), timeout=30.0)
-                        if end.cause in LINK:
-                            tally.links += 1
-                            continue
-                        done += 1
-                        if end.status != "success":
-                            tally.wedged.append(
-                                f"kill {number}, call {done}: {end.cause}: {end.text}"
-                            )
-                    tally.calls += done
+                    done += 1
+                    if end.status != "success":
+                        tally.wedged.append(f"kill {number}, call {done}: {end.cause}: {end.text}")
+                tally.calls += done
     finally:
         running.stop()
     return tally
@@ -177,7 +174,8 @@ async def test_a_device_survives_hangs_of_its_processes(tmp_path: Path) -> None:
 
 @pytest.mark.proof
 async def test_a_device_survives_sixty_hangs_of_its_processes(tmp_path: Path) -> None:
-    await hang(tmp_path, 13, 60)
+    with load():
+        await hang(tmp_path, 13, 60)
 
 
 async def hang(folder: Path, seed: int, times: int) -> None:
@@ -191,7 +189,8 @@ async def hang(folder: Path, seed: int, times: int) -> None:
 
 @pytest.mark.proof
 async def test_a_device_survives_two_hundred_kills_of_its_processes(tmp_path: Path) -> None:
-    tally = await storm(tmp_path, 11, 200)
+    with load():
+        tally = await storm(tmp_path, 11, 200)
     print(tally)
     assert not tally.wedged and tally.links < CALLS, tally
 
