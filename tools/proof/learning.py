@@ -127,7 +127,7 @@ def judge(
 ) -> Result:
     """Run a fixed combination on fresh throws."""
     text = ",".join(f"{task}={action}" for task, action in chosen.items())
-    return campaign(sizes, name, throws or sizes.of(5000), seed, regime, "--choose", text)
+    return campaign(sizes, name, throws or sizes.of(2000), seed, regime, "--choose", text)
 
 
 def fresh(sizes: Sizes, actions: Mapping[str, str], regime: str) -> Path:
