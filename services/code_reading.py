@@ -387,14 +387,17 @@ def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, An
     if isinstance(period, int | float) and period > SLOW and own is not None:
         text = f"{thing.__name__}.period is {period:g} s between two steps; 0.01 would be 10 ms"
         seen.doubtful.append((own.file, own.tree.lineno, text))  # type: ignore[attr-defined]
-    found = {device: _faults_of_driver(thing, table) for device, table in tables.items()}
+    found = {device: _faults_of_driver(thing, **table) for device, table in tables.items()}
     dry = {"dry_run": True} if issubclass(thing, Driver) else {}
     moves = True if seen.streams else None  # set points may move a device without commands
     return {"keys": found, "dry_run": not faults_of_limits(thing, dry, moves), **_plain(seen)}
 
 
-def _faults_of_driver(thing: type, table: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the faults of a driver's class and of the keys of a device's table."""
+def _faults_of_driver(
+    thing: type, table: Mapping[str, Any], follows: bool
+) -> list[tuple[str, str]]:
+    """Return the faults of a driver's class and of the keys of a device's table. `follows`: a
+    stream of set points leads to the device."""
     keys: list[tuple[str, str]] = []
     period: Any = getattr(thing, "period", None)
     if isinstance(period, Key):
@@ -418,7 +421,7 @@ def _faults_of_driver(thing: type, table: Mapping[str, Any]) -> list[tuple[str, 
         text += f"{', '.join(unset)} would not be set; write `super().__init__(config, ports)`"
         keys.append(("driver", f"{text}, or write `setup` instead"))
     check = faults_of_keys if issubclass(thing, Driver) else faults_of_limits
-    return [*keys, *check(thing, table)]
+    return [*keys, *check(thing, table, follows or None)]
 
 
 def _unset(thing: type) -> list[str]:

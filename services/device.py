@@ -320,13 +320,15 @@ def read_keys(driver: type, config: Mapping[str, Any]) -> dict[str, Any]:
     return {name: declared.read(config) for name, declared in keys_of(driver).items()}
 
 
-def faults_of_keys(driver: type, config: Mapping[str, Any]) -> list[tuple[str, str]]:
+def faults_of_keys(
+    driver: type, config: Mapping[str, Any], moves: bool | None = None
+) -> list[tuple[str, str]]:
     """Return each wrong key of a device's table, and what is wrong with it, without making the
     driver; for a driver that declares no keys and reads its table itself, only
     `faults_of_limits`."""
     reads_itself = driver.__init__ is not Driver.__init__ and not keys_of(driver)  # type: ignore[misc]
     own = [] if reads_itself else _faults_of_keys(driver, config)
-    return own + faults_of_limits(driver, config)
+    return own + faults_of_limits(driver, config, moves)
 
 
 def faults_of_limits(
@@ -348,8 +350,9 @@ def faults_of_limits(
         text = f"{driver.__name__}.obeys: expected some of {', '.join(sorted(OBEYED))}"
         faults.append(("driver", f"{text}; found {name!r:.60}"))
     has = _overridden(driver)
-    if can_move(driver) and (absent := {"stop", "stopped"} - has):
-        text = f"{driver.__name__} has {', '.join(sorted(has))}, but no {', '.join(sorted(absent))}"
+    if moves and (absent := {"stop", "stopped"} - has):
+        having = f"has {', '.join(sorted(has))}, but" if has else "follows set points, but has"
+        text = f"{driver.__name__} {having} no {', '.join(sorted(absent))}"
         text += ": after an emergency stop it could move on, and be reported as stopped; write both"
         faults.append(("driver", f"{text} (if it never moves: `pass` and `return True`)"))
     for name in LIMITS:

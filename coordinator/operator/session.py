@@ -36,8 +36,7 @@ from petrobot.coordinator.operator.sliced_cell import TELL, SlicedCell
 from petrobot.coordinator.run.folder import RESULT
 from petrobot.coordinator.run.interfaces import FirstAlternative, Observer
 from petrobot.coordinator.run.lockstep import CoordinatorParty
-from petrobot.coordinator.run.mission import Mission, MissionError, Stage
-from petrobot.coordinator.run.node_status import leased
+from petrobot.coordinator.run.mission import Mission, Stage
 from petrobot.coordinator.run.realtime import RealtimeMission, credentials_of
 from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task import Task
@@ -49,8 +48,6 @@ from petrobot.services.host.whole_file import make_folder, write_whole
 
 REALTIME, LOCKSTEP = "realtime", "lockstep"
 MODES: Final = (REALTIME, LOCKSTEP)
-STATUS_LIMIT: Final = 2.0
-"""How long to wait for nodes to say which devices are in use (s)."""
 
 Watch = Callable[[Mission, float], None]
 """Called regularly with the mission and its clock (s), to show progress."""
@@ -248,17 +245,11 @@ class RealtimeSession(RunSession):
 
     async def connect(self) -> None:
         await self.shell.connect()
-        directory, own = self.mission.executor.directory, self.mission.executor.mission
+        directory = self.mission.executor.directory
         tasks = self._task.primitive_tasks.values()
         actions = (directory.actions.get(name) for task in tasks for name in task.alternatives)
         devices = {action.device for action in actions if action is not None}
-        held = await leased(directory, devices, STATUS_LIMIT)
-        if others := [f"{device} by {name}" for device, name in held.items() if name != own]:
-            text = (
-                f"devices of this task are in use: {', '.join(others)}; wait until that run has "
-                "ended, or end it with `petrobot abort`"
-            )
-            raise MissionError(text, bad_input=True)
+        await self.shell.lease(devices)
 
     async def _lead(self, watch: Watch | None) -> None:
         running = asyncio.ensure_future(self.shell.run(self._start))

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-from collections.abc import Collection
 from datetime import UTC, datetime
 from typing import Any
 
@@ -27,18 +26,6 @@ async def ask_all(directory: Directory, timeout: float) -> dict[str, Any]:
     """
     asked = await asyncio.gather(*(_ask(directory, node, timeout) for node in directory.nodes))
     return dict(zip(directory.nodes, asked, strict=True))
-
-
-async def leased(directory: Directory, devices: Collection[str], timeout: float) -> dict[str, str]:
-    """Return which of these devices accept orders from a caller now, and its name. Nodes that do
-    not answer within `timeout` s are left out."""
-    answers = await ask_all(directory, timeout)
-    return {
-        device: holder
-        for answer in answers.values()
-        for device, holder in answer.get("status", {}).get("leases", {}).items()
-        if device in devices
-    }
 
 
 async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from shlex import quote
 from typing import Final
@@ -15,7 +15,14 @@ from petrobot.coordinator.run.mission import Mission, MissionError, Stage
 from petrobot.services.comm.calls.caller import Notice, PeerLost
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.location_file import Directory
-from petrobot.services.comm.protocol.messages import COORDINATOR, Welcome, split_boot
+from petrobot.services.comm.protocol.messages import (
+    COORDINATOR,
+    LEASE,
+    Answer,
+    Command,
+    Welcome,
+    split_boot,
+)
 from petrobot.services.comm.tls.credentials import Credentials, credentials
 from petrobot.services.host.emergency_latch import uptime
 
@@ -95,7 +102,11 @@ class RealtimeMission:
     ) -> None:
         """`ordered`: when the operator ordered the run (`uptime`); infinity: after everything."""
         self.mission = mission
+        self._directory = directory
         self._ordered = ordered
+        self._leased: tuple[str, ...] = ()
+        self._answers: dict[str, asyncio.Future[Answer]] = {}
+        """Answers to come to the requests for devices, by the command's id."""
         self._missed: list[str] | None = []
         """Nodes that cleared an emergency stop after that; None once all nodes are connected: from
         then on the callers count the stops."""
@@ -137,6 +148,33 @@ class RealtimeMission:
                 f"{', '.join(missed)}: an emergency stop was cleared after this was ordered, so "
                 "nothing was started; if the cell is safe, order it again"
             )
+
+    async def lease(self, devices: Collection[str]) -> None:
+        """Take the devices for this run. Of two runs that start at once one gets them all, because
+        both take them in the order of services.toml. Raises MissionError if another run has one,
+        and UnreachableError if a node does not answer."""
+        self._leased = tuple(device for device in self._directory.devices if device in devices)
+        for device in self._leased:
+            answer = await self._take_device(device)
+            if answer.ok:
+                continue
+            if "text" not in answer.data:
+                node = self._directory.where(device)
+                raise UnreachableError([node], f"{node} was connected and does not answer")
+            raise MissionError(
+                f"in use: {answer.data['text']}; wait until that run has ended, or end it with "
+                "`petrobot abort` (after `petrobot resume`, if its coordinator was killed)",
+                bad_input=True,
+            )
+
+    def _take_device(self, device: str) -> asyncio.Future[Answer]:
+        client = self.clients[self._directory.where(device)]
+        hello = client.caller.hello
+        id_ = f"{hello.name}/{hello.epoch}/{LEASE}/{device}"
+        answer = self._answers[id_] = self._loop.create_future()
+        client.caller.command(self.now(), Command(id_, LEASE, device))
+        client.flush()
+        return answer
 
     def _unreached(self, missing: Sequence[str]) -> Iterator[str]:
         """Return why nodes cannot be reached and what to do. Nodes that run and refuse us do not
@@ -244,6 +282,11 @@ class RealtimeMission:
                     since = split_boot(notice.boot)[2]
                     if self._missed is not None and uptime() - self._ordered > since + TRANSIT:
                         self._missed.append(node)
+                    for device in self._leased:  # a node that was restarted does not know of it
+                        if self._directory.where(device) == node:
+                            self._take_device(device)
+                elif isinstance(notice, Answer) and notice.id in self._answers:
+                    self._answers.pop(notice.id).set_result(notice)
             if not self._closed:
                 self._guarded(lambda now: self.mission.take(now, node, notices))
 

@@ -33,6 +33,7 @@ from petrobot.services.comm.location_file import (
 from petrobot.services.comm.protocol.messages import (
     COORDINATOR,
     LATCHED,
+    LEASE,
     SEED,
     STOPS,
     Answer,
@@ -154,7 +155,7 @@ at once."""
 ANSWER_WITHIN = 1.0
 """Time in which the devices must answer an operator's command (s)."""
 VERBS = frozenset(
-    {"hold", "release", "stop", "status", PICTURE, EMERGENCY_STOP, CLEAR_EMERGENCY, SEED}
+    {"hold", "release", "stop", "status", PICTURE, EMERGENCY_STOP, CLEAR_EMERGENCY, LEASE, SEED}
 )
 """Verbs of a COMMAND."""
 _OWN_CAUSES = ("deadline", "orphan", EMERGENCY_STOP)
@@ -427,6 +428,11 @@ class Node:
         elif not keys and command.target:
             text = f"{self.name} has no device {command.target!r}"
             self.callee.answer(now, command.id, False, {"cause": "unknown_device", "text": text})
+        elif command.verb == LEASE:
+            refused = (self.callee.lease(now, command.id, key) for key in keys if key != GENERAL)
+            cause, text = next(filter(None, refused), ("", ""))
+            told = {"cause": cause, "text": text} if cause else {}
+            self.callee.answer(now, command.id, not cause, told)
         else:
             if command.verb == CLEAR_EMERGENCY:
                 why = self._stops.clear(keys)
@@ -492,7 +498,6 @@ class Node:
                 if command.verb == "status":
                     data["emergency"] = list(self.stopped_in_emergency())
                     data["dry_run"] = self.directory.dry_run
-                    data["leases"] = self.callee.leases
                     data["events_dropped"] = dict(self.callee.events.dropped)
                 self.callee.answer(now, id_, held and not command.missing, data)
 

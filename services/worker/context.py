@@ -163,6 +163,7 @@ class RunContext:
         self._call = call
         self._device = device
         self._clock = clock
+        self._began = clock()
         self._outlets = outlets
         self._report = report
         self._children = 0
@@ -196,7 +197,7 @@ class RunContext:
     def publish(self, stream: str, values: Sequence[float]) -> None:
         """Make `values` the newest set point of a stream. It is sent repeatedly until the run ends
         or withdraws it."""
-        self._outlets.publish(self._clock(), self.run, stream, values)
+        self._outlets.publish(self._clock(), self.run, self._began, stream, values)
 
     def withdraw(self, stream: str) -> None:
         """Withdraw the last set point of a stream."""

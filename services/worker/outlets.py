@@ -20,19 +20,21 @@ SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A set point to send: the newest value of a stream, and how long ago its action published it
-    (s)."""
+    """A set point to send: the newest value of a stream, how long ago its action published it (s),
+    and how long ago its run began (s)."""
 
     run: str
     stream: str
     values: tuple[float, ...]
     elapsed: float
+    age: float
 
 
 @dataclass
 class _Outlet:
     period: float
     run: str = ""
+    began: float = 0.0
     values: tuple[float, ...] = ()
     published: float = 0.0
     next: float = -math.inf
@@ -48,9 +50,11 @@ class Outlets:
         self._outlets: dict[str, _Outlet] = {}
         self._open: dict[str, _Outlet] = {}
 
-    def publish(self, now: float, run: str, stream: str, values: Sequence[float]) -> None:
-        """Make `values` the newest of a stream. Raises ValueError for an unknown stream, and for
-        what is not a list of finite numbers."""
+    def publish(
+        self, now: float, run: str, began: float, stream: str, values: Sequence[float]
+    ) -> None:
+        """Make `values` of a run, which began at `began`, the newest of a stream. Raises ValueError
+        for an unknown stream, and for what is not a list of finite numbers."""
         outlet = self._outlets.get(stream)
         if outlet is None:
             try:
@@ -74,7 +78,8 @@ class Outlets:
             raise ValueError(f"set point of {stream!r} is not finite: {numbers}")
         if stream not in self._open:
             outlet.next = max(outlet.next, now)  # after a pause, missed sends are not made up for
-        outlet.run, outlet.values, outlet.published = run, numbers, now
+        outlet.run, outlet.began = run, began
+        outlet.values, outlet.published = numbers, now
         self._open[stream] = outlet
 
     def withdraw(self, stream: str, run: str | None = None) -> None:
@@ -96,7 +101,8 @@ class Outlets:
             late = now - outlet.next
             # absolute times keep the rate; after a gap of more than a period the grid starts again
             outlet.next = (outlet.next if late < outlet.period else now) + outlet.period
-            sent.append(Sent(outlet.run, stream, outlet.values, max(0.0, now - outlet.published)))
+            elapsed, age = max(0.0, now - outlet.published), max(0.0, now - outlet.began)
+            sent.append(Sent(outlet.run, stream, outlet.values, elapsed, age))
         return sent
 
     def due(self) -> float | None:
@@ -120,19 +126,13 @@ class StreamOutlets:
         self._streams = directory.streams
         self._credentials = credentials(directory, sender)
         self._outlets: dict[str, StreamSender] = {}
-        self._runs: dict[str, str] = {}
-        """By stream: the run whose values were sent last."""
         self._asked: dict[str, float] = {}
 
     def send(self, now: float, sent: Sent) -> bool:
         """Send a set point. Return True if the stream's address must be requested (again)."""
         outlet = self._outlets.get(sent.stream)
-        if outlet is not None:
-            if outlet.up and self._runs.get(sent.stream) != sent.run:
-                outlet.withdraw()
-                self._runs[sent.stream] = sent.run
-            if outlet.send(sent.values, sent.elapsed):
-                return False
+        if outlet is not None and outlet.send(sent.values, sent.elapsed, sent.run, sent.age):
+            return False
         if now < self._asked.get(sent.stream, -math.inf) + ASK_AGAIN:
             return False
         self._asked[sent.stream] = now

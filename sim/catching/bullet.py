@@ -22,7 +22,8 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Mapping, Sequence
+import weakref
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +105,13 @@ def _inertial_text(link: PrincipalInertia, centre: tuple[float, float, float], r
     )
 
 
+def _connect(owner: object) -> tuple[int, Callable[[], object]]:
+    """Return a new physics client and what disconnects it: at the latest, the end of its owner, as
+    a lock-step cell that is given up is not closed."""
+    client = pybullet.connect(pybullet.DIRECT)
+    return client, weakref.finalize(owner, pybullet.disconnect, physicsClientId=client)
+
+
 class BulletArmDynamics:
     """Mass matrix and bias torques of the arm by PyBullet, without rotors and friction; a physics
     client of its own. Implements `physics.ArmDynamics`."""
@@ -111,7 +119,7 @@ class BulletArmDynamics:
     def __init__(
         self, model: PumaModel, gravity: float, flange_load: PrincipalInertia | None = None
     ) -> None:
-        self._client = pybullet.connect(pybullet.DIRECT)
+        self._client, self._disconnect = _connect(self)
         pybullet.setGravity(0.0, 0.0, -gravity, physicsClientId=self._client)
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "arm.urdf"
@@ -152,9 +160,7 @@ class BulletArmDynamics:
 
     def close(self) -> None:
         """Disconnect the physics client."""
-        if self._client >= 0:
-            pybullet.disconnect(physicsClientId=self._client)
-            self._client = -1
+        self._disconnect()
 
 
 class BulletBallContact:
@@ -173,7 +179,7 @@ class BulletBallContact:
         self._model = model
         self._cup_depth = cup.depth
         self.dt = float(settings["step"]["contact"])
-        self._client = pybullet.connect(pybullet.DIRECT)
+        self._client, self._disconnect = _connect(self)
         pybullet.setGravity(0.0, 0.0, -model.gravity, physicsClientId=self._client)
         pybullet.setTimeStep(self.dt, physicsClientId=self._client)
         pybullet.setPhysicsEngineParameter(
@@ -276,9 +282,7 @@ class BulletBallContact:
 
     def close(self) -> None:
         """Disconnect the physics client."""
-        if self._client >= 0:
-            pybullet.disconnect(physicsClientId=self._client)
-            self._client = -1
+        self._disconnect()
 
 
 def cup_urdf(cup: CupTruth, wall: float, count: int) -> str:

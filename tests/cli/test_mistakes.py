@@ -647,6 +647,7 @@ closed = { in = ["close:normal"], out = ["held"] }
 ]
 NO_BRANCH = r"arm_bot.toml:44: subnets.hold.places.close: no outgoing arc `error`"
 USED = "await ctx.sleep(0.3)"
+DRIVES = ("command", "stop", "stopped")
 
 REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
     (
@@ -687,6 +688,14 @@ REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
         [(CODE, USED, 'ctx.publish("speed", [1.0])', "")],
         r"the stream 'speed' is not declared; declare \[streams.speed\] in services.toml",
         [(CELL, "[actions]", '[streams.speed]\nto = "axis"\nperiod = 0.05\n[actions]', "")],
+    ),
+    (
+        [
+            (CELL, "[actions]", '[streams.speed]\nto = "axis"\nperiod = 0.05\n[actions]', ""),
+            *((CODE, f"def {name}(", f"def own_{name}(", "") for name in DRIVES),
+        ],
+        r":\d+: devices.axis.driver: Axis follows set points, but has no stop, stopped: [^|]*both",
+        [(CODE, f"def own_{name}(", f"def {name}(", "") for name in DRIVES[1:]],
     ),
     (
         [(CODE, USED, 'await ctx.put("parts", 1)', "")],

@@ -60,7 +60,10 @@ async def test_a_second_run_is_refused_while_the_first_has_its_device(petrobot: 
     task.write_text(TASK, encoding="utf-8")
     services = str(petrobot.mission.executor.directory.source)
     said = await petrobot("run", str(task), "--services", services, "--no-page", "--quiet")
-    assert said.code == 2 and f"in use: arm by {RUN}; wait until" in said.err, said
+    assert (
+        said.code == 2
+        and f"in use: arm accepts orders from {RUN} at the moment; wait until" in said.err
+    ), said
     assert "of old-1 has died: this is a new run; `petrobot resume old-1` continues" in said.err
     assert {path.name for path in petrobot.runs.iterdir()} == {RUN, "old-1"}
     assert petrobot.arm.moving

@@ -52,17 +52,17 @@ def test_only_the_newest_value_is_delivered() -> None:
     assert sink.got == [((3.0,), 0.04), None, ((5.0,), 0.0)]
 
 
-def test_after_an_emergency_stop_values_count_once_their_sender_has_withdrawn() -> None:
-    """It does so before the first value of a run; silence alone does not make an old run a new
-    one."""
+def test_after_an_emergency_stop_values_count_once_their_sender_tells_a_later_run() -> None:
+    """Silence does not make an old run a new one."""
     sink = RecordingSink()
-    inlet = Inlet(0.1, sink)
-    inlet.receive(1.0, [_point(1)])
-    inlet.bar()
+    inlet = Inlet(0.1, sink, before=2.0)
     for now in (1.1, 1.2, 9.0):
         inlet.receive(now, [_point(2, elapsed=now - 1.0)])
-    inlet.receive(9.1, [_point(3, elapsed=8.1), m.Withdraw(), _point(4, elapsed=8.1)])
-    assert sink.got == [((1.0,), 0.0), None, ((4.0,), 0.0)]
+    inlet.receive(9.1, [m.Withdraw(2.1), _point(3, elapsed=8.1)])
+    assert sink.got == []
+    inlet.receive(9.1, [_point(3, elapsed=8.1), m.Withdraw(1.9), _point(4, elapsed=8.1)])
+    inlet.receive(9.2, [m.Withdraw(2.1), _point(5, elapsed=8.2)])
+    assert sink.got == [((4.0,), 0.0)]
 
 
 def test_a_delay_in_transit_is_part_of_the_age() -> None:
@@ -150,13 +150,31 @@ def test_a_stream_from_its_first_value_to_its_end(
     assert sender.send((1.0, 2.0), held=0.08) and sender.send((3.0, 4.0))
     _until(lambda: bool(sink.got), receiver.poll)
     _until(lambda: sink.got[-1] is not None and sink.got[-1][0] == (3.0, 4.0), receiver.poll)
-    sender.withdraw()
-    _until(lambda: sink.got[-1] is None, receiver.poll)
-    assert sender.send((5.0,))
-    _until(lambda: sink.got[-1] is not None, receiver.poll)
+    assert sender.send((5.0,), run="another")
+    _until(lambda: sink.got[-1] is not None and sink.got[-1][0] == (5.0,), receiver.poll)
     sender.close()
     _until(lambda: sink.got[-1] is None, receiver.poll)
     assert len(receiver.sockets()) == 1 and receiver.faults == 0
+
+
+@pytest.mark.parametrize(("began", "counts"), [("before", False), ("after", True)])
+def test_after_an_emergency_stop_a_new_connection_does_not_make_a_run_new(
+    began: str, counts: bool, sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender
+) -> None:
+    """Nor does a run that published nothing before, such as that of a frozen process."""
+    _until(lambda: bool(sink.got), lambda: sender.send((1.0,), run="old"), receiver.poll)
+    start = time.monotonic()
+    receiver.bar()
+    if began == "after":
+        time.sleep(0.3)  # more than the connection takes
+        start = time.monotonic()
+
+    def send() -> None:
+        sender.send((2.0,), run="new", age=time.monotonic() - start)
+
+    end = time.monotonic() + 1.0
+    _until(lambda: time.monotonic() > end or sink.got[-1] is not None, send, receiver.poll)
+    assert sender.up and (sink.got[-1] is not None) is counts
 
 
 def test_values_of_a_sender_that_is_gone_are_withdrawn(

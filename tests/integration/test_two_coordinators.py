@@ -4,6 +4,9 @@ a clear message and moves nothing."""
 from __future__ import annotations
 
 import asyncio
+import os
+import signal
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -11,7 +14,7 @@ import pytest
 from petrobot.coordinator.cli.loading import load_task
 from petrobot.coordinator.engine import RunRecorded
 from petrobot.coordinator.launch import Setting, local_programs, mission_id, realtime_mission
-from petrobot.coordinator.run.mission import Mission
+from petrobot.coordinator.run.mission import Mission, MissionError
 from petrobot.coordinator.run.realtime import RealtimeMission
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.coordinator.task import Executed, Status
@@ -82,6 +85,32 @@ async def test_the_second_coordinator_is_refused_until_the_first_has_ended(tmp_p
     begun = moves(tmp_path, "begin")
     assert set(begun.values()) == {1} and not moves(tmp_path, "overlap")
     assert not any(call.startswith(second.executor.mission) for call in begun)
+
+
+async def test_of_coordinators_that_take_their_devices_at_once_one_gets_all(tmp_path: Path) -> None:
+    """The others are refused before anything starts, also by a node that was restarted since."""
+    directory = load(shuttle_services(tmp_path))
+    shells = [RealtimeMission(mission_on(directory, 2), directory) for _ in range(6)]
+    async with Supervisor(local_programs(directory), tmp_path / "logs") as nodes:
+        try:
+            await asyncio.gather(*(shell.connect(60.0) for shell in shells[:5]))
+            taken = await asyncio.gather(
+                *(shell.lease(directory.devices) for shell in shells[:5]), return_exceptions=True
+            )
+            assert Counter(map(type, taken)) == {type(None): 1, MissionError: 4}, taken
+            first = shells.pop(taken.index(None))
+            await asyncio.gather(*(shell.close() for shell in shells[:4]))
+            caller = first.clients["right"].caller
+            before = caller.boot
+            os.kill(nodes.process_ids()["right"], signal.SIGKILL)
+            async with asyncio.timeout(LIMIT):
+                while not caller.up or caller.boot == before:
+                    await beat(0.01)
+            await shells[4].connect(60.0)
+            with pytest.raises(MissionError, match="right_hand accepts orders from"):
+                await shells[4].lease({"right_hand"})
+        finally:
+            await asyncio.gather(*(shell.close() for shell in (first, *shells)))
 
 
 async def test_a_goodbye_is_sent_over_a_new_link_if_the_first_breaks(tmp_path: Path) -> None:

@@ -29,20 +29,20 @@ def test_an_outlet_sends_the_newest_at_most_once_a_period(
         now = 0.004 * tick
         if tick in at:
             if at[tick]:
-                outlets.publish(now, "run", "s", [float(tick)])
+                outlets.publish(now, "run", 0.0, "s", [float(tick)])
                 newest = (float(tick), now)
             else:
                 outlets.withdraw("s")
                 newest = None
         for sent in outlets.advance(now):
             assert newest is not None
-            assert sent == Sent("run", "s", (newest[0],), max(0.0, now - newest[1]))
+            assert sent == Sent("run", "s", (newest[0],), max(0.0, now - newest[1]), now)
             times.append(now)
         due = outlets.due()
         assert (due is None) == (newest is None)
         assert due is None or due > now - 1e-5
     assert all(b - a >= period - 2e-3 for a, b in pairwise(times))
-    outlets.publish(1.0, "run", "s", [1.0])
+    outlets.publish(1.0, "run", 0.5, "s", [1.0])
     outlets.withdraw("s", "other run")
     assert outlets.due() is not None
     outlets.close("run")

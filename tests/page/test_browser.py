@@ -159,6 +159,8 @@ async def test_manual_interventions_in_the_net(browser: Browser, page: Page, sta
     await expect(running).to_contain_text("pick")
     await element(tab, "^Action place pick", "Task net").click()
     await tab.get_by_role("button", name="Force picked").click()
+    assert stage.commands[-1][1] == "raise_event", "it asks first"
+    await tab.get_by_role("button", name="Leave pick by force?").click()
     await expect(running).to_contain_text("put")
     await abort(tab.get_by_role("toolbar", name="Mission"))
     await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Aborted")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import math
 from collections.abc import Iterator
@@ -260,6 +261,27 @@ def test_at_the_rim_the_portable_contact_has_converged_and_bullet_is_near(
     assert same(found[BULLET, 1e-4], refined) >= 0.95
     for physics in BACK_ENDS:
         assert same(found[physics, 1e-3], refined) >= 0.9
+
+
+@needs_bullet
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_contact_leaves_no_physics_client(site: Site, model: BallModel, closed: bool) -> None:
+    """Also one that is given up without being closed."""
+    import pybullet
+
+    from petrobot.sim.catching.bullet import BulletBallContact
+
+    truth = site.truth("C")
+    space = ball_contact(BULLET, model, truth.table, truth.cup, 0.003, truth.settings)
+    assert isinstance(space, BulletBallContact)
+    client = space._client
+    assert pybullet.getConnectionInfo(client)["isConnected"]
+    if closed:
+        space.close()
+        space.close()
+    del space
+    gc.collect()
+    assert not pybullet.getConnectionInfo(client)["isConnected"]
 
 
 def test_flight_agrees_with_the_closed_form(space: BallContact) -> None:

@@ -66,9 +66,14 @@ async def handshake(
         return result
     if not seen:
         return error("not_acknowledged", f"{acknowledge} did not become {expect!r}")
-    await ctx.wait(lambda: not acknowledged() or lost(), timeout)
+
+    def withdrawn() -> bool:
+        return acknowledge in device.state["values"] and not acknowledged()
+
+    await ctx.wait(lambda: withdrawn() or lost(), timeout)
     if lost():
         return error("link_lost", f"the link was lost while {acknowledge} was {expect!r}")
-    if acknowledged():
-        return error("not_withdrawn", f"{acknowledge} stays {expect!r}")
+    if not withdrawn():
+        stays = device.state["faults"].get(acknowledge, f"it stays {expect!r}")
+        return error("not_withdrawn", f"{acknowledge}: {stays}")
     return success()

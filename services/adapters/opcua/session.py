@@ -23,6 +23,8 @@ HEARTBEAT: Final = "i=2258"
 show that the server still serves the subscription."""
 BEAT: Final = 500.0
 """Time between two of these (ms)."""
+LARGEST: Final = 40_000
+"""Characters of all values together, which are published each cycle."""
 CHANGED: Final = "nodes of the server have changed"
 UNKNOWN: Final = "the session was lost: it is unknown whether it was written"
 
@@ -174,7 +176,7 @@ class OpcUaSession(Driver):
         async with client:
             nodes: dict[str, tuple[Any, Any]] = {}
             faults: dict[str, str] = {}
-            heard = _Notifications(session)
+            heard = _Notifications(session, LARGEST // max(1, len(self.nodes)))
             subscription = await client.create_subscription(1000 * self.interval, heard)
             heartbeat = client.get_node(HEARTBEAT)
             await subscription.subscribe_data_change(heartbeat, sampling_interval=BEAT)
@@ -209,8 +211,10 @@ class OpcUaSession(Driver):
 class _Notifications:
     """What asyncua calls in the session's thread."""
 
-    def __init__(self, session: SessionThread) -> None:
+    def __init__(self, session: SessionThread, largest: int) -> None:
+        """`largest`: characters of the largest value that is kept."""
         self.names: dict[Any, str] = {}
+        self._largest = largest
         self._session, self._beat = session, time.monotonic()
 
     def silent(self) -> float:
@@ -228,8 +232,10 @@ class _Notifications:
             self._session.tell("bad", (name, status.name))
         elif value is None:
             self._session.tell("bad", (name, "it has no value"))
+        elif len(str(plain := _plain(value))) > self._largest:
+            self._session.tell("bad", (name, f"it is longer than {self._largest} characters"))
         else:
-            self._session.tell("value", (name, _plain(value)))
+            self._session.tell("value", (name, plain))
 
 
 async def _written(

@@ -19,8 +19,13 @@ WAITING = 8
 DEPTH, ITEMS, TABLES = 16, 20_000, 1_000
 """Limits of a message: deepest nesting, most items, and most lists and tables. A driver's state can
 contain several such messages."""
+LARGEST_VALUE = 65_536
+"""Characters of the largest message that is kept for actions: what is kept is published each
+cycle."""
 ENDED_KEPT = 5
 """Ended goals and calls that are kept for actions which have not read them."""
+ANSWERS = frozenset(("action_feedback", "action_result", "service_response", "status"))
+"""Operations of a server that concern a goal or a call."""
 REPEAT = 1.0
 """Seconds after which a cancel is sent again: rosbridge ignores one that comes before it has begun
 the goal."""
@@ -93,7 +98,7 @@ def unfit(values: Any) -> str:
             return f"{words(path)}: is nested more than {DEPTH} deep"
         if words(path) != path or (isinstance(value, str) and words(value) != value):
             return f"{words(path)}: is not Unicode text"
-    return ""
+    return "" if len(str(values)) <= LARGEST_VALUE else f"is longer than {LARGEST_VALUE} characters"
 
 
 def words(said: Any) -> str:
@@ -298,20 +303,25 @@ class Exchanges:
         """Process feedback, a result, a response, or rosbridge's report that an operation failed;
         return why it cannot be used, "" if it can."""
         identity = message.get("id")
+        op, said = message["op"], message.get("values")
+        failed = op == "status" and message.get("level") == "error"
+        if op not in ANSWERS:
+            return f"operation {words(op):.40}: was not asked for"
+        if failed and identity is None:
+            return f"rosbridge reports: {message.get('msg')}"
         one = next((e for e in self.open.values() if e.request["id"] == identity), None)
         if one is None or one.phase not in MOVING:
             return ""
         one.heard = now
-        op, said = message["op"], message.get("values")
         if op == "action_feedback":
             if one.phase is ExchangePhase.PENDING:
                 one.phase = ExchangePhase.ACTIVE
             if fault := unfit(said):
                 return f"feedback: {fault}"
             one.feedback, one.count = said or {}, one.count + 1
-        elif op == "status" and message.get("level") == "error":
+        elif failed:
             one.refuse(message.get("msg"))
-        elif op in ("action_result", "service_response"):
+        elif op != "status":
             status = message.get("status")
             if status is None and isinstance(said, dict) and set(said) == {"status", "result"}:
                 status, said = said["status"], said["result"]  # an older rosbridge

@@ -25,9 +25,6 @@ POINTS = {
     "nav_msgs/msg/Odometry": "pose.pose.position",
 }
 """By type: path of the point that `workspace` bounds."""
-LARGEST_VALUE = 65_536
-"""Largest topic message that is kept for actions (characters): all kept messages are published each
-cycle."""
 
 
 class TopicDriver(Driver):
@@ -147,8 +144,6 @@ class TopicDriver(Driver):
     def arrive(self, now: float, topic: Any, message: Any) -> None:
         """Process a message of a topic."""
         fault = unfit(message)
-        if not fault and len(str(message)) > LARGEST_VALUE:
-            fault = f"is longer than {LARGEST_VALUE} characters"
         if fault:
             self.refuse(f"{topic}: {fault}")
             return

@@ -419,10 +419,10 @@ class Callee:
                 self._running.watch_orphan(id_, now + run.orphan_time)
                 self.soonest = min(self.soonest, now + run.orphan_time)
 
-    @property
-    def leases(self) -> dict[str, str]:
-        """By device the connected caller whose orders it accepts."""
-        return self._peers.leases
+    def lease(self, now: float, id_: str, device: str) -> tuple[str, str] | None:
+        """Give a device to the caller of this command. Return why not: cause and text; None if it
+        has it."""
+        return self._peers.lease(now, self.commander(id_), device, self._in_use)
 
     # Messages of callers.
 

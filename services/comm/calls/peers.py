@@ -168,12 +168,15 @@ class Peers:
                 f"{call.service} only serves {' and '.join(sorted(offer.roles))}, "
                 f"not a {peer.role}",
             )
-        return self._lease(now, name, peer, offer.device, in_use) if offer.device else None
+        return self.lease(now, name, offer.device, in_use) if offer.device else None
 
-    def _lease(
-        self, now: float, name: str, peer: Peer, device: str, in_use: Callable[[str], bool]
+    def lease(
+        self, now: float, name: str, device: str, in_use: Callable[[str], bool]
     ) -> tuple[str, str] | None:
-        if peer.role == NODE:
+        """Let this caller hold the lease of a device. Return why not: cause and text; None if it
+        holds it."""
+        peer = self._peers.get(name)
+        if peer is None or peer.role == NODE:
             return (
                 "device_needs_coordinator",
                 f"{device} only accepts orders from a coordinator, not from node {name}",
@@ -183,11 +186,6 @@ class Peers:
             return "device_leased", f"{device} accepts orders from {holder} at the moment"
         self._leases[device] = name
         return None
-
-    @property
-    def leases(self) -> dict[str, str]:
-        """By device the connected caller whose orders it accepts."""
-        return {device: name for device, name in self._leases.items() if self.is_up(name)}
 
     def _is_near(self, now: float, name: str) -> bool:
         peer = self._peers.get(name)

@@ -52,7 +52,9 @@ def read_code(directory: Directory, seconds: float = SECONDS) -> dict[str, Facts
             more = {"dry_run": True} if directory.dry_run else {}
             if asked.get(device.driver) is None:
                 asked[device.driver] = {}  # also where an action has the same path
-            asked[device.driver][device.name] = {**device.config, **more}
+            follows = any(stream.to == device.name for stream in directory.streams.values())
+            table = {**device.config, **more}
+            asked[device.driver][device.name] = {"table": table, "follows": follows}
     known: dict[str, Facts] = {}
     while left := [[path, config] for path, config in asked.items() if path not in known]:
         told, why = _ask(left, seconds)

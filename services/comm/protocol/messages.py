@@ -26,6 +26,8 @@ LATCHED: Final = "latched"
 """Value of such a result if the node's stop is not cleared, or its caller did not know of it."""
 STOPS: Final = "stops"
 """Value of a latched result: the number of cleared stops that its caller knows of from then on."""
+LEASE: Final = "lease"
+"""Verb of a COMMAND by which a coordinator takes a device before its first call."""
 _BOOT: Final = re.compile(r"(.*)\+([0-9]{1,18})(?:/([0-9]{1,18}(?:\.[0-9]+)?))?", re.DOTALL)
 SEED: Final = "seed"
 """Verb and key of the COMMAND that tells the mission's seed to devices that no action uses."""
@@ -327,9 +329,12 @@ class SetPoint:
 
 @dataclass(frozen=True, slots=True)
 class Withdraw:
-    """The last set point must not be followed any longer."""
+    """The last set point must not be followed any longer; what comes next is of another run, or the
+    first on this connection."""
 
     KIND: ClassVar[int] = 23
+    before: float = 0.0
+    """How long before STREAM_OPEN that run began (s); 0: after it."""
 
 
 Message = (

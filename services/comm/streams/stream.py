@@ -93,21 +93,17 @@ class Inlet:
     fresh one.
     """
 
-    __slots__ = ("_barred", "_lateness", "_limit", "_sink", "_until")
+    __slots__ = ("_barred", "_before", "_lateness", "_limit", "_sink", "_until")
 
-    def __init__(self, period: float, sink: Sink) -> None:
+    def __init__(self, period: float, sink: Sink, before: float = math.inf) -> None:
+        """`before`: how long before the connection a run may have begun whose values count (s): not
+        before the last emergency stop was cleared; infinity: there was none."""
         self._limit = STALE_AFTER * period
         self._sink = sink
         self._lateness = Lateness()
         self._until = math.inf
-        self._barred = False
-
-    def bar(self) -> None:
-        """Withdraw the value, and drop all that come before the sender withdraws: it does so before
-        the first value of each run."""
-        self._barred = True
-        self._until = math.inf
-        self._sink.withdraw()
+        self._before = before
+        self._barred = before < math.inf  # until the sender has said when its run began
 
     def receive(self, now: float, messages: Sequence[Message]) -> None:
         """Handle what has arrived by `now`: the newest message counts, the others only improve the
@@ -119,7 +115,7 @@ class Inlet:
                 late = self._lateness.of(now, message.elapsed)
                 newest = None if self._barred else message
             elif isinstance(message, Withdraw):
-                newest, self._barred = message, False
+                newest, self._barred = message, message.before > self._before
         if isinstance(newest, SetPoint) and late <= self._limit:
             self._until = now - late + self._limit
             self._sink.take(newest.values, newest.held + late)
@@ -244,15 +240,19 @@ class StreamSender:
         self._again = -math.inf
         self._opened = 0.0
         self._number = 0
+        self._run: str | None = None
+        """The run whose values were sent last on this connection."""
 
     @property
     def up(self) -> bool:
         """Return whether the receiver has welcomed the stream."""
         return self._line is not None and self._line.connection.state is _OPEN
 
-    def send(self, values: Sequence[float], held: float = 0.0) -> bool:
-        """Send the newest values, which the sender has held for `held` seconds. Return False if
-        they were dropped."""
+    def send(
+        self, values: Sequence[float], held: float = 0.0, run: str = "", age: float = 0.0
+    ) -> bool:
+        """Send the newest values, which the sender has held for `held` seconds, of a run that began
+        `age` seconds ago. Return False if they were dropped."""
         line = self._line if self.up else self.advance()
         if line is not None and line.unsent:
             line = self.advance()
@@ -261,16 +261,14 @@ class StreamSender:
             return False
         self._number += 1
         elapsed = self._clock() - self._opened
-        sent = self._write(line, SetPoint(self._number, tuple(map(float, values)), held, elapsed))
+        point = SetPoint(self._number, tuple(map(float, values)), held, elapsed)
+        if run == self._run:
+            sent = self._write(line, point)
+        else:
+            self._run = run
+            sent = self._write(line, Withdraw(max(0.0, age - elapsed)), point)
         self.advance()  # read what the receiver sent only after the value is on its way
         return sent
-
-    def withdraw(self) -> None:
-        """Withdraw the last values; done before the first values of each run, too, so that the
-        receiver can tell them from those of a run from before an emergency stop."""
-        line = self.advance()
-        if line is not None:
-            self._write(line, Withdraw())
 
     def close(self) -> None:
         """End the stream."""
@@ -301,9 +299,9 @@ class StreamSender:
             self._drop(now + _RETRY)
         return self._line if self.up else None
 
-    def _write(self, line: StreamConnection, message: Message) -> bool:
+    def _write(self, line: StreamConnection, *messages: Message) -> bool:
         try:
-            line.write(line.connection.send(message))
+            line.write(b"".join(map(line.connection.send, messages)))
         except OSError:
             self._drop(self._clock() + _RETRY)
             return False
@@ -338,7 +336,7 @@ class StreamSender:
     def _take(self, line: StreamConnection, message: Message) -> None:
         if isinstance(message, Welcome):
             self.refusal = ""
-            self._opened, self._number = self._clock(), 0
+            self._opened, self._number, self._run = self._clock(), 0, None
             line.write(line.connection.send(self._open))
         elif isinstance(message, Refuse):
             proven = "" if line.connection.proven else f"{UNPROVEN}: "
@@ -390,6 +388,8 @@ class StreamReceiver:
         self._clock = clock
         self._guests: dict[int, _Guest] = {}
         """Connections by the file number of their socket."""
+        self._barred_at = -math.inf
+        """When the device was last in emergency stop (s)."""
         self._ready = select.epoll()
         self._listener = socket.create_server(
             (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -422,10 +422,10 @@ class StreamReceiver:
             self._admit(now)
 
     def bar(self) -> None:
-        """Withdraw all values; those that the present senders go on to repeat do not count."""
-        for guest in self._guests.values():
-            if guest.inlet is not None:
-                guest.inlet.bar()
+        """End all connections; later, values count only of runs that began after this moment."""
+        self._barred_at = self._clock()
+        for guest in list(self._guests.values()):
+            self._end(guest)
 
     def close(self) -> None:
         """Stop listening and end all streams."""
@@ -470,7 +470,7 @@ class StreamReceiver:
         except OSError:
             self._end(guest)
             return
-        rest = self._open(guest, messages) if guest.inlet is None else messages
+        rest = self._open(now, guest, messages) if guest.inlet is None else messages
         if guest.inlet is not None:
             guest.inlet.receive(now, rest)
             if any(isinstance(message, Bye) for message in rest):
@@ -478,11 +478,12 @@ class StreamReceiver:
         elif guest.inlet is None and now > guest.since + _HANDSHAKE:
             self._end(guest)
 
-    def _open(self, guest: _Guest, messages: list[Message]) -> list[Message]:
+    def _open(self, now: float, guest: _Guest, messages: list[Message]) -> list[Message]:
         """Handle HELLO and STREAM_OPEN of a connection; return the messages after them."""
         for position, message in enumerate(messages):
             if isinstance(message, Hello):
                 welcome = Welcome(NEWEST_VERSION, self._name, self._boot, tuple(self._streams))
+                guest.since = now  # STREAM_OPEN is not sent before
                 self._say(guest, welcome)
             elif isinstance(message, StreamOpen):
                 refusal = self._refusal(message)
@@ -521,7 +522,8 @@ class StreamReceiver:
         for older in [one for one in self._guests.values() if one.stream == stream]:
             self._end(older)
         incoming = self._streams[stream]
-        guest.stream, guest.inlet = stream, Inlet(incoming.period, incoming.sink)
+        before = guest.since - self._barred_at
+        guest.stream, guest.inlet = stream, Inlet(incoming.period, incoming.sink, before)
 
     def _say(self, guest: _Guest, message: Message) -> None:
         with contextlib.suppress(OSError, ProtocolError):

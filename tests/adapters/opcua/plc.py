@@ -1,9 +1,9 @@
 """A simulated PLC for tests, in a separate process: `plc.py PORT [CERTIFICATE KEY CLIENT]`.
 
 The node `manner` decides how `request` is acknowledged: "good", "silent", "stuck" (never
-withdrawn). Other values let something happen once: "retyped" (`count` becomes a text node),
-"forgotten" (all subscriptions are deleted), "bad" (`speed` has a bad status), "gone" (`count` is
-deleted).
+withdrawn), "blind" (it has a bad status once the request is withdrawn). Other values let something
+happen once: "retyped" (`count` becomes a text node), "forgotten" (all subscriptions are deleted),
+"bad" (`speed` has a bad status), "gone" (`count` is deleted).
 """
 
 from __future__ import annotations
@@ -46,10 +46,11 @@ async def trouble(server: Server, nodes: dict[str, Any], manner: str) -> None:
     if manner == "forgotten":
         service = server.iserver.subscription_service
         await service.delete_subscriptions(list(service.subscriptions))
-    elif manner == "bad":
+    elif manner in ("bad", "blind"):
+        name, value = ("speed", 1.5) if manner == "bad" else ("done", True)
         status = ua.StatusCode(ua.StatusCodes.BadSensorFailure)
-        data = ua.DataValue(ua.Variant(1.5, ua.VariantType.Float), StatusCode=status)
-        await nodes["speed"].write_attribute(ua.AttributeIds.Value, data)
+        data = ua.DataValue(ua.Variant(value, KINDS[name]), StatusCode=status)
+        await nodes[name].write_attribute(ua.AttributeIds.Value, data)
     else:
         identifier = nodes["count"].nodeid
         await server.delete_nodes([nodes["count"]])
@@ -81,8 +82,10 @@ async def serve(port: str, *security: str) -> None:
         print("ready", flush=True)
         while True:
             manner, request = await nodes["manner"].get_value(), await nodes["request"].get_value()
-            if manner == "good" or (manner == "stuck" and request):
+            if manner == "good" or (manner in ("stuck", "blind") and request):
                 await nodes["done"].write_value(bool(request))
+            elif manner == "blind":
+                await trouble(server, nodes, manner)
             if manner in ("retyped", "gone", "forgotten", "bad"):
                 await nodes["manner"].write_value("good")
                 await trouble(server, nodes, manner)

@@ -160,6 +160,11 @@ def test_a_handshake_and_its_errors(cell: Cell) -> None:
     request_is(False)
     assert played(cancel_after=0.3) == ("error", "cancelled")
     request_is(False)
+    assert done(driver, {"manner": "blind"}) == ""
+    await_(driver, lambda state: "done" in state["faults"], "the bad status")
+    assert played(timeout=0.5) == ("error", "not_withdrawn")  # nobody knows whether it has ended
+    assert done(driver, {"manner": "good"}) == ""
+    await_(driver, complete, "all values")
     assert done(driver, {"manner": "stuck"}) == ""
     assert played(timeout=0.5) == ("error", "not_withdrawn")
     assert played() == ("error", "already_acknowledged")
@@ -192,7 +197,7 @@ def test_it_keeps_the_rules_of_drivers(cell: Cell) -> None:
 def test_values_of_any_type_are_plain(cell: Cell) -> None:
     """A list of dates would make the state one that cannot be published, and break the driver."""
     driver = cell.driver()
-    heard = _Notifications(driver._session)
+    heard = _Notifications(driver._session, 1000)
     heard.names["node"] = "count"
     dates = [datetime.datetime(2026, 11, 23), [datetime.datetime(2026, 11, 24)], 3]
     item = SimpleNamespace(Value=SimpleNamespace(StatusCode=None))
@@ -204,6 +209,9 @@ def test_values_of_any_type_are_plain(cell: Cell) -> None:
     heard.datachange_notification(SimpleNamespace(nodeid="node"), None, data)
     driver.step(0.0)
     assert "no value" in driver.state()["faults"]["count"] and not driver.state()["values"]
+    heard.datachange_notification(SimpleNamespace(nodeid="node"), "x" * 1001, data)
+    driver.step(0.0)
+    assert "longer than 1000" in driver.state()["faults"]["count"] and not driver.state()["values"]
 
 
 @pytest.mark.processes

@@ -163,7 +163,7 @@ def test_invalid_messages_change_nothing(bridge: Stepped, fake: FakeProcess) -> 
     fake.post("send", json.dumps({"op": "publish", "topic": "/b", "msg": {"x": 1}}))
     bridge.until(lambda: "b" in bridge.topics, "the message after it")
     assert bridge.topics["b"] == {"msg": {"x": 1}, "count": 1} and bridge.link.count == 1
-    assert bridge.phase() is ExchangePhase.ACTIVE and bridge.refused == 11
+    assert bridge.phase() is ExchangePhase.ACTIVE and bridge.refused == 13
     plain(bridge.state(), "state")  # or the driver would die of it
 
 

@@ -86,6 +86,7 @@ def _flat(value: Any) -> list[Any]:
         ({"a": "b", "\ud800": 1}, "Unicode"),
         ({"a": [0] * 30_000}, "more than 20000 items"),
         ({"a": [[]] * 2_000}, "1000 lists and tables"),
+        ({"a": "x" * 70_000}, "longer than 65536 characters"),
         (json.loads('{"a": ' * 30 + "[1]" + "}" * 30), "deep"),
     ],
 )
@@ -246,6 +247,19 @@ def test_words_of_unusual_servers(said: dict[str, Any], phase: ExchangePhase, te
     assert one.phase is phase and text in one.text and one.feedback == {}
     exchanges.receive(0.0, {"op": "action_result", "id": "another", "result": True})
     assert one.phase is phase
+
+
+@pytest.mark.parametrize(
+    ("said", "fault"),
+    [
+        ({"op": "png", "data": "iVBORw0KGgo="}, "operation png: was not asked for"),
+        ({"op": "status", "level": "error", "msg": "no such type"}, "reports: no such type"),
+        ({"op": "status", "level": "warning", "msg": "slow"}, ""),
+        ({"op": "action_result", "id": "another", "result": True}, ""),
+    ],
+)
+def test_what_no_goal_can_be_told_is_shown(said: dict[str, Any], fault: str) -> None:
+    assert fault in Exchanges(1.0).receive(0.0, said)
 
 
 def test_a_result_keeps_only_the_fields_that_are_asked_for() -> None:

@@ -39,7 +39,7 @@ export class Operator {
       pause: button("pause", "pause", "Pause"),
       step: button("step", "step", "Step"),
       resume: button("resume", "resume", "Resume"),
-      abort: button("abort", "abort", "Abort", { class: "command danger", onclick: () => this.confirm(this.buttons.abort, "abort", "Abort the mission?") }),
+      abort: button("abort", "abort", "Abort", { class: "command danger", onclick: () => this.confirm(this.buttons.abort, "Abort the mission?", () => this.give("abort", {})) }),
     };
     this.clear = button("clear_estop", "check", "Clear the stop", { hidden: true, onclick: () => this.clearStop() });
     this.options = h("button", { type: "button", class: "command", hidden: true, "aria-haspopup": "dialog", onclick: () => this.startWith() }, icon("more"), h("span", {}, "Start with"));
@@ -105,22 +105,20 @@ export class Operator {
   }
 
   /** A second press within three seconds carries out what cannot be undone. */
-  confirm(button, verb, question) {
-    const label = button.querySelector("span");
-    if (button.dataset.asked) {
+  confirm(button, question, act) {
+    const label = button.querySelector("span") ?? button.lastChild;
+    const rest = () => {
+      label.textContent = button.dataset.asked;
       delete button.dataset.asked;
-      label.textContent = words(verb).replace(/^./, (c) => c.toUpperCase());
-      this.give(verb, {});
+    };
+    if (button.dataset.asked) {
+      rest();
+      act();
       return;
     }
-    const before = label.textContent;
-    button.dataset.asked = "yes";
+    button.dataset.asked = label.textContent;
     label.textContent = question;
-    setTimeout(() => {
-      if (!button.dataset.asked) return;
-      delete button.dataset.asked;
-      label.textContent = before;
-    }, 3000);
+    setTimeout(() => button.dataset.asked && rest(), 3000);
   }
 
   update(state) {

@@ -73,8 +73,11 @@ export class Selected {
   /** A button for each outgoing transition of a place whose run is active. */
   exits(state, place, run) {
     const made = new Set(state.task.transitions.filter((t) => t.made_from).map((t) => t.name));
-    return state.task.arcs.filter((a) => a.direction === "in" && a.place === place.name && !made.has(a.transition)).map((a) =>
-      action("exit", `Force ${words(a.transition)}`, () => this.operator.give("force_exit", { run: run.id, transition: a.transition }), this.link.barred));
+    return state.task.arcs.filter((a) => a.direction === "in" && a.place === place.name && !made.has(a.transition)).map((a) => {
+      const force = () => this.operator.give("force_exit", { run: run.id, transition: a.transition });
+      const button = action("exit", `Force ${words(a.transition)}`, () => this.operator.confirm(button, `Leave ${words(place.name)} by force?`, force), this.link.barred);
+      return button;
+    });
   }
 
   transition(state, transition, stop) {
