@@ -188,7 +188,7 @@ IN_THE_CELL: list[Mistake] = [
         CELL,
         'move", device = "axis"',
         'move", node = "pc"',
-        r":LINE: actions.move: calls ctx.command \(arm_bot.py:\d+\) and has no device; write",
+        r":LINE: actions.move: uses ctx.command \(arm_bot.py:\d+\) and has no device; write",
     ),
     (CELL, "arm_bot:Axis", "armbot:Axis", r":LINE: .*no module 'armbot' on this host; install"),
     (
@@ -236,9 +236,49 @@ IN_THE_CELL: list[Mistake] = [
         'run = "arm_bot:grip", args = { slip = 1 }',
         r":11: .*no argument 'slip'; did you mean",
     ),
+    (
+        CELL,
+        "arm_bot:Axis",
+        "arm_bot.py:Axis",
+        r":LINE: .*a module is named without .py: .*'arm_bot:",
+    ),
+    (CELL, "arm_bot:grip", "random:grip", r":LINE: .*'random' is Python's own module"),
 ]
 
 IN_THE_CODE: list[Mistake] = [
+    (
+        CODE,
+        "    def step(",
+        "    async def step(",
+        r"arm_bot.py:\d+: `step` of Axis is `async`: .*; write `def step\(self, now\)`",
+    ),
+    (
+        CODE,
+        "def step(self, now: float)",
+        "def step(self)",
+        r"`step` of Axis takes \(self\), but is called with \(self, now\); write",
+    ),
+    (CODE, "return {", "{", r"arm_bot.py:\d+: `state` of Axis returns nothing; write `return`"),
+    (CODE, "return self.at ==", "self.at ==", r"`stopped` of Axis returns nothing; write"),
+    (CODE, "def step(", "def steps(", r"`steps` of Axis is never called; did you mean `step`"),
+    (
+        CODE,
+        'top_speed: float = key(0.5, "m/s")',
+        "top_speed: float = 0.5",
+        r":7: .*Axis does not read it; write top_speed = key\(0.5\) in the class",
+    ),
+    (
+        CODE,
+        "grip(ctx: Context[Remote], *, slips: float",
+        "grip(slips: float",
+        r"arm_bot.py:\d+: grip takes no context; its first parameter is `ctx`, found 'slips'",
+    ),
+    (
+        CODE,
+        "await ctx.sleep(0.3)",
+        "import asyncio; await asyncio.sleep(0.3)",
+        r"arm_bot.py:\d+: asyncio.sleep does not work in an action; write `await ctx.sleep",
+    ),
     (
         CODE,
         "period = 0.01",
@@ -447,6 +487,26 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
         r"arm_bot.py:\d+\): it did nothing.*only 0 of 3 goals were met; the exit code is 0 because",
     ),
     (
+        [(CODE, "await ctx.sleep(0.3)", "ctx.sleep(0.3)", "")],
+        0,
+        r"'wait' or 'sleep' of the context was never awaited in grip \(arm_bot.py:\d+\): it did",
+    ),
+    (
+        [(CODE, 'lambda: ctx.device.state["arrived"]', 'ctx.device.state["arrived"]', "")],
+        1,
+        r"ctx.wait: expected a function, as in `ctx.wait\(lambda: ...\)`, found \w+ in move \(arm",
+    ),
+    (
+        [(CODE, 'ctx.command({"to": to})', "ctx.device.go(to)", "")],
+        1,
+        r"'go' in move \(arm_bot.py:\d+\); its driver runs in another process: .*ctx.command",
+    ),
+    (
+        [(CODE, "return {", "{", "")],
+        3,
+        r"state: expected a dict, found a NoneType, returned by `state` \(arm_bot.py:\d+\)",
+    ),
+    (
         [(CODE, "if not self.paused:", "1 / 0\n        if not self.paused:", "")],
         3,
         r"node pc: device axis: its driver failed: ZeroDivisionError.* in step \(arm_bot.py:\d+\)",
@@ -467,6 +527,7 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
 ON_THE_LINE: list[tuple[list[str], str]] = [
     (["run", "arm_bt.toml"], r"arm_bt.toml: file: cannot be read: No such file"),
     (["check", "services.toml"], r"file: this is a location file, not a task; name the task"),
+    (["check", "."], r"no task '.': this is a folder; name the .toml file of the task"),
     (["run", "armbot"], r"no task 'armbot': give a .toml file, or a task that comes with petrobot"),
     (
         [*RUN, "--runs", "1000000000"],
@@ -543,6 +604,8 @@ WARNINGS = (
     "period is 50",
     "does not use the seed",
     "--dry-run is refused",
+    "`steps` of",
+    "asyncio.sleep",
 )
 
 
@@ -577,7 +640,7 @@ def test_mistakes_between_files_are_reported(
 
 @pytest.mark.processes
 @pytest.mark.parametrize(
-    ("mistakes", "code", "pattern"), IN_THE_RUN, ids=["forgotten await", "step", "state", "period"]
+    ("mistakes", "code", "pattern"), IN_THE_RUN, ids=lambda found: str(found)[:60]
 )
 def test_mistakes_that_a_run_shows_are_told_at_its_end(
     sound: dict[str, str],
@@ -715,7 +778,7 @@ REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
     ),
     (
         [(CELL, 'move", device = "axis"', 'move", node = "pc"', "")],
-        r"actions.move: calls ctx.command .*write device = ",
+        r"actions.move: uses ctx.command .*write device = ",
         [(CELL, 'move", node = "pc"', 'move", device = "axis"', "")],
     ),
 ]

@@ -6,6 +6,7 @@ import hashlib
 import ipaddress
 import json
 import re
+import sys
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -33,6 +34,15 @@ def nearest(name: str, known: Iterable[str]) -> str:
     if close:
         return f"; did you mean {close[0]!r}?"
     return f"; known: {', '.join(names)}" if 0 < len(names) <= 12 else ""
+
+
+def nearest_in(module: str, name: str, names: Iterable[str]) -> str:
+    """Return the same hint for a name that a module does not have; Python's own module hides one of
+    the user that has its name."""
+    near = nearest(name, names)
+    if module in sys.stdlib_module_names and not near.startswith("; did"):
+        return f"; {module!r} is Python's own module: give yours another name"
+    return near
 
 
 def _number(value: Any) -> bool:
