@@ -3,6 +3,7 @@ what was expected, what was found, what to do."""
 
 from __future__ import annotations
 
+import argparse
 import io
 import re
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.cli import main
+from petrobot.coordinator.operator.session import RunSession
 
 CHECK = ["check", "arm_bot.toml"]
 TASK, CELL, CODE = "arm_bot.toml", "services.toml", "arm_bot.py"
@@ -168,6 +170,19 @@ IN_THE_TASK: list[Mistake] = [
         r":LINE: .*'n' is not a variable",
     ),
     (TASK, "lost = { in", "lost = in", r"arm_bot.toml:LINE: TOML: "),
+    (TASK, "broken = {}", "broken = { # don't\n}", r":LINE: TOML: the brace in column 10 is not"),
+    (
+        TASK,
+        'tries = 3, holds = "axis"',
+        "listen = True",
+        r":LINE: TOML: True is Python; write true or false",
+    ),
+    (
+        TASK,
+        'out = ["grip"]',
+        'out = ["grip"], when = "fetch.status == success"',
+        r":LINE: .*when: .*'success' is unknown at column 17; a text is written in quotes: 'succ",
+    ),
     (
         TASK,
         '{ in = ["carry:normal"] }',
@@ -196,6 +211,12 @@ IN_THE_CELL: list[Mistake] = [
         'arm_bot:Axis"',
         "arm_bot:Axis",
         r":LINE: not valid TOML: the quote in column 32 is not",
+    ),
+    (
+        CELL,
+        "move = { run",
+        "move = {\n run",
+        r":LINE: not valid TOML: the brace in column 8 is not closed in its line; write all of it",
     ),
     (CELL, "arm_bot:Axis", "arm_bot.Axis", r":LINE: .*write an import path \"module:Class\""),
     (CELL, "arm_bot:Axis", "arm_bot:move", r":LINE: .*is not a class; a driver is a class derived"),
@@ -540,6 +561,8 @@ ON_THE_LINE: list[tuple[list[str], str]] = [
     ([*RUN, "--set", "speed=1"], r"speed"),
     ([*RUN, "--use", "grip=grab"], r"grab.*grip"),
     ([*RUN, "--services", "cell.toml"], r"cell.toml: No such file"),
+    (["start", "arm_bot.toml"], r"unknown command 'start' \(did you mean 'run' or 'up'\?\)"),
+    (["arm_bot.toml"], r"unknown command .* \(did you mean 'run arm_bot.toml'\?\)"),
     (["rum", "arm_bot.toml"], r"unknown command 'rum' \(did you mean 'run'\?\)"),
     (["run", "arm_bot"], r"no task 'arm_bot': did you mean arm_bot.toml\?"),
     (["show", TASK, "--out", "x.pdf"], r"--out x.pdf: expected a file .svg, found .pdf"),
@@ -803,6 +826,24 @@ def test_a_finding_disappears_with_its_remedy(
         lines = re.sub(r"\n +", " ", words)
         assert len(re.findall(told, lines)) == times, words
         assert not times or len(re.findall(told.partition("[^|]")[0], lines)) == 1, words
+
+
+def test_an_interrupted_run_says_how_it_is_continued(
+    sound: dict[str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    async def ctrl_c(session: RunSession, options: argparse.Namespace) -> None:
+        raise KeyboardInterrupt
+
+    damaged(sound, [], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("petrobot.coordinator.cli.run._lead_lockstep", ctrl_c)
+    assert main([*RUN, "--journal", "runs"]) == 130
+    assert re.search(
+        r"`petrobot resume runs/arm_bot-\S+` continues this run", capsys.readouterr().err
+    )
 
 
 CAMPAIGN = ["campaign", TASK, "--services", CELL, "--runs", "2", "--out", "out"]

@@ -219,7 +219,8 @@ def _names(spec: ModuleSpec) -> set[str] | None:
 WORDS = {
     errno.EADDRINUSE: (
         "port",
-        "{port} is in use on {host}; end the process that listens there, or write another port",
+        "{port} is in use on {host}: does this node run already (`petrobot nodes`)? Else end the "
+        "process that listens there, or write another port",
     ),
     errno.EACCES: ("port", "{port} may not be used by this user; write one above 1023"),
     errno.EADDRNOTAVAIL: (
