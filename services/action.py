@@ -14,6 +14,7 @@ process in real time and inline in a lock-step cell.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -102,15 +103,23 @@ class Wait:
     found). If the runner sends None, `ready` is called again.
     """
 
-    __slots__ = ("due", "ready")
+    __slots__ = ("awaited", "due", "ready")
 
     def __init__(self, ready: Callable[[], bool], due: float | None = None) -> None:
         self.ready = ready
         self.due = due
+        self.awaited = False
 
     def __await__(self) -> Generator[Wait, bool | None, bool]:
+        self.awaited = True
         verdict = yield self
         return self.ready() if verdict is None else verdict
+
+    def __del__(self) -> None:
+        """Warn of a wait that was dropped, as Python does of a coroutine."""
+        if not self.awaited:
+            text = "coroutine 'wait' or 'sleep' of the context was never awaited"
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
 
 
 class CallFailed(Exception):  # noqa: N818 - what happened, not a class of errors

@@ -12,6 +12,7 @@ top-level package that it uses. If the source does not show everything, `complet
 from __future__ import annotations
 
 import ast
+import difflib
 import inspect
 import json
 import os
@@ -26,13 +27,24 @@ from typing import Any, get_type_hints
 
 from petrobot.services import action as actions
 from petrobot.services.comm.location_file import resolve
-from petrobot.services.device import LIMITS, Driver, Key, faults_of_keys, faults_of_limits, keys_of
+from petrobot.services.device import (
+    LIMITS,
+    Driver,
+    HasPicture,
+    Key,
+    QuickStopping,
+    faults_of_keys,
+    faults_of_limits,
+    keys_of,
+)
 from petrobot.services.host.json_text import json_text
 
 AWAITED = frozenset(
     ("wait", "sleep", "call", "command", "get", "get_versioned", "put", "compare_and_set")
 )
 """Methods of the context that do nothing unless they are awaited."""
+CONTEXT = ("ctx", "context")
+"""Usual names of the context."""
 REMEMBERS = frozenset(("get", "get_versioned", "put", "compare_and_set"))
 """Calls of the context that need the global memory."""
 MADE = (actions.success, actions.failure, actions.error)
@@ -42,6 +54,15 @@ METHODS = ("period", "state", "stop", "stopped", "hold", "release", "close")
 CYCLIC = ("command", "step")
 """Methods that a driver with a period needs in addition to `METHODS`."""
 CALLED_IN_CYCLE = ("step", "command", "state", "stop", "stopped", "hold", "release", "quick_stop")
+INTERFACE = {
+    name: method
+    for kind in (Driver, QuickStopping, HasPicture)
+    for name, method in vars(kind).items()
+    if inspect.isfunction(method) and not name.startswith("_")
+}
+"""Methods that a node calls, with their parameters."""
+ANSWERS = ("state", "stopped", "hold", "picture")
+"""Methods whose answer a node needs."""
 SLOW = 1.0
 """Seconds between two steps of a driver above which its unit is probably mistaken."""
 _KINDS = {bool: "bool", int: "int", float: "float", str: "str", list: "list", dict: "dict"}
@@ -69,8 +90,9 @@ class _Seen:
     """Whether it raises events whose names are not literals."""
     memory: tuple[str, int] | None = None
     """Where it uses the global memory first."""
-    commands: tuple[str, int] | None = None
-    """Where it first calls `ctx.command` on every way, not in a branch."""
+    device: tuple[str, int, str] | None = None
+    """Where it first uses `ctx.device` or `ctx.command` on every way, not in a branch, and which of
+    them."""
 
 
 @dataclass(frozen=True)
@@ -185,10 +207,15 @@ def _source(thing: Any) -> _Code | None:
         )
         tree = _definitions(file)[thing.__name__, first]
         names = {**vars(sys.modules[thing.__module__]), **dict(_imported(tree))}
-        near = os.path.relpath(file)
-        return _Code(tree, file if near.startswith("..") else near, names)
+        return _Code(tree, _near(file), names)
     except (OSError, TypeError, SyntaxError, KeyError, AttributeError):
         return None
+
+
+def _near(file: str) -> str:
+    """Return a file's path from here, if it is in this folder or below."""
+    near = os.path.relpath(file)
+    return file if near.startswith("..") else near
 
 
 def _imported(tree: ast.AST) -> Iterator[tuple[str, Any]]:
@@ -223,6 +250,10 @@ def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
             seen.words.add(node.value)
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Await):
             _ignored(code, node.value.value, seen)
+        if isinstance(node, ast.Attribute) and node.attr in ("device", "command"):
+            owner = node.value.id if isinstance(node.value, ast.Name) else ""
+            if owner in CONTEXT and seen.device is None and node not in code.branched:
+                seen.device = (code.file, node.lineno, f"{owner}.{node.attr}")
         if not isinstance(node, ast.Call):
             continue
         made = code.value(node.func)
@@ -232,6 +263,9 @@ def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
             seen.complete = False
         elif made is time.sleep and in_action:
             _sleeps(code, node, seen)
+        elif in_action and ast.unparse(node.func) == "asyncio.sleep":
+            text = "asyncio.sleep does not work in an action; write `await ctx.sleep(...)`"
+            seen.doubtful.append((code.file, node.lineno, text))
         elif inspect.iscoroutinefunction(made) and node not in {*code.awaited, *code.kept}:
             _unawaited(code, node, seen)
         elif _draws_unseeded(made, node):
@@ -294,15 +328,13 @@ def _method(code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen) -
     owner, name = ast.unparse(function.value), function.attr
     first = code.value(node.args[0]) if node.args else None
     ports = owner in ("ports", "self.ports", "self._ports")
-    if owner in ("ctx", "context") or ports:
+    if owner in CONTEXT or ports:
         if name == "call":
             seen.complete = False
         if name in AWAITED and not ports and node not in code.awaited:
             _unawaited(code, node, seen)
         if name in REMEMBERS and not ports and seen.memory is None:
             seen.memory = (code.file, node.lineno)
-        if name == "command" and not ports and seen.commands is None and node not in code.branched:
-            seen.commands = (code.file, node.lineno)
         if name == "raise_event" and not isinstance(first, str):
             seen.any_event = True
         if isinstance(first, str):
@@ -360,10 +392,12 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
             _look(code, seen, is_async)
     else:
         seen.complete = False
-    if not parameters:
-        source = thing.__code__
+    first = parameters[0] if parameters else None
+    if first is None or first.kind is first.KEYWORD_ONLY or hints.get(first.name) in _KINDS:
+        source = inspect.unwrap(thing).__code__
         text = f"{thing.__name__} takes no context; its first parameter is `ctx`"
-        seen.faults.append((source.co_filename, source.co_firstlineno, text))
+        text += f", found {first.name!r}" if first else ""
+        seen.faults.append((_near(source.co_filename), source.co_firstlineno, text))
     return {
         "parameters": {p.name: _KINDS.get(hints.get(p.name, object), "") for p in named},
         "required": [p.name for p in named if p.default is p.empty],
@@ -383,6 +417,8 @@ def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, An
         _look(code, seen, in_action=False)
         if issubclass(thing, Driver) and thing.period is not None:
             _steps(code, seen)
+    if issubclass(thing, Driver):
+        _methods(thing, seen)
     period, own = getattr(thing, "period", None), _code(thing)
     if isinstance(period, int | float) and period > SLOW and own is not None:
         text = f"{thing.__name__}.period is {period:g} s between two steps; 0.01 would be 10 ms"
@@ -391,6 +427,57 @@ def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, An
     dry = {"dry_run": True} if issubclass(thing, Driver) else {}
     moves = True if seen.streams else None  # set points may move a device without commands
     return {"keys": found, "dry_run": not faults_of_limits(thing, dry, moves), **_plain(seen)}
+
+
+def _methods(thing: type[Driver], seen: _Seen) -> None:
+    """Record methods of a driver that its node cannot call, that answer nothing, or that it never
+    calls because of their names."""
+    for base in thing.__mro__[: thing.__mro__.index(Driver)]:
+        for name, method in vars(base).items():
+            if inspect.isfunction(method) and (code := _code(method)) is not None:
+                text = _fault_of_method(name, method, code)
+                if text:
+                    line = code.tree.lineno  # type: ignore[attr-defined]
+                    seen.faults.append((code.file, line, f"`{name}` of {base.__name__} {text}"))
+                elif near := _meant(thing, name):
+                    text = f"`{name}` of {base.__name__} is never called; did you mean `{near}`?"
+                    seen.doubtful.append((code.file, code.tree.lineno, text))  # type: ignore[attr-defined]
+
+
+def _fault_of_method(name: str, method: Callable[..., Any], code: _Code) -> str:
+    """Return why a node cannot use a method of its driver's interface; empty if it can."""
+    if name not in INTERFACE:
+        return ""
+    takes = list(inspect.signature(INTERFACE[name]).parameters)
+    written = f"def {name}({', '.join(takes)})"
+    if not isinstance(code.tree, ast.FunctionDef):
+        return f"is `async`: its node does not await it, so it would do nothing; write `{written}`"
+    try:
+        inspect.signature(method).bind(*takes)
+    except TypeError:
+        own = ", ".join(inspect.signature(method).parameters)
+        return f"takes ({own}), but is called with ({', '.join(takes)}); write `{written}`"
+    answers = any(
+        isinstance(node, ast.Return | ast.Yield) and node.value is not None for node in code.nodes
+    )
+    if name in ANSWERS and not answers and not any(isinstance(n, ast.Raise) for n in code.nodes):
+        return "returns nothing; write `return` before its answer"
+    return ""
+
+
+def _meant(thing: type[Driver], name: str) -> str:
+    """Return which method of the interface a name of a cyclic driver's method probably means: one
+    that the driver lacks, while its own code never uses the name."""
+    if thing.period is None or name in INTERFACE or name.startswith("_"):
+        return ""
+    lacks = [n for n, usual in INTERFACE.items() if getattr(thing, n, usual) is usual]
+    close = difflib.get_close_matches(name, lacks, n=1, cutoff=0.8)
+    used = close and any(
+        isinstance(node, ast.Attribute) and node.attr == name
+        for code in _reachable(thing)
+        for node in code.nodes
+    )
+    return close[0] if close and not used else ""
 
 
 def _faults_of_driver(
@@ -461,7 +548,7 @@ def _plain(seen: _Seen) -> dict[str, Any]:
         "events": seen.events,
         "any_event": seen.any_event,
         "memory": seen.memory,
-        "commands": seen.commands,
+        "device": seen.device,
     }
 
 

@@ -417,8 +417,15 @@ def _faults_of_keys(driver: type, config: Mapping[str, Any]) -> list[tuple[str, 
         except ValueError as fault:
             faults.append((name, str(fault)))
     for name in config:
-        if name not in own and name not in COMMON_KEYS:
-            faults.append((name, f"unknown key {name!r}{nearest(name, [*own, *COMMON_KEYS])}"))
+        if name in own or name in COMMON_KEYS:
+            continue
+        text = f"unknown key {name!r}"
+        if hasattr(driver, name) and name not in RESERVED:
+            default = f"{getattr(driver, name)!r:.40}"
+            text = f"{driver.__name__} does not read it; write {name} = key({default}) in the class"
+        else:
+            text += nearest(name, [*own, *COMMON_KEYS])
+        faults.append((name, text))
     return faults
 
 

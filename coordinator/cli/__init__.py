@@ -124,6 +124,15 @@ PLAIN = (
 """Commands that neither run nor judge a task; they use only some of the exit codes."""
 
 
+MEANT = {
+    "start": "'run' or 'up'",
+    "stop": "'abort' or 'estop'",
+    "status": "'nodes' or 'watch'",
+    "version": "'--version'",
+}
+"""What is probably meant by words that are no commands."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
     try:
@@ -184,6 +193,10 @@ def _overview(arguments: Sequence[str]) -> int:
     from petrobot.coordinator.task.wording import nearest
 
     near = nearest(arguments[0], (command.name for command in COMMANDS))
+    if meant := MEANT.get(arguments[0]):
+        near = f" (did you mean {meant}?)"
+    elif arguments[0].endswith(".toml"):
+        near = f" (did you mean 'run {arguments[0]}'?)"
     print(f"petrobot: unknown command {arguments[0]!r}{near}\n\n{text}", file=sys.stderr)
     return 2
 

@@ -118,8 +118,10 @@ def task_path(name: str) -> Path:
         return shipped
     known = ", ".join(sorted(p.stem for p in SHIPPED.glob("*.toml")))
     text = f"give a .toml file, or a task that comes with petrobot: {known}"
-    if path.with_name(f"{path.name}.toml").is_file():
+    if Path(f"{name}.toml").is_file():
         text = f"did you mean {name}.toml?"
+    elif path.is_dir():
+        text = "this is a folder; name the .toml file of the task"
     raise CommandError(2, f"no task {name!r}: {text}")
 
 

@@ -154,15 +154,15 @@ def _remarks(session: RunSession, result: Mapping[str, Any]) -> Iterator[str]:
 
 
 def give(session: RunSession, options: argparse.Namespace, timeline: Timeline | None) -> None:
-    """Write the result beside the journal and where --json says, print it, and write the report."""
+    """Print the result, write it beside the journal and where --json says, and write the report."""
     result = session.result()
-    session.keep_result()
-    if options.json:
-        write_json(options.json, result)
     if options.json != "-":
         print_result(result)
         for line in _remarks(session, result):
             print(line, file=sys.stderr)
+    session.keep_result()
+    if options.json:
+        write_json(options.json, result)
     if timeline is not None:
         from petrobot.coordinator.drawing import draw
         from petrobot.coordinator.studies.report import report_html

@@ -333,6 +333,10 @@ def conduct(
 
     try:
         asyncio.run(lead())
+    except KeyboardInterrupt:
+        if made and made[0].folder is not None and made[0].mission.executor.finished is None:
+            print(f"`petrobot resume {made[0].folder}` continues this run", file=sys.stderr)
+        raise
     except MissionError as fault:
         raise CommandError(2 if fault.bad_input and not resumed else 1, str(fault)) from fault
     except (CellError, UnreachableError, LaunchError) as fault:
@@ -434,8 +438,8 @@ def _tell_of_waiting(options: argparse.Namespace) -> None:
     folder = journal_folder(options)
     for name in waiting(folder)[:1] if folder is not None else ():
         print(
-            f"the coordinator of {name} has died: this is a new run; `petrobot resume {name}` "
-            "continues that one",
+            f"{name} was interrupted: this is a new run; `petrobot resume {name}` continues that "
+            "one",
             file=sys.stderr,
         )
 

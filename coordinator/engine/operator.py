@@ -88,7 +88,7 @@ def pause_net(draft: Draft, reason: str) -> None:
 def go_on(draft: Draft, policy: Policy) -> None:
     """Resume."""
     if draft.mode not in (Mode.PAUSED, Mode.STEPPING):
-        refuse(draft, f"nothing to resume: the mission run is {draft.mode}", "")
+        refuse(draft, f"nothing to continue: the mission run is {draft.mode}", "")
         return
     step, draft.suspended = draft.suspended, None
     resume(draft, Mode.RUNNING)

@@ -78,9 +78,7 @@ def _refuse_dead(path: Path) -> None:
     file."""
     if path.exists():
         run = path.parent.name
-        raise NoRunError(
-            f"the coordinator of {run} has died: continue the run with `petrobot resume {run}`"
-        )
+        raise NoRunError(f"{run} was interrupted: `petrobot resume {run}` continues it")
 
 
 def _newest_first(folder: Path) -> list[Path]:

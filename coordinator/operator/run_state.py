@@ -308,7 +308,8 @@ class ChangePublisher:
 
     def _finished(self, time: float, finished: Finished) -> None:
         state = "aborted" if self._aborted else finished.status.value
-        self.feed.emit("paused", time=time, paused=None)
+        if self.feed.state["paused"] is not None:
+            self.feed.emit("paused", time=time, paused=None)
         if self.feed.state["mission"]["state"] == "stopped":
             return  # The emergency stop holds until it is cleared, whatever the run's result.
         self.feed.emit("mission", time=time, mission={"state": state, "reason": finished.reason})

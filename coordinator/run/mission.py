@@ -15,6 +15,7 @@ from petrobot.coordinator.engine.instructions import (
     Corrected,
     Fired,
     Instruction,
+    Marked,
     Report,
     RunRecorded,
     Severity,
@@ -137,6 +138,8 @@ class MissionTally:
     goal_transitions: frozenset[str] = frozenset()
     goals: int = 0
     """Firings of goal transitions."""
+    added: int = 0
+    """Tokens that the operator put into the runs place, less those taken out."""
     firings: int = 0
     ended: int = 0
     """Runs that ended and were not cancelled."""
@@ -156,6 +159,9 @@ class MissionTally:
             self.firings += 1
             self.goals += instruction.transition in self.goal_transitions
             self._cycle(now, instruction.before, instruction.after)
+        elif isinstance(instruction, Marked) and instruction.place and self.runs_place is not None:
+            before, after = instruction.before, instruction.after
+            self.added += after[self.runs_place] - before[self.runs_place]
         elif isinstance(instruction, RunRecorded):
             _forget_oldest(self.runs)
             self.runs.append(instruction)
@@ -360,7 +366,8 @@ class Mission:
         failed = finished is None or finished.status is Status.ERROR
         errors = self.tally.last_errors(self.executor.directory)
         has_goal, met = bool(self.tally.goal_transitions), self.tally.goals
-        recovered = not failed and (not has_goal or met >= self.runs)
+        wanted = self.runs + self.tally.added
+        recovered = not failed and (not has_goal or met >= wanted)
         general = {
             "task": self.executor.task.name,
             "mode": mode,
@@ -369,7 +376,7 @@ class Mission:
             "runs": self.runs,
             "status": finished.status.value if finished else Status.ERROR.value,
             "reason": finished.reason if finished else "not finished",
-            **({"goals": f"{met} of {self.runs}"} if has_goal else {}),
+            **({"goals": f"{met} of {wanted}"} if has_goal else {}),
             "happened": self.tally.happened(recovered),
             **({"last_errors": errors} if errors else {}),
             **self.remarks,

@@ -593,9 +593,10 @@ def _macro_exits(task: Task) -> Iterator[Fault]:
     for prefix, places, transitions in levels:
         for t in transitions.values():
             for arc in t.inputs:
-                place = places[arc.place]
+                place = places.get(arc.place)  # None: a parameter of the subnet stands for it
                 if (
-                    place.kind is Kind.MACRO
+                    place is not None
+                    and place.kind is Kind.MACRO
                     and arc.end is End.ERROR
                     and not task.subnets[place.subnet].error
                 ):

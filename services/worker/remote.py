@@ -259,6 +259,9 @@ class CyclicDriver:
         stopped = bool(self.driver.stopped())
         try:
             state = plain(self.driver.state(), "state")
+            if not isinstance(state, dict):
+                text = f"state: expected a dict, found a {type(state).__name__}"
+                raise NotPlainError(text)
         except NotPlainError as fault:
             code = getattr(self.driver.state, "__code__", None)
             if code is None:

@@ -492,7 +492,7 @@ class Runner:
                 cause = "hung" if isinstance(fault, Hung) else "exception"
                 if isinstance(fault, MemoryError):
                     cause = "out_of_memory"
-                words = describe(fault)
+                words = f"{describe(fault)}{self._hint(fault)}"
                 if isinstance(fault, CommandRefused):
                     cause, words = "command_refused", str(fault)
                 self._give_up(now, run, cause, self._with_refusal(run, words))
@@ -502,6 +502,13 @@ class Runner:
                 run.note(f"while it cleaned up: {describe(fault)}")
         if run.phase is STOPPING and run.over:
             run.phase = SETTLING
+
+    def _hint(self, fault: BaseException) -> str:
+        """Return what to do about an attribute that `ctx.device` does not have."""
+        owner = fault.obj if isinstance(fault, AttributeError) else None
+        if owner is not None and owner is self._refusing:
+            return "; its driver runs in another process: write `await ctx.command({...})`"
+        return ""
 
     def _returned(self, now: float, run: Execution, returned: Any) -> None:
         if run.phase is STOPPING:

@@ -3,6 +3,7 @@ what was expected, what was found, what to do."""
 
 from __future__ import annotations
 
+import argparse
 import io
 import re
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.cli import main
+from petrobot.coordinator.operator.session import RunSession
 
 CHECK = ["check", "arm_bot.toml"]
 TASK, CELL, CODE = "arm_bot.toml", "services.toml", "arm_bot.py"
@@ -168,6 +170,19 @@ IN_THE_TASK: list[Mistake] = [
         r":LINE: .*'n' is not a variable",
     ),
     (TASK, "lost = { in", "lost = in", r"arm_bot.toml:LINE: TOML: "),
+    (TASK, "broken = {}", "broken = { # don't\n}", r":LINE: TOML: the brace in column 10 is not"),
+    (
+        TASK,
+        'tries = 3, holds = "axis"',
+        "listen = True",
+        r":LINE: TOML: True is Python; write true or false",
+    ),
+    (
+        TASK,
+        'out = ["grip"]',
+        'out = ["grip"], when = "fetch.status == success"',
+        r":LINE: .*when: .*'success' is unknown at column 17; a text is written in quotes: 'succ",
+    ),
     (
         TASK,
         '{ in = ["carry:normal"] }',
@@ -188,7 +203,7 @@ IN_THE_CELL: list[Mistake] = [
         CELL,
         'move", device = "axis"',
         'move", node = "pc"',
-        r":LINE: actions.move: calls ctx.command \(arm_bot.py:\d+\) and has no device; write",
+        r":LINE: actions.move: uses ctx.command \(arm_bot.py:\d+\) and has no device; write",
     ),
     (CELL, "arm_bot:Axis", "armbot:Axis", r":LINE: .*no module 'armbot' on this host; install"),
     (
@@ -196,6 +211,12 @@ IN_THE_CELL: list[Mistake] = [
         'arm_bot:Axis"',
         "arm_bot:Axis",
         r":LINE: not valid TOML: the quote in column 32 is not",
+    ),
+    (
+        CELL,
+        "move = { run",
+        "move = {\n run",
+        r":LINE: not valid TOML: the brace in column 8 is not closed in its line; write all of it",
     ),
     (CELL, "arm_bot:Axis", "arm_bot.Axis", r":LINE: .*write an import path \"module:Class\""),
     (CELL, "arm_bot:Axis", "arm_bot:move", r":LINE: .*is not a class; a driver is a class derived"),
@@ -236,9 +257,49 @@ IN_THE_CELL: list[Mistake] = [
         'run = "arm_bot:grip", args = { slip = 1 }',
         r":11: .*no argument 'slip'; did you mean",
     ),
+    (
+        CELL,
+        "arm_bot:Axis",
+        "arm_bot.py:Axis",
+        r":LINE: .*a module is named without .py: .*'arm_bot:",
+    ),
+    (CELL, "arm_bot:grip", "random:grip", r":LINE: .*'random' is Python's own module"),
 ]
 
 IN_THE_CODE: list[Mistake] = [
+    (
+        CODE,
+        "    def step(",
+        "    async def step(",
+        r"arm_bot.py:\d+: `step` of Axis is `async`: .*; write `def step\(self, now\)`",
+    ),
+    (
+        CODE,
+        "def step(self, now: float)",
+        "def step(self)",
+        r"`step` of Axis takes \(self\), but is called with \(self, now\); write",
+    ),
+    (CODE, "return {", "{", r"arm_bot.py:\d+: `state` of Axis returns nothing; write `return`"),
+    (CODE, "return self.at ==", "self.at ==", r"`stopped` of Axis returns nothing; write"),
+    (CODE, "def step(", "def steps(", r"`steps` of Axis is never called; did you mean `step`"),
+    (
+        CODE,
+        'top_speed: float = key(0.5, "m/s")',
+        "top_speed: float = 0.5",
+        r":7: .*Axis does not read it; write top_speed = key\(0.5\) in the class",
+    ),
+    (
+        CODE,
+        "grip(ctx: Context[Remote], *, slips: float",
+        "grip(slips: float",
+        r"arm_bot.py:\d+: grip takes no context; its first parameter is `ctx`, found 'slips'",
+    ),
+    (
+        CODE,
+        "await ctx.sleep(0.3)",
+        "import asyncio; await asyncio.sleep(0.3)",
+        r"arm_bot.py:\d+: asyncio.sleep does not work in an action; write `await ctx.sleep",
+    ),
     (
         CODE,
         "period = 0.01",
@@ -447,6 +508,26 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
         r"arm_bot.py:\d+\): it did nothing.*only 0 of 3 goals were met; the exit code is 0 because",
     ),
     (
+        [(CODE, "await ctx.sleep(0.3)", "ctx.sleep(0.3)", "")],
+        0,
+        r"'wait' or 'sleep' of the context was never awaited in grip \(arm_bot.py:\d+\): it did",
+    ),
+    (
+        [(CODE, 'lambda: ctx.device.state["arrived"]', 'ctx.device.state["arrived"]', "")],
+        1,
+        r"ctx.wait: expected a function, as in `ctx.wait\(lambda: ...\)`, found \w+ in move \(arm",
+    ),
+    (
+        [(CODE, 'ctx.command({"to": to})', "ctx.device.go(to)", "")],
+        1,
+        r"'go' in move \(arm_bot.py:\d+\); its driver runs in another process: .*ctx.command",
+    ),
+    (
+        [(CODE, "return {", "{", "")],
+        3,
+        r"state: expected a dict, found a NoneType, returned by `state` \(arm_bot.py:\d+\)",
+    ),
+    (
         [(CODE, "if not self.paused:", "1 / 0\n        if not self.paused:", "")],
         3,
         r"node pc: device axis: its driver failed: ZeroDivisionError.* in step \(arm_bot.py:\d+\)",
@@ -467,6 +548,7 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
 ON_THE_LINE: list[tuple[list[str], str]] = [
     (["run", "arm_bt.toml"], r"arm_bt.toml: file: cannot be read: No such file"),
     (["check", "services.toml"], r"file: this is a location file, not a task; name the task"),
+    (["check", "."], r"no task '.': this is a folder; name the .toml file of the task"),
     (["run", "armbot"], r"no task 'armbot': give a .toml file, or a task that comes with petrobot"),
     (
         [*RUN, "--runs", "1000000000"],
@@ -479,6 +561,8 @@ ON_THE_LINE: list[tuple[list[str], str]] = [
     ([*RUN, "--set", "speed=1"], r"speed"),
     ([*RUN, "--use", "grip=grab"], r"grab.*grip"),
     ([*RUN, "--services", "cell.toml"], r"cell.toml: No such file"),
+    (["start", "arm_bot.toml"], r"unknown command 'start' \(did you mean 'run' or 'up'\?\)"),
+    (["arm_bot.toml"], r"unknown command .* \(did you mean 'run arm_bot.toml'\?\)"),
     (["rum", "arm_bot.toml"], r"unknown command 'rum' \(did you mean 'run'\?\)"),
     (["run", "arm_bot"], r"no task 'arm_bot': did you mean arm_bot.toml\?"),
     (["show", TASK, "--out", "x.pdf"], r"--out x.pdf: expected a file .svg, found .pdf"),
@@ -543,6 +627,8 @@ WARNINGS = (
     "period is 50",
     "does not use the seed",
     "--dry-run is refused",
+    "`steps` of",
+    "asyncio.sleep",
 )
 
 
@@ -577,7 +663,7 @@ def test_mistakes_between_files_are_reported(
 
 @pytest.mark.processes
 @pytest.mark.parametrize(
-    ("mistakes", "code", "pattern"), IN_THE_RUN, ids=["forgotten await", "step", "state", "period"]
+    ("mistakes", "code", "pattern"), IN_THE_RUN, ids=lambda found: str(found)[:60]
 )
 def test_mistakes_that_a_run_shows_are_told_at_its_end(
     sound: dict[str, str],
@@ -724,7 +810,7 @@ REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
     ),
     (
         [(CELL, 'move", device = "axis"', 'move", node = "pc"', "")],
-        r"actions.move: calls ctx.command .*write device = ",
+        r"actions.move: uses ctx.command .*write device = ",
         [(CELL, 'move", node = "pc"', 'move", device = "axis"', "")],
     ),
 ]
@@ -749,6 +835,24 @@ def test_a_finding_disappears_with_its_remedy(
         lines = re.sub(r"\n +", " ", words)
         assert len(re.findall(told, lines)) == times, words
         assert not times or len(re.findall(told.partition("[^|]")[0], lines)) == 1, words
+
+
+def test_an_interrupted_run_says_how_it_is_continued(
+    sound: dict[str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    async def ctrl_c(session: RunSession, options: argparse.Namespace) -> None:
+        raise KeyboardInterrupt
+
+    damaged(sound, [], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("petrobot.coordinator.cli.run._lead_lockstep", ctrl_c)
+    assert main([*RUN, "--journal", "runs"]) == 130
+    assert re.search(
+        r"`petrobot resume runs/arm_bot-\S+` continues this run", capsys.readouterr().err
+    )
 
 
 CAMPAIGN = ["campaign", TASK, "--services", CELL, "--runs", "2", "--out", "out"]

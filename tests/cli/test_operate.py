@@ -44,6 +44,8 @@ async def test_pause_reaches_the_devices_and_continue_releases_them(petrobot: Te
     said = await petrobot("continue")
     assert said.code == 0 and "continues" in said.out
     await petrobot.until(lambda: not petrobot.arm.held)
+    said = await petrobot("continue")
+    assert said.code == 1 and "nothing to continue: the mission run is running" in said.err
 
 
 @pytest.mark.processes
@@ -64,7 +66,7 @@ async def test_a_second_run_is_refused_while_the_first_has_its_device(petrobot: 
         said.code == 2
         and f"in use: arm accepts orders from {RUN} at the moment; wait until" in said.err
     ), said
-    assert "of old-1 has died: this is a new run; `petrobot resume old-1` continues" in said.err
+    assert "old-1 was interrupted: this is a new run; `petrobot resume old-1` continues" in said.err
     assert {path.name for path in petrobot.runs.iterdir()} == {RUN, "old-1"}
     assert petrobot.arm.moving
 
@@ -185,7 +187,7 @@ async def test_a_remark_is_kept_and_changes_nothing(petrobot: Terminal) -> None:
     await petrobot.working()
     assert (await petrobot("pause")).code == 0
     before = petrobot.mission.executor.state
-    assert (await petrobot("remark", " the table was moved ", "--as", "ben")).code == 0
+    assert (await petrobot("remark", " the", "table was moved ", "--as", "ben")).code == 0
     assert petrobot.mission.executor.state is before
     [remark] = remarks(read_journal(petrobot.runs / RUN / JOURNAL))
     assert remark.author.startswith("ben ") and remark.text == "the table was moved"
@@ -205,11 +207,15 @@ async def test_a_remark_is_one_plain_line(petrobot: Terminal, text: str) -> None
 
 async def test_abort_ends_the_run_in_error(petrobot: Terminal) -> None:
     """The reason names the operator."""
+    watching = asyncio.create_task(petrobot("watch"))
+    await petrobot.until(lambda: petrobot.operation.feed.watched)
     await petrobot.working("--as", "ana")
     assert (await petrobot("abort", "--as", "ana")).code == 0
     await petrobot.until(lambda: petrobot.mission.executor.finished is not None)
     finished = petrobot.mission.executor.finished
     assert finished is not None and "ana" in finished.reason
+    lines = (await watching).out.splitlines()
+    assert lines[-1].endswith(f"mission  {finished.reason}") and "continued" not in lines[-2]
     assert not petrobot.arm.moving
 
 
@@ -321,7 +327,7 @@ async def test_watch_follows_the_run_until_its_end(petrobot: Terminal) -> None:
         (("token", "jobs", "0"), "such as +1 or -1, got 0"),
         (("token", "job", "+1"), "did you mean 'jobs'"),
         (("override", "work"), "or give --free"),
-        (("override", "work", "fly"), "no alternative is named 'fly'"),
+        (("override", "work", "fly"), "no alternative is named 'fly'; known: "),
         (("pause", "--run", "nowhere"), "no run 'nowhere'"),
     ],
 )
@@ -365,7 +371,7 @@ def test_of_a_run_whose_coordinator_died_it_says_how_to_continue(
     (folder / ADDRESS_FILE).write_text(json.dumps(address))
     (folder / JOURNAL).write_text("")
     assert main(["pause", *named, "--journal", str(tmp_path)]) == 2
-    told = "the coordinator of tidy-1 has died: continue the run with `petrobot resume tidy-1`"
+    told = "tidy-1 was interrupted: `petrobot resume tidy-1` continues it"
     assert told in capsys.readouterr().err
 
 

@@ -49,7 +49,7 @@ def directory_in(folder: Path, host: str, port: int) -> Directory:
     [
         (
             OSError(errno.EADDRINUSE, "in use"),
-            "nodes.left.port: 7301 is in use on 10.0.0.7; end the process",
+            "nodes.left.port: 7301 is in use on 10.0.0.7: does this node run already",
         ),
         (OSError(errno.EACCES, "denied"), "nodes.left.port: 7301 may not be used by this user"),
         (

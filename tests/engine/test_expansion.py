@@ -162,6 +162,12 @@ def test_short_forms_expand_to_plain_net_elements() -> None:
     assert {f.code for f in check(task).errors} == {"uncovered-exit"}  # bin may be 'right'
 
 
+def test_a_subnet_takes_tokens_from_a_place_that_is_its_parameter() -> None:
+    old, new = 'out = ["over", "to"]', 'out = ["over"]'
+    text = SHORT.replace(old, new).replace('in = ["move:normal"]', 'in = ["move:normal", "to"]')
+    assert arcs(loads(text))["put.moved"] == "put.move:normal done -> put.over"
+
+
 def test_a_macro_place_holds_its_resource_once() -> None:
     """Two branches inside do not need the resource twice."""
     forked = (

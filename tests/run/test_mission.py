@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.engine import Corrected, Engine, Fired, Report, RunRecorded
-from petrobot.coordinator.engine.instructions import Severity
+from petrobot.coordinator.engine.instructions import Marked, Severity
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.run.executor import Executor
 from petrobot.coordinator.run.interfaces import FirstAlternative
@@ -167,6 +167,12 @@ def test_an_error_that_cost_a_goal_is_not_called_recovered(
     told = mission.result("lockstep", 0.0)
     assert (told["status"], told["goals"]) == ("success", f"{met} of 4")
     assert ("all recovered" in told["happened"]) == (met == 4)
+    place = mission.tally.runs_place
+    assert place is not None
+    after = tuple(n == place for n in range(place + 1))
+    mission.tally.instruction(0.0, Marked("balls_left", (0,) * (place + 1), after))
+    told = mission.result("lockstep", 0.0)  # the operator asked for one more
+    assert told["goals"] == f"{met} of 5" and "all recovered" not in told["happened"]
 
 
 def test_an_arm_that_cannot_be_recovered_ends_the_task_in_error(catch_ball: Task) -> None:

@@ -161,9 +161,11 @@ async def take_controls(client: OperatorClient, wait: float | None) -> None:
 
 
 def named(known: Mapping[str, Any], name: str, what: str) -> str:
-    """Return a name that is known. Raises CommandError (2), which suggests the nearest names."""
-    from petrobot.coordinator.task.wording import nearest
+    """Return a name that is known. Raises CommandError (2), which suggests the nearest name, or
+    lists the first ones."""
+    from petrobot.coordinator.task.wording import few, nearest
 
     if name not in known:
-        raise CommandError(2, f"no {what} is named {name!r}{nearest(name, list(known))}")
+        near = nearest(name, list(known)) or f"; known: {few(list(known)) or 'none'}"
+        raise CommandError(2, f"no {what} is named {name!r}{near}")
     return name

@@ -11,10 +11,10 @@ EXAMPLE = 'petrobot remark "a visitor touched the table"'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    parser.add_argument("text", help="one line of at most 1,000 characters")
+    parser.add_argument("text", nargs="+", help="one line of at most 1,000 characters")
     command.add_arguments(parser, controls=False)
 
 
 def run(options: argparse.Namespace) -> int:
     """Remark."""
-    return command.give(options, "remark", lambda client: {"text": options.text})
+    return command.give(options, "remark", lambda client: {"text": " ".join(options.text)})

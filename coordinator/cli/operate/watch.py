@@ -113,6 +113,13 @@ def _paused(change: Mapping[str, Any]) -> str:
     return f"paused   {paused['reason']}" + (f" ({nodes})" if nodes else "")
 
 
+def _mission(change: Mapping[str, Any]) -> str:
+    state, reason = change["mission"].get("state", ""), change["mission"].get("reason", "")
+    if not state or reason.startswith(f"{state}:"):
+        return f"mission  {reason}" if state else ""
+    return f"mission  {state}" + (f": {reason}" if reason else "")
+
+
 _WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "fired": lambda c: f"fired    {c['firing']['transition']}  ({c['firing']['cause']})",
     "run_started": lambda c: (
@@ -120,12 +127,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     ),
     "run_ended": _ended,
     "paused": _paused,
-    "mission": lambda c: (
-        f"mission  {c['mission']['state']}"
-        + (f": {c['mission']['reason']}" if c["mission"].get("reason") else "")
-        if "state" in c["mission"]
-        else ""
-    ),
+    "mission": _mission,
     "notice": lambda c: f"{c['notice']['level']:8} {c['notice']['text']}",
     "controls": lambda c: f"controls {c['controls']['holder'] or 'free'}",
     "breakpoints": lambda c: f"breaks   {', '.join(c['breakpoints']) or 'none'}",

@@ -66,11 +66,8 @@ def code_findings(
         yield from _events(task, action, code[action])
     yield from _undeclared(task, drivers, raised)
     actions = [code[action] for action in used]
-    for kind, severity, read in (
-        ("faults", Severity.ERROR, actions),
-        ("doubtful", Severity.WARNING, [*actions, *drivers]),
-    ):
-        found = {tuple(fault) for facts in read for fault in facts.get(kind, ())}
+    for kind, severity in (("faults", Severity.ERROR), ("doubtful", Severity.WARNING)):
+        found = {tuple(one) for facts in (*actions, *drivers) for one in facts.get(kind, ())}
         for file, line, text in sorted(found):
             yield Finding(severity, "code", f"{file}:{line}", text)
 

@@ -199,9 +199,10 @@ def _kind(node: Node, domains: Mapping[str, Domain], faults: list[str]) -> str:
         return _literal_kind(node.value)
     if isinstance(node, Name):
         if node.name not in domains:
-            faults.append(
-                f"{node.name!r} is unknown at column {node.at + 1}{nearest(node.name, domains)}"
-            )
+            text = nearest(node.name, domains)
+            if any(node.name in domain.values for domain in domains.values()):
+                text = f"; a text is written in quotes: '{node.name}'"
+            faults.append(f"{node.name!r} is unknown at column {node.at + 1}{text}")
             return "?"
         kind = domains[node.name].kind
         return "number" if kind in ("int", "float") else kind

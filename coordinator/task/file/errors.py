@@ -55,16 +55,25 @@ def syntax_fault(text: str, error: tomllib.TOMLDecodeError) -> tuple[Fault, int]
         return Fault(
             name, f"already written in line {first}", "drop one of the two, or rename it"
         ), line
-    if r"character '\n'" in str(error):
-        return Fault("TOML", _unclosed(text.splitlines()[line - 1]), "close it"), line
+    why, remedy = _syntax((*text.splitlines(), "")[line - 1])
+    if why:
+        return Fault("TOML", why, remedy), line
     return Fault("TOML", str(error), "see toml.io for the syntax"), line
 
 
-def _unclosed(line: str) -> str:
-    """Say which quote of a line of TOML is not closed."""
-    closed = re.compile(r"""\"[^\"]*\"|'[^']*'""")
-    opened = re.search("[\"']", closed.sub(lambda whole: " " * len(whole[0]), line))
-    return f"the quote in column {opened.start() + 1} is not closed" if opened else "a line ends"
+def _syntax(line: str) -> tuple[str, str]:
+    """Return what is wrong with a line that is not TOML, and the remedy: a quote or brace that is
+    not closed, or a word of Python; empty if it is something else."""
+    closed = re.compile(r"""\"(?:\\.|[^\"\\])*\"|'[^']*'|#.*""")
+    rest = closed.sub(lambda whole: " " * len(whole[0]), line)
+    if opened := re.search("[\"']", rest):
+        return f"the quote in column {opened.start() + 1} is not closed", "close it"
+    if rest.count("{") > rest.count("}"):
+        text = f"the brace in column {rest.index('{') + 1} is not closed in its line"
+        return text, "write all of it in one line, or as a table of its own"
+    if word := re.search(r"=\s*(True|False|None)\b", rest):
+        return f"{word[1]} is Python", "write true or false, or leave the key out"
+    return "", ""
 
 
 def _keys(text: str) -> Iterator[tuple[int, str]]:

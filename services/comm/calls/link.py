@@ -422,7 +422,7 @@ class AsyncLink(asyncio.BufferedProtocol):
         """The other side broke the protocol (for subclasses that count this)."""
 
     def _handshake_over(self) -> None:
-        self.cut(f"no handshake within {self.timing.handshake:g} s")
+        self.cut(f"no handshake within {self.timing.handshake:g} s: is it a node of petrobot?")
 
     def _beat(self) -> None:
         now = self.now()

@@ -444,7 +444,6 @@ def resolve(path: str) -> Any:
     found = getattr(module, attribute, None)
     if not callable(found):
         names = [n for n in vars(module) if not n.startswith("_")]
-        raise ImportError(
-            f"{written!r} has no callable {attribute!r}{directory_file.nearest(attribute, names)}"
-        )
+        near = directory_file.nearest_in(written, attribute, names)
+        raise ImportError(f"{written!r} has no callable {attribute!r}{near}")
     return found

@@ -125,10 +125,10 @@ def code_faults(directory: Directory, code: Mapping[str, Facts], text: str) -> t
             key = f"{'actions' if entry.name in directory.actions else 'services'}.{entry.name}"
             unread(f"{key}.run", entry.run)
     for action in directory.actions.values():
-        place = code.get(action.run, {}).get("commands")
+        place = code.get(action.run, {}).get("device")
         if place and not action.device:
             where = f"{Path(place[0]).name}:{place[1]}"
-            text = f'calls ctx.command ({where}) and has no device; write device = "..." for node'
+            text = f'uses {place[2]} ({where}) and has no device; write device = "..." for node'
             faults.add(f"actions.{action.name}", text)
     for device in directory.devices.values():
         unread(f"devices.{device.name}.driver", device.driver)

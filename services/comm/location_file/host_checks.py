@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from petrobot.services.comm.location_file import Directory, DirectoryError, module_name
-from petrobot.services.comm.location_file.reading import Faults, nearest
+from petrobot.services.comm.location_file.reading import Faults, nearest, nearest_in
 from petrobot.services.comm.protocol.security import is_loopback
 
 
@@ -164,6 +164,8 @@ def _unknown(path: str) -> str:
     """Return what is wrong with an import path, with the remedy; empty if nothing is, as far as its
     source shows."""
     module, _, attribute = path.partition(":")
+    if module.endswith(".py"):
+        return f"a module is named without .py: write {module[:-3] + ':' + attribute!r}"
     try:
         spec = importlib.util.find_spec(module_name(module))
     except Exception as fault:  # a parent package that cannot be imported, whatever it raises
@@ -179,7 +181,7 @@ def _unknown(path: str) -> str:
     names = _names(spec)
     if names is None or attribute in names:
         return ""
-    return f"{module!r} has no {attribute!r}{nearest(attribute, names)}"
+    return f"{module!r} has no {attribute!r}{nearest_in(module, attribute, names)}"
 
 
 def _bound(statement: ast.Assign | ast.AnnAssign) -> set[str]:
@@ -217,7 +219,8 @@ def _names(spec: ModuleSpec) -> set[str] | None:
 WORDS = {
     errno.EADDRINUSE: (
         "port",
-        "{port} is in use on {host}; end the process that listens there, or write another port",
+        "{port} is in use on {host}: does this node run already (`petrobot nodes`)? Else end the "
+        "process that listens there, or write another port",
     ),
     errno.EACCES: ("port", "{port} may not be used by this user; write one above 1023"),
     errno.EADDRNOTAVAIL: (

@@ -6,6 +6,7 @@ import hashlib
 import ipaddress
 import json
 import re
+import sys
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -33,6 +34,15 @@ def nearest(name: str, known: Iterable[str]) -> str:
     if close:
         return f"; did you mean {close[0]!r}?"
     return f"; known: {', '.join(names)}" if 0 < len(names) <= 12 else ""
+
+
+def nearest_in(module: str, name: str, names: Iterable[str]) -> str:
+    """Return the same hint for a name that a module does not have; Python's own module hides one of
+    the user that has its name."""
+    near = nearest(name, names)
+    if module in sys.stdlib_module_names and not near.startswith("; did"):
+        return f"; {module!r} is Python's own module: give yours another name"
+    return near
 
 
 def _number(value: Any) -> bool:
@@ -271,16 +281,25 @@ def _syntax_fault(text: str, source: str, why: str) -> str:
             f"{source}{line}: {name}: already written in line {first}; a name belongs to one "
             "table: remove one of the two or rename it"
         )
-    if place and r"character '\n'" in why:
-        why = _unclosed(text.splitlines()[int(place[1]) - 1])
-    return f"{source}{line}: not valid TOML: {why}; correct this line"
+    found, remedy = _syntax((*text.splitlines(), "")[int(place[1]) - 1]) if place else ("", "")
+    why, remedy = (found, remedy) if found else (why, "correct this line")
+    return f"{source}{line}: not valid TOML: {why}; {remedy}"
 
 
-def _unclosed(line: str) -> str:
-    """Say which quote of a line of TOML is not closed (`coordinator.task.file.errors` does too)."""
-    closed = re.compile(r"""\"[^\"]*\"|'[^']*'""")
-    opened = re.search("[\"']", closed.sub(lambda whole: " " * len(whole[0]), line))
-    return f"the quote in column {opened.start() + 1} is not closed" if opened else "a line ends"
+def _syntax(line: str) -> tuple[str, str]:
+    """Return what is wrong with a line that is not TOML, and the remedy: a quote or brace that is
+    not closed, or a word of Python; empty if it is something else
+    (`coordinator.task.file.errors` has the same)."""
+    closed = re.compile(r"""\"(?:\\.|[^\"\\])*\"|'[^']*'|#.*""")
+    rest = closed.sub(lambda whole: " " * len(whole[0]), line)
+    if opened := re.search("[\"']", rest):
+        return f"the quote in column {opened.start() + 1} is not closed", "close it"
+    if rest.count("{") > rest.count("}"):
+        text = f"the brace in column {rest.index('{') + 1} is not closed in its line"
+        return text, "write all of it in one line, or as a table of its own"
+    if word := re.search(r"=\s*(True|False|None)\b", rest):
+        return f"{word[1]} is Python", "write true or false, or leave the key out"
+    return "", ""
 
 
 def _check_top(data: Mapping[str, Any], faults: Faults) -> None:
