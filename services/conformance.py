@@ -22,7 +22,7 @@ from typing import Any
 
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.plain import plain
-from petrobot.services.device import LIMITS, Driver, keys_of
+from petrobot.services.device import LIMITS, Driver, QuickStopping, keys_of
 from petrobot.services.rehearsal import TestPorts
 from petrobot.services.worker.setpoints import SetpointReceiver
 
@@ -173,7 +173,7 @@ class _Check:
         self.steps = self.late = 0
         self.longest = 0.0
         self.driver = make()
-        self.period = self.driver.period or 0.01
+        self.period = max(0.0, self.driver.period or 0.0) or 0.01
         self.idle: dict[str, float] = {}
         """By how much each number of the state usually changes in a step at rest."""
         self.fresh = True
@@ -306,6 +306,11 @@ class _Check:
         if answer == "held" and not self.run(seconds, positions=positions):
             self.fault("release: the movement that was held does not continue")
         self.stop("stop", positions)
+        if isinstance(self.driver, QuickStopping):
+            self.move(there, seconds)
+            self.move(back, PART * took)
+            self.stop("quick_stop during a movement", positions, self.driver.quick_stop)
+            self.again("made again after a quick stop")  # it may need its drives switched on
 
     def limits(self, commands: Sequence[Command], seconds: float) -> None:
         """Check that it obeys those of `speed`, `workspace` and `dry_run` that are in its
@@ -412,13 +417,19 @@ class _Check:
             return False
         return True
 
-    def stop(self, what: str, positions: Mapping[str, float] | None = None) -> None:
-        """Stop it, twice."""
-        self.driver.stop(self.now())
+    def stop(
+        self,
+        what: str,
+        positions: Mapping[str, float] | None = None,
+        routine: Callable[[float], None] | None = None,
+    ) -> None:
+        """Stop it twice, by its stop routine or another one."""
+        stop = routine or self.driver.stop
+        stop(self.now())
         try:
-            self.driver.stop(self.now())
+            stop(self.now())
         except Exception as fault:
-            self.fault(f"stop, a second time: {type(fault).__name__}: {fault}")
+            self.fault(f"{stop.__name__}, a second time: {type(fault).__name__}: {fault}")
         self.stands(what, positions)
 
     def stands(self, what: str, positions: Mapping[str, float] | None = None) -> None:

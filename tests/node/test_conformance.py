@@ -254,9 +254,28 @@ class Deaf(Axis):
             raise ValueError("to")
 
 
+class IgnoresQuickStop(Axis):
+    def quick_stop(self, now: float) -> None:
+        """Leave the motion to itself."""
+
+
+class QuickStopsOnce(Axis):
+    def quick_stop(self, now: float) -> None:
+        if self.stopped():
+            raise RuntimeError("already stopped")
+        self.stop(now)
+
+
+class Backwards(Axis):
+    period = -0.01
+
+
 @pytest.mark.parametrize(
     ("kind", "fault"),
     [
+        (IgnoresQuickStop, "quick_stop during a movement: stopped() is still False after 1 s"),
+        (QuickStopsOnce, "quick_stop, a second time: RuntimeError: already stopped"),
+        (Backwards, "period: expected seconds above 0 or None, got -0.01"),
         (NeverStops, "stop during a movement: stopped() is still False after 1 s"),
         (SaysItStands, "stopped: True during {'to': 0.2}, while axis[0].at changed"),
         (RunsOnAfterStop, "stop during a movement: stopped() is True, and axis[0].at still"),

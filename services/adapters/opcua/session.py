@@ -61,6 +61,8 @@ class OpcUaSession(Driver):
         self.faults = {"session": "no session yet"}
         self._asked = self._done = 0
         self._write_fault = ""
+        self._stop_due = False
+        """Whether it was stopped while there was no session."""
         self._session = SessionThread(self._serve)
 
     def _check_keys(self) -> None:
@@ -111,6 +113,8 @@ class OpcUaSession(Driver):
             if kind == "up":  # values and faults of nodes may have come before it
                 self.faults = {**self.faults, **item}
                 self.faults.pop("session", None)
+                if self._stop_due:
+                    self.stop(now)
             elif kind == "down":
                 self.faults, self.values = {"session": f"{item}; trying again"}, {}
                 if self._done < self._asked:
@@ -143,8 +147,9 @@ class OpcUaSession(Driver):
         }
 
     def stop(self, now: float) -> None:
-        """Write `on_stop`."""
-        if self.on_stop and "session" not in self.faults:
+        """Write `on_stop`; without a session, as soon as there is one."""
+        self._stop_due = "session" in self.faults
+        if self.on_stop and not self._stop_due:
             self._write(dict(self.on_stop))
 
     def stopped(self) -> bool:

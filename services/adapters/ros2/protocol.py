@@ -78,8 +78,9 @@ def _finite(text: str) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def unfit(values: Any) -> str:
-    """Return what is wrong with the values of a message, "" if they are finite and can be sent on.
+def unfit(values: Any, most: int = LARGEST_VALUE) -> str:
+    """Return what is wrong with the values of a message, "" if they are finite, not longer than
+    `most` characters and can be sent on.
 
     ROS messages have no null: rosbridge writes it for NaN and infinity.
     """
@@ -98,7 +99,7 @@ def unfit(values: Any) -> str:
             return f"{words(path)}: is nested more than {DEPTH} deep"
         if words(path) != path or (isinstance(value, str) and words(value) != value):
             return f"{words(path)}: is not Unicode text"
-    return "" if len(str(values)) <= LARGEST_VALUE else f"is longer than {LARGEST_VALUE} characters"
+    return "" if len(str(values)) <= most else f"is longer than {most} characters"
 
 
 def words(said: Any) -> str:

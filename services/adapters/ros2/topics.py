@@ -10,7 +10,14 @@ from typing import Any
 
 from petrobot import Driver, Ports, key
 from petrobot.services.adapters.ros2 import definitions
-from petrobot.services.adapters.ros2.protocol import Message, filled, pick, unfit, words
+from petrobot.services.adapters.ros2.protocol import (
+    LARGEST_VALUE,
+    Message,
+    filled,
+    pick,
+    unfit,
+    words,
+)
 
 SPEEDS = {
     "geometry_msgs/msg/Twist": [
@@ -25,6 +32,8 @@ POINTS = {
     "nav_msgs/msg/Odometry": "pose.pose.position",
 }
 """By type: path of the point that `workspace` bounds."""
+TOPICS = 100_000
+"""Characters of all kept topic messages together: they are published each cycle."""
 
 
 class TopicDriver(Driver):
@@ -143,8 +152,8 @@ class TopicDriver(Driver):
 
     def arrive(self, now: float, topic: Any, message: Any) -> None:
         """Process a message of a topic."""
-        fault = unfit(message)
-        if fault:
+        most = min(LARGEST_VALUE, TOPICS // max(1, len(self.subscribe)))
+        if fault := unfit(message, most):
             self.refuse(f"{topic}: {fault}")
             return
         for name, sub in self.subscribe.items():

@@ -187,6 +187,15 @@ def test_a_handshake_and_its_errors(cell: Cell) -> None:
 
 
 @pytest.mark.processes
+def test_a_stop_without_a_session_is_made_up_for(cell: Cell) -> None:
+    driver = cell.driver(on_stop={"count": 7})
+    driver.stop(0.0)
+    cell.power(True)
+    state = await_(driver, lambda state: state["values"].get("count") == 7, "count = 7")
+    assert driver.stopped() and state["done"] == 1
+
+
+@pytest.mark.processes
 def test_it_keeps_the_rules_of_drivers(cell: Cell) -> None:
     cell.power(True)
     found = check_driver(cell.driver, cable=cell.power, within=30.0, seconds=30.0)

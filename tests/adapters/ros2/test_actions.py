@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import runpy
+import socket
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 from petrobot import Rehearsal, Result, check_driver, rehearse
 from petrobot.services.adapters.ros2 import actions
 from petrobot.services.adapters.ros2.bridge import Bridge
+from petrobot.services.worker.pipe import NewestLink
 from tests.adapters.ros2.fake import Fake, Message
 
 HERE = "tests.adapters.ros2.fake:Fake"
@@ -528,6 +530,23 @@ def test_in_a_dry_run_nothing_is_sent_but_questions() -> None:
     called = rehearse(actions.call, device=bridge, service="/no", values={"left": "level"}).result
     assert (called.status, called.values) == ("success", {"left": None})
     assert {m["op"] for m in link.fake.log} == {"subscribe"}
+
+
+def test_large_messages_do_not_make_the_state_too_large() -> None:
+    """It is published in one datagram, which has room for about 200 kB."""
+    here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    topics = {f"t{n}": {"topic": f"/t{n}", "type": "a/msg/B"} for n in range(5)}
+    bridge, _ = wired(Ports(), subscribe=topics)
+    for name in topics:
+        for size in (1_000, 15_000, 60_000):
+            bridge.arrive(0.0, f"/{name}", {"data": "x" * size})
+    kept = bridge.state()["topics"]
+    assert {len(one["msg"]["data"]) for one in kept.values()} == {15_000}
+    assert bridge.refused == 5 and "longer than 20000 characters" in bridge.fault
+    link = NewestLink(here)
+    assert link.send([bridge.state()])
+    link.close()
+    there.close()
 
 
 def test_the_driver_keeps_the_rules() -> None:
