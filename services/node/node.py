@@ -78,16 +78,20 @@ class EventTimers:
     def __init__(self, periods: Mapping[str, float]) -> None:
         self._periods = dict(periods)
         self._next: dict[str, float] = {}
+        self._soonest = -math.inf if self._periods else math.inf
 
     def advance(self, now: float) -> list[str]:
         """Return the names whose pulse is due, in the order of services.toml."""
-        fired = []
+        fired: list[str] = []
+        if now + SLACK < self._soonest:
+            return fired
         for name, period in self._periods.items():
             due = self._next.setdefault(name, now + period)
             if now + SLACK < due:
                 continue
             self._next[name] = due + period * (1 + math.floor((now + SLACK - due) / period))
             fired.append(name)
+        self._soonest = min(self._next.values())
         return fired
 
     def due(self) -> float | None:
@@ -341,7 +345,10 @@ class Node:
         """Return whether no call, no command and no emergency stop is due yet."""
         if self._commands or now >= self.callee.soonest or now >= self._stops.due:
             return False
-        return all(now < caller.soonest for caller in self.callers.values())
+        for caller in self.callers.values():  # a plain loop: lock step asks in every tick
+            if now >= caller.soonest:
+                return False
+        return True
 
     def _advance_ends(self, now: float) -> None:
         """Advance callee and callers that are due; calling `due` keeps their `soonest` up to
