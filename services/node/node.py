@@ -345,10 +345,7 @@ class Node:
         """Return whether no call, no command and no emergency stop is due yet."""
         if self._commands or now >= self.callee.soonest or now >= self._stops.due:
             return False
-        for caller in self.callers.values():  # a plain loop: lock step asks in every tick
-            if now >= caller.soonest:
-                return False
-        return True
+        return all(now < caller.soonest for caller in self.callers.values())
 
     def _advance_ends(self, now: float) -> None:
         """Advance callee and callers that are due; calling `due` keeps their `soonest` up to

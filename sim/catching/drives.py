@@ -439,7 +439,7 @@ class ArmBus(DriveBus[ServoDrive]):
         plant, before, stirred, self._stirred = self.plant, self._tau, self._stirred, False
         moving = any(plant.qd)
         if stirred:
-            self._enabled = all([drive.state is _ENABLED for drive in self.drives])
+            self._enabled = {drive.state for drive in self.drives} == {_ENABLED}
             self._quiet_until = min(self._quiet_until, self._awaited())
         self._tau = tau = self._torques(now, dt)
         plant.step(dt, tau)
@@ -449,17 +449,17 @@ class ArmBus(DriveBus[ServoDrive]):
 
     def _torques(self, now: float, dt: float) -> tuple[float, ...]:
         """Return the torques of all drives, and watch the drives."""
-        plant = self.plant
+        q: Any = tuple(self.plant.q)  # six floats, as kernels want them
+        qd: Any = tuple(self.plant.qd)
         if not self._enabled:
-            pairs = zip(self.drives, plant.q, plant.qd, strict=True)
-            return tuple([drive.torque(now, dt, q, qd) for drive, q, qd in pairs])
-        tau, near = torques(self._rows, tuple(plant.q), tuple(plant.qd), dt)
+            each = zip(self.drives, q, qd, strict=True)
+            return tuple([drive.torque(now, dt, angle, speed) for drive, angle, speed in each])
+        tau, near = torques(self._rows, q, qd, dt)
         for drive, torque in zip(self.drives, tau, strict=True):
             drive.turn(torque)
         if not near or now > self._quiet_until:
-            # Each, not any: all are watched.
-            busy = any([drive.watch(now) for drive in self.drives])
-            self._quiet_until = -math.inf if busy else self._awaited()
+            busy = [drive.watch(now) for drive in self.drives]
+            self._quiet_until = -math.inf if any(busy) else self._awaited()
         return tau
 
     def _stir(self) -> None:

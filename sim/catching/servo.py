@@ -75,7 +75,7 @@ def torque(row: Row, q: float, qd: float, dt: float) -> float:
     row[ERROR] = error = row[REFERENCE] - q
     most, integral = row[MOST], row[INTEGRAL]
     wanted = row[VELOCITY] + POSITION_GAIN * error - qd
-    tau = row[INERTIA] * row[ACCELERATION] + row[STIFFNESS] * wanted + integral
+    tau: float = row[INERTIA] * row[ACCELERATION] + row[STIFFNESS] * wanted + integral
     if not -most < tau < most:
         return math.copysign(most, tau)
     if row[STANDING] == 0.0 or not -DEAD_BAND < error < DEAD_BAND:
@@ -110,7 +110,7 @@ def aimed(row: Row, target: float, most: float) -> bool:
     if target == last and row[STANDING] != 0.0:
         return False
     step = target - last
-    cut = abs(step) > most * (1.0 + 1e-3)
+    cut: bool = abs(step) > most * (1.0 + 1e-3)
     if cut:
         target = last + math.copysign(most, step)
     passed(row, before, last, target)
@@ -147,9 +147,7 @@ def _interpolate(row: Row, dt: float) -> None:
 def _decelerate(row: Row, dt: float) -> None:
     before = row[VELOCITY]
     change = row[RAMP] * dt
-    row[VELOCITY] = after = (
-        0.0 if abs(before) <= change else before - math.copysign(change, before)
-    )
+    row[VELOCITY] = after = 0.0 if abs(before) <= change else before - math.copysign(change, before)
     row[ACCELERATION] = (after - before) / dt
     row[STANDING] = 1.0 if before == 0.0 else 0.0
     row[REFERENCE] += 0.5 * (before + after) * dt
