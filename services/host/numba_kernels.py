@@ -57,14 +57,6 @@ def packed(function: Callable[..., Any], numbers: Iterable[float]) -> Sequence[f
     return tuple(map(float, numbers))
 
 
-def rows_for(function: Callable[..., Any], count: int, width: int) -> Any:
-    """Return rows of zeros that a kernel may change: a numpy array (count, width) if compiled, else
-    lists of floats, which plain Python reads and writes faster."""
-    if hasattr(function, "py_func"):
-        return np.zeros((count, width))
-    return [[0.0] * width for _ in range(count)]
-
-
 def plain(function: Callable[P, R]) -> Callable[P, R]:
     """Return the Python function of a kernel, to compare the two."""
     source: Callable[P, R] = getattr(function, "py_func", function)

@@ -20,7 +20,6 @@ from petrobot.services.comm.canopen.cia402 import (
     StatusBit,
     to_units,
 )
-from petrobot.services.host.numba_kernels import rows_for
 from petrobot.sim.bus.canopen_node import CanopenNode
 from petrobot.sim.bus.power_drive import (
     ENABLE,
@@ -30,7 +29,7 @@ from petrobot.sim.bus.power_drive import (
     DriveBus,
     PowerDrive,
 )
-from petrobot.sim.catching.servo import WIDTH, DriveRating, JointServo, Row, torques
+from petrobot.sim.catching.servo import DriveRating, JointServo
 
 # The digital-input node on the arm's bus (CiA 401): light barrier in the cup and arm-power chain.
 
@@ -145,15 +144,10 @@ class ServoDrive(PowerDrive):
     fixed = (ObjectIndex.MODE, ObjectIndex.INTERPOLATION_PERIOD, ObjectIndex.SOFTWARE_LIMITS)
 
     def __init__(
-        self,
-        joint: int,
-        rating: DriveRating,
-        plant: Plant,
-        stir: Callable[[], None],
-        row: Row = None,
+        self, joint: int, rating: DriveRating, plant: Plant, stir: Callable[[], None]
     ) -> None:
         """`stir` is called whenever something happens that may change the torque of a joint at
-        rest; `row` holds the servo's numbers."""
+        rest."""
         super().__init__(joint + 1, "joint_drive.eds", SYNC_PATIENCE, stir)
         self.joint = joint
         self.plant = plant
@@ -164,7 +158,7 @@ class ServoDrive(PowerDrive):
         self._usual = False
         """Whether both PDOs have the layout that masters of this profile use, and are
         synchronous."""
-        self.servo = JointServo(rating, plant.q[joint], row)
+        self.servo = JointServo(rating, plant.q[joint])
         self._speed_factor = 1.0
         self._torque = 0.0
         self._error_since: float | None = None
@@ -267,7 +261,7 @@ class ServoDrive(PowerDrive):
         values, rpdo, tpdo = self.values, self.rpdo, self.tpdo
         self._usual = rpdo.synchronous and tpdo.on and tpdo.synchronous
         self._usual = self._usual and (rpdo.keys, tpdo.keys) == (_RPDO_KEYS, _TPDO_KEYS)
-        self.servo.window = values[ObjectIndex.FOLLOWING_ERROR_WINDOW, 0] / UNITS
+        self._window = values[ObjectIndex.FOLLOWING_ERROR_WINDOW, 0] / UNITS
         self._patience = values[ObjectIndex.FOLLOWING_ERROR_TIMEOUT, 0] * 1e-3
         self._range = values[ObjectIndex.SOFTWARE_LIMITS, 1], values[ObjectIndex.SOFTWARE_LIMITS, 2]
         if values[ObjectIndex.INTERPOLATION_PERIOD, 1]:
@@ -321,7 +315,9 @@ class ServoDrive(PowerDrive):
         servo = self.servo
         self._torque = tau = servo.torque(q, qd, dt)
         if state is _ENABLED:
-            self.watch(now)
+            late, window = now - self._synced > self._sync_patience + 1e-9, self._window
+            if late or self._error_since is not None or not -window <= servo.error <= window:
+                self._watch(now, late)
         elif state is DriveState.FAULT_REACTION_ACTIVE and servo.ramped_down and abs(qd) < 0.02:
             self.ramp_ended()
         return tau
@@ -337,23 +333,16 @@ class ServoDrive(PowerDrive):
             and self.state is not DriveState.FAULT_REACTION_ACTIVE
         )
 
-    def turn(self, torque: float) -> None:
-        """Note the torque (N m) of the servo, which the bus has computed."""
-        self._torque = torque
-
-    def watch(self, now: float) -> bool:
-        """Watch following error (6065h, 6066h) and loss of SYNC (1006h) of an enabled drive; return
-        whether either is too large."""
-        if self.late(now):
+    def _watch(self, now: float, late: bool) -> None:
+        """Watch following error (6065h, 6066h) and loss of SYNC (1006h)."""
+        if late:
             self.trip(DriveFault.SYNC_LOST)
-        elif not self.servo.off:
+        elif -self._window <= self.servo.error <= self._window:
             self._error_since = None
-            return False
         elif self._error_since is None:
             self._error_since = now
         elif now - self._error_since >= self._patience:
             self.trip(DriveFault.FOLLOWING_ERROR)
-        return True
 
     def _target(self) -> float:
         """Return object 607Ah within the software limits 607Dh, in rad."""
@@ -375,13 +364,7 @@ class ArmBus(DriveBus[ServoDrive]):
         self.plant = plant
         self._resting, self._stirred = False, True
         self._rests_until = -math.inf
-        self._tau: tuple[float, ...] = ()
-        self._rows = rows_for(torques, len(drives), WIDTH)
-        self._enabled = False
-        """Whether all drives are enabled."""
-        self._quiet_until = -math.inf
-        """Until when (s) no drive need be watched while all following errors are within their
-        windows."""
+        self._tau: list[float] = []
         self._odd = False
         self._heard: Sequence[Frame] = ()
         self._echoes: Sequence[Frame] = ()
@@ -389,10 +372,7 @@ class ArmBus(DriveBus[ServoDrive]):
         per drive."""
         self.inputs = DigitalInputs(INPUTS_NODE)
         super().__init__(
-            tuple(
-                ServoDrive(joint, each, plant, self._stir, self._rows[joint])
-                for joint, each in enumerate(drives)
-            ),
+            tuple(ServoDrive(joint, each, plant, self._stir) for joint, each in enumerate(drives)),
             self.inputs,
         )
 
@@ -436,31 +416,16 @@ class ArmBus(DriveBus[ServoDrive]):
             self._due = min([node.due() for node in self._nodes])
         if self._resting and now <= self._rests_until:
             return
-        plant, before, stirred, self._stirred = self.plant, self._tau, self._stirred, False
+        plant, before, self._stirred = self.plant, self._tau, False
         moving = any(plant.qd)
-        if stirred:
-            self._enabled = {drive.state for drive in self.drives} == {_ENABLED}
-            self._quiet_until = min(self._quiet_until, self._awaited())
-        self._tau = tau = self._torques(now, dt)
+        self._tau = tau = [
+            drive.torque(now, dt, q, qd)
+            for drive, q, qd in zip(self.drives, plant.q, plant.qd, strict=True)
+        ]
         plant.step(dt, tau)
         if not (moving or self._stirred or tau != before or any(plant.qd)):
             self._resting = all(drive.settled for drive in self.drives)
             self._rests_until = self._awaited()
-
-    def _torques(self, now: float, dt: float) -> tuple[float, ...]:
-        """Return the torques of all drives, and watch the drives."""
-        q: Any = tuple(self.plant.q)  # six floats, as kernels want them
-        qd: Any = tuple(self.plant.qd)
-        if not self._enabled:
-            each = zip(self.drives, q, qd, strict=True)
-            return tuple([drive.torque(now, dt, angle, speed) for drive, angle, speed in each])
-        tau, near = torques(self._rows, q, qd, dt)
-        for drive, torque in zip(self.drives, tau, strict=True):
-            drive.turn(torque)
-        if not near or now > self._quiet_until:
-            busy = [drive.watch(now) for drive in self.drives]
-            self._quiet_until = -math.inf if any(busy) else self._awaited()
-        return tau
 
     def _stir(self) -> None:
         self._resting, self._stirred = False, True
