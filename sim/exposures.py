@@ -64,6 +64,8 @@ class Exposures:
 
     def take(self, until: float) -> list[Exposed]:
         """Return the images that leave up to `until` (s), in order."""
+        if not self._waiting:
+            return []
         count = 0
         while count < len(self._waiting) and self._waiting[count].ready <= until + _ON_TIME:
             count += 1

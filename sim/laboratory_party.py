@@ -163,10 +163,13 @@ class LaboratoryParty(ABC):
         self._send_frames()
         self._send_images(now)
         self._send_tcp()
-        self.callee.advance(now)
-        for order in self.callee.orders():
-            answer_command(now, self.callee, order)
-        for peer, message in self.callee.messages():
+        callee = self.callee
+        if now >= callee.soonest:
+            callee.advance(now)
+            callee.due()  # keeps `soonest` up to date
+        for order in callee.orders():
+            answer_command(now, callee, order)
+        for peer, message in callee.messages():
             self._out.append(Envelope(peer, self.name, peer, "call", message))
 
     def drain(self) -> Sequence[Envelope]:

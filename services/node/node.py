@@ -79,16 +79,20 @@ class EventTimers:
     def __init__(self, periods: Mapping[str, float]) -> None:
         self._periods = dict(periods)
         self._next: dict[str, float] = {}
+        self._soonest = -math.inf if self._periods else math.inf
 
     def advance(self, now: float) -> list[str]:
         """Return the names whose pulse is due, in the order of services.toml."""
-        fired = []
+        fired: list[str] = []
+        if now + SLACK < self._soonest:
+            return fired
         for name, period in self._periods.items():
             due = self._next.setdefault(name, now + period)
             if now + SLACK < due:
                 continue
             self._next[name] = due + period * (1 + math.floor((now + SLACK - due) / period))
             fired.append(name)
+        self._soonest = min(self._next.values())
         return fired
 
     def due(self) -> float | None:

@@ -22,6 +22,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from petrobot.services.host.numba_kernels import kernel, packed
 from petrobot.sim.catching.ball import BallModel, BallState
 from petrobot.sim.catching.physics import TABLE_TOP
@@ -50,6 +53,8 @@ Gaps = tuple[float, float, float, float]
 
 _TOUCH = 1e-5
 """m; a smaller gap counts as contact."""
+_FAR = 1e-3
+"""m; a surface that is farther away need not be looked at, whatever the gap exactly is."""
 _EDGE = 0.001
 """Radius of the edges of the cup's walls (m): that of Bullet's boxes."""
 _BOUNCE = 0.05
@@ -493,15 +498,34 @@ def stepped_ball(
 @kernel
 def _gaps(p: Triple, cup: Cup, near: Flags, numbers: Sequence[float]) -> Gaps:
     """Return the gaps to the surfaces that are not `near`, 0 for the others. The next wall is never
-    nearer than the nearest one: if that is out of reach, its gap counts for both."""
-    table = 0.0 if near[0] else contact_at(0, p, cup, numbers)[0]
-    wall = 0.0 if near[1] else contact_at(1, p, cup, numbers)[0]
+    nearer than the nearest one: if that is out of reach, its gap counts for both. A surface that is
+    clearly out of reach has the gap `_FAR`: that costs less than to compute it."""
+    r = numbers[2]
+    reach = r + _FAR
+    table, wall, bottom = _FAR, _FAR, _FAR
+    if near[0]:
+        table = 0.0
+    elif p[2] < numbers[7] + reach and p[0] > numbers[4] - reach:
+        table = _at_table(p, numbers)[0]
+    (ox, oy, oz), (zx, zy, zz), _ = cup
+    dx, dy, dz = p[0] - ox, p[1] - oy, p[2] - oz
+    height, radius = dx * zx + dy * zy + dz * zz, numbers[11]
+    inside = radius - reach
+    if near[1]:
+        wall = 0.0
+    elif height < reach and (
+        inside <= 0.0 or dx * dx + dy * dy + dz * dz - height * height > inside * inside
+    ):
+        wall = contact_at(1, p, cup, numbers)[0]
     following = wall
     if near[2]:
         following = 0.0
     elif wall <= 2.0 * _TOUCH:
         following = contact_at(2, p, cup, numbers)[0]
-    bottom = 0.0 if near[3] else contact_at(3, p, cup, numbers)[0]
+    if near[3]:
+        bottom = 0.0
+    elif height < reach - numbers[12]:
+        bottom = _at_bottom(p, cup, numbers)[0]
     return table, wall, following, bottom
 
 
@@ -537,6 +561,59 @@ def _out(
     return p, (one, two, three, four)
 
 
+_MEMORY = 4 * 8
+"""Numbers that `stepped_packed` keeps between steps: for each surface its impulse, and whether the
+ball touches it."""
+
+
+_twist = kernel(twist)
+
+
+@kernel
+def stepped_packed(
+    p: Triple,
+    ball: Ball,
+    before: Frame3,
+    after: Frame3,
+    memory: NDArray[np.float64],
+    fresh: bool,
+    numbers: Sequence[float],
+) -> tuple[Triple, Ball]:
+    """Call `stepped_ball` with flags and impulses that stay in `memory`. In compiled code, passing
+    them as tuples takes longer than the step itself."""
+    pressed = (memory[7] > 0.0, memory[15] > 0.0, memory[23] > 0.0, memory[31] > 0.0)
+    guess = (_impulse(memory, 0), _impulse(memory, 8), _impulse(memory, 16), _impulse(memory, 24))
+    p, ball, pressed, guess = stepped_ball(
+        p,
+        ball,
+        (before.origin, before.z, before.x),
+        (after.origin, after.z, after.x),
+        _twist(before, after, numbers[0]),
+        pressed,
+        guess,
+        fresh,
+        numbers,
+    )
+    for on in range(4):
+        for part in range(7):
+            memory[8 * on + part] = guess[on][part]
+        memory[8 * on + 7] = 1.0 if pressed[on] else 0.0
+    return p, ball
+
+
+@kernel
+def _impulse(memory: NDArray[np.float64], at: int) -> Impulse:
+    return (
+        memory[at],
+        memory[at + 1],
+        memory[at + 2],
+        memory[at + 3],
+        memory[at + 4],
+        memory[at + 5],
+        memory[at + 6],
+    )
+
+
 _NO_IMPULSE: Impulse = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _NO_IMPULSES: Impulses = (_NO_IMPULSE, _NO_IMPULSE, _NO_IMPULSE, _NO_IMPULSE)
 
@@ -557,40 +634,51 @@ class OwnBallContact:
         """`wall`: thickness of the cup's wall and bottom (m); `settings`: the laboratory file."""
         self.dt = float(settings["step"]["contact"])
         self._numbers = numbers_of(model, table, cup, wall, settings)
+        self._packs = hasattr(stepped_packed, "py_func")
+        """Whether kernels are compiled: then flags and impulses stay in `_memory`."""
+        self._memory = np.zeros(_MEMORY)
         self.put_ball(BallState((0.0, 0.0, -10.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
         # Compile the kernels, or load them from the cache, now and not at the first contact.
         self.step(_SOMEWHERE, _SOMEWHERE)
 
     def put_ball(self, state: BallState) -> None:
         """Set the ball's state."""
-        (x, y, z), (a, b, c), (d, e, f) = state
-        self._position: Triple = float(x), float(y), float(z)
-        self._ball: Ball = float(a), float(b), float(c), float(d), float(e), float(f)
+        self._state = BallState(*((float(x), float(y), float(z)) for x, y, z in state))
+        (a, b, c), (d, e, f) = self._state.velocity, self._state.spin
+        self._ball: Ball = a, b, c, d, e, f
         self._pressed: Flags = (False, False, False, False)
         self._impulses = _NO_IMPULSES
+        self._memory[:] = 0.0
         self._fresh = True
 
     def ball(self) -> BallState:
         """Return the ball's state."""
-        a, b, c, d, e, f = self._ball
-        return BallState(self._position, (a, b, c), (d, e, f))
+        return self._state
 
     def step(self, before: Frame3, after: Frame3) -> BallState:
         """Step by `dt` while the cup moves from `before` to `after` (origin: mouth centre, z out of
         the mouth)."""
-        self._position, self._ball, self._pressed, self._impulses = stepped_ball(
-            self._position,
-            self._ball,
-            (before.origin, before.z, before.x),
-            (after.origin, after.z, after.x),
-            twist(before, after, self.dt),
-            self._pressed,
-            self._impulses,
-            self._fresh,
-            self._numbers,
-        )
+        position = self._state.position
+        if self._packs:
+            position, self._ball = stepped_packed(
+                position, self._ball, before, after, self._memory, self._fresh, self._numbers
+            )
+        else:
+            position, self._ball, self._pressed, self._impulses = stepped_ball(
+                position,
+                self._ball,
+                (before.origin, before.z, before.x),
+                (after.origin, after.z, after.x),
+                twist(before, after, self.dt),
+                self._pressed,
+                self._impulses,
+                self._fresh,
+                self._numbers,
+            )
         self._fresh = False
-        return self.ball()
+        a, b, c, d, e, f = self._ball
+        self._state = BallState(position, (a, b, c), (d, e, f))
+        return self._state
 
     def close(self) -> None:
         """Release nothing: this back end holds nothing outside Python."""

@@ -63,14 +63,11 @@ def twist(
     Angular velocity to first order in the angle turned, half the sum of axis x change of axis:
     exact to 1e-5 at 5 rad/s.
     """
-    if before is after:
-        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    o, p = before.origin, after.origin
-    wx = wy = wz = 0.0
-    for (ax, ay, az), (bx, by, bz) in zip(before[:3], after[:3], strict=True):
-        wx += ay * bz - az * by
-        wy += az * bx - ax * bz
-        wz += ax * by - ay * bx
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz), o = before
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz), p = after
+    wx = (xy * az - xz * ay) + (yy * bz - yz * by) + (zy * cz - zz * cy)
+    wy = (xz * ax - xx * az) + (yz * bx - yx * bz) + (zz * cx - zx * cz)
+    wz = (xx * ay - xy * ax) + (yx * by - yy * bx) + (zx * cy - zy * cx)
     half = 0.5 / dt
     return ((p[0] - o[0]) / dt, (p[1] - o[1]) / dt, (p[2] - o[2]) / dt), (
         wx * half,

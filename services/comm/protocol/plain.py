@@ -30,6 +30,7 @@ memory."""
 
 SCALARS = frozenset((NoneType, bool, int, float, str, bytes))
 _SIMPLE = SCALARS - {int}
+_ROWS = frozenset((list, tuple))
 _INT_MIN, _INT_MAX = -(2**63), 2**64 - 1
 _INT64 = 2**63
 _KEY, _SHORT_INT = 60, 200
@@ -111,9 +112,9 @@ def _plain_dict(
         kind = type(item)
         if kind in _SIMPLE or (kind is int and -_INT64 <= item < _INT64):
             copy[key] = item  # as `_plain`, without building the name of the position
-        elif kind is list and depth > 1 and left[0] > 0 and _SIMPLE.issuperset(map(type, item)):
+        elif kind in _ROWS and depth > 1 and left[0] > 0 and _SIMPLE.issuperset(map(type, item)):
             left[0] -= 1
-            copy[key] = item[:]  # a list of simple values: one copy without a look at each
+            copy[key] = [*item]  # simple values: one copy without a look at each
         else:
             copy[key] = _plain(item, f"{where}.{key[:_KEY]}", depth - 1, left)
     return copy
