@@ -523,6 +523,18 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
         r"'go' in move \(arm_bot.py:\d+\); its driver runs in another process: .*ctx.command",
     ),
     (
+        [
+            (
+                CODE,
+                "        self.at = self.goal",
+                "        self.ports.serial('x', 1)\n        self.at = self.goal",
+                "",
+            )
+        ],
+        2,
+        r"^petrobot run: services.toml: devices.axis: lock step has no line .* real time, or",
+    ),
+    (
         [(CODE, "return {", "{", "")],
         3,
         r"state: expected a dict, found a NoneType, returned by `state` \(arm_bot.py:\d+\)",
