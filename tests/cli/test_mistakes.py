@@ -746,6 +746,15 @@ closed = { in = ["close:normal"], out = ["held"] }
 NO_BRANCH = r"arm_bot.toml:44: subnets.hold.places.close: no outgoing arc `error`"
 USED = "await ctx.sleep(0.3)"
 
+OUTER = [
+    *SUBNET,
+    (
+        TASK,
+        "[subnets.hold.places]",
+        '[subnets.hold.errors]\nto = "lost"\n[subnets.hold.places]',
+        "",
+    ),
+]
 REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
     (
         SUBNET,
@@ -769,6 +778,29 @@ REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
                 '[subnets.hold.errors]\nto = "lost"\n[subnets.hold.places]',
                 "",
             )
+        ],
+    ),
+    (
+        [
+            *OUTER,
+            (TASK, 'out = ["held"]', 'out = ["held", "done"]', ""),
+            (TASK, "broken = {}", 'broken = {}\ndone = { kind = "control" }', ""),
+        ],
+        r"closed.out: unknown place 'done'; a subnet gets .*write done = \"place\" in \[sub",
+        [
+            (
+                TASK,
+                "[subnets.hold.places]",
+                '[subnets.hold.parameters]\ndone = "place"\n[subnets.hold.places]',
+                "",
+            ),
+            (TASK, 'subnet = "hold",', 'subnet = "hold", args = { done = "done" },', ""),
+            (
+                TASK,
+                'again = { kind = "macro", subnet = "hold",',
+                'again = { kind = "macro", subnet = "hold", args = { done = "done" },',
+                "",
+            ),
         ],
     ),
     (
