@@ -271,7 +271,7 @@ IN_THE_CODE: list[Mistake] = [
         CODE,
         "    def step(",
         "    async def step(",
-        r"arm_bot.py:\d+: `step` of Axis is `async`: .*; write `def step\(self, now\)`",
+        r":7: devices.axis.driver: `step` of Axis is `async`: .*; write `def step`",
     ),
     (
         CODE,
@@ -538,6 +538,11 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
         [(CODE, "return {", "{", "")],
         3,
         r"state: expected a dict, found a NoneType, returned by `state` \(arm_bot.py:\d+\)",
+    ),
+    (
+        [(CODE, "    def command(", "    async def command(", "")],
+        2,
+        r"devices.axis: arm_bot:Axis refuses it: `command` of Axis is `async`: .* write `def comm",
     ),
     (
         [(CODE, "if not self.paused:", "1 / 0\n        if not self.paused:", "")],
