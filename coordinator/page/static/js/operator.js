@@ -38,7 +38,7 @@ export class Operator {
       start: button("start", "play", "Start", { class: "command primary" }),
       pause: button("pause", "pause", "Pause"),
       step: button("step", "step", "Step"),
-      resume: button("resume", "resume", "Continue"),
+      resume: button("resume", "resume", "Resume"),
       abort: button("abort", "abort", "Abort", { class: "command danger", onclick: () => this.confirm(this.buttons.abort, "abort", "Abort the mission?") }),
     };
     this.clear = button("clear_estop", "check", "Clear the stop", { hidden: true, onclick: () => this.clearStop() });
