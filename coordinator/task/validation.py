@@ -471,9 +471,9 @@ def _arcs(
                 f"expected a weight of 1 or more for the arc with {name!r}, got {weight}",
                 "give 1 or more",
             )
-    named = (("in", [a.place for a in t.inputs]), ("out", [a.place for a in t.outputs]))
-    for side, names in (*named, ("in", [i.place for i in t.inhibitors])):
-        for name, n in Counter(names).items():
+    ends_of = (("in", [a.place for a in t.inputs]), ("out", [a.place for a in t.outputs]))
+    for side, listed_places in (*ends_of, ("in", [i.place for i in t.inhibitors])):
+        for name, n in Counter(listed_places).items():
             if n > 1:
                 yield Fault(
                     f"{key}.{side}",
