@@ -565,6 +565,7 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
 ON_THE_LINE: list[tuple[list[str], str]] = [
     (["run", "arm_bt.toml"], r"arm_bt.toml: file: cannot be read: No such file"),
     (["check", "services.toml"], r"file: this is a location file, not a task; name the task"),
+    (["log", "last"], r"no run 'last'; /.*/arm_bot/runs holds no run; change to the folder where"),
     (["check", "."], r"no task '.': this is a folder; name the .toml file of the task"),
     (["run", "armbot"], r"no task 'armbot': give a .toml file, or a task that comes with petrobot"),
     (
