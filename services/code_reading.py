@@ -450,8 +450,6 @@ def _fault_of_method(name: str, method: Callable[..., Any], code: _Code) -> str:
         return ""
     takes = list(inspect.signature(INTERFACE[name]).parameters)
     written = f"def {name}({', '.join(takes)})"
-    if not isinstance(code.tree, ast.FunctionDef):
-        return f"is `async`: its node does not await it, so it would do nothing; write `{written}`"
     try:
         inspect.signature(method).bind(*takes)
     except TypeError:

@@ -13,6 +13,7 @@ import logging
 import math
 from collections.abc import Collection, Mapping, Sequence
 from copy import copy
+from inspect import iscoroutinefunction
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from petrobot.services.comm.canopen.bus import CanBus
@@ -346,6 +347,10 @@ def faults_of_limits(
         text = f"{driver.__name__}.obeys: expected a tuple, found {obeys!r:.60}; write"
         faults.append(("driver", f'{text} obeys = ("{obeys.strip():.60}",)'))
         obeys = (obeys,)
+    called = (*RESERVED, "quick_stop", PICTURE)
+    for name in sorted(n for n in called if iscoroutinefunction(getattr(driver, n, None))):
+        text = f"`{name}` of {driver.__name__} is `async`: its node does not await it, so it would"
+        faults.append(("driver", f"{text} do nothing; write `def {name}`"))
     for name in sorted({*obeys} - OBEYED):
         text = f"{driver.__name__}.obeys: expected some of {', '.join(sorted(OBEYED))}"
         faults.append(("driver", f"{text}; found {name!r:.60}"))

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import threading
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Any, Final
 
 from petrobot.services.comm.streams.line import PAUSES
+
+_log = logging.getLogger(__name__)
 
 WAITING: Final = 1000
 """Most items that wait in each direction: that bounds the memory, whatever one end does."""
@@ -55,8 +58,10 @@ class SessionThread:
         for _ in range(len(self._news)):
             kind, item = self._news.popleft()
             if kind in ("up", "down"):
-                self.up, self.why = kind == "up", str(item or "")
-                self.count += self.up
+                before, self.up = self.why, kind == "up"
+                self.why, self.count = str(item or "") if not self.up else "", self.count + self.up
+                if not self.up and self.why != before:  # not at each attempt
+                    _log.warning("no connection to the device: %s", self.why)
             yield kind, item
 
     def send(self, item: Any) -> None:

@@ -61,7 +61,9 @@ def journal_of(name: str, folder: Path = DEFAULT) -> Path:
         if candidate.is_file():
             return candidate
     known = sorted(p.parent.name for p in folder.glob(f"*/{JOURNAL}"))
-    there = f"runs in {folder}: {', '.join(known[-8:])}" if known else f"{folder} holds no run"
+    there = f"{folder.absolute()} holds no run; change to the folder where it was started"
+    if known:
+        there = f"runs in {folder}: {', '.join(known[-8:])}"
     raise NoRunError(f"no run {name!r}; {there}")
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from math import inf, isfinite, prod
 
 from petrobot.coordinator.task.conditions import Expression, Literal, Name
@@ -242,7 +242,7 @@ def _net(
             yield from _arguments_of_macro(names, key, place, places)
     for transition in transitions.values():
         key = f"{prefix}transitions.{transition.name}"
-        yield from _arcs(key, transition, places, names.places)
+        yield from _arcs(key, transition, places, names)
         yield from _trigger(task, key, transition)
         yield from _sets(names, key, transition)
         yield from _copies(key, transition, places)
@@ -439,9 +439,22 @@ def is_plain(value: Value) -> bool:
     return isinstance(value, bool | int | str) or (isinstance(value, float) and isfinite(value))
 
 
+def _place_remedy(key: str, name: str, outer: Container[str]) -> str:
+    """Return what to do about an arc with a place that its net does not have; `outer` are the
+    places of the task, for a transition of a subnet."""
+    net = key.partition(".transitions.")[0] if key.startswith("subnets.") else ""
+    if name in outer:
+        return (
+            f'a subnet gets a place of the task as a parameter: write {name} = "place" in '
+            f'[{net}.parameters], and {name} = "{name}" in the `args` of its macro places'
+        )
+    return f"declare it in [{net}.places]" if net else "declare it in [places]"
+
+
 def _arcs(
-    key: str, t: Transition, places: Mapping[str, Place], parameters: Iterable[str] = ()
+    key: str, t: Transition, places: Mapping[str, Place], names: _Names | None = None
 ) -> Iterator[Fault]:
+    parameters, outer = (names.places, names.outer) if names is not None else ((), ())
     ends: list[tuple[str, str, int]] = [("in", a.place, a.weight) for a in t.inputs]
     ends += [("out", a.place, a.weight) for a in t.outputs]
     ends += [("in", i.place, i.threshold) for i in t.inhibitors]
@@ -449,8 +462,8 @@ def _arcs(
         if name not in places and name not in parameters:
             yield Fault(
                 f"{key}.{side}",
-                f"unknown place {name!r}{nearest(name, places)}",
-                "declare it in [places]",
+                f"unknown place {name!r}{nearest(name, places) if name not in outer else ''}",
+                _place_remedy(key, name, outer),
             )
         if weight < 1:
             yield Fault(
@@ -458,9 +471,9 @@ def _arcs(
                 f"expected a weight of 1 or more for the arc with {name!r}, got {weight}",
                 "give 1 or more",
             )
-    named = (("in", [a.place for a in t.inputs]), ("out", [a.place for a in t.outputs]))
-    for side, names in (*named, ("in", [i.place for i in t.inhibitors])):
-        for name, n in Counter(names).items():
+    ends_of = (("in", [a.place for a in t.inputs]), ("out", [a.place for a in t.outputs]))
+    for side, listed_places in (*ends_of, ("in", [i.place for i in t.inhibitors])):
+        for name, n in Counter(listed_places).items():
             if n > 1:
                 yield Fault(
                     f"{key}.{side}",

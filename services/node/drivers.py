@@ -34,6 +34,8 @@ def make_driver(directory: Directory, device: DeviceEntry, ports: Ports) -> Driv
         driver: Driver = kind(config, ports)
     except ImportError as fault:
         raise DirectoryError((f"{here}.driver: {fault}",)) from fault
+    except DirectoryError:  # of its ports: it names the device and the remedy
+        raise
     except OSError as fault:
         text = f"{here}: {device.driver} cannot open its device: {fault}"
         raise DirectoryError(

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from petrobot.services.comm.canopen.bus import Frame
-from petrobot.services.comm.location_file import DeviceEntry, Directory
+from petrobot.services.comm.location_file import DeviceEntry, Directory, DirectoryError
 from petrobot.services.comm.lockstep.cell import CellError
 from petrobot.services.comm.lockstep.channels import (
     can_body,
@@ -207,10 +207,10 @@ class LockstepPorts(DevicePorts):
         if not self._lives_at:
             self._lives_at = self._directory.laboratory()
         if not self._lives_at:
-            raise ValueError(
-                'lock step needs a simulated node; write sim = "module:function" in one '
-                "[nodes.NAME]"
-            )
+            text = f"{self._directory.source}: devices.{self._device.name}: lock step has no line "
+            text += "to a real device; run it in real time, or "
+            text += 'write sim = "module:function" in one [nodes.NAME] (docs/drivers.md)'
+            raise DirectoryError((text,))
         return self._lives_at
 
 

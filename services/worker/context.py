@@ -188,9 +188,10 @@ class RunContext:
 
     def wait(self, ready: Callable[[], bool], timeout: float | None = None) -> Wait:
         """Awaitable: True as soon as `ready()` holds, False after `timeout` seconds."""
-        if not callable(ready):
+        given: object = ready
+        if not callable(given):
             text = "ctx.wait: expected a function, as in `ctx.wait(lambda: ...)`"
-            raise TypeError(f"{text}, found {ready!r:.60}")
+            raise TypeError(f"{text}, found {given!r:.60}")
         return Wait(ready, None if timeout is None else self._clock() + timeout)
 
     def sleep(self, seconds: float) -> Wait:

@@ -271,7 +271,7 @@ IN_THE_CODE: list[Mistake] = [
         CODE,
         "    def step(",
         "    async def step(",
-        r"arm_bot.py:\d+: `step` of Axis is `async`: .*; write `def step\(self, now\)`",
+        r":7: devices.axis.driver: `step` of Axis is `async`: .*; write `def step`",
     ),
     (
         CODE,
@@ -523,9 +523,26 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
         r"'go' in move \(arm_bot.py:\d+\); its driver runs in another process: .*ctx.command",
     ),
     (
+        [
+            (
+                CODE,
+                "        self.at = self.goal",
+                "        self.ports.serial('x', 1)\n        self.at = self.goal",
+                "",
+            )
+        ],
+        2,
+        r"^petrobot run: services.toml: devices.axis: lock step has no line .* real time, or",
+    ),
+    (
         [(CODE, "return {", "{", "")],
         3,
         r"state: expected a dict, found a NoneType, returned by `state` \(arm_bot.py:\d+\)",
+    ),
+    (
+        [(CODE, "    def command(", "    async def command(", "")],
+        2,
+        r"devices.axis: arm_bot:Axis refuses it: `command` of Axis is `async`: .* write `def comm",
     ),
     (
         [(CODE, "if not self.paused:", "1 / 0\n        if not self.paused:", "")],
@@ -548,6 +565,7 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
 ON_THE_LINE: list[tuple[list[str], str]] = [
     (["run", "arm_bt.toml"], r"arm_bt.toml: file: cannot be read: No such file"),
     (["check", "services.toml"], r"file: this is a location file, not a task; name the task"),
+    (["log", "last"], r"no run 'last'; /.*/arm_bot/runs holds no run; change to the folder where"),
     (["check", "."], r"no task '.': this is a folder; name the .toml file of the task"),
     (["run", "armbot"], r"no task 'armbot': give a .toml file, or a task that comes with petrobot"),
     (
@@ -735,6 +753,15 @@ NO_BRANCH = r"arm_bot.toml:44: subnets.hold.places.close: no outgoing arc `error
 USED = "await ctx.sleep(0.3)"
 DRIVES = ("command", "stop", "stopped")
 
+OUTER = [
+    *SUBNET,
+    (
+        TASK,
+        "[subnets.hold.places]",
+        '[subnets.hold.errors]\nto = "lost"\n[subnets.hold.places]',
+        "",
+    ),
+]
 REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
     (
         SUBNET,
@@ -758,6 +785,29 @@ REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
                 '[subnets.hold.errors]\nto = "lost"\n[subnets.hold.places]',
                 "",
             )
+        ],
+    ),
+    (
+        [
+            *OUTER,
+            (TASK, 'out = ["held"]', 'out = ["held", "done"]', ""),
+            (TASK, "broken = {}", 'broken = {}\ndone = { kind = "control" }', ""),
+        ],
+        r"closed.out: unknown place 'done'; a subnet gets .*write done = \"place\" in \[sub",
+        [
+            (
+                TASK,
+                "[subnets.hold.places]",
+                '[subnets.hold.parameters]\ndone = "place"\n[subnets.hold.places]',
+                "",
+            ),
+            (TASK, 'subnet = "hold",', 'subnet = "hold", args = { done = "done" },', ""),
+            (
+                TASK,
+                'again = { kind = "macro", subnet = "hold",',
+                'again = { kind = "macro", subnet = "hold", args = { done = "done" },',
+                "",
+            ),
         ],
     ),
     (

@@ -67,6 +67,18 @@ def news(session: SessionThread, kind: str) -> list[tuple[str, Any]]:
 Begin = Callable[[Serve], SessionThread]
 
 
+def test_a_device_that_cannot_be_reached_is_logged_once(
+    begin: Begin, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def refused(session: SessionThread) -> None:
+        raise ConnectionError("connection refused")
+
+    session = begin(refused)
+    for _ in range(2):
+        assert news(session, "down") == [("down", "connection refused")]
+    assert caplog.messages == ["no connection to the device: connection refused"]
+
+
 def test_a_session_that_breaks_is_begun_again(begin: Begin) -> None:
     taker = Taker()
     session = begin(taker.serve)
