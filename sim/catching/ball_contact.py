@@ -22,9 +22,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from petrobot.services.host.numba_kernels import kernel, packed
 from petrobot.sim.catching.ball import BallModel, BallState
 from petrobot.sim.catching.physics import TABLE_TOP
@@ -561,59 +558,6 @@ def _out(
     return p, (one, two, three, four)
 
 
-_MEMORY = 4 * 8
-"""Numbers that `stepped_packed` keeps between steps: for each surface its impulse, and whether the
-ball touches it."""
-
-
-_twist = kernel(twist)
-
-
-@kernel
-def stepped_packed(
-    p: Triple,
-    ball: Ball,
-    before: Frame3,
-    after: Frame3,
-    memory: NDArray[np.float64],
-    fresh: bool,
-    numbers: Sequence[float],
-) -> tuple[Triple, Ball]:
-    """Call `stepped_ball` with flags and impulses that stay in `memory`. In compiled code, passing
-    them as tuples takes longer than the step itself."""
-    pressed = (memory[7] > 0.0, memory[15] > 0.0, memory[23] > 0.0, memory[31] > 0.0)
-    guess = (_impulse(memory, 0), _impulse(memory, 8), _impulse(memory, 16), _impulse(memory, 24))
-    p, ball, pressed, guess = stepped_ball(
-        p,
-        ball,
-        (before.origin, before.z, before.x),
-        (after.origin, after.z, after.x),
-        _twist(before, after, numbers[0]),
-        pressed,
-        guess,
-        fresh,
-        numbers,
-    )
-    for on in range(4):
-        for part in range(7):
-            memory[8 * on + part] = guess[on][part]
-        memory[8 * on + 7] = 1.0 if pressed[on] else 0.0
-    return p, ball
-
-
-@kernel
-def _impulse(memory: NDArray[np.float64], at: int) -> Impulse:
-    return (
-        memory[at],
-        memory[at + 1],
-        memory[at + 2],
-        memory[at + 3],
-        memory[at + 4],
-        memory[at + 5],
-        memory[at + 6],
-    )
-
-
 _NO_IMPULSE: Impulse = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _NO_IMPULSES: Impulses = (_NO_IMPULSE, _NO_IMPULSE, _NO_IMPULSE, _NO_IMPULSE)
 
@@ -634,51 +578,40 @@ class OwnBallContact:
         """`wall`: thickness of the cup's wall and bottom (m); `settings`: the laboratory file."""
         self.dt = float(settings["step"]["contact"])
         self._numbers = numbers_of(model, table, cup, wall, settings)
-        self._packs = hasattr(stepped_packed, "py_func")
-        """Whether kernels are compiled: then flags and impulses stay in `_memory`."""
-        self._memory = np.zeros(_MEMORY)
         self.put_ball(BallState((0.0, 0.0, -10.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
         # Compile the kernels, or load them from the cache, now and not at the first contact.
         self.step(_SOMEWHERE, _SOMEWHERE)
 
     def put_ball(self, state: BallState) -> None:
         """Set the ball's state."""
-        self._state = BallState(*((float(x), float(y), float(z)) for x, y, z in state))
-        (a, b, c), (d, e, f) = self._state.velocity, self._state.spin
-        self._ball: Ball = a, b, c, d, e, f
+        (x, y, z), (a, b, c), (d, e, f) = state
+        self._position: Triple = float(x), float(y), float(z)
+        self._ball: Ball = float(a), float(b), float(c), float(d), float(e), float(f)
         self._pressed: Flags = (False, False, False, False)
         self._impulses = _NO_IMPULSES
-        self._memory[:] = 0.0
         self._fresh = True
 
     def ball(self) -> BallState:
         """Return the ball's state."""
-        return self._state
+        a, b, c, d, e, f = self._ball
+        return BallState(self._position, (a, b, c), (d, e, f))
 
     def step(self, before: Frame3, after: Frame3) -> BallState:
         """Step by `dt` while the cup moves from `before` to `after` (origin: mouth centre, z out of
         the mouth)."""
-        position = self._state.position
-        if self._packs:
-            position, self._ball = stepped_packed(
-                position, self._ball, before, after, self._memory, self._fresh, self._numbers
-            )
-        else:
-            position, self._ball, self._pressed, self._impulses = stepped_ball(
-                position,
-                self._ball,
-                (before.origin, before.z, before.x),
-                (after.origin, after.z, after.x),
-                twist(before, after, self.dt),
-                self._pressed,
-                self._impulses,
-                self._fresh,
-                self._numbers,
-            )
+        self._position, self._ball, self._pressed, self._impulses = stepped_ball(
+            self._position,
+            self._ball,
+            (before.origin, before.z, before.x),
+            (after.origin, after.z, after.x),
+            twist(before, after, self.dt),
+            self._pressed,
+            self._impulses,
+            self._fresh,
+            self._numbers,
+        )
         self._fresh = False
-        a, b, c, d, e, f = self._ball
-        self._state = BallState(position, (a, b, c), (d, e, f))
-        return self._state
+        return self.ball()
 
     def close(self) -> None:
         """Release nothing: this back end holds nothing outside Python."""

@@ -63,6 +63,8 @@ def twist(
     Angular velocity to first order in the angle turned, half the sum of axis x change of axis:
     exact to 1e-5 at 5 rad/s.
     """
+    if before is after:
+        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz), o = before
     (ax, ay, az), (bx, by, bz), (cx, cy, cz), p = after
     wx = (xy * az - xz * ay) + (yy * bz - yz * by) + (zy * cz - zz * cy)
