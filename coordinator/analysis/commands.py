@@ -73,6 +73,12 @@ class CommandResult:
     """The analysis itself, to draw its witnesses; only from `analyse_command`."""
 
 
+def _full(code: int, text: str) -> CommandResult:
+    """Return the result if the memory is used up. It is made before the work: at the MemoryError
+    there may be none left for it, as the exception still holds all that was read."""
+    return CommandResult(code, text, {"error": text})
+
+
 def open_model(path: Path, load_task: LoadTask) -> Task | NetFile:
     """Open a task (`.toml`) or a net file. Raises NetFileError and the errors of `load_task`."""
     return load_task(path) if path.suffix == ".toml" else read_net(path)
@@ -109,6 +115,7 @@ def analyse_command(
     limits = limits or SearchLimits()
     clock, deadlines = limits.clock, _deadlines(limits, 1 + bool(changes))
     due = deadlines[-1][0]
+    full = _full(FAULT, f"{path}: the memory was used up; give more --memory, or fewer --states")
     try:
         with until(due, clock):
             model = open_model(path, load_task)
@@ -153,8 +160,7 @@ def analyse_command(
         told = f"{_named(path, late)}; give more --seconds"
         return CommandResult(FAULT, told, {"error": told})
     except MemoryError:
-        told = f"{path}: the memory was used up; give more --memory, or fewer --states"
-        return CommandResult(FAULT, told, {"error": told})
+        return full
     said += [wrapped(f"note: {note}", 4) for note in notes]
     return CommandResult(
         OK if analyses[-1].ok else FAULT,
@@ -358,6 +364,7 @@ def simulate_command(
 
     A net needs a horizon; for a task it is optional. `changes` as in `whatif`.
     """
+    full = _full(BAD_INPUT, f"{path}: out of memory; use fewer --replicas")
     try:
         model, wanted = open_model(path, load_task), [read_change(text) for text in changes]
         cell = _cell(model, cell_of)
@@ -395,8 +402,7 @@ def simulate_command(
     except (NetFileError, NoEstimate, ValueError, KeyError, OverflowError) as error:
         return _refused(path, error)
     except MemoryError:
-        told = f"{path}: out of memory; use fewer --replicas"
-        return CommandResult(BAD_INPUT, told, {"error": told})
+        return full
 
 
 def _simulated(name: str, seen: Simulation, notes: tuple[str, ...]) -> CommandResult:
@@ -454,6 +460,8 @@ def convert_command(
     """
     assumed: list[str] = []
     which = ""
+    told = f"{source}: the memory was used up; the net is too large for {target.suffix}"
+    full = _full(BAD_INPUT, told)
     try:
         model = open_model(source, load_task)
         if exact and (not isinstance(model, Task) or view == "gspn" or measure is not None):
@@ -478,8 +486,7 @@ def convert_command(
     except (NetFileError, NoEstimate, ValueError, OverflowError) as error:
         return _refused(source, error)
     except MemoryError:
-        told = f"{source}: the memory was used up; the net is too large for {target.suffix}"
-        return CommandResult(BAD_INPUT, told, {"error": told})
+        return full
     except OSError as error:
         return CommandResult(
             BAD_INPUT,

@@ -426,10 +426,10 @@ class Analysis:
             for v in self.verdicts().values()
             if v.holds and v.assumption and self.ends is not None
         )
-        lines += (
-            ["", *(f"These hold for the executed task if {text}." for text in assumed)]
-            if assumed
-            else []
+        # Where some verdicts are proved on the ends net, those of the graph may assume more.
+        most = [text for text in assumed if sum(a.startswith(text) for a in assumed) == 1]
+        lines += ["", *(f"These hold for the executed task if {text}." for text in most)] * any(
+            most
         )
         lines += self._number_lines()
         lines += [f"note: {note}" for note in self.told]
