@@ -622,9 +622,14 @@ def test_a_figure_that_few_phases_change_is_doubtful(kind: str) -> None:
     assert (world.ended, world.now) == (Status.SUCCESS, 1.5)
     x = execute(task)
     assert played(x).figures["mean time (s)"] == pytest.approx((1.5, 0.0))
-    doubts = [text for text in analyse(task, view="gspn").doubts if "exact times" in text]
+    found = analyse(task, view="gspn")
+    doubts = [text for text in found.doubts if "exact times" in text]
     assert len(doubts) == (kind != "one after the other")
     assert all(" 1.5 there (standard error 0)" in text for text in doubts)
+    (head,) = [line for line in found.text().splitlines() if line.startswith("forecast: ")]
+    data = found.to_json()["forecast"]["exact"]
+    assert bool(data) is bool(doubts) is ("mean time (s) 1.5 +- 0" in head)
+    assert not data or data["mean time (s)"] == pytest.approx((1.5, 0.0))
 
 
 @settings(COMMON, max_examples=5)
