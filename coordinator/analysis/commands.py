@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import hypot, isfinite, sqrt
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from petrobot.coordinator.analysis.execution.chain import played
+from petrobot.coordinator.analysis.execution.progress import progress_of
 from petrobot.coordinator.analysis.formats import FORMATS, read_net, written
 from petrobot.coordinator.analysis.formats.netfile import (
     NetFile,
@@ -22,7 +24,7 @@ from petrobot.coordinator.analysis.formats.netfile import (
     unit_rates,
 )
 from petrobot.coordinator.analysis.limits import OutOfTime, until
-from petrobot.coordinator.analysis.may_run import Cell, assumed, devices_of
+from petrobot.coordinator.analysis.may_run import BUDGET, Cell, assumed, devices_of
 from petrobot.coordinator.analysis.net.ends_net import ends_net
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.picture import graph_svg
@@ -38,7 +40,8 @@ from petrobot.coordinator.analysis.time.simulate import (
     goal_by_marking,
     simulate,
 )
-from petrobot.coordinator.analysis.time.stochastic import stochastic_view
+from petrobot.coordinator.analysis.time.stochastic import StochasticView, stochastic_view
+from petrobot.coordinator.analysis.time.task_forecast import MATTERS, TIME
 from petrobot.coordinator.analysis.time.whatif import (
     Change,
     change_gspn,
@@ -71,6 +74,12 @@ class CommandResult:
     data: dict[str, Any]
     analysis: Analysis | None = None
     """The analysis itself, to draw its witnesses; only from `analyse_command`."""
+
+
+def _full(code: int, text: str) -> CommandResult:
+    """Return the result if the memory is used up. It is made before the work: at the MemoryError
+    there may be none left for it, as the exception still holds all that was read."""
+    return CommandResult(code, text, {"error": text})
 
 
 def open_model(path: Path, load_task: LoadTask) -> Task | NetFile:
@@ -109,6 +118,7 @@ def analyse_command(
     limits = limits or SearchLimits()
     clock, deadlines = limits.clock, _deadlines(limits, 1 + bool(changes))
     due = deadlines[-1][0]
+    full = _full(FAULT, f"{path}: the memory was used up; give more --memory, or fewer --states")
     try:
         with until(due, clock):
             model = open_model(path, load_task)
@@ -153,8 +163,7 @@ def analyse_command(
         told = f"{_named(path, late)}; give more --seconds"
         return CommandResult(FAULT, told, {"error": told})
     except MemoryError:
-        told = f"{path}: the memory was used up; give more --memory, or fewer --states"
-        return CommandResult(FAULT, told, {"error": told})
+        return full
     said += [wrapped(f"note: {note}", 4) for note in notes]
     return CommandResult(
         OK if analyses[-1].ok else FAULT,
@@ -358,19 +367,19 @@ def simulate_command(
 
     A net needs a horizon; for a task it is optional. `changes` as in `whatif`.
     """
+    full = _full(BAD_INPUT, f"{path}: out of memory; use fewer --replicas")
     try:
         model, wanted = open_model(path, load_task), [read_change(text) for text in changes]
         cell = _cell(model, cell_of)
         known = _measured(model, measure, cell)
         subject, name, notes = _subject(model, rates, "gspn")
-        goal = lost = None
+        goal = lost = view = measured = None
         if isinstance(model, Task):
             model, measured = change_task(model, known, wanted)
             view = stochastic_view(
                 model, measured, stages=stages, timer_stages=stages, devices=devices_of(cell)
             )
-            doubts = (f"doubtful: {text}" for text in view.doubts)
-            gspn, notes = view.gspn, (*doubts, *view.assumptions, assumed(cell))
+            gspn, notes = view.gspn, (*view.assumptions, assumed(cell))
             goal = goal_by_marking(lambda m: view.ended(m) is Status.SUCCESS)
             lost = goal_by_marking(lambda m: view.ended(m) is Status.ERROR)
         else:
@@ -391,12 +400,49 @@ def simulate_command(
             firings=firings,
             progress=progress,
         )
+        if view is not None:
+            doubts = [*view.doubts]
+            if horizon is None and seen.complete:
+                doubts += _unlike_the_engine(view, measured, devices_of(cell), seen, stages)
+            notes = (*(f"doubtful: {text}" for text in doubts), *notes)
         return _simulated(name or path.stem, seen, notes)
     except (NetFileError, NoEstimate, ValueError, KeyError, OverflowError) as error:
         return _refused(path, error)
     except MemoryError:
-        told = f"{path}: out of memory; use fewer --replicas"
-        return CommandResult(BAD_INPUT, told, {"error": told})
+        return full
+
+
+def _unlike_the_engine(
+    view: StochasticView,
+    measured: Measured | None,
+    devices: Mapping[str, str] | None,
+    seen: Simulation,
+    stages: int,
+) -> list[str]:
+    """Return which figures of a simulation missions on the execution graph have otherwise, where
+    the engine decides conflicts and times have no phases; or why that is not known."""
+    assert seen.completed is not None
+    try:
+        x = progress_of(OrdinaryView(view.task), BUDGET.steps, measured, devices).x
+        if not x.complete:
+            raise ValueError("the execution graph is too large")
+        plays = played(x, measured)
+    except (ValueError, OutOfTime) as why:
+        return [f"not compared with missions of the engine: {why}"]
+    share, off = seen.completed.mean, list[str]()
+    here = {"P_complete": (share, sqrt(share * (1 - share) / seen.replicas))}
+    if seen.time is not None:
+        here[TIME] = (seen.time.mean, float(seen.times.std()) / sqrt(len(seen.times)))
+    for name, (value, error) in here.items():
+        mean, other = plays.figures[name]
+        if abs(value - mean) > max(5 * hypot(error, other), MATTERS * abs(mean)):
+            off.append(f"{name} {value:.6g} here, {mean:.6g} there (standard error {other:.2g})")
+    said = f"{plays.missions} missions of the execution graph have other figures: {', '.join(off)}"
+    assumed = (
+        "conflicts that neither priority nor weight decides are drawn, and a timer or a duration "
+        f"has at most {stages} phases"
+    )
+    return [f"{said}. Here {assumed}"] * bool(off)
 
 
 def _simulated(name: str, seen: Simulation, notes: tuple[str, ...]) -> CommandResult:
@@ -454,6 +500,8 @@ def convert_command(
     """
     assumed: list[str] = []
     which = ""
+    told = f"{source}: the memory was used up; the net is too large for {target.suffix}"
+    full = _full(BAD_INPUT, told)
     try:
         model = open_model(source, load_task)
         if exact and (not isinstance(model, Task) or view == "gspn" or measure is not None):
@@ -478,8 +526,7 @@ def convert_command(
     except (NetFileError, NoEstimate, ValueError, OverflowError) as error:
         return _refused(source, error)
     except MemoryError:
-        told = f"{source}: the memory was used up; the net is too large for {target.suffix}"
-        return CommandResult(BAD_INPUT, told, {"error": told})
+        return full
     except OSError as error:
         return CommandResult(
             BAD_INPUT,

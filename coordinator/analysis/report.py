@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.coordinator.analysis.execution.chain import played
+from petrobot.coordinator.analysis.execution.chain import MissionFigures, played
 from petrobot.coordinator.analysis.execution.graph import STEPS, TooManyValues, in_words
 from petrobot.coordinator.analysis.execution.progress import (
     NAMES,
@@ -179,6 +179,9 @@ class Analysis:
     doubts: tuple[str, ...] = ()
     """Why the figures of `forecast` are not those of the executed task; empty if nothing speaks
     against them."""
+    exact: MissionFigures | None = None
+    """Figures of missions with exact times, if those of `forecast` are doubtful because of its few
+    phases."""
     refused: bool = False
     """Whether the task may not run for a reason beyond these verdicts (`may_run`)."""
     fewer: Mapping[int, Analysis] = field(default_factory=dict)
@@ -347,7 +350,11 @@ class Analysis:
                 "throughput": self.forecast.throughput,
                 "mean_tokens": self.forecast.mean_tokens,
                 "residual": self.forecast.done.residual,
-                "forecast": self.forecast.to_json() | {"doubts": list(self.doubts)},
+                "forecast": self.forecast.to_json()
+                | {
+                    "doubts": list(self.doubts),
+                    "exact": self.exact and {"missions": self.exact.missions} | self.exact.figures,
+                },
             }
         return {"throughput": None, "mean_tokens": None, "residual": None}
 
@@ -426,10 +433,10 @@ class Analysis:
             for v in self.verdicts().values()
             if v.holds and v.assumption and self.ends is not None
         )
-        lines += (
-            ["", *(f"These hold for the executed task if {text}." for text in assumed)]
-            if assumed
-            else []
+        # Where some verdicts are proved on the ends net, those of the graph may assume more.
+        most = [text for text in assumed if sum(a.startswith(text) for a in assumed) == 1]
+        lines += ["", *(f"These hold for the executed task if {text}." for text in most)] * any(
+            most
         )
         lines += self._number_lines()
         lines += [f"note: {note}" for note in self.told]
@@ -463,10 +470,14 @@ class Analysis:
         )
         never = "  no run ever reaches `final`, so there is no mean time"
         several = f" of a mission run of {f.trials} trials" if f.trials > 1 else ""
+        head = f"forecast{several}: "
+        exact = self.exact.figures if self.exact else {}
+        told = ", ".join(f"{n} {mean:.6g} +- {error:.2g}" for n, (mean, error) in exact.items())
         return [
             "",
-            f"forecast{several}: P_complete {done.probability:.9f}, {goal}R_conj "
-            f"{f.conjunctive_reliability:.6f}",
+            *([f"{head}{told} (mean and standard error with exact times)"] if told else []),
+            f"{'with few phases: ' if told else head}P_complete {done.probability:.9f}, {goal}"
+            f"R_conj {f.conjunctive_reliability:.6f}",
             time if done.probability else never,
             *([f"  one trial: {_figures(f.one_trial.figures)}"] if several else []),
             *(f"doubtful: {text}" for text in self.doubts),
@@ -698,11 +709,13 @@ def with_forecast(
     """Return the analysis of a task with its forecast, as `analyse` with `view="gspn"` does, and
     without searching again."""
     notes, doubts = list(found.notes), list[str]()
-    numbers = None
+    numbers = exact = None
     try:
         numbers = _forecast(task, measured, stages, limits, notes, devices)
         if numbers is not None:
-            doubts = _doubts(numbers, found.progress, measured, stages, limits, notes, devices)
+            doubts, exact = _doubts(
+                numbers, found.progress, measured, stages, limits, notes, devices
+            )
     except KeyboardInterrupt:
         notes.append(CUT)
     return replace(
@@ -711,6 +724,7 @@ def with_forecast(
         notes=tuple(notes),
         interrupted=CUT in notes,
         doubts=tuple(doubts),
+        exact=exact,
     )
 
 
@@ -747,16 +761,17 @@ def _doubts(
     limits: SearchLimits | None,
     notes: list[str],
     devices: Mapping[str, str] | None,
-) -> list[str]:
+) -> tuple[list[str], MissionFigures | None]:
     """Compare a forecast with the execution graph as a Markov chain, which follows the engine in
     everything but durations, and with missions played on it, whose durations are not divided into
-    phases. Return which figures differ and what only one side assumes; add a note where one of the
-    two comparisons cannot be made.
+    phases. Return which figures differ and what only one side assumes, and the figures of those
+    missions if they are among them; add a note where one of the two comparisons cannot be made.
     """
     doubts, failed = list(found.view.doubts), dict[str, str]()
+    exact = list[MissionFigures]()
     there: Mapping[str, Callable[[Progress], list[str]]] = {
         "the execution graph": partial(_as_chain, found, measured, stages, limits, devices),
-        "missions with exact times": partial(_as_played, found, measured, stages),
+        "missions with exact times": partial(_as_played, found, measured, stages, exact),
     }
     for what, compared in there.items():
         try:
@@ -768,7 +783,7 @@ def _doubts(
                 raise KeyboardInterrupt from why
             failed.setdefault(_why(why), what)
     notes += [f"the forecast was not compared with {there}: {why}" for why, there in failed.items()]
-    return doubts
+    return doubts, next(iter(exact), None)
 
 
 def _as_chain(
@@ -810,11 +825,15 @@ def _as_chain(
 
 
 def _as_played(
-    found: Forecast, measured: Measured | None, stages: int, progress: Progress
+    found: Forecast,
+    measured: Measured | None,
+    stages: int,
+    exact: list[MissionFigures],
+    progress: Progress,
 ) -> list[str]:
     """Return which figures missions with exact times have otherwise, if by more than MATTERS and
     five standard errors, and the execution graph as a chain does not tell them right either: what
-    phases do. Raises NoEstimate, TooLarge and OutOfTime."""
+    phases do. Then append those missions to `exact`. Raises NoEstimate, TooLarge and OutOfTime."""
     plays, off, chain = played(progress.x, measured), list[str](), progress.chain
     for name, value in found.figures.items():
         mean, error = plays.figures[name]
@@ -825,6 +844,7 @@ def _as_played(
             off.append(f"{name} {value:.6g} here, {mean:.6g} there (standard error {error:.2g})")
     if not off:
         return []
+    exact.append(plays)
     return [
         f"{plays.missions} missions of the execution graph with exact times have other figures: "
         f"{', '.join(off)}. Here a timer or a duration has at most {stages} phases"

@@ -150,7 +150,7 @@ def waiting_for(draft: Draft) -> str:
         marked = {p for p, n in enumerate(draft.marking) if n}
         near = [x for x in draft.compiled.transitions if marked & {p for p, _ in x.needs}]
     chances = [
-        f"{x.name} waits for {_awaited(draft, x)}"
+        f"{x.name} waits for {in_words(draft, x)}"
         for x in draft.compiled.transitions
         if can_still_fire(draft, x)
     ]
@@ -162,10 +162,11 @@ def waiting_for(draft: Draft) -> str:
     return "; ".join([*chances, *found]) or "no transition takes any of its tokens"
 
 
-def _awaited(draft: Draft, x: CompiledTransition) -> str:
+def in_words(draft: Draft, x: CompiledTransition) -> str:
+    """Return which events, time or variable a transition that can still fire waits for."""
     events = [event for event in (x.pulse, *x.flags) if event and event not in draft.flags]
     timer = draft.timers.get(x.name)
-    if timer is not None and not timer.elapsed:
+    if x.after is not None and (timer is None or not timer.elapsed):
         events.append(f"its {x.after:g} s")
     return " and ".join(events) or f"a variable ({x.when})"
 

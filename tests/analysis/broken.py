@@ -15,6 +15,7 @@ from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.report import Analysis, analyse
 from petrobot.coordinator.cli.analyse import picture, refused
 from petrobot.coordinator.task import End, Kind, Task, Transition
+from petrobot.coordinator.task.conditions import parse
 from petrobot.coordinator.task.file import load
 from tests.engine.conftest import make_task
 
@@ -90,6 +91,20 @@ def with_button(task: Task, broken: str) -> Task:
         transitions={**task.transitions, **loop.transitions},
         primitive_tasks={**task.primitive_tasks, **loop.primitive_tasks},
         events={**task.events, **loop.events},
+    )
+
+
+def with_stop(task: Task) -> Task:
+    """Add a stop button, which ends the task with `final_error` where nothing is active."""
+    net = {"halt": {"in": "running", "event": "stop", "out": "halted"}}
+    branch = make_task("running=1 halted", net, "stop+")
+    ends = "halted == 1" if task.final_error is None else f"halted == 1 or {task.final_error}"
+    return replace(
+        task,
+        places={**task.places, **branch.places},
+        transitions={**task.transitions, **branch.transitions},
+        events={**task.events, **branch.events},
+        final_error=parse(ends),
     )
 
 

@@ -260,6 +260,14 @@ def test_an_analysis_uses_no_more_memory_than_allowed(tmp_path: Path) -> None:
     assert data["throughput"] is not None or any("memory" in note for note in data["notes"])
 
 
+def test_a_file_that_is_too_large_for_the_memory_has_a_message(tmp_path: Path) -> None:
+    """Where the memory is used up while the file is read, what was read is freed only later."""
+    process = started(ring(20_000, 1), tmp_path, "analyse", "--memory", "1", "--seconds", "0")
+    out, complaint = process.communicate(timeout=300)
+    assert process.returncode == 1, complaint
+    assert "the memory was used up; give more --memory, or fewer --states" in out
+
+
 def test_a_net_that_cannot_be_solved_can_be_simulated(tmp_path: Path) -> None:
     arguments = ("simulate", "--rates", "unit", "--replicas", "20", "--horizon", "2", "--json", "-")
     process = started(ring(300, 20), tmp_path, *arguments)

@@ -25,11 +25,19 @@ from petrobot.coordinator.analysis.report import analyse
 from petrobot.coordinator.analysis.time.measured import Measured
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
-from petrobot.coordinator.task import Estimate, Kind, Status, Task
+from petrobot.coordinator.task import (
+    Estimate,
+    Inhibitor,
+    Kind,
+    Status,
+    Task,
+    Variable,
+    VariableType,
+)
 from petrobot.coordinator.task.conditions import parse
 from petrobot.coordinator.task.file import load, loads
 from petrobot.coordinator.task.net import Net
-from tests.analysis.broken import with_button
+from tests.analysis.broken import with_button, with_stop
 from tests.analysis.random_nets import state_machines
 from tests.engine.conftest import make_task
 from tests.engine.test_expansion import TRIES
@@ -322,6 +330,46 @@ def test_a_branch_that_listens_does_not_hide_what_is_stuck(what: str) -> None:
     assert not answer.ok and any("sound" in line for line in answer.objections())
 
 
+@pytest.mark.parametrize("what", STUCK)
+def test_a_stop_button_does_not_hide_what_is_stuck(what: str) -> None:
+    """It could be pressed all the time, so nothing but a person would end what hangs."""
+    found = judged(with_stop(STUCK[what].task))
+    assert found.deadlock_free.holds and found.sound.holds is False
+    assert found.sound.reason.startswith("the task can only give up") or (
+        found.sound.details[-1] == "nothing else can happen; only halt ends it"
+    )
+
+
+@pytest.mark.parametrize("halts", [False, True])
+def test_a_stop_button_is_not_a_fault(halts: bool) -> None:
+    """Where it bars what would follow, `final` cannot be reached after it; else it only marks."""
+    task = with_stop(seeded().task)
+    bar = Inhibitor("halted", 1)
+    first = replace(task.transitions["next"], inhibitors=(bar,) * halts)
+    answer = may_run(replace(task, transitions={**task.transitions, "next": first}), None, Budget())
+    assert answer.ok and not answer.objections()
+
+
+def test_giving_up_may_wait_for_events_that_the_task_needs_anyhow() -> None:
+    """A part that was lost is not missed before all others have come, and each may go left or
+    right."""
+    task = make_task(
+        "parts=3 stored left! right!",
+        {
+            "to_left": {"in": "parts", "event": "red", "out": "left"},
+            "to_right": {"in": "parts", "event": "green", "out": "right"},
+            "good": {"in": "left:normal", "out": "stored"},
+            "well": {"in": "right:normal", "out": "stored"},
+            "lost": {"in": "left:error"},
+            "gone": {"in": "right:error"},
+        },
+        "red green",
+        final="stored == 3",
+        final_error=parse("parts == 0 and stored < 3"),
+    )
+    assert judged(task).sound.holds
+
+
 @pytest.mark.parametrize("broken", ["idle", "broken"])
 def test_a_branch_that_listens_is_not_a_fault(broken: str) -> None:
     task = replace(seeded().task, final_error=parse("broken > 0"))
@@ -349,6 +397,14 @@ def test_giving_up_may_wait_for_a_person_or_for_runs_that_are_active() -> None:
 
 
 LEFT_BEHIND: dict[str, tuple[dict[str, dict[str, Any]], str, str]] = {
+    "nothing has written the variable of a condition": (
+        {
+            "good": {"in": "act:normal", "when": "n > 5"},
+            "fair": {"in": "act:normal", "when": "n <= 5"},
+        },
+        "places.act",
+        "a run that ended is still there: good waits for a variable (n > 5)",
+    ),
     "an internal event must come before the end": (
         {"good": {"in": "act:normal", "event": "spark"}},
         "places.act",
@@ -383,7 +439,9 @@ def test_a_run_that_is_left_at_the_end_is_a_warning(what: str) -> None:
     more, key, words = LEFT_BEHIND[what]
     net = {"begin": {"in": "go", "out": "act"}, "bad": {"in": "act:error"}, **more}
     marking = "go=1 act! hook=1 rail=1" + " other!" * ("other" in str(net))
+    unset = {"n": Variable("n", VariableType.INT)} if "n > 5" in words else {}
     task = make_task(marking, net, final="go == 0", events="spark<act")
+    task = replace(task, variables=unset)
     judged_ = may_run(task, None, Budget())
     assert judged_.ok and judged_.analysis is not None
     (found,) = [f for f in judged_.report.findings if f.code == "left-behind" and f.key == key]
@@ -392,6 +450,7 @@ def test_a_run_that_is_left_at_the_end_is_a_warning(what: str) -> None:
     assert not any("act 0 to 1" in note for note in judged_.analysis.notes)
     net["left"] = {"in": "act:normal", "priority": -1}
     task = make_task(marking, net, final="go == 0 and act == 0", events="spark<act")
+    task = replace(task, variables=unset)
     keys = {f.key for f in may_run(task, None, Budget()).report.findings if f.code == "left-behind"}
     assert key not in keys
 
@@ -415,6 +474,27 @@ def test_the_cause_of_a_dead_end_names_the_variable_without_a_value() -> None:
     found = judged(unset).deadlock_free
     assert found.reason == "stuck with go seen: large has a false condition (n > 5): n has no value"
     assert found.details[-1] == "next is barred by seen, which holds 1"
+
+
+def test_a_run_that_is_always_active_keeps_the_task_from_its_end() -> None:
+    net = {
+        "poll": {"in": "cpu", "out": "look"},
+        "seen": {"in": "look:normal", "out": "cpu"},
+        "unseen": {"in": "look:error", "out": "cpu"},
+    }
+    found = judged(make_task("cpu~=1 look! parts", net, final="parts == 0")).sound
+    asked = "the end asks for no active run of look (only places with `listen` may have one)"
+    assert found.holds is False and asked in found.details
+
+
+def test_a_queue_that_only_the_operator_fills_is_searched_with_few_runs() -> None:
+    """Each token that he adds waits for the one server; a state with many runs takes long."""
+    net = {"next": {"in": "parts", "out": "look"}, "bad": {"in": "look:error", "out": "look"}}
+    net["seen"] = {"in": "look:normal"}
+    task = make_task("parts=1 look!", net, final="parts == 0")
+    task = replace(task, places={**task.places, "look": replace(task.places["look"], servers=1)})
+    x = with_operator(execute(task), limit=2_000)
+    assert not x.complete and 10 < max(sum(s.marking) for s in x.states) < 150
 
 
 def test_what_only_listens_is_not_what_is_stuck() -> None:
@@ -638,6 +718,13 @@ def test_an_incomplete_graph_proves_nothing_but_still_refutes() -> None:
     assert {verdicts[name].holds for name in NAMES if name != "quasi_live"} == {None}
     unknown = judged(fine, 40).deadlock_free
     assert unknown.holds is None and "more than 40 stimuli and firings" in unknown.reason
+
+
+def test_the_assumption_of_the_verdicts_is_told_once() -> None:
+    """Some are proved on the cut execution graph, others on the ends net."""
+    found = analyse(load(TASKS / "catch_ball.toml"), steps=1_000)
+    assert found.progress is not None and not found.progress.x.complete
+    assert found.text().count("These hold for the executed task if ") == 1
 
 
 @pytest.mark.parametrize(

@@ -6,12 +6,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from math import exp, log, sqrt
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import assume, event, example, given, settings
 from hypothesis import strategies as st
 
+from petrobot.coordinator.analysis.commands import simulate_command
 from petrobot.coordinator.analysis.execution.chain import (
     ExecutionChain,
     TooLarge,
@@ -48,7 +50,7 @@ from petrobot.coordinator.engine import (
 from petrobot.coordinator.engine.stimuli import Stimulus
 from petrobot.coordinator.task import Estimate, Executed, Scope, Status, Task
 from petrobot.coordinator.task.conditions import parse
-from petrobot.coordinator.task.file import loads
+from petrobot.coordinator.task.file import load, loads
 from tests.analysis.test_execution_graph import COMMON
 from tests.analysis.test_views import timed
 from tests.engine.test_properties import tasks as any_tasks
@@ -605,26 +607,34 @@ EXACT = {
 
 
 @pytest.mark.parametrize("kind", EXACT)
-def test_a_figure_that_few_phases_change_is_doubtful(kind: str) -> None:
+def test_a_figure_that_few_phases_change_is_doubtful(kind: str, tmp_path: Path) -> None:
     """Timers are fixed times in the engine: of two that begin together, the mean of the later one
-    is longer by phases."""
+    is longer by phases, even by the many of a simulation."""
     places, *moves = EXACT[kind]
-    task = loads(
+    text = (
         'schema = 1\n[task]\nname = "t"\nfinal = "a == 1 and b == 1"\n[places]\n'
         f"{places}a = {{}}\nb = {{}}\n[transitions]\n"
         + "".join(
             arcs(f"t{i}", take, give, f", after = {s}") for i, (give, take, s) in enumerate(moves)
-        ),
-        "t.toml",
+        )
     )
+    task, file = loads(text, "t.toml"), tmp_path / "t.toml"
+    file.write_text(text, encoding="utf-8")
+    simulated = simulate_command(file, load, np.random.default_rng(2), replicas=200).text
+    assert (" here, 1.5 there (standard error 0)" in simulated) is kind.startswith("two")
     world = Clock(Engine(task), np.random.default_rng(1))
     world.play()
     assert (world.ended, world.now) == (Status.SUCCESS, 1.5)
     x = execute(task)
     assert played(x).figures["mean time (s)"] == pytest.approx((1.5, 0.0))
-    doubts = [text for text in analyse(task, view="gspn").doubts if "exact times" in text]
+    found = analyse(task, view="gspn")
+    doubts = [text for text in found.doubts if "exact times" in text]
     assert len(doubts) == (kind != "one after the other")
     assert all(" 1.5 there (standard error 0)" in text for text in doubts)
+    (head,) = [line for line in found.text().splitlines() if line.startswith("forecast: ")]
+    data = found.to_json()["forecast"]["exact"]
+    assert bool(data) is bool(doubts) is ("mean time (s) 1.5 +- 0" in head)
+    assert not data or data["mean time (s)"] == pytest.approx((1.5, 0.0))
 
 
 @settings(COMMON, max_examples=5)

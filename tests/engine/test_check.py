@@ -263,8 +263,13 @@ def test_conflicts_of_a_long_task_are_found_soon(task: Tasks) -> None:
     assert effort(160) < 5 * effort(80)
 
 
-def test_invariant_that_excludes_two_transitions(task: Tasks) -> None:
+@pytest.mark.parametrize("lost", [{}, {"lost": {"in": "q", "out": "c", "event": "g"}}])
+def test_invariant_that_excludes_two_transitions(
+    task: Tasks, lost: dict[str, dict[str, Any]]
+) -> None:
+    """Also where a token can leave for a control place: it does not come back."""
     net = {
+        **lost,
         "swap": {"in": "p", "out": "q", "event": "f"},
         "back": {"in": "q", "out": "p", "event": "f"},
         "t": {"in": "p r", "out": "p", "event": "e"},
@@ -272,19 +277,19 @@ def test_invariant_that_excludes_two_transitions(task: Tasks) -> None:
     }
     pairs = [
         f.text
-        for f in check(task("p~=1 q~ r~=1", net, "e f")).findings
+        for f in check(task("p~=1 q~ c r~=1", net, "e f g")).findings
         if f.code == "unsettled-conflict"
     ]
     assert pairs == []
     pairs = [
         f.text
-        for f in check(task("p~=1 q~=1 r~=1", net, "e f")).findings
+        for f in check(task("p~=1 q~=1 c r~=1", net, "e f g")).findings
         if f.code == "unsettled-conflict"
     ]
     assert any(t.startswith("t and u") for t in pairs), "with two tokens they can meet"
     pairs = [
         f.text
-        for f in check(task("p=1 q r~=1", net, "e f")).findings
+        for f in check(task("p=1 q c r~=1", net, "e f g")).findings
         if f.code == "unsettled-conflict"
     ]
     assert any(t.startswith("t and u") for t in pairs), "the operator may add the second one"

@@ -11,7 +11,7 @@ import numpy as np
 from petrobot.coordinator.analysis.execution.graph import ExecutionGraph
 from petrobot.coordinator.engine import Phase, State
 from petrobot.coordinator.engine.draft import Draft
-from petrobot.coordinator.engine.firing import Obstacle, obstacles
+from petrobot.coordinator.engine.firing import Obstacle, in_words, obstacles
 from petrobot.coordinator.task import Kind
 from petrobot.coordinator.task.compiled_task import CompiledTransition
 from petrobot.coordinator.task.conditions import And, Compare, Expression, Literal, Name
@@ -142,8 +142,7 @@ def awaiting(x: ExecutionGraph, state: int, place: str) -> str:
         if any(arc.name == place for arc in t.actions):
             found = obstacles(draft, t)
             if not found:
-                waits = [*((t.pulse,) if t.pulse else ()), *t.flags]
-                return f"{t.name} waits for {' and '.join(waits) or 'its time'}"
+                return f"{t.name} waits for {in_words(draft, t)}"
             if not any(
                 _other_end(draft, one) and draft.compiled.net.places[one.place or 0] == place
                 for one in found
@@ -197,6 +196,10 @@ def _asked(
                 left.add(index[name])
         elif not held[name]:
             spent.add(index[name])
+    busy = sorted({r.place for r in draft.live() if not task.places[r.place].listen})
+    if not missed and busy:
+        names = " or ".join(busy)
+        missed.append(f"no active run of {names} (only places with `listen` may have one)")
     ends = [" and ".join(dict.fromkeys(missed))]
     ends += [str(task.final_error)] if task.final_error is not None else []
     return ", or for ".join(ends), spent, left, tuple(gone)

@@ -11,7 +11,7 @@ replay each path along the search tree exactly.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -47,6 +47,9 @@ SHOWN = 20
 """The most firings of one stimulus that are written."""
 STEPS = 300_000
 """The most stimuli and firings for one graph; they take about twenty seconds."""
+QUEUE = 16
+"""So many runs of a state count like one more firing. Else a queue that grows for ever, by a timer
+or by the operator's tokens, reaches thousands of runs, and each stimulus takes as long."""
 
 
 TOLD_FIRST, TOLD_LAST = 5, 10
@@ -156,10 +159,9 @@ class ExecutionGraph:
         mask: Mask = some[self.label]
         return mask
 
-    @cached_property
-    def calm(self) -> Graph:
-        """The states and the edges that are not a run which ends in ERROR."""
-        return Graph(len(self.states), self.source[~self.fails], self.target[~self.fails])
+    def of_edges(self, some: Mask) -> Graph:
+        """Return the graph of all states with some of the edges."""
+        return Graph(len(self.states), self.source[some], self.target[some])
 
     @cached_property
     def retries(self) -> tuple[tuple[str, ...], ...]:
@@ -335,7 +337,7 @@ class _Search:
             found = self._result(x.first, end, np.array(by_hand, np.bool_), limit)
             if found.dead[len(x) :].any() or len(found.contests) > len(x.contests):
                 break
-        return found
+        return replace(found, complete=found.complete and self.handled < limit)
 
     def _explore(self, i: int, limit: int) -> int:
         """Follow the stimuli of the states from number i on; return the first state that was not
@@ -352,7 +354,8 @@ class _Search:
             state, said = self.engine.handle(before, cause.stimulus)
             j = self._found(before, self.orders[i], state, said, (i, cause.stimulus))
             step = Step(cause.text, _fired(said), cause.stimulus)
-            self.handled += 1 + len(step.firings)
+            runs = sum(map(len, state.tokens.values()))
+            self.handled += 1 + len(step.firings) + runs // QUEUE
             if i != j or step.firings:
                 source.append(i)
                 target.append(j)

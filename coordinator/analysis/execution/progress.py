@@ -46,12 +46,14 @@ from petrobot.coordinator.analysis.execution.names import cases
 from petrobot.coordinator.analysis.limits import OutOfTime, overtime
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
+from petrobot.coordinator.analysis.net.qualitative import FAIR
 from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
 from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
 from petrobot.coordinator.engine import (
     AddTokens,
     Begin,
     Engine,
+    EventOccurred,
     Phase,
     Policy,
     RemoveTokens,
@@ -63,8 +65,6 @@ from petrobot.coordinator.task.compiled_task import CompiledTransition
 from petrobot.coordinator.task.conditions import ConditionFault
 from petrobot.coordinator.task.wording import few
 
-FAIR = "every awaited event comes at some time, and a run may always end in each of its ways"
-"""What progress needs of the world."""
 MENDED = "the operator repairs what `final_error` leaves and starts the task again"
 AGAIN = {
     "live": "from every state every transition can fire again",
@@ -263,17 +263,19 @@ class Progress:
         """From everywhere `final` can be reached, or the task can give up without a further error.
 
         Giving up after an error that is yet to come does not count: that error may belong to a
-        branch that has nothing to do with what is stuck, and never comes if all goes well.
+        branch that has nothing to do with what is stuck, and never comes if all goes well. Nor does
+        a stop button that could be pressed all the time.
         """
         x = self.x
         if overtime():
             return self._unknown("")
         final, tired = x.engine.compiled.task.final, x.graph.backward(x.given_up)
+        calm = x.of_edges(~x.fails & ~x.firing(self._stops))
         hopeless = f"the task can only give up: it never comes to {final}"
         only_gives_up = x.complete and not x.final.any() and tired.all()
         good = x.final.copy()
         good[x.expanded :] = True
-        lost = np.flatnonzero(~(x.graph.backward(good) | x.calm.backward(x.given_up)))
+        lost = np.flatnonzero(~(x.graph.backward(good) | calm.backward(x.given_up)))
         if not len(lost) and only_gives_up:
             return self._no(hopeless, int(np.flatnonzero(x.given_up)[0]))
         if not len(lost):
@@ -282,22 +284,54 @@ class Progress:
         reason = f"from {left_over(x, first)} no designed end can be reached"
         if x.dead.any() or x.livelocks:  # told by the verdict on deadlocks
             return self._no(reason, first)
-        # Without a further error, a lost state leads to lost states only.
-        parts = x.calm.components
-        last = lost[x.calm.bottom[parts[lost]]]
+        # Without a further error or a stop, a lost state leads to lost states only.
+        parts = calm.components
+        last = lost[calm.bottom[parts[lost]]]
         inside = parts == parts[last[0]]
         state = min(np.flatnonzero(inside).tolist(), key=lambda i: (_active(x.states[i]), i))
-        steps = np.unique(x.label[inside[x.source] & ~x.fails]).tolist()
+        steps = np.unique(x.label[inside[x.source] & inside[x.target] & ~x.fails]).tolist()
         still = {name for n in steps for name in x.steps[n].firings}
-        why = explain(x, state, still)
+        why = explain(x, state, still | self._stops)
         if why.short:
             first, reason = state, f"stuck with {left_over(x, state)}: {why.short}"
             goes_on = f"meanwhile {few(sorted(still))} can fire for ever"
         else:
             reason = hopeless if only_gives_up else reason
             goes_on = f"the task can continue for ever, but never reaches {final}"
-        goes_on += "; only a further error ends it" * bool(tired[first])
+        goes_on = goes_on if still else "nothing else can happen"
+        if tired[first]:
+            leaves = np.isin(x.source, lost) & ~np.isin(x.target, lost) & ~x.fails
+            fired = {name for n in np.unique(x.label[leaves]) for name in x.steps[n].firings}
+            ways = sorted(self._stops & fired)
+            goes_on += f"; only {few(ways) if ways else 'a further error'} ends it"
         return self._no(reason, first, (*why.details, goes_on))
+
+    @cached_property
+    def _stops(self) -> frozenset[str]:
+        """Transitions by which an external event may end a mission that could still reach `final`
+        and has met no error, such as a stop button.
+
+        After them `final` cannot be reached; or they only fill places that nothing empties and that
+        `final` does not name, so that all they ever bring is `final_error`.
+        """
+        x, known = self.x, self.x.engine.compiled
+        used = {p for arcs in known.net.consume for p, _ in arcs}
+        used |= {p for name, p in known.net.place_index.items() if name in known.task.final.names}
+        awaiting = {t.name: {*t.flags, t.pulse} for t in known.transitions if t.flags or t.pulse}
+        given = {t.name: {p for p, *_ in t.produce} for t in known.transitions}
+        marks = {name for name, places in given.items() if places and not places & used}
+        good = x.final.copy()
+        good[x.expanded :] = True
+        can = x.graph.backward(good)
+        found, free = set[str](), (self._nominal & can)[x.source]
+        for n in np.unique(x.label[free]).tolist():
+            found |= marks.intersection(awaiting, x.steps[n].firings)
+        for n in np.unique(x.label[free & ~can[x.target]]).tolist():
+            cause = x.steps[n].stimulus
+            came = cause.event if isinstance(cause, EventOccurred) else None
+            fired = x.steps[n].firings
+            found |= {name for name in awaiting if name in fired or came in awaiting[name]}
+        return frozenset(found)
 
     @cached_property
     def quasi_live(self) -> PropertyVerdict:

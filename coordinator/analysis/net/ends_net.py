@@ -44,7 +44,7 @@ from petrobot.coordinator.analysis.net.coverability import Coverability
 from petrobot.coordinator.analysis.net.graph import Graph
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.qualitative import (
-    FAIRNESS,
+    FAIR,
     SAFETY,
     Qualitative,
     boundedness,
@@ -495,7 +495,7 @@ def proven(n: EndsNet, space: Space, view: OrdinaryView) -> dict[str, PropertyVe
 
     def holds(name: str, reason: str) -> None:
         text = f"{reason} (shown on the ends net: {len(space)} markings)"
-        found[name] = PropertyVerdict(True, text, assumption=FAIRNESS)
+        found[name] = PropertyVerdict(True, text, assumption=FAIR)
 
     flat, index = n.task, n.task.net.place_index
     held = partial(n.held, space)

@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from petrobot.coordinator.analysis.net.explore import Explored, Numbers, widened_layout
 from petrobot.coordinator.analysis.net.pack import Layout, Rules, Words
 
-SUCCESSORS = 1 << 17
+SUCCESSORS = 1 << 18
 """Successors aimed at in a block: many of them are equal, but their arrays should stay in the
 cache."""
 TESTS = 1 << 22
 """The most pairs of marking and transition that a block tests."""
 EMPTY = -1
 """What the table holds in a free slot."""
-NEAR = 1 << 18
+NEAR = 1 << 19
 """Slots of the table of the successors of one block."""
 MULTIPLIERS = (
     np.random.Generator(np.random.PCG64(0x9E3779B97F4A7C15)).integers(1, 1 << 63, 4096, np.uint64)

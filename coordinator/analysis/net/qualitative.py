@@ -30,11 +30,8 @@ from petrobot.coordinator.task.net import Net
 SAFETY = ""
 """No assumption: every marking of the executed task is one of the ordinary net, so what never
 happens in the net never happens in execution."""
-FAIRNESS = (
-    "every awaited event eventually occurs, and every status of an action is possible "
-    "again and again"
-)
-"""What liveness and progress of the executed task require beyond the ordinary net."""
+FAIR = "every awaited event comes at some time, and a run may always end in each of its ways"
+"""What liveness and progress of the executed task need of the world."""
 HUNT = 10_000
 """Markings that the search for deadlocks may visit if the space is not complete."""
 GROUPS = 100
@@ -248,19 +245,19 @@ def _deadlock_free(space: Space, dead: NDArray[np.int64], hunt: Hunt | None) -> 
         return PropertyVerdict(
             True,
             f"{always} needs no token and nothing disables it: it can always fire",
-            assumption=FAIRNESS,
+            assumption=FAIR,
         )
     if hunt is not None and not hunt.complete and _siphons_suffice(space.net):
         reason = (
             "every siphon contains an initially marked trap, so some transition is always enabled"
         )
-        return PropertyVerdict(True, reason, assumption=FAIRNESS)
+        return PropertyVerdict(True, reason, assumption=FAIR)
     if hunt is not None and hunt.complete:
         reason = f"no reachable marking is dead (checked {hunt.states} markings by stubborn sets)"
-        return PropertyVerdict(True, reason, assumption=FAIRNESS)
+        return PropertyVerdict(True, reason, assumption=FAIR)
     if not space.complete:
         return _unknown(space, f"no dead marking among the {space.expanded} examined")
-    return PropertyVerdict(True, "no reachable marking is dead", assumption=FAIRNESS)
+    return PropertyVerdict(True, "no reachable marking is dead", assumption=FAIR)
 
 
 def _never_barred(net: Net) -> str | None:
@@ -330,7 +327,7 @@ def _quasi_live(
     fired = space.fired
     if fired.all():
         return PropertyVerdict(
-            True, "every transition can fire", assumption=FAIRNESS, complete=space.complete
+            True, "every transition can fire", assumption=FAIR, complete=space.complete
         )
     idle = [space.net.transitions[t] for t in np.flatnonzero(~fired)]
     dead = [name for name, level in zip(space.net.transitions, levels, strict=True) if level == 0]
@@ -342,7 +339,7 @@ def _quasi_live(
         return PropertyVerdict(
             True,
             "every transition can fire (by the coverability tree)",
-            assumption=FAIRNESS,
+            assumption=FAIR,
             complete=False,
         )
     if not space.complete:
@@ -376,7 +373,7 @@ def _live(
     lost = [t for t, level in enumerate(levels) if level != 4]
     if not lost:
         return PropertyVerdict(
-            True, "from every marking every transition can fire again", assumption=FAIRNESS
+            True, "from every marking every transition can fire again", assumption=FAIR
         )
     ours = graph.components[space.source]
     for component in np.flatnonzero(graph.bottom).tolist():
@@ -415,7 +412,7 @@ def _reversible(space: Space, graph: Graph | None, hunt: Hunt | None) -> Propert
     away = np.flatnonzero(~graph.returning)
     if not len(away):
         return PropertyVerdict(
-            True, "the initial marking can be reached again from everywhere", assumption=FAIRNESS
+            True, "the initial marking can be reached again from everywhere", assumption=FAIR
         )
     first = int(away[0])
     reason = (

@@ -29,10 +29,16 @@ Flow = dict[int, int]
 
 
 def semiflows(task: Task) -> tuple[Flow, ...]:
-    """Return P-semiflows without control places; empty if there are none, or too many to compute
-    here."""
+    """Return weights of places, without control places, whose weighted sum of tokens never grows;
+    empty if there are none, or too many to compute here.
+
+    They are P-semiflows, in which a control place may stand that no transition empties: what the
+    operator adds to it comes nowhere else, so without it the sum can only fall.
+    """
     net = task.net
-    places = [i for i, p in enumerate(task.places.values()) if p.kind is not Kind.CONTROL]
+    control = {i for i, p in enumerate(task.places.values()) if p.kind is Kind.CONTROL}
+    taken = {p for arcs in net.consume for p, _ in arcs}
+    places = [i for i in range(len(net.places)) if i not in control & taken]
     rows: list[tuple[Flow, dict[int, int]]] = [({p: 1}, _effects(net, p)) for p in places]
     for t in range(len(net.transitions)):
         rest = [r for r in rows if not r[1].get(t)]
@@ -41,7 +47,7 @@ def semiflows(task: Task) -> tuple[Flow, ...]:
         if len(rest) + len(gain) * len(loss) > ROWS:
             return ()
         rows = _minimal(rest + [_combine(a, b, t) for a in gain for b in loss])
-    return tuple(flow for flow, _ in rows)
+    return tuple({p: w for p, w in flow.items() if p not in control} for flow, _ in rows)
 
 
 def never_together(net: Net, flows: tuple[Flow, ...], t: int, u: int) -> bool:
