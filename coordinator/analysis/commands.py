@@ -28,7 +28,7 @@ from petrobot.coordinator.analysis.may_run import BUDGET, Cell, assumed, devices
 from petrobot.coordinator.analysis.net.ends_net import ends_net
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.picture import graph_svg
-from petrobot.coordinator.analysis.net.space import SearchLimits, explore
+from petrobot.coordinator.analysis.net.space import INTERRUPTED, SearchLimits, explore
 from petrobot.coordinator.analysis.report import CUT, FULL, LATE, Analysis, analyse
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
@@ -427,8 +427,8 @@ def _unlike_the_engine(
         if not x.complete:
             raise ValueError("the execution graph is too large")
         plays = played(x, measured)
-    except (ValueError, OutOfTime) as why:
-        return [f"not compared with missions of the engine: {why}"]
+    except (ValueError, OutOfTime, KeyboardInterrupt) as why:
+        return [f"not compared with missions of the engine: {str(why) or INTERRUPTED}"]
     share, off = seen.completed.mean, list[str]()
     here = {"P_complete": (share, sqrt(share * (1 - share) / seen.replicas))}
     if seen.time is not None:
