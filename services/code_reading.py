@@ -434,7 +434,8 @@ def _methods(thing: type[Driver], seen: _Seen) -> None:
     calls because of their names."""
     for base in thing.__mro__[: thing.__mro__.index(Driver)]:
         for name, method in vars(base).items():
-            if inspect.isfunction(method) and (code := _code(method)) is not None:
+            used = inspect.isfunction(method) and getattr(thing, name) is method
+            if used and (code := _code(method)) is not None:
                 text = _fault_of_method(name, method, code)
                 if text:
                     line = code.tree.lineno  # type: ignore[attr-defined]

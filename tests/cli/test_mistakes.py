@@ -762,6 +762,11 @@ OUTER = [
         "",
     ),
 ]
+AXIS = """class Axis(Rail):
+    def state(self) -> Mapping[str, Any]:
+        return {"at": self.at, "arrived": self.stopped()}"""
+"""A driver that does not use what the class above it has."""
+
 REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
     (
         SUBNET,
@@ -857,6 +862,14 @@ REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
         [(CODE, "    period = 0.01", "    # no period", "")],
         r"Axis has `step` and no period[^|]*write `period = 0.01`",
         [(CODE, "    # no period", "    period = 0.01", "")],
+    ),
+    (
+        [(CODE, "return {", "{", "")],
+        r"`state` of Axis returns nothing",
+        [
+            (CODE, "class Axis(", "class Rail(", ""),
+            (CODE, "async def move(", f"{AXIS}\n\n\nasync def move(", ""),
+        ],
     ),
     (
         [(CELL, 'move", device = "axis"', 'move", node = "pc"', "")],
