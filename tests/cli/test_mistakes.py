@@ -865,7 +865,7 @@ REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
     ),
     (
         [(CODE, "return {", "{", "")],
-        r"`state` of Axis returns nothing",
+        r"`state` of \w+ returns nothing",
         [
             (CODE, "class Axis(", "class Rail(", ""),
             (CODE, "async def move(", f"{AXIS}\n\n\nasync def move(", ""),
