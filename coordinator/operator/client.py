@@ -4,6 +4,7 @@ and sends commands."""
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 from collections.abc import AsyncIterator, Callable
 from typing import Any, Self
@@ -95,10 +96,10 @@ class OperatorClient:
         self._numbers += 1
         number = self._numbers
         answer = self._answers[number] = asyncio.get_running_loop().create_future()
-        await self._socket.send_json(
-            {"type": "command", "id": number, "verb": verb, "data": data or {}}
-        )
+        message = {"type": "command", "id": number, "verb": verb, "data": data or {}}
         try:
+            with contextlib.suppress(ConnectionError):  # the reader ends `answer`, and says why
+                await self._socket.send_json(message)
             async with asyncio.timeout(ANSWER):
                 await answer
             given: dict[str, Any] = answer.result()

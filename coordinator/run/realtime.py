@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import math
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -66,6 +67,8 @@ class Punctuality:
 
 LINGER = 1.0
 """Longest wait for anything at the end of a run (s)."""
+ASK_AGAIN: Final = 0.2
+"""Seconds after which a device that another run has is asked for again."""
 LEAVE: Final = 2.5
 """How long to wait for a lost node, so that it can be sent BYE (s): a little longer than it keeps
 the leases of a coordinator that left without BYE (`services.comm.calls.callee.Retention.lease`)."""
@@ -107,6 +110,8 @@ class RealtimeMission:
         self._leased: tuple[str, ...] = ()
         self._answers: dict[str, asyncio.Future[Answer]] = {}
         """Answers to come to the requests for devices, by the command's id."""
+        self._asked = itertools.count()
+        """Numbers of these requests."""
         self._missed: list[str] | None = []
         """Nodes that cleared an emergency stop after that; None once all nodes are connected: from
         then on the callers count the stops."""
@@ -151,11 +156,16 @@ class RealtimeMission:
 
     async def lease(self, devices: Collection[str]) -> None:
         """Take the devices for this run. Of two runs that start at once one gets them all, because
-        both take them in the order of services.toml. Raises MissionError if another run has one,
-        and UnreachableError if a node does not answer."""
+        both take them in the order of services.toml. A run whose coordinator was killed keeps its
+        devices for a while, so they are asked for as long. Raises MissionError if another run has
+        one, and UnreachableError if a node does not answer."""
         self._leased = tuple(device for device in self._directory.devices if device in devices)
+        until = self.now() + LEAVE
         for device in self._leased:
             answer = await self._take_device(device)
+            while not answer.ok and "text" in answer.data and self.now() < until:
+                await asyncio.sleep(ASK_AGAIN)
+                answer = await self._take_device(device)
             if answer.ok:
                 continue
             if "text" not in answer.data:
@@ -170,7 +180,7 @@ class RealtimeMission:
     def _take_device(self, device: str) -> asyncio.Future[Answer]:
         client = self.clients[self._directory.where(device)]
         hello = client.caller.hello
-        id_ = f"{hello.name}/{hello.epoch}/{LEASE}/{device}"
+        id_ = f"{hello.name}/{hello.epoch}/{LEASE}/{next(self._asked)}"
         answer = self._answers[id_] = self._loop.create_future()
         client.caller.command(self.now(), Command(id_, LEASE, device))
         client.flush()

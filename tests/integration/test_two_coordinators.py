@@ -109,6 +109,10 @@ async def test_of_coordinators_that_take_their_devices_at_once_one_gets_all(tmp_
             await shells[4].connect(60.0)
             with pytest.raises(MissionError, match="right_hand accepts orders from"):
                 await shells[4].lease({"right_hand"})
+            waiting = asyncio.create_task(shells[4].lease({"right_hand"}))
+            await beat(0.3)
+            await first.close()  # a killed one says no BYE; its devices are free some time later
+            await waiting
         finally:
             await asyncio.gather(*(shell.close() for shell in (first, *shells)))
 
