@@ -390,6 +390,27 @@ def test_what_fires_at_once_fires_in_the_order_of_a_step_at_length(task: Task) -
     figures_agree(task)
 
 
+def test_a_ring_of_inhibitors_is_doubtful() -> None:
+    """The engine fires both of `a` and `b`, in this order; the view draws, and may bar `a`."""
+    nexts = {"a": "b", "b": "c", "c": "a"}
+    moves = "".join(arcs(f"move_{x}", f"{x},!of_{y}", f"of_{x}") for x, y in nexts.items())
+    kept = " and ".join(f"{x} >= 0 and of_{x} >= 0" for x in nexts)
+    task = loads(
+        f'schema = 1\n[task]\nname = "t"\nfinal = "work == 0 and of_a > 0 and {kept}"\n'
+        f'final_error = "work == 0 and of_a == 0 and {kept}"\n{head("work")}[places]\n'
+        'work = { kind = "action", task = "work", tokens = 1 }\n'
+        + "".join(f"{x} = {{ }}\nof_{x} = {{ }}\n" for x in nexts)
+        + f"[transitions]\n{moves}{arcs('end', 'work:normal', 'a,b')}"
+        f"{arcs('bad', 'work:error', 'a')}",
+        "t.toml",
+    )
+    x = execute(task, limit=STEPS)
+    chain, view, found = in_both(x)
+    assert chain.figures["P_complete"] > found.figures["P_complete"] + 0.1
+    (doubt,) = view.doubts
+    assert doubt.startswith("move_a, move_b, move_c: each keeps the next one from firing")
+
+
 def test_the_time_of_one_of_several_ended_runs_is_doubtful() -> None:
     task = loads(
         f'schema = 1\n[task]\nname = "t"\nfinal = "work == 0"\n{head("work")}[places]\n'

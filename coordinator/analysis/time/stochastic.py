@@ -72,6 +72,7 @@ from petrobot.coordinator.task.conditions.language import Scalar, with_values
 from petrobot.coordinator.task.conditions.regions import can_hold, region_values
 from petrobot.coordinator.task.net import Marking, Net
 from petrobot.coordinator.task.validation import condition_domains, is_pulse
+from petrobot.coordinator.task.wording import few
 
 FLUSH, TASK, CHOICE = 3_000_000, 1_000_000, 500_000
 """Priorities of flushing, of the task's transitions (above TASK in their order) and of choosing. As
@@ -893,7 +894,8 @@ class _Derivation:
         By rank; among equals as in a step of the engine, whose transitions are all judged in one
         marking. So a transition comes after those that it spoils, and after those that compete
         with, spoil or are spoiled by what it enables. What competes for tokens, or spoils each
-        other, keeps one number: only a draw decides that.
+        other, keeps one number: only a draw decides that. So does a longer ring, whose order in the
+        engine depends on which of its transitions can fire: a doubt.
         """
         moves = list(self.compiled.values())
         takers, barred, readers, setters = (defaultdict[Any, set[int]](set) for _ in range(4))
@@ -934,6 +936,13 @@ class _Derivation:
             hard |= {(i, j) for i in (spoils[j] & equal[j]) | rivals[j]}
             first = set[int]().union(*(disturbs[k] for k in enables[j]))
             soon |= {(i, j) for i in first & equal[j]}
+        spoiling = {(i, j) for j in range(len(moves)) for i in spoils[j] & equal[j]}
+        rings = _groups(len(moves), spoiling)
+        lost = {rings[i] for i, j in spoiling if rings[i] == rings[j] and (j, i) not in hard}
+        for number in sorted(lost):
+            names = few([x.name for x, n in zip(moves, rings, strict=True) if n == number])
+            text = "each keeps the next one from firing, in a ring, so a draw decides who is first"
+            self.doubts.append(f"{names}: {text}")
         ring = _groups(len(moves), hard | soon)
         level = _levels(len(moves), hard | {(i, j) for i, j in soon if ring[i] != ring[j]})
         keys = [(x.rank, n) for x, n in zip(moves, level, strict=True)]
