@@ -436,13 +436,13 @@ def _methods(thing: type[Driver], seen: _Seen) -> None:
         for name, method in vars(base).items():
             used = inspect.isfunction(method) and getattr(thing, name) is method
             if used and (code := _code(method)) is not None:
-                text = _fault_of_method(name, method, code)
-                if text:
-                    line = code.tree.lineno  # type: ignore[attr-defined]
-                    seen.faults.append((code.file, line, f"`{name}` of {base.__name__} {text}"))
+                line = code.tree.lineno  # type: ignore[attr-defined]
+                what = f"`{name}` of {base.__name__}"
+                if text := _fault_of_method(name, method, code):
+                    seen.faults.append((code.file, line, f"{what} {text}"))
                 elif near := _meant(thing, name):
-                    text = f"`{name}` of {base.__name__} is never called; did you mean `{near}`?"
-                    seen.doubtful.append((code.file, code.tree.lineno, text))  # type: ignore[attr-defined]
+                    text = f"{what} is never called; did you mean `{near}`?"
+                    seen.doubtful.append((code.file, line, text))
 
 
 def _fault_of_method(name: str, method: Callable[..., Any], code: _Code) -> str:
