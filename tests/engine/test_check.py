@@ -151,6 +151,12 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
             "task.final",
             lambda t: t("x y", {"t": {"in": "x", "out": "y"}}, final="x == 0"),
         ),
+        (
+            "overridden",
+            W,
+            "task.parameters.seed",
+            lambda t: replace(t("a!=1 y", A), parameters={"seed": 1, "regime": "A"}),
+        ),
         ("unused", N, "events.e", lambda t: t("a!=1 y", A, "e")),
         (
             "never-written",

@@ -97,7 +97,7 @@ async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
     await tab.get_by_role("button", name="Add token").click()
     await expect(element(tab, "^Control place jobs, 2 tokens", "Task net")).to_be_visible()
     await tab.screenshot(path=shots / "paused.png")
-    await toolbar.get_by_role("button", name="Resume").click()
+    await toolbar.get_by_role("button", name="Continue").click()
     await expect(mission).to_contain_text("Success")
     why = (
         tab.get_by_role("region", name="Last firings")

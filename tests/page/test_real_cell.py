@@ -176,7 +176,7 @@ async def lead_by_hand(tab: Tab, shots: Path) -> None:
     await toolbar.get_by_role("button", name="Step").click()
     await expect(fired).to_have_count(2)
     await expect(toolbar).to_contain_text("Paused after one firing")
-    await toolbar.get_by_role("button", name="Resume").click()
+    await toolbar.get_by_role("button", name="Continue").click()
     await expect(mission).to_contain_text("Success")
     why = fired.filter(has_text="slipped").first
     await expect(why).to_contain_text("pick part on arm: the part slipped out of the gripper")

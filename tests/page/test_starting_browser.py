@@ -181,7 +181,7 @@ async def test_the_selector_is_overridden_and_frozen_from_the_page(
     await expect(toolbar).to_contain_text("Paused after one firing")
     selected = tab.get_by_role("region", name="Selected")
     await tab.get_by_role("button", name="Remove breakpoint").click()
-    await toolbar.get_by_role("button", name="Resume").click()
+    await toolbar.get_by_role("button", name="Continue").click()
     await expect(mission(tab)).to_contain_text("Success")
     await expect(selected).to_be_visible()
     reasons = {run["why"] for run in cell.state["ended"] if run["place"] == "look"}

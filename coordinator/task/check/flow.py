@@ -117,6 +117,11 @@ def unused(task: Task) -> Iterator[Finding]:
                 "no action place runs it",
                 "drop it, or give it a place",
             )
+    for name in [p for p in task.parameters if p in ("seed", "runs")]:
+        text = f"`prepare` and `score` receive what --{name} gives by this name, not this value"
+        yield Finding(
+            Severity.WARNING, "overridden", f"task.parameters.{name}", text, "drop it, or rename it"
+        )
     written = {v for p in places for v in p.out.values()}
     written |= {name for t in task.transitions.values() for name, _ in t.sets}
     read = {n for t in task.transitions.values() if t.when is not None for n in t.when.names}

@@ -11,7 +11,7 @@ const STOP_MS = 1500; // without an answer for so long, an emergency stop takes 
 
 const ABOUT_CONTROLS = ["take_controls", "ask_controls", "release_controls"]; // all other commands take free controls
 const DONE = {
-  start: "Started", pause: "Paused", resume: "Resumed", step: "Continued for one firing", abort: "Aborted", estop: "Emergency stop sent",
+  start: "Started", pause: "Paused", resume: "Continued", step: "Continued for one firing", abort: "Aborted", estop: "Emergency stop sent",
   add_tokens: "Token added", remove_tokens: "Token removed", raise_event: "Event raised", force_exit: "Transition forced",
   take_controls: "You hold the controls", ask_controls: "Asked for the controls", release_controls: "Controls released",
   load: "Task loaded", clear_estop: "Emergency stop cleared", override_selector: "Selector set", breakpoint: "Breakpoint set",
@@ -38,7 +38,7 @@ export class Operator {
       start: button("start", "play", "Start", { class: "command primary" }),
       pause: button("pause", "pause", "Pause"),
       step: button("step", "step", "Step"),
-      resume: button("resume", "resume", "Resume"),
+      resume: button("resume", "resume", "Continue"),
       abort: button("abort", "abort", "Abort", { class: "command danger", onclick: () => this.confirm(this.buttons.abort, "Abort the mission?", () => this.give("abort", {})) }),
     };
     this.clear = button("clear_estop", "check", "Clear the stop", { hidden: true, onclick: () => this.clearStop() });
