@@ -135,8 +135,8 @@ def explain(x: ExecutionGraph, state: int, still: Collection[str] = ()) -> Expla
     ]
     # A place that the end wants empty is not to be filled: what else the end asks for comes first.
     spare = not ended and any(one.place in spent for one in lacks[0][1])
-    short = f"the end asks for {missed}, and {told[0]}" if spare else told[0]
-    return Explanation(short, (*told[1:MOST], *more, *dict.fromkeys(fates)))
+    first = f"the end asks for {missed}, and {told[0]}" if spare else told[0]
+    return Explanation(first, (*told[1:MOST], *more, *dict.fromkeys(fates)))
 
 
 def fate(x: ExecutionGraph, state: int, place: int) -> str:
