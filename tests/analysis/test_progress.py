@@ -1147,3 +1147,79 @@ def test_only_runs_that_end_in_error_are_retries() -> None:
         "again": {"in": "act:error", "out": "act"},
     }
     assert execute(make_task("act!=1 done", again, final="done == 1")).retries == (("again",),)
+
+
+def test_a_variable_without_a_value_is_why_a_transition_never_fires() -> None:
+    """The tokens are there; what is missing is the value."""
+    task = make_task(
+        "parts=1 work! look! seen",
+        {
+            "next": {"in": "parts", "out": "work"},
+            "worked": {"in": "work:normal", "out": "seen"},
+            "spoilt": {"in": "work:error", "out": "seen"},
+            "left": {"in": "seen", "when": "side == 1"},
+            "right": {"in": "seen", "out": "look", "when": "side == 2"},
+            "looked": {"in": "look:normal", "out": "seen"},
+            "lost": {"in": "look:error", "out": "seen"},
+        },
+        final="parts == 0 and seen == 0",
+        variables={"side": 0},
+        out={"look": {"side": "side"}},
+    )
+    task = replace(task, variables={"side": Variable("side", VariableType.INT)})
+    assert judged(task).quasi_live.reason.startswith(
+        "left can never fire: when its tokens are there, it has a false condition (side == 1): "
+        "side has no value; right"
+    )
+
+
+def test_a_place_that_never_holds_enough_is_told_with_the_number() -> None:
+    net = {"next": {"in": "parts grip*2", "out": "done"}, "back": {"in": "done", "out": "grip"}}
+    task = make_task("parts=1 grip~=1 done", net, final="parts == 0 and done == 0")
+    assert judged(task).quasi_live.reason.startswith(
+        "next can never fire: it needs 2 of grip, which only `back` can fill"
+    )
+
+
+def test_what_the_end_asks_for_comes_before_a_place_that_it_wants_empty() -> None:
+    """The task has done all its work, and a token stays where the end wants none."""
+    net = {"next": {"in": "parts idle", "out": "look"}}
+    net |= {"seen": {"in": "look:normal", "out": "idle"}}
+    net |= {"lost": {"in": "look:error", "out": "idle"}}
+    task = make_task("parts=1 idle=1 look!", net, final="parts == 0 and idle == 0")
+    assert judged(task).deadlock_free.reason == (
+        "stuck with idle: the end asks for idle == 0 (it holds 1), and next needs parts, which "
+        "is empty"
+    )
+
+
+def test_a_false_condition_is_told_with_who_wrote_its_variable() -> None:
+    busy, free = (("busy", parse("1")),), (("busy", parse("0")),)
+    task = make_task(
+        "parts=2 arm~=1 look!",
+        {
+            "next": {"in": "parts arm", "out": "look", "when": "busy == 0", "sets": busy},
+            "seen": {"in": "look:normal", "out": "arm"},
+            "lost": {"in": "look:error", "out": "arm", "sets": free},
+        },
+        final="parts == 0",
+        variables={"busy": 0},
+    )
+    verdict = judged(task).deadlock_free
+    assert verdict.reason == "stuck with parts: next has a false condition (busy == 0)"
+    assert verdict.details[0] == "busy: `next` set it to 1; otherwise only `lost` sets it"
+
+
+def test_a_resource_that_an_ended_run_keeps_is_told_with_what_that_run_lacks() -> None:
+    task = make_task(
+        "parts=1 arm~=1 look! cup",
+        {
+            "next": {"in": "parts arm", "out": "look"},
+            "seen": {"in": "look:normal cup", "out": "arm cup"},
+            "lost": {"in": "look:error", "out": "arm"},
+        },
+        final="parts == 0",
+    )
+    verdict = judged(task).returned
+    assert verdict.holds is False
+    assert "look has ended: seen needs cup, which is empty" in verdict.details

@@ -319,6 +319,21 @@ def test_places_that_wait_together_are_one_finding(task: Tasks) -> None:
     assert texts["places.z"].startswith("only e can free its token:")
 
 
+@pytest.mark.parametrize(
+    ("events", "told"),
+    [
+        ("e*", "if it never comes, or only too early, the task hangs"),
+        ("e+", "if it never comes, the task hangs"),
+    ],
+)
+def test_an_event_that_is_lost_if_it_comes_early_is_told(
+    task: Tasks, events: str, told: str
+) -> None:
+    made = check(task("z=1", {"u": {"in": "z", "event": "e"}}, events)).findings
+    (text,) = (f.text for f in made if f.code == "external-wait")
+    assert text == f"only e can free its token: {told}"
+
+
 def test_after_beside_an_external_wait(task: Tasks) -> None:
     net = {"t": {"in": "x", "event": "e"}, "late": {"in": "x", "after": 9.0}}
     assert "external-wait" not in found(task("x=1", net, "e"))

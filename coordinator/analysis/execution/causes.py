@@ -115,7 +115,10 @@ def explain(x: ExecutionGraph, state: int, still: Collection[str] = ()) -> Expla
         return Explanation(text, gone)
     # The transition that lacks least comes first.
     lacks.sort(key=lambda one: (one[2], _rank(x.engine.compiled.net, one[0], one[1])))
-    told = [f"{t.name} {' and '.join(_words(draft, t, one) for one in own)}" for t, own, _ in lacks]
+    told = [
+        f"{t.name} {' and '.join(obstacle_text(draft, t, one) for one in own)}"
+        for t, own, _ in lacks
+    ]
     more = [f"and {len(told) - MOST} more"] if len(told) > MOST else []
     known = {t.index for t, _, _ in lacks}
     fates = [
@@ -124,7 +127,16 @@ def explain(x: ExecutionGraph, state: int, still: Collection[str] = ()) -> Expla
         for one in own
         for fate in _fates(x, draft, firings, one, known)
     ]
-    return Explanation(told[0], (*told[1:MOST], *more, *dict.fromkeys(fates)))
+    fates += [
+        line
+        for t, own, _ in lacks[:MOST]
+        if any(one.kind == "condition" for one in own)
+        for line in _values(draft, t, firings)
+    ]
+    # A place that the end wants empty is not to be filled: what else the end asks for comes first.
+    spare = not ended and any(one.place in spent for one in lacks[0][1])
+    first = f"the end asks for {missed}, and {told[0]}" if spare else told[0]
+    return Explanation(first, (*told[1:MOST], *more, *dict.fromkeys(fates)))
 
 
 def fate(x: ExecutionGraph, state: int, place: int) -> str:
@@ -147,7 +159,7 @@ def awaiting(x: ExecutionGraph, state: int, place: str) -> str:
                 _other_end(draft, one) and draft.compiled.net.places[one.place or 0] == place
                 for one in found
             ):
-                return f"{t.name} {' and '.join(_words(draft, t, one) for one in found)}"
+                return f"{t.name} {' and '.join(obstacle_text(draft, t, one) for one in found)}"
     return f"no transition takes a run of {place} that ended that way"
 
 
@@ -160,13 +172,33 @@ def _rank(net: Net, t: CompiledTransition, found: Sequence[Obstacle]) -> int:
     return 3 if any(one.kind == "short" for one in found) else 1
 
 
-def _words(draft: Draft, t: CompiledTransition, one: Obstacle) -> str:
+def obstacle_text(draft: Draft, t: CompiledTransition, one: Obstacle) -> str:
     """Return what a transition lacks; of a false condition also the variables without a value."""
     if one.kind != "condition" or t.when is None:
         return one.text
     variables = draft.compiled.task.variables
     unset = [n for n in sorted(t.when.names & set(variables)) if draft.variables.get(n) is None]
     return f"{one.text}: {' and '.join(unset)} ha{_has(unset)} no value" if unset else one.text
+
+
+def _values(draft: Draft, t: CompiledTransition, firings: Sequence[str]) -> Iterator[str]:
+    """Yield who wrote the variables of a false condition, for those that only firings write."""
+    task = draft.compiled.task
+    told = {name for place in task.places.values() for name in place.out.values()}
+    for name in sorted((t.when.names if t.when else frozenset()) & set(task.variables) - told):
+        setters = [u.name for u in task.transitions.values() if name in dict(u.sets)]
+        last = next((f for f in reversed(firings) if f in setters), None)
+        others = ", ".join(f"`{u}`" for u in setters if u != last)
+        value = repr(draft.variables.get(name))
+        if last is not None:
+            also = f"; otherwise only {others} set{_s(setters[1:])} it" if others else ""
+            yield f"{name}: `{last}` set it to {value}{also or ', and nothing else sets it'}"
+        elif setters:
+            yield f"{name}: {value} from the beginning; only {others} set{_s(setters)} it"
+
+
+def _s(names: Sequence[str]) -> str:
+    return "s" if len(names) == 1 else ""
 
 
 def _has(names: Sequence[str]) -> str:
@@ -258,7 +290,7 @@ def _fates(
     for t in () if known.intersection(takers) else takers:
         taker = x.engine.compiled.transitions[t]
         lacks = [lack for lack in obstacles(draft, taker) if not _other_end(draft, lack)]
-        words = " and ".join(_words(draft, taker, lack) for lack in lacks)
+        words = " and ".join(obstacle_text(draft, taker, lack) for lack in lacks)
         if lacks:
             yield f"{name}: `{taker.name}` would take some out of it, but it {words}"
         for lack in lacks:

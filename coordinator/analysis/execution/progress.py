@@ -33,6 +33,7 @@ from petrobot.coordinator.analysis.execution.causes import (
     explain,
     fate,
     left_over,
+    obstacle_text,
     settled,
 )
 from petrobot.coordinator.analysis.execution.chain import ExecutionChain, TooLarge, chain_of
@@ -375,9 +376,13 @@ class Progress:
 
         compiled = self.x.engine.compiled
         lacking: list[set[str]] = []
+        near: list[set[str]] = []
         for state in self.x.states:
-            found = obstacles(Draft(compiled, state), t)
+            draft = Draft(compiled, state)
+            found = obstacles(draft, t)
             lacking.append({_lack(one.kind, one.text) for one in found})
+            if not any(one.kind in ("short", "run") for one in found):
+                near.append({_lack(one.kind, obstacle_text(draft, t, one)) for one in found})
             if not found:
                 return "whenever its arcs are satisfied, others fire before its event or time comes"
         always, net, empty = set.intersection(*lacking), compiled.net, list[str]()
@@ -386,7 +391,7 @@ class Progress:
             if net.initial[p] < w and givers <= idle:
                 names = ", ".join(f"`{net.transitions[u]}`" for u in sorted(givers))
                 own = f"only {names} can fill" if givers else "nothing ever fills"
-                empty.append(f"{net.places[p]}, which {own}")
+                empty.append(f"{f'{w} of ' * (w > 1)}{net.places[p]}, which {own}")
         if empty:
             return f"it needs {' and '.join(empty)}"
         if false := self._never_true(t):
@@ -394,6 +399,8 @@ class Progress:
         if always:
             text = f"in every state at rest it {' and '.join(sorted(always))}"
             return text + self._first_takers(t, idle)
+        if near:
+            return f"when its tokens are there, it {' or '.join(sorted(set.union(*near)))}"
         needs = ", ".join(net.places[p] for p, _ in t.needs)
         return f"the tokens that it needs ({needs}) are never there together"
 
@@ -546,8 +553,11 @@ class Progress:
                         "the end"
                     )
                     lost = left < place.tokens
-                    details = (f"{place.name}: {fate(self.x, int(i), p)}",) if lost else ()
-                    return self._no(reason, int(i), details)
+                    details = [f"{place.name}: {fate(self.x, int(i), p)}"] if lost else []
+                    done = (r.place for r in self.x.states[i].runs() if r.phase is Phase.DONE)
+                    for name in dict.fromkeys(done):
+                        details.append(f"{name} has ended: {awaiting(self.x, int(i), name)}")
+                    return self._no(reason, int(i), tuple(details))
         return self._yes("every resource has its initial number of tokens at the end")
 
     # --- recovery -------------------------------------------------------------------------------

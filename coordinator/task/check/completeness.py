@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from petrobot.coordinator.task import (
+    EarlyEvent,
     End,
     Event,
     Kind,
@@ -124,7 +125,10 @@ def external_waits(
             text = f"only {listed(waits)} can free the tokens of {', '.join(names)}"
         remedy = "put a transition with `after` beside it"
         if source is None:
-            text += ": if it never comes, the task hangs"
+            early = any(task.events[e].early is EarlyEvent.DROP for e in waits)
+            text += f": if it never comes{', or only too early' * early}, the task hangs"
+            if early:
+                remedy += ', or let it come early (`memory = "latched"`, `early = "keep"`)'
         else:
             text += f", and no driver, action, service or timer of {source} raises it"
             remedy += ", or raise it by hand: petrobot raise EVENT"
