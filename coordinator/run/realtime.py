@@ -296,7 +296,9 @@ class RealtimeMission:
                         if self._directory.where(device) == node:
                             self._take_device(device)
                 elif isinstance(notice, Answer) and notice.id in self._answers:
-                    self._answers.pop(notice.id).set_result(notice)
+                    asked = self._answers.pop(notice.id)
+                    if not asked.cancelled():  # by Ctrl-C before the answer came
+                        asked.set_result(notice)
             if not self._closed:
                 self._guarded(lambda now: self.mission.take(now, node, notices))
 

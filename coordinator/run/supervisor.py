@@ -27,6 +27,7 @@ LONGEST_PAUSE = 8.0
 # for the rest of what an ended program has said (s); what it has left running may never stop
 # talking
 LAST_WORDS = 0.5
+READY = b"ready"  # what a program prints when others may use it
 STABLE_AFTER = 10.0  # a node that ran so long (s) starts again without pause
 
 
@@ -240,16 +241,20 @@ async def output_pipe(limit: int = 1 << 16) -> AsyncIterator[tuple[BinaryIO, asy
 async def _copy(child: _Child, output: asyncio.StreamReader, log: IO[bytes]) -> None:
     """Write what a program prints to its log, and note when it is ready. If the log cannot be
     written before that, the program is ended; later the program matters more than its log."""
-    async for line in output:
+    said = b""
+    # Not line by line: a line may be longer than the reader's limit, and if the copying ended then,
+    # the pipe would fill and block each later action that prints.
+    while part := await output.read(1 << 16):
         try:
-            log.write(line)
+            log.write(part)
         except OSError as fault:
             if not child.ready.is_set():
                 child.log_fault = child.log_fault or OSError(
                     fault.errno, fault.strerror, str(child.log)
                 )
                 _signal(child, signal.SIGTERM)
-        if b"ready" in line and child.log_fault is None:
+        said = said[1 - len(READY) :] + part  # the word may come in two parts
+        if READY in said and child.log_fault is None:
             child.ready.set()
 
 

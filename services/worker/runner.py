@@ -6,6 +6,7 @@ from __future__ import annotations
 import inspect
 import logging
 import math
+import os
 import sys
 import time
 import warnings
@@ -224,9 +225,12 @@ class Execution:
     def _timed(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Any:
         global _active
         before, earlier, _active = time.process_time(), _active, self
+        process = os.getpid()
         try:
             return function(*arguments, **named)
         finally:
+            if os.getpid() != process:  # a fork by the action: the run is its parent's
+                os._exit(0)
             _active = earlier
             self.cpu += time.process_time() - before
 

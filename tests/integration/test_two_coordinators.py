@@ -117,6 +117,22 @@ async def test_of_coordinators_that_take_their_devices_at_once_one_gets_all(tmp_
             await asyncio.gather(*(shell.close() for shell in (first, *shells)))
 
 
+async def test_an_answer_that_comes_after_ctrl_c_leaves_the_link(tmp_path: Path) -> None:
+    """Over a broken link no BYE is sent: the node would keep the device for two seconds."""
+    directory = load(shuttle_services(tmp_path))
+    shell = RealtimeMission(mission_on(directory, 2), directory)
+    async with Supervisor(local_programs(directory), tmp_path / "logs"):
+        try:
+            await shell.connect(60.0)
+            asking = asyncio.create_task(shell.lease({"left_hand"}))
+            await asyncio.sleep(0)
+            asking.cancel()
+            async with asyncio.timeout(LIMIT):
+                await shell.lease({"left_hand"})
+        finally:
+            await shell.close()
+
+
 async def test_a_goodbye_is_sent_over_a_new_link_if_the_first_breaks(tmp_path: Path) -> None:
     """The link breaks just as the first one ends: it connects again to say goodbye, and the next
     coordinator gets the hands at once."""

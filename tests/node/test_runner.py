@@ -3,6 +3,7 @@ run ends exactly once."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Generator
 from dataclasses import replace
 from typing import Any
@@ -647,3 +648,30 @@ def test_a_held_run_can_be_cancelled(bench: Make) -> None:
     b.take(Cancel(run))
     b.tick()
     assert b.ended(run).cause == "cancelled"
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("how", ["returns", "raises", "waits"])
+def test_a_process_that_an_action_forks_ends_where_it_leaves_the_action(
+    bench: Make, how: str
+) -> None:
+    """In it, the rest of the program would go on a second time: in lock step the whole cell."""
+    children: list[int] = []
+
+    async def forks(ctx: Context) -> Result:
+        children.append(os.fork())
+        if children == [0] and how == "raises":
+            raise SystemExit(3)
+        if how == "waits":
+            await ctx.sleep(0.02)
+        return success()
+
+    b, process = bench(act=forks), os.getpid()
+    run = b.begin("act")
+    try:
+        b.tick(0.1)
+    finally:
+        if os.getpid() != process:
+            os._exit(9)  # it went on
+    assert b.ended(run).status == "success"
+    assert os.waitpid(children[0], 0)[1] == 0

@@ -134,3 +134,12 @@ async def test_a_child_process_left_running_does_not_hide_its_parents_death(
     finally:
         lines = (tmp_path / "a.log").read_text().splitlines()
         kill(int(line) for line in lines if line.isdigit())
+
+
+async def test_a_long_line_does_not_end_the_copying_of_what_a_program_prints(
+    tmp_path: Path,
+) -> None:
+    """If it did, the pipe would fill, and whatever prints later would block for ever."""
+    said = "print('x' * (1 << 20), flush=True); " * 2
+    async with Supervisor([program("a", f"{said}{STEADY}")], tmp_path):  # until it is ready
+        assert (tmp_path / "a.log").stat().st_size > 2 << 20
