@@ -799,6 +799,22 @@ class Progress:
         return tuple(said)
 
     @cached_property
+    def may_stay(self) -> frozenset[str]:
+        """Places whose tokens only external events take, and from which none need be taken: an end
+        can be reached without, as where a stop button waits. Empty if the graph is not complete."""
+        x, known, found = self.x, self.x.engine.compiled, set[str]()
+        calm = ~x.fails & ~x.firing(self._stops)
+        for name, p in known.net.place_index.items() if self._whole else ():
+            takers = [t for t in known.transitions if p in dict(t.needs)]
+            if all(t.flags or t.pulse for t in takers):
+                stays = ~x.firing([t.name for t in takers])
+                free = x.of_edges(stays).backward(x.final)
+                free |= x.of_edges(stays & calm).backward(x.given_up)
+                held = (i for i, state in enumerate(x.states) if state.marking[p])
+                found |= {name} if takers and all(free[i] for i in held) else set()
+        return frozenset(found)
+
+    @cached_property
     def left_behind(self) -> dict[tuple[str, ...], PropertyVerdict]:
         """By action places that do not listen: that runs which have ended are still there at an end
         with `final`, because nothing could take them."""
