@@ -623,6 +623,46 @@ def test_a_transition_that_never_fires_names_who_takes_its_tokens_first() -> Non
     assert "because `ask` takes it first" in found.reason
 
 
+def test_a_transition_that_never_fires_names_who_takes_its_runs_first() -> None:
+    net = {**SORTING, "tired": {"in": "park:normal", "out": "broken arm", "priority": 2}}
+    final, end = "parts == 0 and arm == 1", parse("broken == 1")
+    found = judged(make_task(SORT, net, final=final, final_error=end)).quasi_live
+    assert found.reason == (
+        "parked can never fire: in every state at rest it needs a run of park that ended in "
+        "success or failure, because `tired` takes it first"
+    )
+
+
+def test_of_a_ring_that_never_begins_only_its_own_transitions_are_told() -> None:
+    net: dict[str, dict[str, Any]] = {
+        "after": {"in": "end", "out": "done"},
+        "far": {"in": "gate", "out": "look"},
+        "seen": {"in": "look:normal", "out": "gate end"},
+        "lost": {"in": "look:error", "out": "gate end"},
+        "near": {"in": "parts", "out": "done"},
+    }
+    task = make_task("parts=1 gate look! end done", net, final="done == 1")
+    assert judged(task).quasi_live.reason == (
+        "far can never fire: it needs gate, which only `seen`, `lost` can fill; and so neither "
+        "can after, seen, lost"
+    )
+
+
+def test_a_retry_is_not_why_its_place_is_never_entered() -> None:
+    net: dict[str, dict[str, Any]] = {
+        "far": {"in": "gate", "out": "look"},
+        "seen": {"in": "look:normal", "out": "done"},
+        "lost": {"in": "look:error", "out": "done"},
+        "near": {"in": "parts", "out": "done"},
+    }
+    task = make_task("parts=1 gate look! done", net, final="done == 1")
+    look = replace(task.places["look"], tries=2)
+    assert judged(replace(task, places={**task.places, "look": look})).quasi_live.reason == (
+        "far can never fire: it needs gate, which nothing ever fills; and so neither can seen, "
+        "lost, look.retry"
+    )
+
+
 def test_a_task_that_gives_up_after_three_errors_is_sound() -> None:
     """`final_error` is also fulfilled in passing, but only a state at rest is an end."""
     task = make_task(
