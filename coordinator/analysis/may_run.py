@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from petrobot.coordinator.task import Input, Status, Task, Transition
 from petrobot.coordinator.task.check import CheckReport, Finding, Severity, check, in_file
+from petrobot.coordinator.task.check.completeness import EXTERNAL_WAIT, external_waits
 from petrobot.coordinator.task.validation import is_pulse
 from petrobot.coordinator.task.wording import listed, wrapped
 
@@ -147,11 +148,14 @@ def _search(task: Task, budget: Budget, devices: Mapping[str, str] | None) -> An
 
 def _with_graph(report: CheckReport, analysis: Analysis) -> CheckReport:
     """Return the findings with what the execution graph shows: retries without a limit, runs that
-    stay behind at the end, and conflicts in place of those that the arcs suggest. Without a
-    complete graph, those stand."""
+    stay behind at the end, and conflicts and waits for events in place of those that the arcs
+    suggest. Without a complete graph, those stand."""
     if analysis.progress is None or not analysis.progress.x.complete:
         return report
-    rest = [f for f in report.findings if f.code not in ("unsettled-conflict", "arrival-order")]
+    judged = ("unsettled-conflict", "arrival-order", EXTERNAL_WAIT)
+    rest = [f for f in report.findings if f.code not in judged]
+    may_stay = analysis.progress.may_stay
+    rest += external_waits(analysis.progress.x.engine.compiled.task, may_stay=may_stay)
     found = [_contest(contest) for contest in analysis.progress.contests]
     found += map(_retries, analysis.progress.x.retries)
     found += [_left_behind(p, verdict) for p, verdict in analysis.progress.left_behind.items()]

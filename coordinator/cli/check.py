@@ -104,10 +104,10 @@ def _checked(task: Task, services: Path | None) -> tuple[MayRun, CheckReport]:
     directory = load_directory(services)
     refuse_misplaced(directory)
     judged = may_run(task, cell_of(directory), BUDGET)
-    return judged, _with_code(task, directory, judged.report)
+    return judged, _with_code(task, directory, judged)
 
 
-def _with_code(task: Task, directory: Directory, report: CheckReport) -> CheckReport:
+def _with_code(task: Task, directory: Directory, judged: MayRun) -> CheckReport:
     """Add findings about the code that the location file names. Raises CommandError for errors in
     that file."""
     from petrobot.coordinator.task.check import CheckReport, Finding, Severity, in_file
@@ -137,10 +137,12 @@ def _with_code(task: Task, directory: Directory, report: CheckReport) -> CheckRe
         found.append(Finding(Severity.NOTE, NO_DRY_RUN, str(directory.source), text, remedy))
     errors = [f for f in found if f.severity is Severity.ERROR]
     warnings = [f for f in found if f.severity is not Severity.ERROR]
-    known = [f for f in report.findings if f.code != EXTERNAL_WAIT]
-    if len(known) < len(report.findings):  # now it is known which events the cell raises
+    known = [f for f in judged.report.findings if f.code != EXTERNAL_WAIT]
+    if len(known) < len(judged.report.findings):  # now it is known which events the cell raises
         source = str(directory.source) if complete else None
-        warnings += external_waits(task.flat, raised, source)
+        progress = None if judged.analysis is None else judged.analysis.progress
+        may_stay = frozenset[str]() if progress is None else progress.may_stay
+        warnings += external_waits(task.flat, raised, source, may_stay)
     return CheckReport(in_file(task, (*errors, *known, *warnings)))
 
 

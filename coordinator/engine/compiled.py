@@ -91,9 +91,9 @@ def compile_task(task: Task, devices: Mapping[str, str]) -> Compiled:
             p for p in flat.places if any(f"{p}.executed" in _names(t) for t in transitions)
         ),
         copies=_index(
-            (net.transition_index[t.name], [t.expanded_from])
+            (net.transition_index[t.name], [t.copy_of])
             for t in flat.transitions.values()
-            if t.expanded_from in flat.transitions
+            if t.copy_of != t.name
         ),
         setting=_index(
             (net.transition_index[t.name], dict(t.sets)) for t in flat.transitions.values()

@@ -177,7 +177,8 @@ class Obstacle(NamedTuple):
 
     place: int | None
     kind: str
-    """`short`, `full`, `run` (no run there that ended so), `condition` or `event`."""
+    """`short`, `full`, `run` (runs are there, but in another phase or with another end),
+    `condition` or `event`."""
     text: str
     """What the transition does not have, to be read after its name."""
 
@@ -197,7 +198,8 @@ def obstacles(draft: Draft, x: CompiledTransition) -> list[Obstacle]:
     for arc in x.actions:
         runs = eligible_runs(draft, arc, _NOTHING, heard=False)
         if len(runs) < arc.weight:
-            found.append(Obstacle(arc.place, "run", f"needs a run of {arc.name} {_ENDED[arc.end]}"))
+            kind = "short" if draft.marking[arc.place] < arc.weight else "run"
+            found.append(Obstacle(arc.place, kind, f"needs a run of {arc.name} {_ENDED[arc.end]}"))
         elif len(eligible_runs(draft, arc, _NOTHING)) < arc.weight:
             text = f"waits for {', '.join(arc.raised)}, which no run of {arc.name} has raised"
             found.append(Obstacle(arc.place, "event", text))

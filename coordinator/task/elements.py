@@ -263,6 +263,13 @@ class Transition:
     x: float | None = None
     y: float | None = None
 
+    @property
+    def copy_of(self) -> str:
+        """The transition of which `tries` made this copy, one for each number of used tries (their
+        names end in these numbers); its own name if it is none."""
+        original, _, number = self.name.rpartition(".")
+        return original if self.expanded_from and number[:1].isdigit() else self.name
+
 
 @dataclass(frozen=True, slots=True)
 class Event:

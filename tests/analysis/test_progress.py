@@ -49,6 +49,10 @@ def judged(task: Task, limit: int = 40_000) -> Progress:
     return progress_of(OrdinaryView(task), limit)
 
 
+def codes(task: Task) -> set[str]:
+    return {finding.code for finding in may_run(task, None, Budget()).report.findings}
+
+
 @dataclass(frozen=True)
 class Case:
     """A small task that gets stuck, and the words that must describe its dead end."""
@@ -267,6 +271,62 @@ STUCK |= {
 }
 
 
+SORT = "parts=3 arm~=1 tries=2 fetch! park! broken depot store hand"
+SORTING: Mapping[str, Mapping[str, Any]] = {
+    "parked": {"in": "park:normal tries", "out": "arm parts", "priority": 1},
+    "tired": {"in": "park:normal !tries", "out": "broken arm"},
+    "no_park": {"in": "park:error", "out": "broken arm"},
+    "next": {"in": "parts arm !broken", "out": "fetch"},
+    "fetched": {"in": "fetch:normal", "out": "arm"},
+    "no_fetch": {"in": "fetch:error", "out": "park"},
+}
+"""A correct task that parks the arm after an error, at most twice."""
+
+
+@pytest.mark.parametrize(
+    ("changes", "final", "told"),
+    [
+        ({"fetched": {"out": "depot"}}, "arm == 1", "next needs arm, which is empty"),
+        ({"no_fetch": {"out": "parts"}}, "arm == 1", "next needs arm, which is empty"),
+        ({}, "arm == 2", "no transition takes what is left, and the end asks for arm == 2 (it "),
+        (
+            {"fetched": {"out": "hand"}, "stored": {"in": "hand depot", "out": "arm store"}},
+            "arm == 1",
+            "stored needs depot, which is empty",
+        ),
+    ],
+)
+def test_the_first_cause_is_the_one_from_which_the_others_follow(
+    changes: Mapping[str, Mapping[str, Any]], final: str, told: str
+) -> None:
+    """A counter that holds its tokens is not what is stuck, nor is what waits for a token that
+    another transition holds up."""
+    net = {**SORTING, **{name: {**SORTING.get(name, {}), **new} for name, new in changes.items()}}
+    final, end = f"parts == 0 and {final}", parse("broken == 1")
+    verdict = judged(make_task(SORT, net, final=final, final_error=end)).deadlock_free
+    assert verdict.holds is False
+    assert verdict.reason.partition(": ")[2].startswith(told), verdict
+
+
+def test_tokens_that_came_back_are_not_called_lost() -> None:
+    final, end = "parts == 0 and arm == 2", parse("broken == 1")
+    verdict = judged(make_task(SORT, SORTING, final=final, final_error=end)).deadlock_free
+    assert verdict.details[0] == "arm: only `parked`, `tired`, `no_park`, `fetched` can fill it"
+
+
+def test_of_the_copies_that_tries_makes_only_the_nearest_is_told() -> None:
+    net: dict[str, dict[str, Any]] = {
+        "go": {"in": "parts", "out": "look"},
+        "seen": {"in": "look:normal tray", "out": "done"},
+        "lost": {"in": "look:error", "out": "done"},
+    }
+    task = make_task("parts=2 tray=1 look! done", net, final="done == 2")
+    look = replace(task.places["look"], tries=3)
+    verdict = judged(replace(task, places={**task.places, "look": look})).deadlock_free
+    assert verdict.reason.endswith(": seen needs tray, which is empty")
+    assert verdict.details[0] == "tray: taken by `seen`, and no transition returns it"
+
+
 @pytest.mark.parametrize(
     ("steps", "told"),
     [
@@ -338,6 +398,13 @@ def test_a_stop_button_does_not_hide_what_is_stuck(what: str) -> None:
     assert found.sound.reason.startswith("the task can only give up") or (
         found.sound.details[-1] == "nothing else can happen; only halt ends it"
     )
+
+
+def test_a_stop_button_may_stay_unpressed() -> None:
+    """No warning says that the task hangs without it; of an event that the task needs, one does."""
+    assert "external-wait" not in codes(with_stop(seeded().task))
+    needs = seeded(next={"in": "parts arm camera", "event": "bell"}).task
+    assert "external-wait" in codes(with_stop(needs))
 
 
 @pytest.mark.parametrize("halts", [False, True])
@@ -554,6 +621,46 @@ def test_a_transition_that_never_fires_names_who_takes_its_tokens_first() -> Non
     found = judged(make_task("jobs=1 head~=1 poll!", net, final="jobs == 0")).quasi_live
     assert found.reason.startswith("clean can never fire: in every state at rest it needs head")
     assert "because `ask` takes it first" in found.reason
+
+
+def test_a_transition_that_never_fires_names_who_takes_its_runs_first() -> None:
+    net = {**SORTING, "tired": {"in": "park:normal", "out": "broken arm", "priority": 2}}
+    final, end = "parts == 0 and arm == 1", parse("broken == 1")
+    found = judged(make_task(SORT, net, final=final, final_error=end)).quasi_live
+    assert found.reason == (
+        "parked can never fire: in every state at rest it needs a run of park that ended in "
+        "success or failure, because `tired` takes it first"
+    )
+
+
+def test_of_a_ring_that_never_begins_only_its_own_transitions_are_told() -> None:
+    net: dict[str, dict[str, Any]] = {
+        "after": {"in": "end", "out": "done"},
+        "far": {"in": "gate", "out": "look"},
+        "seen": {"in": "look:normal", "out": "gate end"},
+        "lost": {"in": "look:error", "out": "gate end"},
+        "near": {"in": "parts", "out": "done"},
+    }
+    task = make_task("parts=1 gate look! end done", net, final="done == 1")
+    assert judged(task).quasi_live.reason == (
+        "far can never fire: it needs gate, which only `seen`, `lost` can fill; and so neither "
+        "can after, seen, lost"
+    )
+
+
+def test_a_retry_is_not_why_its_place_is_never_entered() -> None:
+    net: dict[str, dict[str, Any]] = {
+        "far": {"in": "gate", "out": "look"},
+        "seen": {"in": "look:normal", "out": "done"},
+        "lost": {"in": "look:error", "out": "done"},
+        "near": {"in": "parts", "out": "done"},
+    }
+    task = make_task("parts=1 gate look! done", net, final="done == 1")
+    look = replace(task.places["look"], tries=2)
+    assert judged(replace(task, places={**task.places, "look": look})).quasi_live.reason == (
+        "far can never fire: it needs gate, which nothing ever fills; and so neither can seen, "
+        "lost, look.retry"
+    )
 
 
 def test_a_task_that_gives_up_after_three_errors_is_sound() -> None:

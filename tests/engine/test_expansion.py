@@ -14,6 +14,7 @@ from petrobot.coordinator.engine import (
     EventOccurred,
     Finished,
     Fired,
+    ForceExit,
     RunEnded,
     StartRun,
     StopConfirmed,
@@ -348,6 +349,14 @@ def test_each_token_has_its_tries(
     assert isinstance(play.all[-1], Finished) and play.all[-1].status is Status.SUCCESS
     left = dict(zip(play.engine.compiled.net.places, play.state.marking, strict=True))
     assert (left["grasp.left"], left["grasp.used"], left["hand"]) == (2, 0, 1)
+
+
+def test_an_added_error_branch_is_forced_whatever_tries_are_used() -> None:
+    """The operator names `grasp.error`; its copies are for the tries used."""
+    dropped = '[transitions.dropped]\nin = ["grasp:error"]\n'
+    play = Play(Engine(loads(TRIES.replace(dropped, "") + '[errors]\nto = "parts"\n')))
+    play(Begin(), RunEnded("grasp#1", Status.ERROR), ForceExit("grasp.error"))
+    assert play.fired[-2:] == ["grasp.error.1", "next"]
 
 
 def test_a_timeout_is_a_shorter_deadline() -> None:

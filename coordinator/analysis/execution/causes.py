@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from petrobot.coordinator.analysis.execution.graph import ExecutionGraph
+from petrobot.coordinator.analysis.execution.names import cases
 from petrobot.coordinator.engine import Phase, State
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import Obstacle, in_words, obstacles
@@ -95,14 +96,17 @@ def explain(x: ExecutionGraph, state: int, still: Collection[str] = ()) -> Expla
     ended = {place for place in done if stays[net.place_index[place]]}
     waiting = [t for t in transitions if t.name not in still and _near(t, ended, stays)]
     missed, spent, left, gone = _asked(x, draft, firings)
+    if not ended:
+        left |= {p for p, n in enumerate(draft.marking) if n and not net.initial[p]}
+        used = _used_up(net, draft.marking, spent)
+        waiting = [t for t in waiting if not _at_rest(draft, t)]
+        waiting = [t for t in waiting if left.intersection(p for p, _ in t.needs)] or [
+            t for t in waiting if used.isdisjoint(_short(obstacles(draft, t)))
+        ]
     lacks = list[Lack]()
-    for t in waiting if ended else [t for t in waiting if not _at_rest(draft, t)]:
+    for t in _by_copy(draft, waiting):
         found = obstacles(draft, t)
-        surplus = left.intersection(p for p, _ in t.needs)
-        short = {one.place for one in found if one.kind == "short"}
-        if not ended and not surplus and short & spent:
-            continue  # the end wants that place empty, and so it is
-        own = [one for one in found if not _other_end(draft, one)]
+        own = [one for one in found if one.kind != "run"]
         if own or not ended:
             lacks.append((t, own, len(found)))
     if not lacks and ended:
@@ -113,8 +117,16 @@ def explain(x: ExecutionGraph, state: int, still: Collection[str] = ()) -> Expla
     if not lacks:
         text = f"no transition takes what is left, and the end asks for {missed}"
         return Explanation(text, gone)
-    # The transition that lacks least comes first.
-    lacks.sort(key=lambda one: (one[2], _rank(x.engine.compiled.net, one[0], one[1])))
+    # What waits for a token that another of them could move comes last; first, what lacks least.
+    takes = {t.index: {p for p, _ in t.needs} for t, _, _ in lacks}
+    follows = {
+        t.index
+        for t, own, _ in lacks
+        for p in _short(own)
+        for held in [_held(net, draft, _since(net, firings, p))]
+        if any(not places.isdisjoint(held) for u, places in takes.items() if u != t.index)
+    }
+    lacks.sort(key=lambda one: (one[0].index in follows, one[2], _rank(net, one[0], one[1])))
     told = [
         f"{t.name} {' and '.join(obstacle_text(draft, t, one) for one in own)}"
         for t, own, _ in lacks
@@ -156,11 +168,49 @@ def awaiting(x: ExecutionGraph, state: int, place: str) -> str:
             if not found:
                 return f"{t.name} waits for {in_words(draft, t)}"
             if not any(
-                _other_end(draft, one) and draft.compiled.net.places[one.place or 0] == place
+                one.kind == "run" and draft.compiled.net.places[one.place or 0] == place
                 for one in found
             ):
                 return f"{t.name} {' and '.join(obstacle_text(draft, t, one) for one in found)}"
     return f"no transition takes a run of {place} that ended that way"
+
+
+def _short(found: Sequence[Obstacle]) -> set[int]:
+    """Return the places that hold too few tokens."""
+    return {one.place for one in found if one.kind == "short" and one.place is not None}
+
+
+def _by_copy(draft: Draft, waiting: Sequence[CompiledTransition]) -> Iterator[CompiledTransition]:
+    """Yield of the copies that `tries` makes of a transition the one that lacks least: the others
+    are for another number of used tries."""
+    lacking = {t.name: (len(obstacles(draft, t)), t.index) for t in waiting}
+    kept = {
+        min(copies & lacking.keys(), key=lacking.__getitem__)
+        for copies in cases(draft.compiled.task).values()
+        if copies & lacking.keys()
+    }
+    return (t for t in waiting if t.name in kept)
+
+
+def _used_up(net: Net, marking: Sequence[int], spent: set[int]) -> set[int]:
+    """Return the places that `final` wants empty and that are (`spent`), and the empty places that
+    only tokens from there could fill."""
+    used = set(spent)
+    while more := {
+        p
+        for taken, given in zip(net.consume, net.produce, strict=True)
+        for p, _ in given
+        if p not in used and not marking[p] + net.initial[p] and used & {q for q, _ in taken}
+    }:
+        used |= more
+    while filled := {
+        p
+        for taken, given in zip(net.consume, net.produce, strict=True)
+        for p, _ in given
+        if p in used - spent and used.isdisjoint(q for q, _ in taken)
+    }:
+        used -= filled
+    return used
 
 
 def _rank(net: Net, t: CompiledTransition, found: Sequence[Obstacle]) -> int:
@@ -262,14 +312,6 @@ def _at_rest(draft: Draft, t: CompiledTransition) -> bool:
     )
 
 
-def _other_end(draft: Draft, one: Obstacle) -> bool:
-    """Return whether the transition is blocked only because the run there ended with another
-    status."""
-    if one.kind != "run" or one.place is None:
-        return False
-    return bool(draft.tokens.get(draft.compiled.net.places[one.place]))
-
-
 def _fates(
     x: ExecutionGraph, draft: Draft, firings: tuple[str, ...], one: Obstacle, known: set[int]
 ) -> Iterator[str]:
@@ -289,7 +331,7 @@ def _fates(
         yield f"{name}: no transition takes any out of it"
     for t in () if known.intersection(takers) else takers:
         taker = x.engine.compiled.transitions[t]
-        lacks = [lack for lack in obstacles(draft, taker) if not _other_end(draft, lack)]
+        lacks = [lack for lack in obstacles(draft, taker) if lack.kind != "run"]
         words = " and ".join(obstacle_text(draft, taker, lack) for lack in lacks)
         if lacks:
             yield f"{name}: `{taker.name}` would take some out of it, but it {words}"
@@ -298,22 +340,41 @@ def _fates(
                 yield from _fates(x, draft, firings, lack, known)
 
 
+def _since(net: Net, firings: tuple[str, ...], place: int) -> list[int]:
+    """Return the firings from the last one on that took tokens of the place which have not come
+    back; empty if there is none."""
+    order = [net.transition_index[name] for name in firings]
+    change = [dict(net.compiled.changes[t]).get(place, 0) for t in order]
+    gained = 0
+    for i in reversed(range(len(order))):
+        gained += change[i]
+        if change[i] < 0 and gained < 0:
+            return order[i:]
+    return []
+
+
+def _held(net: Net, draft: Draft, since: list[int]) -> list[int]:
+    """Return the marked places at which the tokens are that the first firing took."""
+    return [p for p in sorted(_carried(net, since)[1]) if draft.marking[p]] if since else []
+
+
 def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
     """Return which firing took the place's tokens last, and where they went."""
-    change = [dict(changes).get(place, 0) for changes in net.compiled.changes]
-    givers = [t for t, gain in enumerate(change) if gain > 0]
-    order = [net.transition_index[name] for name in firings]
-    last = max((i for i, t in enumerate(order) if change[t] < 0), default=None)
+    givers = [
+        t for t, changes in enumerate(net.compiled.changes) if dict(changes).get(place, 0) > 0
+    ]
     back = ", ".join(f"`{net.transitions[t]}`" for t in givers)
-    if last is None and givers:
+    since = _since(net, firings, place)
+    if not since and givers:
+        order = [net.transition_index[name] for name in firings]
         return f"only {back} can fill it{_elsewhere(net, order, givers)}"
-    if last is None:
+    if not since:
         return "nothing ever fills it"
-    taker = f"taken by `{net.transitions[order[last]]}`"
+    taker = f"taken by `{net.transitions[since[0]]}`"
     if not givers:
         return f"{taker}, and no transition returns it"
-    movers, carried = _carried(net, order[last:])
-    held = [net.places[p] for p in sorted(carried) if draft.marking[p]]
+    movers, carried = _carried(net, since)
+    held = [net.places[p] for p in _held(net, draft, since)]
     names = ", ".join(f"`{net.transitions[t]}`" for t in dict.fromkeys(movers))
     if not _leads(net, carried, set(givers), place):
         if movers:

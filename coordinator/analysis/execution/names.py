@@ -360,8 +360,7 @@ def cases(task: Task) -> dict[str, frozenset[str]]:
     each number of used tries: it can fire if one of them can."""
     found: dict[str, set[str]] = {}
     for t in task.transitions.values():
-        own = t.expanded_from if t.expanded_from in task.transitions else t.name
-        found.setdefault(own, set()).add(t.name)
+        found.setdefault(t.copy_of, set()).add(t.name)
     return {name: frozenset(names) for name, names in found.items()}
 
 

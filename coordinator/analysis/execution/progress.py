@@ -349,7 +349,8 @@ class Progress:
         roots = [t for t in idle if not self._fed_by(t, numbers, t.needs)]
         # In a ring of transitions that wait for each other, name the one that lacks a token, not
         # one that lacks a run: the ring should begin with that token.
-        roots = roots or [t for t in idle if self._fed_by(t, numbers, t.plain)] or idle
+        ring = [t for t in idle if self._fed_by(t, numbers, t.plain)]
+        roots = roots or [t for t in ring if self._feeds_itself(t, numbers)] or ring or idle
         told = [f"{t.name} can never fire: {self._never(t, numbers)}" for t in roots]
         if others := [t.name for t in idle if t not in roots]:
             told.append(f"and so neither can {few(others)}")
@@ -359,10 +360,22 @@ class Progress:
         """Return whether the transition needs a token that only others in `idle` produce."""
         net = self.x.engine.compiled.net
         for p, w in needs:
-            givers = self._givers(p)
-            if net.initial[p] < w and givers and givers <= idle - {t.index}:
+            others = self._givers(p) - {t.index}
+            if net.initial[p] < w and others and others <= idle:
                 return True
         return False
+
+    def _feeds_itself(self, t: CompiledTransition, idle: set[int]) -> bool:
+        """Return whether others in `idle` need what it produces, and it needs what they produce."""
+        net, fed = self.x.engine.compiled.net, set[int]()
+        while more := {
+            u
+            for u in idle - fed
+            for p, w in net.consume[u]
+            if net.initial[p] < w and self._givers(p) & (fed | {t.index})
+        }:
+            fed |= more
+        return t.index in fed
 
     def _givers(self, place: int) -> set[int]:
         net = self.x.engine.compiled.net
@@ -435,16 +448,27 @@ class Progress:
         return f"its condition ({t.when}) is never true: {' and '.join(only)}"
 
     def _first_takers(self, t: CompiledTransition, idle: set[int]) -> str:
-        """Return which other transitions take the tokens that come into a place which is empty
-        whenever the task rests; empty if there is no such place."""
-        net = self.x.engine.compiled.net
-        for p, _ in t.plain:
-            if any(state.marking[p] for state in self.x.states):
+        """Return which other transitions take the tokens that come into a place, or the runs that
+        end there, so that none is left whenever the task rests; empty if there is no such place."""
+        from petrobot.coordinator.engine.draft import Draft
+        from petrobot.coordinator.engine.firing import Claims, eligible_runs
+
+        compiled, states = self.x.engine.compiled, self.x.states
+        ends = {arc.place: arc for arc in t.actions}
+        for p, _ in t.needs:
+            arc = ends.get(p)
+            if any(
+                eligible_runs(Draft(compiled, s), arc, Claims(), heard=False)
+                if arc
+                else s.marking[p]
+                for s in states
+            ):
                 continue
             takers = [
-                f"`{net.transitions[u]}`"
-                for u, arcs in enumerate(net.consume)
-                if p in dict(arcs) and u not in idle
+                f"`{u.name}`"
+                for u in compiled.transitions
+                if p in dict(u.needs) and u.index not in idle
+                if arc is None or arc.end in {a.end for a in u.actions if a.place == p}
             ]
             if takers:
                 return f", because {' and '.join(takers)} take{'s' * (len(takers) == 1)} it first"
@@ -807,6 +831,22 @@ class Progress:
         if held:
             said.append(f"tokens at the end depend on the path: {', '.join(held)}")
         return tuple(said)
+
+    @cached_property
+    def may_stay(self) -> frozenset[str]:
+        """Places whose tokens only external events take, and from which none need be taken: an end
+        can be reached without, as where a stop button waits. Empty if the graph is not complete."""
+        x, known, found = self.x, self.x.engine.compiled, set[str]()
+        calm = ~x.fails & ~x.firing(self._stops)
+        for name, p in known.net.place_index.items() if self._whole else ():
+            takers = [t for t in known.transitions if p in dict(t.needs)]
+            if all(t.flags or t.pulse for t in takers):
+                stays = ~x.firing([t.name for t in takers])
+                free = x.of_edges(stays).backward(x.final)
+                free |= x.of_edges(stays & calm).backward(x.given_up)
+                held = (i for i, state in enumerate(x.states) if state.marking[p])
+                found |= {name} if takers and all(free[i] for i in held) else set()
+        return frozenset(found)
 
     @cached_property
     def left_behind(self) -> dict[tuple[str, ...], PropertyVerdict]:

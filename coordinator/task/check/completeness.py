@@ -97,18 +97,23 @@ def event_faults(task: Task) -> Iterator[Finding]:
 
 
 def external_waits(
-    task: Task, raised: Collection[str] = (), source: str | None = None
+    task: Task,
+    raised: Collection[str] = (),
+    source: str | None = None,
+    may_stay: Collection[str] = (),
 ) -> Iterator[Finding]:
     """Places whose tokens only an external event can free, with no `after` beside it: one finding
     for those that the same transitions take. A place that listens may wait for ever.
 
     `raised`: the events that the cell is known to raise; they are awaited as designed. `source`:
-    the location file, if it is known that the cell raises no others.
+    the location file, if it is known that the cell raises no others. `may_stay`: places whose
+    tokens are known not to keep the task from its end.
     """
     takers: dict[tuple[str, End | None], list[str]] = {}
+    spared = {*may_stay, *(p.name for p in task.places.values() if p.listen)}
     for t in task.transitions.values():
         for arc in t.inputs:
-            if arc.end not in (End.PREEMPT, End.GOING) and not task.places[arc.place].listen:
+            if arc.end not in (End.PREEMPT, End.GOING) and arc.place not in spared:
                 takers.setdefault((arc.place, arc.end), []).append(t.name)
     joined: dict[tuple[str, ...], list[tuple[str, End | None]]] = {}
     for place in task.places:
