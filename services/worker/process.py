@@ -96,7 +96,7 @@ class Setup:
 
 class Surroundings:
     """What the code of one run may change for the runs after it: working directory, file mode mask,
-    limits and timers of the process."""
+    standard streams, limits and timers of the process."""
 
     LIMITS = tuple(
         getattr(resource, f"RLIMIT_{name}")
@@ -110,11 +110,15 @@ class Surroundings:
         self._mask = os.umask(0)
         os.umask(self._mask)
         self._depth = sys.getrecursionlimit()
+        self._streams = (sys.stdin, sys.stdout, sys.stderr)
         self._limits = [resource.getrlimit(limit) for limit in self.LIMITS]
 
     def restored(self) -> str:
         """Make them so again. Return why that is not possible, empty if it is."""
         os.umask(self._mask)
+        sys.stdin, sys.stdout, sys.stderr = self._streams
+        if any(stream is not None and stream.closed for stream in self._streams):
+            return "it has closed a standard stream"
         if sys.getrecursionlimit() != self._depth:
             sys.setrecursionlimit(self._depth)
         try:

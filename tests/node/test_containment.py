@@ -377,7 +377,10 @@ async def test_a_hold_that_is_read_after_its_run_does_not_hold_the_next(operator
     assert (await operator.call("nap", 20.0, seconds=0.05)).status == "success"
 
 
-@pytest.mark.parametrize("what", ["folder", "mask", "depth", "timer", "memory", "files"])
+@pytest.mark.parametrize(
+    "what",
+    ["folder", "mask", "depth", "timer", "no output", "closed output", "memory", "files"],
+)
 async def test_what_a_run_changes_in_its_process_does_not_reach_the_next(
     operator: Operator, what: str
 ) -> None:
@@ -391,4 +394,6 @@ async def test_what_a_run_changes_in_its_process_does_not_reach_the_next(
         assert end.values["found"] == before
         again += end.values["pid"] == changed.values.get("pid")
         await asyncio.sleep(0.05)
-    assert again or what in ("memory", "files"), "after these a process may be of no more use"
+    assert again or what in ("closed output", "memory", "files"), (
+        "after these a process may be of no more use"
+    )

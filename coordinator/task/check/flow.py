@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from petrobot.coordinator.task import Kind, Scope, Task
+from petrobot.coordinator.task import Kind, Task
 from petrobot.coordinator.task.check.findings import NEVER_MARKED, Finding
 from petrobot.coordinator.task.instant_firings import endless
 from petrobot.coordinator.task.wording import Severity, few, listed
@@ -95,18 +95,9 @@ def unused(task: Task) -> Iterator[Finding]:
     places = [p for p in task.places.values() if p.kind is Kind.ACTION]
     for event in task.events.values():
         if event.name not in events:
-            how = (
-                "raised, but no transition uses it"
-                if event.scope is Scope.INTERNAL
-                else "no transition waits for it"
-            )
-            yield Finding(
-                Severity.NOTE,
-                "unused",
-                f"events.{event.name}",
-                how,
-                "drop it, or name it in a transition",
-            )
+            key, text = f"events.{event.name}", "no transition waits for it"
+            remedy = "drop it, or name it in a transition"
+            yield Finding(Severity.NOTE, "unused", key, text, remedy)
     for primitive in task.primitive_tasks:
         if primitive not in {p.task for p in places}:
             key = f"primitive_tasks.{primitive}"

@@ -31,6 +31,8 @@ CHANGES: dict[str, Callable[[], Any]] = {
     "depth": lambda: sys.setrecursionlimit(60),
     "timer": lambda: signal.setitimer(signal.ITIMER_REAL, 0.2),
     "memory": lambda: resource.setrlimit(resource.RLIMIT_AS, (1 << 20, resource.RLIM_INFINITY)),
+    "no output": lambda: setattr(sys, "stdout", None),
+    "closed output": lambda: sys.stdout.close(),
     "files": lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (5, 1024)),
 }
 """What an action may leave behind in its process."""
@@ -42,6 +44,7 @@ def change(ctx: Context, *, what: str = "") -> Result:
     os.umask(mask)
     depth = sys.getrecursionlimit()
     found = [str(Path.cwd()), mask, depth, list(resource.getrlimit(resource.RLIMIT_NOFILE))]
+    found.append(sys.stdout is not None and not sys.stdout.closed)
     CHANGES[what]()
     return success(found=found, pid=os.getpid())
 
