@@ -377,7 +377,7 @@ async def test_a_hold_that_is_read_after_its_run_does_not_hold_the_next(operator
     assert (await operator.call("nap", 20.0, seconds=0.05)).status == "success"
 
 
-@pytest.mark.parametrize("what", ["folder", "mask", "depth", "timer", "memory", "files"])
+@pytest.mark.parametrize("what", ["folder", "mask", "depth", "timer", "clock", "memory", "files"])
 async def test_what_a_run_changes_in_its_process_does_not_reach_the_next(
     operator: Operator, what: str
 ) -> None:
