@@ -130,7 +130,7 @@ def inline_service(service: ServiceEntry, raised: Callable[[Event], None]) -> In
             if from_outside(fault):
                 raise
             log_fault(_log, fault, "call %s of service %s raised", call.id, service.name)
-            cause = "hung" if isinstance(fault, Hung) else "exception"
+            cause = "hung" if issubclass(type(fault), Hung) else "exception"
             return Outcome(call.id, Status.ERROR, {}, cause, describe(fault))
         try:
             outcome = checked_result(call.id, result, "values")

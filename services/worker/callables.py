@@ -73,8 +73,13 @@ def words_of(fault: BaseException) -> str:
 def describe(fault: BaseException) -> str:
     """Return the type and message of an exception, and the last three lines of user code that it
     came through."""
-    steps = [step for step in traceback.walk_tb(fault.__traceback__) if is_users(step[0])]
-    return f"{type(fault).__name__}: {words_of(fault)}{_places(steps[:-4:-1])}"
+    try:
+        steps = [step for step in traceback.walk_tb(fault.__traceback__) if is_users(step[0])]
+        return f"{type(fault).__name__}: {words_of(fault)}{_places(steps[:-4:-1])}"
+    except BaseException as worse:  # its attributes are code of a user, too
+        if from_outside(worse):
+            raise
+        return "an exception that cannot be described"
 
 
 def where(frame: FrameType) -> str:
@@ -138,7 +143,7 @@ def from_outside(fault: BaseException) -> bool:
     does it by a `raise`.
     """
     if (
-        not isinstance(fault, KeyboardInterrupt)
+        not issubclass(type(fault), KeyboardInterrupt)  # not `isinstance`: that asks the exception
         or threading.current_thread() is not threading.main_thread()
     ):
         return False

@@ -76,10 +76,10 @@ def result_of(outcome: Outcome) -> Result:
 def checked_result(identity: str, returned: Any, where: str = "result") -> Outcome:
     """Return what an action or a service returned as an outcome of plain data that can be sent.
     Raises ValueError if that is impossible; `where` names the values in its text."""
-    if not isinstance(returned, Result):
-        name = type(returned).__name__
-        raise ValueError(f"returned a {name}; return success(), failure() or error()")
     try:
+        if not isinstance(returned, Result):
+            name = type(returned).__name__
+            raise ValueError(f"returned a {name}; return success(), failure() or error()")
         values = plain(returned.values, where)
         if type(values) is not dict:
             raise ValueError(f"{where}: expected values by name, found a {type(values).__name__}")

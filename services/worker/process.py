@@ -16,11 +16,13 @@ import select
 import signal
 import socket
 import sys
-import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+
+# Its own name, as in `runner`.
+from time import monotonic
 from typing import Any
 
 from petrobot.services.comm.location_file import Directory, DirectoryError, parse
@@ -164,7 +166,7 @@ class Worker:
         self._permits = permits
         self._link = link
         self._ports = ports
-        self._remote = RemoteDriver(self._post_command, time.monotonic) if link else None
+        self._remote = RemoteDriver(self._post_command, monotonic) if link else None
         actions = {
             a.name: a
             for a in directory.actions.values()
@@ -176,7 +178,7 @@ class Worker:
             reseed = ports.draws.reseed
         self._place = InlineHost(
             actions,
-            clock=time.monotonic,
+            clock=monotonic,
             driver=driver,
             remote=self._remote,
             streams={s.name: s.period for s in directory.streams.values()},
@@ -218,24 +220,24 @@ class Worker:
             self._ends.poll(None if pause is None else 1e3 * min(pause, LONGEST_PAUSE))
             if self._link is not None:
                 self._read_link(self._link)
-            now = time.monotonic()
+            now = monotonic()
             for item in self._node.read():
                 self._take(now, item)
             if self._ports is not None:
                 self._ports.poll()
-            now = time.monotonic()
+            now = monotonic()
             if self._guard is not None and now >= self._guard.due:
                 self._watch(now, self._guard)
             if self._ports is not None and self._barred:
                 self._ports.withhold(self._barred)
             self._advance(now)
             while self._calls and self._may_begin():
-                self._advance(time.monotonic())
+                self._advance(monotonic())
             if self._calls:
                 self._give_back()
             if self._changed and not self._node.unsent:
                 os._exit(CHANGED)
-        self._place.close(time.monotonic())
+        self._place.close(monotonic())
         self._outlets.close()
 
     def _advance(self, now: float) -> None:
@@ -291,7 +293,7 @@ class Worker:
         due = self._place.due()
         if self._guard is not None:
             due = self._guard.due if due is None else min(due, self._guard.due)
-        pause = None if due is None else max(0.0, due - time.monotonic())
+        pause = None if due is None else max(0.0, due - monotonic())
         busy = self._ports is not None and self._ports.busy
         if self._place.polling or self._connecting or busy:
             return POLL if pause is None else min(pause, POLL)
@@ -372,7 +374,7 @@ def serve(
         directory = parse(setup.text, Path(setup.source))
         if link is None and setup.device:
             ports = ProcessPorts(
-                directory, directory.devices[setup.device], time.monotonic, setup.tickets
+                directory, directory.devices[setup.device], monotonic, setup.tickets
             )
             driver = make_driver(directory, directory.devices[setup.device], ports)
             ports.draws.reseed(0)

@@ -379,7 +379,7 @@ async def test_a_hold_that_is_read_after_its_run_does_not_hold_the_next(operator
 
 @pytest.mark.parametrize(
     "what",
-    ["folder", "mask", "depth", "timer", "no output", "closed output", "memory", "files"],
+    ["folder", "mask", "depth", "timer", "clock", "no output", "closed output", "memory", "files"],
 )
 async def test_what_a_run_changes_in_its_process_does_not_reach_the_next(
     operator: Operator, what: str

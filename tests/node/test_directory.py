@@ -292,12 +292,24 @@ def test_an_unreadable_file_raises_the_systems_error(tmp_path: Path) -> None:
             "importing 'broken_driver' raises ZeroDivisionError: division by zero; correct the "
             "module",
         ),
+        (
+            "ends_itself:main",
+            "importing 'ends_itself' raises SystemExit: 0; correct the module",
+        ),
+        (
+            "speechless:main",
+            "importing 'speechless' raises speechless.Mute: <exception str() failed>; correct the "
+            "module",
+        ),
     ],
 )
 def test_imports_are_verified_on_the_host_that_runs_them(
     path: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "broken_driver.py").write_text("1 / 0\n")
+    (tmp_path / "ends_itself.py").write_text("import sys\ndef main(): ...\nsys.exit(0)\n")
+    mute = "class Mute(Exception):\n    def __str__(self): raise self\nraise Mute\n"
+    (tmp_path / "speechless.py").write_text(mute)
     monkeypatch.syspath_prepend(str(tmp_path))
     directory = parse(GOOD.replace("json:JSONDecoder", path), Path("services.toml"))
     (fault,) = verify_imports(directory, "vision")

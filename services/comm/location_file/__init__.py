@@ -8,6 +8,7 @@ import importlib.util
 import logging
 import math
 import sys
+import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -437,10 +438,11 @@ def resolve(path: str) -> Any:
             f"cannot import {written!r} ({fault}); put it beside the location file, or install "
             "its package on this host"
         ) from fault
-    except Exception as fault:
-        raise ImportError(
-            f"importing {written!r} raises {type(fault).__name__}: {fault}; correct the module"
-        ) from fault
+    except KeyboardInterrupt:
+        raise
+    except BaseException as fault:  # a module may call sys.exit, and its exceptions may be broken
+        words = traceback.format_exception_only(fault)[-1].strip()
+        raise ImportError(f"importing {written!r} raises {words}; correct the module") from fault
     found = getattr(module, attribute, None)
     if not callable(found):
         names = [n for n in vars(module) if not n.startswith("_")]

@@ -31,6 +31,7 @@ CHANGES: dict[str, Callable[[], Any]] = {
     "depth": lambda: sys.setrecursionlimit(60),
     "timer": lambda: signal.setitimer(signal.ITIMER_REAL, 0.2),
     "memory": lambda: resource.setrlimit(resource.RLIMIT_AS, (1 << 20, resource.RLIM_INFINITY)),
+    "clock": lambda: vars(time).update(monotonic=str, time=str, process_time=str),
     "no output": lambda: setattr(sys, "stdout", None),
     "closed output": lambda: sys.stdout.close(),
     "files": lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (5, 1024)),

@@ -25,6 +25,17 @@ class Mute(Exception):  # noqa: N818 - not a name of ours
         raise RuntimeError("no words")
 
 
+def _unasked(_: object) -> Any:
+    raise OwnEnd("bound to nothing")
+
+
+_SEALED = property(_unasked)
+Unbound: Any = type("Unbound", (), {"__class__": _SEALED})
+"""A proxy whose object is missing: even its class cannot be asked."""
+Classless: Any = type("Classless", (Exception,), {"__class__": _SEALED, "__traceback__": _SEALED})
+"""An exception whose class and traceback cannot be asked."""
+
+
 class Endless(Mapping[str, Any]):
     """A mapping without an end."""
 
@@ -115,6 +126,8 @@ RESULTS: Mapping[str, Callable[[], Any]] = {
     "an unknown status": lambda: Result("perhaps", {}),  # type: ignore[arg-type]
     "no status": lambda: Result(None, {}),  # type: ignore[arg-type]
     "no result": lambda: None,
+    "a proxy without its object": Unbound,
+    "a value that is such a proxy": lambda: success(x=Unbound()),
     "a dict": lambda: {"x": 1},
     "a cause without words": lambda: error(Mute()),  # type: ignore[arg-type]
     "a cause that leaves": lambda: error(Leaving()),  # type: ignore[arg-type]
@@ -134,6 +147,7 @@ RAISES: Mapping[str, Callable[[], BaseException]] = {
     "StopIteration": lambda: StopIteration(3),
     "one without words": Mute,
     "one whose words leave": Leaving,
+    "one without a class": Classless,
     "one with many words": lambda: ValueError("x" * 20_000_000),
     "one with half a letter": lambda: ValueError("\ud800"),
 }
