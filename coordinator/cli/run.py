@@ -334,8 +334,9 @@ def conduct(
     try:
         asyncio.run(lead())
     except KeyboardInterrupt:
-        if made and made[0].folder is not None and made[0].mission.executor.finished is None:
-            print(f"`petrobot resume {made[0].folder}` continues this run", file=sys.stderr)
+        folder = made[0].folder if made and made[0].mission.executor.finished is None else None
+        if folder is not None and folder.exists():  # one that had not begun leaves none
+            print(f"`petrobot resume {folder}` continues this run", file=sys.stderr)
         raise
     except MissionError as fault:
         raise CommandError(2 if fault.bad_input and not resumed else 1, str(fault)) from fault

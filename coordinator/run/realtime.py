@@ -297,7 +297,7 @@ class RealtimeMission:
                             self._take_device(device)
                 elif isinstance(notice, Answer) and notice.id in self._answers:
                     asked = self._answers.pop(notice.id)
-                    if not asked.cancelled():  # by Ctrl-C before the answer came
+                    if not asked.done():  # Ctrl-C may have ended the wait for it
                         asked.set_result(notice)
             if not self._closed:
                 self._guarded(lambda now: self.mission.take(now, node, notices))

@@ -228,11 +228,10 @@ class Execution:
     def _timed(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Any:
         global _active
         before, earlier, _active = process_time(), _active, self
-        process = os.getpid()
         try:
             return function(*arguments, **named)
         finally:
-            if os.getpid() != process:  # a fork by the action: the run is its parent's
+            if _forked:
                 os._exit(0)
             _active = earlier
             self.cpu += process_time() - before
@@ -240,6 +239,16 @@ class Execution:
 
 _active: Execution | None = None
 """The run whose code is running now."""
+_forked = False
+"""Whether an action has forked this process: the run is its parent's."""
+
+
+def _note_fork() -> None:
+    global _forked
+    _forked = _active is not None
+
+
+os.register_at_fork(after_in_child=_note_fork)
 
 
 def _watch_unawaited() -> None:
@@ -513,7 +522,9 @@ class Runner:
 
     def _hint(self, fault: BaseException) -> str:
         """Return what to do about an attribute that `ctx.device` does not have."""
-        owner = getattr(fault, "obj", None)
+        if not issubclass(type(fault), AttributeError):
+            return ""
+        owner = vars(AttributeError)["obj"].__get__(fault)  # not what a subclass calls `obj`
         if owner is not None and owner is self._refusing:
             return "; its driver runs in another process: write `await ctx.command({...})`"
         return ""

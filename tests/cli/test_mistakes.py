@@ -900,22 +900,27 @@ def test_a_finding_disappears_with_its_remedy(
         assert not times or len(re.findall(told.partition("[^|]")[0], lines)) == 1, words
 
 
+@pytest.mark.parametrize("begun", [True, False])
 def test_an_interrupted_run_says_how_it_is_continued(
+    begun: bool,
     sound: dict[str, str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    """One that has not begun leaves nothing that could be continued."""
+
     async def ctrl_c(session: RunSession, options: argparse.Namespace) -> None:
+        if not begun:
+            await session.abandon()
         raise KeyboardInterrupt
 
     damaged(sound, [], tmp_path)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("petrobot.coordinator.cli.run._lead_lockstep", ctrl_c)
     assert main([*RUN, "--journal", "runs"]) == 130
-    assert re.search(
-        r"`petrobot resume runs/arm_bot-\S+` continues this run", capsys.readouterr().err
-    )
+    told = r"`petrobot resume runs/arm_bot-\S+` continues this run"
+    assert bool(re.search(told, capsys.readouterr().err)) == begun
 
 
 CAMPAIGN = ["campaign", TASK, "--services", CELL, "--runs", "2", "--out", "out"]

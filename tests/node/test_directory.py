@@ -298,8 +298,12 @@ def test_an_unreadable_file_raises_the_systems_error(tmp_path: Path) -> None:
         ),
         (
             "speechless:main",
-            "importing 'speechless' raises speechless.Mute: <exception str() failed>; correct the "
-            "module",
+            "importing 'speechless' raises Mute: <exception str() failed>; correct the module",
+        ),
+        (
+            "unfinished:main",
+            "importing 'unfinished' raises SyntaxError: '(' was never closed (unfinished.py, line "
+            "2); correct the module",
         ),
     ],
 )
@@ -310,6 +314,7 @@ def test_imports_are_verified_on_the_host_that_runs_them(
     (tmp_path / "ends_itself.py").write_text("import sys\ndef main(): ...\nsys.exit(0)\n")
     mute = "class Mute(Exception):\n    def __str__(self): raise self\nraise Mute\n"
     (tmp_path / "speechless.py").write_text(mute)
+    (tmp_path / "unfinished.py").write_text("import os\nprint(\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     directory = parse(GOOD.replace("json:JSONDecoder", path), Path("services.toml"))
     (fault,) = verify_imports(directory, "vision")

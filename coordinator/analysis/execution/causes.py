@@ -238,17 +238,14 @@ def _values(draft: Draft, t: CompiledTransition, firings: Sequence[str]) -> Iter
     for name in sorted((t.when.names if t.when else frozenset()) & set(task.variables) - told):
         setters = [u.name for u in task.transitions.values() if name in dict(u.sets)]
         last = next((f for f in reversed(firings) if f in setters), None)
-        others = ", ".join(f"`{u}`" for u in setters if u != last)
+        others = [f"`{u}`" for u in setters if u != last]
+        only = f"only {', '.join(others)} set{'s' * (len(others) == 1)} it"
         value = repr(draft.variables.get(name))
         if last is not None:
-            also = f"; otherwise only {others} set{_s(setters[1:])} it" if others else ""
-            yield f"{name}: `{last}` set it to {value}{also or ', and nothing else sets it'}"
-        elif setters:
-            yield f"{name}: {value} from the beginning; only {others} set{_s(setters)} it"
-
-
-def _s(names: Sequence[str]) -> str:
-    return "s" if len(names) == 1 else ""
+            also = f"otherwise {only}" if others else "nothing else sets it"
+            yield f"{name}: `{last}` set it to {value}; {also}"
+        elif others:
+            yield f"{name}: {value} from the beginning; {only}"
 
 
 def _has(names: Sequence[str]) -> str:

@@ -840,12 +840,12 @@ class Progress:
         calm = ~x.fails & ~x.firing(self._stops)
         for name, p in known.net.place_index.items() if self._whole else ():
             takers = [t for t in known.transitions if p in dict(t.needs)]
-            if all(t.flags or t.pulse for t in takers):
+            if takers and all(t.flags or t.pulse for t in takers):
                 stays = ~x.firing([t.name for t in takers])
                 free = x.of_edges(stays).backward(x.final)
                 free |= x.of_edges(stays & calm).backward(x.given_up)
                 held = (i for i, state in enumerate(x.states) if state.marking[p])
-                found |= {name} if takers and all(free[i] for i in held) else set()
+                found |= {name} if all(free[i] for i in held) else set()
         return frozenset(found)
 
     @cached_property

@@ -441,8 +441,10 @@ def resolve(path: str) -> Any:
     except KeyboardInterrupt:
         raise
     except BaseException as fault:  # a module may call sys.exit, and its exceptions may be broken
-        words = traceback.format_exception_only(fault)[-1].strip()
-        raise ImportError(f"importing {written!r} raises {words}; correct the module") from fault
+        words = traceback.TracebackException(type(fault), fault, None)  # also if `str` raises
+        raise ImportError(
+            f"importing {written!r} raises {type(fault).__name__}: {words}; correct the module"
+        ) from fault
     found = getattr(module, attribute, None)
     if not callable(found):
         names = [n for n in vars(module) if not n.startswith("_")]

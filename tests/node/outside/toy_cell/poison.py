@@ -34,6 +34,8 @@ Unbound: Any = type("Unbound", (), {"__class__": _SEALED})
 """A proxy whose object is missing: even its class cannot be asked."""
 Classless: Any = type("Classless", (Exception,), {"__class__": _SEALED, "__traceback__": _SEALED})
 """An exception whose class and traceback cannot be asked."""
+Ownerless: Any = type("Ownerless", (AttributeError,), {"obj": _SEALED})
+"""One that does not tell which object lacks the attribute."""
 
 
 class Endless(Mapping[str, Any]):
@@ -148,6 +150,7 @@ RAISES: Mapping[str, Callable[[], BaseException]] = {
     "one without words": Mute,
     "one whose words leave": Leaving,
     "one without a class": Classless,
+    "one without an object": Ownerless,
     "one with many words": lambda: ValueError("x" * 20_000_000),
     "one with half a letter": lambda: ValueError("\ud800"),
 }
