@@ -86,6 +86,8 @@ class CatchingLaboratory(LaboratoryParty):
         self._home: list[float] = site.arm.poses["home"].tolist()
         self.bus = ArmBus(self.plant, site.drives)
         self._world: BallWorld | None = None
+        self._read: dict[str, Truth] = {}
+        """By regime, the truth that the coming preparation will use."""
         self._prepare(self.now, seed, truth, throws)
 
     def _prepare(self, now: float, seed: int, truth: Truth, throws: int | None) -> None:
@@ -153,10 +155,11 @@ class CatchingLaboratory(LaboratoryParty):
         self.exposures.put(stated, ready, self._picture(now))
 
     def make_ready(self, arguments: Mapping[str, Any]) -> None:
-        """Draw the static scene of a regime's camera before its first image, which takes seconds.
+        """Read a regime's truth, and draw the static scene of its camera, which takes seconds.
         Raises LaboratoryError."""
         regime = str(arguments.get("regime", "A"))
-        camera_of(self._site.cell, self._site.truth(regime), self._noise).warm_up()
+        truth = self._read[regime] = self._site.truth(regime)
+        camera_of(self._site.cell, truth, self._noise).warm_up()
 
     def camera(self) -> PinholeCamera:
         """Return the camera as it is mounted in this regime, ready for the next image."""
@@ -279,7 +282,8 @@ class CatchingLaboratory(LaboratoryParty):
     def prepare(self, arguments: Mapping[str, Any]) -> None:
         """Begin a new experiment: seed=0, regime="A", throws=None. Raises ValueError."""
         seed, throws = whole_number(arguments, "seed", 0), whole_number(arguments, "throws", None)
-        truth = self._site.truth(str(arguments.get("regime", "A")))
+        regime = str(arguments.get("regime", "A"))
+        truth = self._read.pop(regime, None) or self._site.truth(regime)
         self._prepare(self.now, seed or 0, truth, throws)
 
     def score(self, arguments: Mapping[str, Any]) -> dict[str, Any]:

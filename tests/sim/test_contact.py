@@ -7,6 +7,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -265,23 +266,45 @@ def test_at_the_rim_the_portable_contact_has_converged_and_bullet_is_near(
 
 @needs_bullet
 @pytest.mark.parametrize("closed", [True, False])
-def test_a_contact_leaves_no_physics_client(site: Site, model: BallModel, closed: bool) -> None:
-    """Also one that is given up without being closed."""
-    import pybullet
+def test_the_next_contact_gets_the_physics_client_of_the_last_one(
+    site: Site, model: BallModel, closed: bool
+) -> None:
+    """Also of one that is given up without being closed; and it computes the same bits as in a new
+    client, whatever was there before."""
+    from petrobot.sim.catching import bullet
 
-    from petrobot.sim.catching.bullet import BulletBallContact
+    (cup, balls), truth = rim_balls(5), site.truth("C")
 
-    truth = site.truth("C")
-    space = ball_contact(BULLET, model, truth.table, truth.cup, 0.003, truth.settings)
-    assert isinstance(space, BulletBallContact)
-    client = space._client
-    assert pybullet.getConnectionInfo(client)["isConnected"]
+    def paths(space: BallContact) -> list[BallState]:
+        states = []
+        for start in balls:
+            space.put_ball(start)
+            states += [space.step(cup, cup) for _ in range(200)]
+        return states
+
+    def made(step: float) -> Any:
+        settings = {**truth.settings, "step": {**truth.settings["step"], "contact": step}}
+        return ball_contact(BULLET, model, truth.table, truth.cup, 0.003, settings)
+
+    before = list(bullet._idle)
+    bullet._idle.clear()
+    new = made(1e-3)
+    expected = paths(new)
+    last = made(2e-3)
+    assert paths(last) != expected and last._client != new._client
+    number = last._client
     if closed:
-        space.close()
-        space.close()
-    del space
+        last.close()
+        last.close()
+    del last
     gc.collect()
-    assert not pybullet.getConnectionInfo(client)["isConnected"]
+    assert bullet._idle == [number]
+    again = made(1e-3)
+    assert again._client == number and not bullet._idle
+    assert paths(again) == expected
+    new.close()
+    again.close()
+    bullet._idle += before
 
 
 def test_flight_agrees_with_the_closed_form(space: BallContact) -> None:

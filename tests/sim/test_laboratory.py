@@ -25,6 +25,7 @@ from petrobot.sim.catching.site import Site
 from petrobot.sim.catching.thrower import draw_throw
 from petrobot.sim.catching.truth import Scatter
 from petrobot.sim.exposures import Exposures
+from tests.sim.conftest import needs_bullet
 
 REPOSITORY = Path(__file__).parents[2]
 Bench = Any
@@ -309,6 +310,22 @@ def test_an_invalid_fault_is_refused(
 
 
 # Services
+
+
+@needs_bullet
+def test_a_preparation_connects_no_physics_client(
+    bench: Benches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In real time the drives are silent as long as a preparation takes; with a new client that was
+    40 ms at times, after which the arm's driver takes a drive for lost."""
+    import pybullet
+
+    here = bench()
+    connected: list[int] = []
+    monkeypatch.setattr(pybullet, "connect", connected.append)
+    for regime in ("C+dim", "A@2"):
+        assert here.call("laboratory_prepare", seed=5, regime=regime).status == "success"
+    assert connected == []
 
 
 def test_prepare_begins_a_new_experiment(bench: Benches) -> None:
