@@ -113,8 +113,8 @@ async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
 
 
 async def test_two_operators(browser: Browser, page: Page, stage: Stage) -> None:
-    """One holds the controls; the other sees the same, asks for them and gets them; every client
-    may press the emergency stop."""
+    """One holds the controls; the other sees the same, asks for them and gets them, and keeps them
+    after a refresh; a duplicate of his tab does not. Every client may press the emergency stop."""
     ana, ben = await opened(browser, page), await opened(browser, page)
     await start_mission(ana)
     await expect(ben.get_by_role("status", name="Mission state")).to_contain_text("Running")
@@ -126,6 +126,10 @@ async def test_two_operators(browser: Browser, page: Page, stage: Stage) -> None
     await expect(bens).to_contain_text("You hold the controls")
     await ben.reload()
     await expect(bens).to_contain_text("You hold the controls")
+    async with ben.expect_popup() as duplicate:
+        await ben.evaluate("open(location.href)")  # with a copy of what the tab has stored
+    carl = (await duplicate.value).get_by_role("toolbar", name="Mission")
+    await expect(carl).to_contain_text("holds the controls")
     await ana.get_by_role("searchbox", name="Find a place or transition").focus()
     await ana.keyboard.press("F9")
     for tab in (ana, ben):

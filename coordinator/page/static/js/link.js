@@ -8,15 +8,14 @@ const ANSWER_MS = 20000;
 const GOING_AWAY = 1001;
 const UNKNOWN_HERE = 401;
 
-/** A tab's secret: it stays the same operator after a refresh. */
-function tabSecret() {
-  let secret = sessionStorage.getItem("petrobot.tab");
-  if (!secret) {
-    secret = Array.from(crypto.getRandomValues(new Uint8Array(16)), (b) => b.toString(16).padStart(2, "0")).join("");
-    sessionStorage.setItem("petrobot.tab", secret);
-  }
-  return secret;
-}
+/** A tab's secret: it stays the same operator after a refresh. It is stored only while the page is away, since the
+ * browser copies what is stored into a duplicate of the tab, which is another operator. */
+const SECRET = "petrobot.tab";
+const made = () => Array.from(crypto.getRandomValues(new Uint8Array(16)), (b) => b.toString(16).padStart(2, "0")).join("");
+const tabSecret = sessionStorage.getItem(SECRET) ?? made();
+sessionStorage.removeItem(SECRET);
+addEventListener("pagehide", () => sessionStorage.setItem(SECRET, tabSecret));
+addEventListener("pageshow", () => sessionStorage.removeItem(SECRET));
 
 export class Link {
   /** `painted(changed, changes)` is called at most once a frame with the set of altered parts. */
@@ -54,7 +53,7 @@ export class Link {
     socket.onopen = () => {
       met = true;
       this.refused = false;
-      socket.send(JSON.stringify({ type: "hello", protocol: 1, name: "operator", tab: tabSecret() }));
+      socket.send(JSON.stringify({ type: "hello", protocol: 1, name: "operator", tab: tabSecret }));
     };
     socket.onmessage = (event) => this.receive(socket, event.data);
     socket.onclose = (event) => {
