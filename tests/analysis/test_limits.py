@@ -106,7 +106,7 @@ def test_facts_are_told_if_the_memory_is_used_up() -> None:
             raise MemoryError
         return examine(space, in_haste=True)
 
-    found = report._examined(stuck_and_unsafe(30_000), None, "auto", notes := list[str](), examined)
+    found = report._examined(stuck_and_unsafe(30_000), None, notes := list[str](), examined)
     assert notes == [report.FULL]
     assert found.safe.holds is False and found.quasi_live.holds is True
     assert found.live.holds is None and found.bounded.holds is not False

@@ -209,25 +209,22 @@ class Graph:
         inside: Mask = self.components[self.source] == self.components[self.target]
         return inside
 
-    def almost_sure(
-        self, goal: Mask, free: Mask, *, allowed: Mask | None = None, hits: Mask | None = None
-    ) -> Mask:
+    def almost_sure(self, goal: Mask, free: Mask, *, allowed: Mask | None = None) -> Mask:
         """Return the vertices from which some strategy reaches the goal with probability 1.
 
-        The goal is a vertex of `goal` or an edge of `hits`. The strategy may leave out any edge
-        that is `free`; every other edge has a positive probability whenever its source is visited
-        (fairness). Before the goal only `allowed` vertices may be visited.
+        The strategy may leave out any edge that is `free`; every other edge has a positive
+        probability whenever its source is visited (fairness). Before the goal only `allowed`
+        vertices may be visited.
 
         This is almost sure reachability in a Markov decision process (C. Baier, J.-P. Katoen,
         Principles of Model Checking, MIT Press 2008, section 10.6.1), computed as a greatest fixed
         point: start with all vertices, and remove those from which an edge that cannot be left out
         leaves the set, and those from which the goal cannot be reached inside the set.
         """
-        hits = np.zeros(len(self.target), dtype=np.bool_) if hits is None else hits
         winning = goal.copy() if allowed is None else goal | allowed
         if allowed is None:
             winning[:] = True
-        forced = ~free & ~hits
+        forced = ~free
         while True:
             keep_time("verdicts")
             # First the vertices that the environment can push out of the set ...
@@ -236,10 +233,8 @@ class Graph:
                 winning[self.source[leaves]] = False
                 continue
             # ... then those from which the goal is no longer reachable inside it.
-            start = goal & winning
-            start[self.source[hits & winning[self.source]]] = True
             inside = winning[self.source] & winning[self.target]
-            reaching = self.backward(start, inside)
+            reaching = self.backward(goal & winning, inside)
             if np.array_equal(reaching & winning, winning):
                 return winning
             winning &= reaching
