@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 from petrobot.coordinator.learning.statistics import (
     EMPTY,
     Moments,
-    clopper_pearson,
     merged,
     whole,
     wilson,
@@ -209,11 +208,9 @@ class Tally:
         """R; nan if no run counts."""
         return self.count(Status.SUCCESS) / self.runs if self.runs else float("nan")
 
-    def interval(self, level: float = 0.95, *, exact: bool = False) -> tuple[float, float]:
-        """Return the confidence interval of R: Wilson's, or the exact one of Clopper and
-        Pearson."""
-        made = clopper_pearson if exact else wilson
-        return made(self.count(Status.SUCCESS), self.runs, level)
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Return Wilson's confidence interval of R."""
+        return wilson(self.count(Status.SUCCESS), self.runs, level)
 
     @property
     def availability(self) -> float:
