@@ -63,10 +63,10 @@ class RoverBody:
     """Wheels 0 (left) and 1 (right) and the body on them. `move_to` advances it to a moment; times
     are on the caller's clock (s)."""
 
-    def __init__(self, truth: RoverTruth, rng: np.random.Generator, now: float = 0.0) -> None:
+    def __init__(self, truth: RoverTruth, rng: np.random.Generator) -> None:
         """`rng` draws the slip."""
         self.wheels = (Wheel(0.0, 1.0), Wheel(0.0, 1.0))
-        self.now = now
+        self.now = 0.0
         self.place(truth, FloorPose(0.0, 0.0, 0.0), rng)
 
     def place(self, truth: RoverTruth, pose: FloorPose, rng: np.random.Generator) -> None:
