@@ -158,7 +158,7 @@ def test_completion_against_dense_matrices(gspn: Gspn, data: st.DataObject) -> N
     assume(chain.n <= 80)
     goal = np.zeros(chain.n, dtype=bool)
     goal[data.draw(st.sampled_from(chain.tangible.tolist()))] = True
-    assume(chain.graph.forward([0])[goal].any() and not goal[0])
+    assume(not goal[0])
     done = completion(chain, goal)
     Q, start = dense(chain)
     end = goal[chain.tangible]
@@ -197,7 +197,7 @@ def test_derivatives_against_differences(gspn: Gspn, data: st.DataObject) -> Non
     assume(chain.n <= 80)
     goal = np.zeros(chain.n, dtype=bool)
     goal[data.draw(st.sampled_from(chain.tangible.tolist()))] = True
-    assume(chain.graph.forward([0])[goal].any() and not goal[0])
+    assume(not goal[0])
     done = completion(chain, goal)
     by_h, by_time = reliability_slopes(done), time_slopes(done)
     name = data.draw(st.sampled_from(gspn.net.transitions))

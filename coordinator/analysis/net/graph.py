@@ -101,39 +101,22 @@ class Graph:
         order = np.argsort(self.target, kind="stable")
         return np.searchsorted(self.target[order], np.arange(self.n + 1)).astype(np.int64), order
 
-    def forward(self, seeds: Mask | Sequence[int], edges: Mask | None = None) -> Mask:
-        """Return the vertices reachable from the seeds, seeds included.
-
-        `edges` restricts the search to some edges; by default all count.
-        """
-        return self._spread(seeds, edges, self.row, None, self.target)
-
     def backward(self, seeds: Mask | Sequence[int], edges: Mask | None = None) -> Mask:
         """Return the vertices from which a seed can be reached, seeds included.
 
         `edges` restricts the search to some edges; by default all count.
         """
-        return self._spread(seeds, edges, *self.into, self.source)
-
-    def _spread(
-        self,
-        seeds: Mask | Sequence[int],
-        edges: Mask | None,
-        row: Index,
-        order: Index | None,
-        far: NDArray[np.int32],
-    ) -> Mask:
-        """Breadth-first search, one whole layer of vertices per numpy operation."""
+        # Breadth-first, one whole layer of vertices per numpy operation.
+        row, order = self.into
         reached = np.zeros(self.n, dtype=np.bool_)
         reached[seeds] = True
         front = np.flatnonzero(reached)
         while len(front):
             keep_time("verdicts")
-            at = ranges(row[front], row[front + 1])
-            at = at if order is None else order[at]
+            at = order[ranges(row[front], row[front + 1])]
             if edges is not None:
                 at = at[edges[at]]
-            near = far[at]
+            near = self.source[at]
             front = np.unique(near[~reached[near]])
             reached[front] = True
         return reached
