@@ -270,7 +270,7 @@ def _assumed(model: Task | NetFile, cell: Cell | None) -> tuple[str, ...]:
     return (assumed(cell),) if isinstance(model, Task) else ()
 
 
-def _measured(model: Task | NetFile, measure: Measure | None, cell: Cell | None = None) -> Measured:
+def _measured(model: Task | NetFile, measure: Measure | None, cell: Cell | None) -> Measured:
     """Return the measurements of a task. Raises NetFileError if the model is not a task."""
     if measure is None:
         return Measured()
@@ -613,8 +613,8 @@ def graph_command(path: Path) -> CommandResult:
 def gspn_of(
     path: Path,
     *,
-    measure: Measure | None = None,
-    cell_of: CellOf | None = None,
+    measure: Measure | None,
+    cell_of: CellOf | None,
 ) -> tuple[NetFile, Mapping[str, str], str]:
     """Return the GSPN of a task or net file, where each rate and weight comes from, by name, and
     which cell is assumed (empty for a net file).

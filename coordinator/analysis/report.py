@@ -696,8 +696,8 @@ def with_forecast(
     *,
     measured: Measured | None = None,
     stages: int = 8,
-    limits: SearchLimits | None = None,
-    devices: Mapping[str, str] | None = None,
+    limits: SearchLimits | None,
+    devices: Mapping[str, str] | None,
 ) -> Analysis:
     """Return the analysis of a task with its forecast, as `analyse` with `view="gspn"` does, and
     without searching again."""

@@ -226,7 +226,7 @@ class Tally:
             out = out.merged(moments) if is_counted(exit_) else out
         return out
 
-    def cost(self, measure: str = "wall") -> Moments:
+    def cost(self, measure: str) -> Moments:
         """Return the cost over the counted runs by a measure: `wall`, `cpu` (s), `count` or
         `value:NAME`. Raises ValueError for any other measure.
 
@@ -248,7 +248,7 @@ class Tally:
             )
         return self.values.get(name, EMPTY)
 
-    def cost_correlation(self, measure: str = "wall") -> float:
+    def cost_correlation(self, measure: str) -> float:
         """Return the correlation of success and cost over the counted runs: they come from the same
         runs, so the interval of J needs it. For `cpu` it is that of the sample. Of other numbers
         only their sums are known: -1, which makes the interval of J widest."""

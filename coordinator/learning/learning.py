@@ -231,7 +231,7 @@ class Learning:
 
     # --- state --------------------------------------------------------------------------------
 
-    def prime(self, prior: Estimates | None = None, trials: float = 0.0) -> None:
+    def prime(self, prior: Estimates | None, trials: float) -> None:
         """Let the selectors take their sums from the known estimates, which may contain runs of
         other machines, and from those of another plant as from so many trials of each action. Not
         those that the task judges: estimates hold no verdicts of the task."""

@@ -368,7 +368,7 @@ def task_figures(
     trials: Mapping[str, TrialSums],
     measures: Mapping[str, str],
     compared: Mapping[str, Comparison],
-    rho: float | None = None,
+    rho: float | None,
 ) -> TaskFigures | None:
     """Return R_conj, C and J of a whole task, as its trials measured them by context; None without
     trials.

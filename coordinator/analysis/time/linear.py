@@ -51,7 +51,7 @@ class SolveOrder:
     """
 
     @classmethod
-    def of(cls, graph: Graph, inside: Mask | None = None) -> SolveOrder:
+    def of(cls, graph: Graph, inside: Mask | None) -> SolveOrder:
         """Return the order for the vertices in `inside` (by default all); the others count as 0."""
         keep = np.ones(graph.n, dtype=np.bool_) if inside is None else inside
         component = graph.components
