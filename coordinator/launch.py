@@ -316,7 +316,7 @@ def local_nodes(
     logs: Path = NODE_LOGS,
     *,
     lockstep: bool = False,
-    mock: Path | None = None,
+    mock: Path | None,
     respawn: bool = True,
 ) -> Supervisor:
     """Launch the nodes of this host while the context lasts; each writes to its log in `logs`."""

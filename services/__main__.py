@@ -56,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
     return commands
 
 
-def read(path: Path, name: str, dry_run: bool = False) -> tuple[Directory, str]:
+def read(path: Path, name: str, dry_run: bool) -> tuple[Directory, str]:
     """The location file and its text. Raises DirectoryError when it is bad or this node cannot run
     here."""
     try:

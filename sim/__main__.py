@@ -44,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
     return commands
 
 
-def read(path: Path, dry_run: bool = False) -> tuple[Directory, str]:
+def read(path: Path, dry_run: bool) -> tuple[Directory, str]:
     """Return the location file and the name of its simulated node. Raises DirectoryError."""
     try:
         directory = load(path, dry_run)

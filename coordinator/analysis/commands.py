@@ -1,7 +1,6 @@
 """The commands analyse, simulate, convert and show --graph as functions: exit code, text, data.
 
-The caller passes `load_task`, because this package knows tasks but not task files. Clocks and
-random generators come from the caller as well.
+Clocks and random generators come from the caller.
 """
 
 from __future__ import annotations
@@ -50,6 +49,7 @@ from petrobot.coordinator.analysis.time.whatif import (
     read_change,
 )
 from petrobot.coordinator.task import End, Kind, Place, Status, Task, Transition
+from petrobot.coordinator.task.file import load
 from petrobot.coordinator.task.net import Net
 from petrobot.coordinator.task.wording import wrapped
 from petrobot.services.host.whole_file import write_whole
@@ -58,7 +58,6 @@ OK, FAULT, BAD_INPUT = 0, 1, 2
 SEARCHED = 0.5
 """Share of the seconds of an analysis that its searches may use; the rest is for the verdicts."""
 
-LoadTask = Callable[[Path], Task]
 Measure = Callable[[Task, Cell | None], Measured]
 """Returns what was measured of a task that runs in a cell."""
 CellOf = Callable[[Task], Cell | None]
@@ -82,14 +81,13 @@ def _full(code: int, text: str) -> CommandResult:
     return CommandResult(code, text, {"error": text})
 
 
-def open_model(path: Path, load_task: LoadTask) -> Task | NetFile:
-    """Open a task (`.toml`) or a net file. Raises NetFileError and the errors of `load_task`."""
-    return load_task(path) if path.suffix == ".toml" else read_net(path)
+def open_model(path: Path) -> Task | NetFile:
+    """Open a task (`.toml`) or a net file. Raises NetFileError and the errors of `load`."""
+    return load(path) if path.suffix == ".toml" else read_net(path)
 
 
 def analyse_command(
     path: Path,
-    load_task: LoadTask,
     *,
     view: str | None = None,
     rates: Path | str | None = None,
@@ -121,7 +119,7 @@ def analyse_command(
     full = _full(FAULT, f"{path}: the memory was used up; give more --memory, or fewer --states")
     try:
         with until(due, clock):
-            model = open_model(path, load_task)
+            model = open_model(path)
         view = view or _view(model, rates)
         subject, name, notes = _subject(model, rates, view)
         cell = _cell(model, cell_of)
@@ -272,7 +270,7 @@ def _assumed(model: Task | NetFile, cell: Cell | None) -> tuple[str, ...]:
     return (assumed(cell),) if isinstance(model, Task) else ()
 
 
-def _measured(model: Task | NetFile, measure: Measure | None, cell: Cell | None = None) -> Measured:
+def _measured(model: Task | NetFile, measure: Measure | None, cell: Cell | None) -> Measured:
     """Return the measurements of a task. Raises NetFileError if the model is not a task."""
     if measure is None:
         return Measured()
@@ -349,7 +347,6 @@ def _text(path: Path) -> str:
 
 def simulate_command(
     path: Path,
-    load_task: LoadTask,
     random: np.random.Generator,
     *,
     rates: Path | str | None = None,
@@ -369,7 +366,7 @@ def simulate_command(
     """
     full = _full(BAD_INPUT, f"{path}: out of memory; use fewer --replicas")
     try:
-        model, wanted = open_model(path, load_task), [read_change(text) for text in changes]
+        model, wanted = open_model(path), [read_change(text) for text in changes]
         cell = _cell(model, cell_of)
         known = _measured(model, measure, cell)
         subject, name, notes = _subject(model, rates, "gspn")
@@ -486,7 +483,6 @@ def _interval(one: IntervalEstimate) -> str:
 def convert_command(
     source: Path,
     target: Path,
-    load_task: LoadTask,
     *,
     view: str | None = None,
     exact: bool = False,
@@ -503,7 +499,7 @@ def convert_command(
     told = f"{source}: the memory was used up; the net is too large for {target.suffix}"
     full = _full(BAD_INPUT, told)
     try:
-        model = open_model(source, load_task)
+        model = open_model(source)
         if exact and (not isinstance(model, Task) or view == "gspn" or measure is not None):
             told = "the ends net of a task without times; leave out --view and --estimates"
             raise NetFileError("--exact", str(source), f"expected {told}", "or leave out --exact")
@@ -592,11 +588,11 @@ def net_file_of(task: Task) -> NetFile:
     return NetFile(task.net, task.name, None, labels, positions)
 
 
-def graph_command(path: Path, load_task: LoadTask) -> CommandResult:
+def graph_command(path: Path) -> CommandResult:
     """Run `petrobot show --graph`: the reachability graph as SVG in data["svg"], with the path to
     the first deadlock highlighted."""
     try:
-        model = open_model(path, load_task)
+        model = open_model(path)
         net, final = model.net, None
         space = explore(net, limits=SearchLimits(states=10_000))
     except (NetFileError, ValueError, OverflowError) as error:
@@ -616,17 +612,16 @@ def graph_command(path: Path, load_task: LoadTask) -> CommandResult:
 
 def gspn_of(
     path: Path,
-    load_task: LoadTask,
     *,
-    measure: Measure | None = None,
-    cell_of: CellOf | None = None,
+    measure: Measure | None,
+    cell_of: CellOf | None,
 ) -> tuple[NetFile, Mapping[str, str], str]:
     """Return the GSPN of a task or net file, where each rate and weight comes from, by name, and
     which cell is assumed (empty for a net file).
 
-    Raises NetFileError, NoEstimate and the errors of `load_task`.
+    Raises NetFileError, NoEstimate and the errors of `load`.
     """
-    model = open_model(path, load_task)
+    model = open_model(path)
     cell = _cell(model, cell_of)
     known = _measured(model, measure, cell)
     if isinstance(model, Task):

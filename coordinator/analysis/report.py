@@ -32,7 +32,6 @@ from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
 from petrobot.coordinator.analysis.net.space import (
     INTERRUPTED,
-    EngineName,
     SearchLimits,
     Space,
     explore,
@@ -497,7 +496,6 @@ def analyse(
     measured: Measured | None = None,
     stages: int = 8,
     limits: SearchLimits | None = None,
-    engine: EngineName = "auto",
     ordinary: Net | None = None,
     steps: int = STEPS,
     devices: Mapping[str, str] | None = None,
@@ -512,13 +510,13 @@ def analyse(
     actions that has one.
     """
     if isinstance(model, Task):
-        return _analyse_task(model, view, measured, stages, limits, engine, steps, devices)
+        return _analyse_task(model, view, measured, stages, limits, steps, devices)
     net = ordinary or (model.net if isinstance(model, Gspn) else model)
     notes: list[str] = []
-    found = _examined(net, limits, engine, notes)
+    found = _examined(net, limits, notes)
     run = None
     if isinstance(model, Gspn) and view == "gspn" and not notes:
-        run = _long_run(model, found.space, limits, engine, notes)
+        run = _long_run(model, found.space, limits, notes)
     stopped = bool(notes) and notes[-1] == CUT
     return Analysis(
         name or "net",
@@ -547,16 +545,14 @@ STOPPED = {INTERRUPTED: CUT, "memory limit": FULL, "time limit": LATE}
 """What ended an analysis before its end, and the note that says so."""
 
 
-def _search(
-    net: Net, limits: SearchLimits | None, engine: EngineName, found: list[Space]
-) -> Coverability | None:
+def _search(net: Net, limits: SearchLimits | None, found: list[Space]) -> Coverability | None:
     """Append the space within the limits to `found`, and before it the first part of a large one.
 
     A net that is proven unbounded is searched only up to LOOK markings.
     """
     limits, cover = limits or SearchLimits(), None
     if limits.states is None or limits.states > LOOK:
-        first = explore(net, limits=replace(limits, states=LOOK), engine=engine)
+        first = explore(net, limits=replace(limits, states=LOOK))
         found.append(first)
         if first.complete or len(first) < LOOK:
             return None
@@ -566,14 +562,13 @@ def _search(
         if cover is not None and (cover.bounded is False or open_):
             found.append(replace(first, reason=ENDLESS))
             return cover
-    found.append(explore(net, limits=limits, engine=engine))
+    found.append(explore(net, limits=limits))
     return cover
 
 
 def _examined(
     net: Net,
     limits: SearchLimits | None,
-    engine: EngineName,
     notes: list[str],
     judge: Callable[..., Qualitative] = examine,
 ) -> Qualitative:
@@ -581,7 +576,7 @@ def _examined(
     return those that what was found by then proves."""
     found, reason = list[Space](), INTERRUPTED
     try:
-        cover = _search(net, limits, engine, found)
+        cover = _search(net, limits, found)
         if found[-1].reason != INTERRUPTED:
             return judge(found[-1], cover=cover)
     except KeyboardInterrupt:
@@ -601,11 +596,11 @@ def _examined(
 
 
 def _long_run(
-    model: Gspn, space: Space, limits: SearchLimits | None, engine: EngineName, notes: list[str]
+    model: Gspn, space: Space, limits: SearchLimits | None, notes: list[str]
 ) -> LongRun | None:
     try:
         if model.net != space.net:
-            space = explore(model.net, limits=limits, engine=engine)
+            space = explore(model.net, limits=limits)
         if space.reason != INTERRUPTED:
             return long_run(Chain.of(model, space=space))
     except (ValueError, ArithmeticError, MemoryError) as why:
@@ -623,13 +618,12 @@ def _analyse_task(
     measured: Measured | None,
     stages: int,
     limits: SearchLimits | None,
-    engine: EngineName,
     steps: int,
     devices: Mapping[str, str] | None,
     fewer: bool = True,
 ) -> Analysis:
     ordinary, n, notes = OrdinaryView(task), ends_net(task), list[str]()
-    found = _examined(n.net, limits, engine, notes, partial(judged, n))
+    found = _examined(n.net, limits, notes, partial(judged, n))
     progress = None
     shown: Mapping[str, PropertyVerdict] = {}
     why = "the analysis was stopped before"
@@ -665,7 +659,7 @@ def _analyse_task(
         n,
     )
     if fewer and not (judgement.interrupted or judgement.objections):
-        smaller = _with_fewer_runs(task, progress, limits, engine, steps, devices)
+        smaller = _with_fewer_runs(task, progress, limits, steps, devices)
         judgement = replace(judgement, fewer=smaller)
     if view != "gspn" or judgement.interrupted:
         return judgement
@@ -678,7 +672,6 @@ def _with_fewer_runs(
     task: Task,
     progress: Progress | None,
     limits: SearchLimits | None,
-    engine: EngineName,
     steps: int,
     devices: Mapping[str, str] | None,
 ) -> dict[int, Analysis]:
@@ -690,7 +683,7 @@ def _with_fewer_runs(
     for runs in range(1, min(place.tokens, FEWER + 1)):
         places = {**task.places, place.name: replace(place, tokens=runs)}
         smaller = replace(task, places=places)
-        one = _analyse_task(smaller, "", None, STAGES, limits, engine, steps, devices, fewer=False)
+        one = _analyse_task(smaller, "", None, STAGES, limits, steps, devices, fewer=False)
         found[runs] = one
         if one.objections or one.progress is None or not one.progress.x.complete:
             break
@@ -703,8 +696,8 @@ def with_forecast(
     *,
     measured: Measured | None = None,
     stages: int = 8,
-    limits: SearchLimits | None = None,
-    devices: Mapping[str, str] | None = None,
+    limits: SearchLimits | None,
+    devices: Mapping[str, str] | None,
 ) -> Analysis:
     """Return the analysis of a task with its forecast, as `analyse` with `view="gspn"` does, and
     without searching again."""

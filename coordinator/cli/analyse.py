@@ -110,7 +110,6 @@ def run(options: argparse.Namespace) -> int:
     """Analyse the net; print and write what was found. Return the exit code."""
     from petrobot.coordinator.analysis.commands import analyse_command
     from petrobot.coordinator.analysis.net.space import SearchLimits
-    from petrobot.coordinator.task.file import load
 
     longest = options.seconds or None
     limits = SearchLimits(
@@ -120,7 +119,6 @@ def run(options: argparse.Namespace) -> int:
     with progress_of_search(limits) as watched, bounded_memory(limits.memory or 0):
         outcome = analyse_command(
             path,
-            load,
             view=options.view,
             rates=options.rates,
             limits=watched,

@@ -54,13 +54,11 @@ def run(options: argparse.Namespace) -> int:
     """Convert the file, and list what could not be kept."""
     from petrobot.coordinator.analysis.commands import convert_command
     from petrobot.coordinator.cli.analyse import bounded_memory, give
-    from petrobot.coordinator.task.file import load
 
     with bounded_memory():  # a chain (`.drn`) may be far larger than its net
         found = convert_command(
             task_path(options.source),
             options.target,
-            load,
             view=options.view,
             exact=options.exact,
             measure=measurements(options.estimates),

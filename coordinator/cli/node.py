@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import os
+import sys
+from typing import NoReturn
 
-from petrobot.coordinator.cli.exec import become
 from petrobot.coordinator.cli.loading import add_services_argument, services_path
 from petrobot.coordinator.cli.options import add_log_level_argument
 
@@ -28,3 +30,11 @@ def run(options: argparse.Namespace) -> int:
         "--log-level",
         options.log_level,
     )
+
+
+def become(module: str, *arguments: str) -> NoReturn:
+    """Replace this process by `python -m module arguments`. A child process would survive when its
+    parent is killed."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execv(sys.executable, [sys.executable, "-m", module, *arguments])

@@ -116,7 +116,6 @@ def _gspn(options: argparse.Namespace) -> str:
     """Draw the stochastic view of a task, or a net file that has rates. Raises CommandError."""
     from petrobot.coordinator.analysis.commands import gspn_of
     from petrobot.coordinator.studies.report.gspn_picture import gspn_svg
-    from petrobot.coordinator.task.file import load
 
     for name in ("errors", "expanded", "inside", "heat"):
         if getattr(options, name):
@@ -126,7 +125,6 @@ def _gspn(options: argparse.Namespace) -> str:
     try:
         model, sources, assumed = gspn_of(
             path,
-            load,
             measure=measurements(options.estimates),
             cell_of=cell_finder(options.services, options.task),
         )
@@ -163,9 +161,8 @@ def _heat(task: Task, options: argparse.Namespace) -> Overlay:
 
 def _graph(options: argparse.Namespace) -> str:
     from petrobot.coordinator.analysis.commands import graph_command
-    from petrobot.coordinator.task.file import load
 
-    outcome = graph_command(task_path(options.task), load)
+    outcome = graph_command(task_path(options.task))
     if outcome.code:
         raise CommandError(outcome.code, outcome.text)
     return str(outcome.data["svg"])

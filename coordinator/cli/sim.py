@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from petrobot.coordinator.cli.exec import become
 from petrobot.coordinator.cli.loading import add_services_argument, services_path
+from petrobot.coordinator.cli.node import become
 from petrobot.coordinator.cli.options import add_log_level_argument
 
 EXAMPLE = "petrobot sim --services services.toml"

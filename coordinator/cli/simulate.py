@@ -69,7 +69,6 @@ def run(options: argparse.Namespace) -> int:
 
     from petrobot.coordinator.analysis.commands import simulate_command
     from petrobot.coordinator.cli.analyse import bounded_memory, give
-    from petrobot.coordinator.task.file import load
 
     random = np.random.default_rng(options.seed)
     given: dict[str, Any] = {
@@ -81,5 +80,5 @@ def run(options: argparse.Namespace) -> int:
     given["measure"] = measurements(options.estimates)
     given["cell_of"] = cell_finder(options.services, options.file)
     with bounded_memory():
-        found = simulate_command(task_path(options.file), load, random, **given)
+        found = simulate_command(task_path(options.file), random, **given)
     return give(found, options.json)

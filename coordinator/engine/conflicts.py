@@ -29,8 +29,8 @@ def choose_step(
     choices: Sequence[str],
     only: Sequence[str] | None,
     *,
-    ask: bool = False,
-    keep_ranks: bool = True,
+    ask: bool,
+    keep_ranks: bool,
 ) -> list[Match] | Draw:
     """Return the transitions that fire together in this marking, in an order in which each can fire
     after those before it.

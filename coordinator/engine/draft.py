@@ -87,7 +87,7 @@ class Draft:
         """Add an instruction."""
         self.instructions.append(instruction)
 
-    def report(self, severity: Severity, key: str, text: str, of: str = "") -> None:
+    def report(self, severity: Severity, key: str, text: str, of: str) -> None:
         """Add a message for people."""
         self.instructions.append(Report(severity, key, text, of))
 

@@ -457,5 +457,5 @@ def _note(draft: Draft, key: str, text: str, of: str = "") -> None:
     draft.report(Severity.NOTE, key, text, of)
 
 
-def _warn(draft: Draft, key: str, text: str, of: str = "") -> None:
+def _warn(draft: Draft, key: str, text: str, of: str) -> None:
     draft.report(Severity.WARNING, key, text, of)

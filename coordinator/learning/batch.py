@@ -68,7 +68,7 @@ class Batch:
     """Further arrays that a rule needs, by name; their first axis is the row."""
 
     @classmethod
-    def fresh(cls, rows: int, n: int, rho: float | None = None) -> Batch:
+    def fresh(cls, rows: int, n: int, rho: float | None) -> Batch:
         """Create learners without any experience: all actions are equally likely. Raises ValueError
         for fewer than one row or action."""
         if n < 1 or rows < 1:

@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 from petrobot.coordinator.learning.statistics import (
     EMPTY,
     Moments,
-    clopper_pearson,
     merged,
     whole,
     wilson,
@@ -209,11 +208,9 @@ class Tally:
         """R; nan if no run counts."""
         return self.count(Status.SUCCESS) / self.runs if self.runs else float("nan")
 
-    def interval(self, level: float = 0.95, *, exact: bool = False) -> tuple[float, float]:
-        """Return the confidence interval of R: Wilson's, or the exact one of Clopper and
-        Pearson."""
-        made = clopper_pearson if exact else wilson
-        return made(self.count(Status.SUCCESS), self.runs, level)
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Return Wilson's confidence interval of R."""
+        return wilson(self.count(Status.SUCCESS), self.runs, level)
 
     @property
     def availability(self) -> float:
@@ -229,7 +226,7 @@ class Tally:
             out = out.merged(moments) if is_counted(exit_) else out
         return out
 
-    def cost(self, measure: str = "wall") -> Moments:
+    def cost(self, measure: str) -> Moments:
         """Return the cost over the counted runs by a measure: `wall`, `cpu` (s), `count` or
         `value:NAME`. Raises ValueError for any other measure.
 
@@ -251,7 +248,7 @@ class Tally:
             )
         return self.values.get(name, EMPTY)
 
-    def cost_correlation(self, measure: str = "wall") -> float:
+    def cost_correlation(self, measure: str) -> float:
         """Return the correlation of success and cost over the counted runs: they come from the same
         runs, so the interval of J needs it. For `cpu` it is that of the sample. Of other numbers
         only their sums are known: -1, which makes the interval of J widest."""

@@ -7,7 +7,7 @@ the same order yield the same state.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any
@@ -231,7 +231,7 @@ class Learning:
 
     # --- state --------------------------------------------------------------------------------
 
-    def prime(self, prior: Estimates | None = None, trials: float = 0.0) -> None:
+    def prime(self, prior: Estimates | None, trials: float) -> None:
         """Let the selectors take their sums from the known estimates, which may contain runs of
         other machines, and from those of another plant as from so many trials of each action. Not
         those that the task judges: estimates hold no verdicts of the task."""
@@ -267,10 +267,10 @@ class Learning:
             except (ValueError, KeyError, TypeError) as fault:
                 raise ValueError(f"{' + '.join(self.joint.tasks)}: {fault}") from fault
 
-    def freeze(self, frozen: bool = True, primitive_tasks: Iterable[str] | None = None) -> None:
-        """Stop (or continue) learning. A frozen selector chooses the action that it has learned to
-        be best. Estimates still count."""
-        for name in self.selectors if primitive_tasks is None else primitive_tasks:
-            self.selectors[name].frozen = frozen
-        if self.joint is not None and primitive_tasks is None:
-            self.joint.selector.frozen = frozen
+    def freeze(self) -> None:
+        """Stop learning. A frozen selector chooses the action that it has learned to be best.
+        Estimates still count."""
+        for selector in self.selectors.values():
+            selector.frozen = True
+        if self.joint is not None:
+            self.joint.selector.frozen = True

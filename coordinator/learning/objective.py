@@ -5,10 +5,9 @@ Over several scenarios an action is judged by its worst case. R is its reliabili
 that is hardest for it, never the share over all its runs: actions that were run in unequal shares
 of easy and hard scenarios would be put in the wrong order (E. H. Simpson, J. Royal Statistical
 Society B 13 (1951) 238). C is its mean cost in the hardest scenario whose reliability is not below
-the target R_d; the lower confidence bound decides which scenarios these are, with hysteresis. rho
-is 1 / max C over the actions of the one primitive task, or declared. All J of a comparison are
-computed from sums with one rho; J values made with different rho are never averaged. Intervals of J
-hold for that rho.
+the target R_d; the lower confidence bound decides which scenarios these are. rho is 1 / max C over
+the actions of the one primitive task, or declared. All J of a comparison are computed from sums
+with one rho; J values made with different rho are never averaged. Intervals of J hold for that rho.
 """
 
 from __future__ import annotations
@@ -176,25 +175,15 @@ def objective(reliability: float, cost: float, rho: float, availability: float =
 def admitted(
     by_scenario: Mapping[str, Tally],
     target: float | None,
-    before: Iterable[str] = (),
     level: float = 0.95,
 ) -> tuple[str, ...]:
-    """Return the scenarios in which an action meets the target reliability, given those in which it
-    did `before`.
-
-    A scenario enters when the lower confidence bound of R reaches the target, and leaves when R
-    itself falls below it. In between it keeps its state, so the set does not flicker. Without a
-    target, all scenarios with runs are in.
-    """
-    inside = set(before)
-    out = []
-    for scenario, tally in sorted(by_scenario.items()):
-        if not tally.runs:
-            continue
-        bound = tally.reliability if scenario in inside else tally.interval(level)[0]
-        if target is None or bound >= target:
-            out.append(scenario)
-    return tuple(out)
+    """Return the scenarios in which the lower confidence bound of an action's R reaches the target;
+    without a target, all scenarios with runs."""
+    return tuple(
+        scenario
+        for scenario, tally in sorted(by_scenario.items())
+        if tally.runs and (target is None or tally.interval(level)[0] >= target)
+    )
 
 
 def hardest(by_scenario: Mapping[str, Tally], inside: Sequence[str]) -> str | None:
@@ -202,25 +191,19 @@ def hardest(by_scenario: Mapping[str, Tally], inside: Sequence[str]) -> str | No
     return min(inside, key=lambda s: (by_scenario[s].reliability, s), default=None)
 
 
-def compare(
-    actions: Mapping[str, Mapping[str, Tally]],
-    question: Question,
-    before: Mapping[str, Sequence[str]] | None = None,
-) -> Comparison:
+def compare(actions: Mapping[str, Mapping[str, Tally]], question: Question) -> Comparison:
     """Compare the alternatives of a primitive task. `actions`: the tallies of each action by
     scenario.
 
-    `before`: the admitted scenarios by action of the last comparison (hysteresis). All actions are
-    judged over the scenarios in which all of them were run: R in the worst of these, C in the
-    hardest admitted one. While no action meets the target in any scenario, none is ruled out.
+    All actions are judged over the scenarios in which all of them were run: R in the worst of
+    these, C in the hardest admitted one. While no action meets the target in any scenario, none is
+    ruled out.
     """
-    was, common = before or {}, shared(actions)
+    common = shared(actions)
     over = {
         a: {s: t for s, t in by.items() if not common or s in common} for a, by in actions.items()
     }
-    inside = {
-        a: admitted(by, question.target, was.get(a, ()), question.level) for a, by in over.items()
-    }
+    inside = {a: admitted(by, question.target, question.level) for a, by in over.items()}
     unmet = not any(inside.values())
     rows = []
     for action, by_scenario in over.items():
@@ -385,7 +368,7 @@ def task_figures(
     trials: Mapping[str, TrialSums],
     measures: Mapping[str, str],
     compared: Mapping[str, Comparison],
-    rho: float | None = None,
+    rho: float | None,
 ) -> TaskFigures | None:
     """Return R_conj, C and J of a whole task, as its trials measured them by context; None without
     trials.

@@ -199,7 +199,7 @@ def _preempting(task: Task, place: str) -> set[str]:
 
 
 def _ends(
-    tally: Tally, takers: set[str], extra: float | None = None
+    tally: Tally, takers: set[str], extra: float | None
 ) -> tuple[dict[Status, Estimate], dict[str, Estimate]]:
     """Return the duration distributions of a run's own ends by status, and of its preemptions by
     transition. Its own ends come `extra` s later; by default as long as it was seen to wait."""

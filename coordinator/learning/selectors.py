@@ -37,7 +37,7 @@ def eligible(batch: Batch, target: float, before: Mask, level: float = 0.95) -> 
     """Return the actions that meet the target now, shape (rows, n), given those that did `before`.
 
     An action enters when Wilson's lower bound of its R reaches the target, and leaves when R itself
-    falls below it (hysteresis, as in `objective.admitted`, here for many learners at once).
+    falls below it: in between it keeps its state, so the set does not flicker.
     """
     from scipy.special import ndtri  # here, because it takes 0.15 s: each coordinator pays
 
@@ -283,10 +283,9 @@ class RuleSelector:
 
     # --- by hand ------------------------------------------------------------------------------
 
-    def reset(self, context: str | None = None) -> None:
-        """Forget what was learned, in one context or in all."""
-        for known in list(self.learners) if context is None else [context]:
-            self.learners.pop(known, None)
+    def reset(self) -> None:
+        """Forget what was learned."""
+        self.learners.clear()
 
     def state(self) -> dict[str, Any]:
         """Return everything that was learned, as plain data."""

@@ -45,7 +45,7 @@ class Controls:
             self._asking.append(who)
         return self._hand_over(self.holder)
 
-    def release(self, who: str, to: object = None) -> Answer:
+    def release(self, who: str, to: object) -> Answer:
         """Free the controls, or hand them to a client that asks; ignored from a client without
         them."""
         if who != self.holder:

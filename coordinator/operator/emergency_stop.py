@@ -201,7 +201,7 @@ async def _order(
     try:
         if verb == STOP:
             if not bus:
-                await _answered(stopped, asking, NODE_LATE)
+                await _answered(stopped, asking)
             if not bus and not stopped.answered:
                 # The processes of its devices check the latch themselves: they stop even if the
                 # node is frozen.
@@ -222,9 +222,9 @@ async def _order(
     return stopped
 
 
-async def _answered(stopped: Stopped, asking: asyncio.Task[None], timeout: float) -> None:
-    """Wait for the node's first answer, at most this long (s)."""
-    deadline = asyncio.get_running_loop().time() + timeout
+async def _answered(stopped: Stopped, asking: asyncio.Task[None]) -> None:
+    """Wait for the node's first answer, at most `NODE_LATE` s."""
+    deadline = asyncio.get_running_loop().time() + NODE_LATE
     while (
         not stopped.answered and not asking.done() and asyncio.get_running_loop().time() < deadline
     ):

@@ -196,9 +196,7 @@ def prepare_from(
     return made
 
 
-def resume(
-    found: Recorded, observers: Sequence[Observer] = (), ordered: float = math.inf
-) -> RunSession:
+def resume(found: Recorded, observers: Sequence[Observer], ordered: float) -> RunSession:
     """Continue a run whose coordinator was killed. A lock-step cell that ended with its coordinator
     is built again from its seed; nodes that wait for their coordinator are joined. `observers` see
     the recorded steps, too. `ordered` as for `RunRequest`.

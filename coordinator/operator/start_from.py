@@ -106,7 +106,7 @@ class Departure:
 
 
 def departure(
-    journal: Journal, engine: Engine, run: str, record: int, going: Mapping[str, str] | str = AGAIN
+    journal: Journal, engine: Engine, run: str, record: int, going: Mapping[str, str] | str
 ) -> Departure:
     """Return the state after a record (of those between two stimuli, the earlier one) as a point to
     start from.

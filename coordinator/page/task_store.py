@@ -65,11 +65,6 @@ class TaskStore:
         self._shipped = shipped
 
     @property
-    def folder(self) -> Path:
-        """Folder where tasks are saved."""
-        return self._folder
-
-    @property
     def folders(self) -> dict[str, str]:
         """Folders of its files, for work in another process."""
         return {"tasks": str(self._folder), "shipped": str(self._shipped or "")}

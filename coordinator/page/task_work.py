@@ -129,7 +129,7 @@ def load(text: str, filename: str) -> Task:
         raise FormatError(str(error)) from error
 
 
-def export(text: str, filename: str, form: str, cell: Fields = None) -> ConvertedTask:
+def export(text: str, filename: str, form: str, cell: Fields) -> ConvertedTask:
     """Return the task in another format; `gspn.svg` draws its stochastic view. Raises
     FormatError."""
     task = load(text, filename)

@@ -176,8 +176,8 @@ class _Chain:
 
     __slots__ = ("slope", "strength", "x", "y")
 
-    def __init__(self, x: float, y: float, slope: float, strength: float) -> None:
-        self.x, self.y, self.slope, self.strength = [x], [y], slope, strength
+    def __init__(self, x: float, y: float, slope: float) -> None:
+        self.x, self.y, self.slope, self.strength = [x], [y], slope, 0.0
 
     def ahead(self, x: float) -> float:
         """Return where the line should be at a distance x (m)."""
@@ -236,7 +236,7 @@ def _seeds(
             if near:
                 y = min(near, key=lambda y: abs(y - wanted))
                 slope = expected.slope + expected.bend * (x[i] - expected.near)
-                seeds.append((_Chain(x[i], y, slope, 0.0), i + 1))
+                seeds.append((_Chain(x[i], y, slope), i + 1))
         return seeds
     for i, places in enumerate(rows):
         if len(seeds) >= 14:
@@ -255,7 +255,7 @@ def _pairs_on(
         slopes = [(other - y) / (x[j] - x[i]) for other in rows[j]]
         fit = sorted((s for s in slopes if abs(s) < FIRST_SLOPE), key=abs)[:2]
         if fit:
-            return [(_Chain(x[i], y, slope, 0.0), i + 1) for slope in fit]
+            return [(_Chain(x[i], y, slope), i + 1) for slope in fit]
     return []
 
 

@@ -340,7 +340,7 @@ async def _go(drive: _Drive, to: Pose, rate: float) -> Result | None:
         return None
     towards = math.atan2(to.y - y, to.x - x)
     if abs(turned(towards - heading)) > 0.3:
-        ended = await _turn(drive, towards, rate, look=True) or await _join(drive)
+        ended = await _turn(drive, towards, rate) or await _join(drive)
         if ended is not None:
             return ended
         x, y, _ = ctx.device.state["pose"]
@@ -360,11 +360,11 @@ async def _go(drive: _Drive, to: Pose, rate: float) -> Result | None:
     return None if ended.cause == "arrived" else ended
 
 
-async def _turn(drive: _Drive, heading: float, rate: float, *, look: bool = False) -> Result | None:
-    """Turn on the spot to a heading (rad, odometry frame), with `look` only until the track is
-    seen; return None when done."""
+async def _turn(drive: _Drive, heading: float, rate: float) -> Result | None:
+    """Turn on the spot to a heading (rad, odometry frame), at most until the track is seen; return
+    None when done."""
     ended = await drive.until(
-        lambda state: success() if _turned(state) or (look and state["sights"] > 1) else None,
+        lambda state: success() if _turned(state) or state["sights"] > 1 else None,
         min(8.0, drive.left()),
         {"do": "turn", "to": heading, "rate": rate},
     )
@@ -378,7 +378,7 @@ def _turned(state: Mapping[str, Any]) -> bool:
 async def _look(drive: _Drive, heading: float, rate: float) -> Result | None:
     """Turn to a heading and look; drive to the track if it is there. Return None when it is not."""
     ctx = drive.ctx
-    ended = await _turn(drive, heading, rate, look=True)
+    ended = await _turn(drive, heading, rate)
     if ended is not None:
         return ended
     await ctx.wait(lambda: ctx.device.state["sights"] > 0, LOOK)

@@ -64,12 +64,13 @@ class Prediction:
             )
         return cls(go - age, (x, y, z), (vx, vy, vz), sigma_y, sigma_t)
 
-    def shrunk(self, spread: float) -> Prediction:
-        """Weigh the prediction against a prior of y = 0 +- `spread` (m).
+    def shrunk(self) -> Prediction:
+        """Weigh the prediction against a prior of y = 0 +- `PRIOR_SPREAD`.
 
         The mean of two Gaussians: a coarse prediction moves the arm only a part of the way.
         """
-        weight = spread * spread / (spread * spread + self.sigma_y * self.sigma_y)
+        prior = PRIOR_SPREAD * PRIOR_SPREAD
+        weight = prior / (prior + self.sigma_y * self.sigma_y)
         x, y, z = self.point
         vx, vy, vz = self.velocity
         return replace(self, point=(x, y * weight, z), velocity=(vx, vy * weight, vz))
@@ -177,7 +178,7 @@ class Interceptor:
     ) -> CatchPlan | None:
         """Return the best catching pose from the arm's state and limits (rad, rad/s, rad/s^2); None
         if no candidate can be reached."""
-        prediction = prediction.shrunk(PRIOR_SPREAD)
+        prediction = prediction.shrunk()
         layout = self._layout(strategy)
         axis = _against(prediction.velocity, strategy.tilt)
         fall = np.array(self._fall(strategy, prediction, axis))

@@ -417,10 +417,10 @@ class CollisionGuard:
             return "wrist at the pedestal"
         return ""
 
-    def path_clear(self, start: Sequence[float], end: Sequence[float], parts: int = 5) -> bool:
-        """Return whether the straight path between two joint poses is clear, checked at so many
+    def path_clear(self, start: Sequence[float], end: Sequence[float]) -> bool:
+        """Return whether the straight path between two joint poses is clear, checked at five
         points."""
-        steps = [number / parts for number in range(1, parts + 1)]
+        steps = [number / 5 for number in range(1, 6)]
         return not any(
             self.violation([a + share * (b - a) for a, b in zip(start, end, strict=True)])
             for share in steps

@@ -193,7 +193,7 @@ class InlineHost:
         driver, self._driver, self._cyclic = self._driver, None, None
         starting = self._next_step is None and not self._runner.runs
         self._told += self._runner.reports()
-        self._told += self._runner.give_up_all(now, "device_died", self.failed)
+        self._told += self._runner.give_up_all(now, self.failed)
         if driver is not None:
             with contextlib.suppress(Exception):
                 stop_at_once(driver, now)

@@ -264,9 +264,7 @@ def _end_with_launcher(launcher: int, over: asyncio.Event) -> None:
         over.set()
 
 
-async def serve(
-    directory: Directory, name: str, text: str, *, mock: str = "", memory: int = 0
-) -> None:
+async def serve(directory: Directory, name: str, text: str, *, mock: str, memory: int) -> None:
     """Run a node until SIGTERM or SIGINT; prints one line with `ready` when it serves."""
     over = asyncio.Event()
     loop = asyncio.get_running_loop()

@@ -411,7 +411,7 @@ class Runner:
         for run in [run for run in self._runs.values() if run.phase is TAKING]:
             self._await_taking(now, run)
 
-    def give_up_all(self, now: float, cause: str, text: str) -> list[Report]:
+    def give_up_all(self, now: float, text: str) -> list[Report]:
         """Return how all runs end when their device has failed; its stop routine is not called."""
         ends: list[Report] = []
         for identity, run in self._runs.items():
@@ -420,7 +420,8 @@ class Runner:
             self._outlets.close(identity)
             executed = Executed.NO if run.phase is NEW else Executed.UNKNOWN
             took = 0.0 if run.phase is NEW else now - run.started
-            ends.append(Outcome(identity, Status.ERROR, {}, cause, text, executed, took, run.cpu))
+            died = Outcome(identity, Status.ERROR, {}, "device_died", text, executed, took, run.cpu)
+            ends.append(died)
         self._runs.clear()
         return ends
 

@@ -311,11 +311,11 @@ class CanopenNode:
         frames, self.outbox = self.outbox, []
         return frames
 
-    def report(self, code: int, register: int, detail: bytes = b"") -> None:
+    def report(self, code: int, register: int) -> None:
         """Send EMCY (not while stopped)."""
         self.values[0x1001, 0] = register
         if self.nmt in (NmtState.OPERATIONAL, NmtState.PREOPERATIONAL):
-            self.outbox.append(emergency(self.node, code, register, detail))
+            self.outbox.append(emergency(self.node, code, register))
 
     def send_tpdo(self) -> None:
         """Send the TPDO now, if it is on and the node operational."""

@@ -42,8 +42,8 @@ class DigitalInputs(CanopenNode):
     POWER: Final = 0x02
     """Arm-power chain closed."""
 
-    def __init__(self, node: int) -> None:
-        super().__init__(node, "digital_inputs.eds")
+    def __init__(self) -> None:
+        super().__init__(INPUTS_NODE, "digital_inputs.eds")
         self.inputs = self.POWER
         self._sent = -1
         self._due = 0.0
@@ -370,7 +370,7 @@ class ArmBus(DriveBus[ServoDrive]):
         self._echoes: Sequence[Frame] = ()
         """Set points of the newest cycle that found and left the arm at rest, and the answers, one
         per drive."""
-        self.inputs = DigitalInputs(INPUTS_NODE)
+        self.inputs = DigitalInputs()
         super().__init__(
             tuple(ServoDrive(joint, each, plant, self._stir) for joint, each in enumerate(drives)),
             self.inputs,

@@ -51,7 +51,7 @@ def _at(p: Point3) -> tuple[float, float]:
     return (x + ASIDE * y - LEFT) * SCALE, (TOP - z - UP * y) * SCALE
 
 
-def _line(a: Point3, b: Point3, wide: float, colour: str, cap: str = "round") -> str:
+def _line(a: Point3, b: Point3, wide: float, colour: str, cap: str) -> str:
     (x1, y1), (x2, y2) = _at(a), _at(b)
     return (
         f'<path d="M{x1:.1f} {y1:.1f}L{x2:.1f} {y2:.1f}" fill="none" stroke="{colour}" '

@@ -80,7 +80,7 @@ class FilmView:
 
 
 def images(
-    score: Mapping[str, Any], nominal: Mapping[str, Any], fps: float = 20.0, speedup: float = 4.0
+    score: Mapping[str, Any], nominal: Mapping[str, Any], fps: float, speedup: float
 ) -> Iterator[Picture]:
     """Yield the film's images (rows, columns, 3), blue, green, red; the run is shown `speedup`
     times as fast as it was.

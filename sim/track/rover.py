@@ -30,9 +30,8 @@ _STUCK: Final = 0.01
 class Wheel:
     """One wheel: its speed follows the set point with a lag, or its brake holds it."""
 
-    def __init__(self, radius: float, lag: float) -> None:
-        self.radius = radius
-        self.lag = lag
+    def __init__(self) -> None:
+        self.radius, self.lag = 0.0, 1.0  # until the rover is placed
         self.target = 0.0
         """Set point of its motor (rad/s)."""
         self.speed = 0.0
@@ -63,10 +62,10 @@ class RoverBody:
     """Wheels 0 (left) and 1 (right) and the body on them. `move_to` advances it to a moment; times
     are on the caller's clock (s)."""
 
-    def __init__(self, truth: RoverTruth, rng: np.random.Generator, now: float = 0.0) -> None:
+    def __init__(self, truth: RoverTruth, rng: np.random.Generator) -> None:
         """`rng` draws the slip."""
-        self.wheels = (Wheel(0.0, 1.0), Wheel(0.0, 1.0))
-        self.now = now
+        self.wheels = (Wheel(), Wheel())
+        self.now = 0.0
         self.place(truth, FloorPose(0.0, 0.0, 0.0), rng)
 
     def place(self, truth: RoverTruth, pose: FloorPose, rng: np.random.Generator) -> None:

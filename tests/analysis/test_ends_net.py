@@ -85,15 +85,15 @@ def n_holds_x(task: Task, devices: dict[str, str], limit: int = LIMIT) -> bool:
         return False
     running = [i for i, s in enumerate(x.states) if s.mode in (Mode.RUNNING, Mode.FRESH)]
     livelocks = set(x.livelocks)
+    known = {space.marking(i): i for i in range(len(space))}
     number = dict[int, int]()
     for i in running:
         marking = marking_of(n, x, x.states[i])
         assert n.projected(marking) == x.states[i].marking
         if i in livelocks:
             continue
-        found = space.number(marking)
-        assert found is not None, (n.net.describe(marking), x.firings(i))
-        number[i] = found
+        assert marking in known, (n.net.describe(marking), x.firings(i))
+        number[i] = known[marking]
     for i, j, label in zip(x.source, x.target, x.label, strict=True):
         if int(i) in number and int(j) in number:
             step = x.steps[label]

@@ -24,7 +24,6 @@ from petrobot.coordinator.analysis.net.coverability import coverability, find_pu
 from petrobot.coordinator.analysis.net.qualitative import examine
 from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.cli import main
-from petrobot.coordinator.task.file import load
 from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import philosophers
 
@@ -59,7 +58,7 @@ def arc(source: str, target: str, weight: int = 1, more: str = "") -> str:
 
 def analysed(path: Path, **more: Any) -> dict[str, Any]:
     """Return the JSON of the command, parsed strictly."""
-    text = json.dumps(analyse_command(path, load, **more).data, allow_nan=False)
+    text = json.dumps(analyse_command(path, **more).data, allow_nan=False)
     data: dict[str, Any] = json.loads(text)
     return data
 
@@ -92,7 +91,7 @@ def test_data_of_other_tools_is_not_part_of_the_net(tmp_path: Path) -> None:
         and data["live"]
     )
     target = tmp_path / "again.pnml"
-    assert convert_command(path, target, load).code == 0
+    assert convert_command(path, target).code == 0
     again = target.read_text(encoding="utf-8")
     assert 'idref="a"' in again and 'id="z"' in again and 'source="z"' in again
     assert read_net(target).net == read_net(path).net
@@ -232,7 +231,7 @@ def test_more_tokens_than_a_word_can_count(tmp_path: Path) -> None:
     body = place("a", 1) + '<transition id="t"/>' + arc("a", "t") + arc("t", "a", 1 << 62)
     data = analysed(pnml(tmp_path, body))
     assert data["bounded"] is False and data["states"] is None
-    outcome = analyse_command(pnml(tmp_path, place("a", 1 << 80)), load)
+    outcome = analyse_command(pnml(tmp_path, place("a", 1 << 80)))
     assert outcome.code == 2 and "63" in outcome.text and "net.pnml" in outcome.text
 
 
@@ -265,7 +264,7 @@ def test_a_simulation_without_time_is_valid_json(tmp_path: Path) -> None:
     path, rates = pnml(tmp_path, LOOP), tmp_path / "rates.toml"
     rates.write_text("[weights]\nt = 1\nu = 1\n", encoding="utf-8")
     seen = simulate_command(
-        path, load, np.random.default_rng(1), rates=rates, replicas=3, horizon=1.0, firings=200
+        path, np.random.default_rng(1), rates=rates, replicas=3, horizon=1.0, firings=200
     )
     assert seen.code == 1 and seen.data["complete"] is False
     assert json.loads(json.dumps(seen.data, allow_nan=False))["throughput"]["t"] == [
@@ -522,7 +521,7 @@ def test_reading_a_file_takes_time_in_proportion_to_its_size(
         steps = 0
         path = pnml(tmp_path, chained(size))
         target = tmp_path / "again.pnml"
-        assert convert_command(path, target, load).code == 0
+        assert convert_command(path, target).code == 0
         assert read_net(target).net == read_net(path).net
         taken.append(steps)
     assert taken[1] < 12 * taken[0]
@@ -541,6 +540,6 @@ def test_a_chain_without_an_end_is_not_followed_for_ever(
         "</edges></gspn></project>",
         encoding="utf-8",
     )
-    outcome = convert_command(path, rates, load)
+    outcome = convert_command(path, rates)
     assert outcome.code == 2 and "the search stopped: limit of 1000" in outcome.text
     assert not rates.exists()

@@ -24,7 +24,6 @@ from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
 from petrobot.coordinator.analysis.net.space import SearchLimits, Space
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.cli import loading
-from petrobot.coordinator.task.file import load
 from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import KANBAN_RATES, kanban, philosophers
 from tests.waiting import Limit
@@ -47,10 +46,10 @@ def test_what_is_not_known_in_time_is_no_bad_input() -> None:
     """The file is good: the exit code is that of an answer that is not yes. What was known by then
     is in the answer."""
     path, clock = CATCH.with_name("pick_and_place.toml"), count().__next__
-    late = analyse_command(path, load, limits=SearchLimits(seconds=60, clock=clock))
+    late = analyse_command(path, limits=SearchLimits(seconds=60, clock=clock))
     assert report.LATE in late.data["notes"] and not late.data["recoveries"]
     clock = count().__next__
-    outcome = analyse_command(path, load, limits=SearchLimits(seconds=20, clock=clock))
+    outcome = analyse_command(path, limits=SearchLimits(seconds=20, clock=clock))
     assert outcome.code == 1 and report.LATE in outcome.data["notes"]
     verdicts = {name: v["holds"] for name, v in outcome.data["verdicts"].items()}
     assert verdicts["bounded"] and verdicts["deadlock_free"] and verdicts["quasi_live"]
@@ -83,7 +82,7 @@ def test_facts_are_told_whenever_the_time_is_used_up(readings: int, tmp_path: Pa
     path = tmp_path / "net.pnml"
     path.write_text(write_pnml(NetFile(stuck_and_unsafe(30_000))), encoding="utf-8")
     limits = SearchLimits(seconds=5.0, clock=Brief(readings))
-    outcome = analyse_command(path, load, limits=limits, structure=False)
+    outcome = analyse_command(path, limits=limits, structure=False)
     assert outcome.code == 1
     assert outcome.data["verdicts"]["safe"]["holds"] is False
     assert all(v["holds"] in (True, False, None) for v in outcome.data["verdicts"].values())
@@ -93,7 +92,7 @@ def test_facts_are_told_whenever_the_time_is_used_up(readings: int, tmp_path: Pa
 def test_a_large_file_is_not_read_beyond_the_time(tmp_path: Path) -> None:
     path = tmp_path / "net.pnml"
     path.write_text(write_pnml(NetFile(ring(2_000, 1))), encoding="utf-8")
-    outcome = analyse_command(path, load, limits=SearchLimits(seconds=5.0, clock=Brief(2)))
+    outcome = analyse_command(path, limits=SearchLimits(seconds=5.0, clock=Brief(2)))
     assert outcome.code == 1
     assert "the net in the file: unknown within the time limit; give more --seconds" in outcome.text
 
@@ -106,7 +105,7 @@ def test_facts_are_told_if_the_memory_is_used_up() -> None:
             raise MemoryError
         return examine(space, in_haste=True)
 
-    found = report._examined(stuck_and_unsafe(30_000), None, "auto", notes := list[str](), examined)
+    found = report._examined(stuck_and_unsafe(30_000), None, notes := list[str](), examined)
     assert notes == [report.FULL]
     assert found.safe.holds is False and found.quasi_live.holds is True
     assert found.live.holds is None and found.bounded.holds is not False
@@ -194,7 +193,7 @@ def test_structure_stops_with_the_time_of_the_analysis(tmp_path: Path) -> None:
     path.write_text(write_pnml(NetFile(many_siphons(60))), encoding="utf-8")
     clock = Steps()
     limits = SearchLimits(seconds=300.0, clock=clock)
-    found = analyse_command(path, load, limits=limits)
+    found = analyse_command(path, limits=limits)
     assert found.data["complete"] is True and found.data["states"] == 60
     structure = found.data["structure"]
     assert structure["siphons_complete"] is False and structure["siphons_controlled"] is not True
@@ -212,7 +211,7 @@ def test_all_parts_of_an_analysis_share_its_time(tmp_path: Path) -> None:
     for seconds in (2.0, 20.0, 60.0, 200.0):
         clock = Steps()
         limits = SearchLimits(seconds=seconds, clock=clock)
-        found = analyse_command(path, load, limits=limits, changes=["tin1.rate=2"])
+        found = analyse_command(path, limits=limits, changes=["tin1.rate=2"])
         assert clock.now < seconds + 100.0  # the clock is read once for each block, sweep or branch
         assert found.data["complete"] or "time limit" in found.data["reason"]
         assert found.data["throughput"] is not None or any(
@@ -225,7 +224,7 @@ def test_the_forecast_of_a_task_ends_in_time(seconds: float) -> None:
     """Wherever the time limit is reached, there is a result that says what is unknown."""
     clock = Steps()
     limits = SearchLimits(seconds=seconds, clock=clock)
-    found = analyse_command(CATCH, load, view="gspn", limits=limits, changes=["runs=1"])
+    found = analyse_command(CATCH, view="gspn", limits=limits, changes=["runs=1"])
     assert clock.now < seconds + 100.0
     assert "states" in found.data or "time limit" in found.text
     said = " ".join(found.data.get("notes", ())) + found.text

@@ -23,7 +23,6 @@ from petrobot.coordinator.analysis.time.markov import (
 )
 from petrobot.coordinator.analysis.time.sensitivity import (
     reliability_slopes,
-    reward_slopes,
     time_slopes,
 )
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
@@ -159,7 +158,7 @@ def test_completion_against_dense_matrices(gspn: Gspn, data: st.DataObject) -> N
     assume(chain.n <= 80)
     goal = np.zeros(chain.n, dtype=bool)
     goal[data.draw(st.sampled_from(chain.tangible.tolist()))] = True
-    assume(chain.graph.forward([0])[goal].any() and not goal[0])
+    assume(not goal[0])
     done = completion(chain, goal)
     Q, start = dense(chain)
     end = goal[chain.tangible]
@@ -198,7 +197,7 @@ def test_derivatives_against_differences(gspn: Gspn, data: st.DataObject) -> Non
     assume(chain.n <= 80)
     goal = np.zeros(chain.n, dtype=bool)
     goal[data.draw(st.sampled_from(chain.tangible.tolist()))] = True
-    assume(chain.graph.forward([0])[goal].any() and not goal[0])
+    assume(not goal[0])
     done = completion(chain, goal)
     by_h, by_time = reliability_slopes(done), time_slopes(done)
     name = data.draw(st.sampled_from(gspn.net.transitions))
@@ -217,30 +216,6 @@ def test_derivatives_against_differences(gspn: Gspn, data: st.DataObject) -> Non
     )
     assert by_time[name].derivative * by_time[name].value == pytest.approx(
         by_time[name].elasticity * done.mean
-    )
-
-
-@settings(max_examples=25, deadline=None)
-@given(gspns(), st.data())
-def test_throughput_derivatives_against_differences(gspn: Gspn, data: st.DataObject) -> None:
-    chain = Chain.of(gspn)
-    assume(chain.n <= 80 and chain.graph.bottom.sum() == 1)
-    run = long_run(chain)
-    name, what = (
-        data.draw(st.sampled_from(gspn.net.transitions)),
-        data.draw(st.sampled_from(gspn.net.transitions)),
-    )
-    tokens = chain.space.tokens(0).astype(float)
-    step = 1e-5
-    more, less = (
-        long_run(Chain.of(bumped(gspn, name, f), space=chain.space)) for f in (1 + step, 1 - step)
-    )
-    slope = reward_slopes(run, impulse={what: 1.0})[name]
-    change = (more.throughput[what] - less.throughput[what]) / (2 * step)
-    assert slope.derivative * slope.value == pytest.approx(change, rel=1e-4, abs=1e-6)
-    slope = reward_slopes(run, tokens)[name]
-    assert slope.derivative * slope.value == pytest.approx(
-        (more.reward(tokens) - less.reward(tokens)) / (2 * step), rel=1e-4, abs=1e-6
     )
 
 
@@ -288,8 +263,6 @@ def test_the_long_run_mixes_the_reachable_components() -> None:
         "back"
     ] == pytest.approx(0.25)
     assert run.throughput["to"] == pytest.approx(0.75 * 2 / 3)
-    with pytest.raises(ValueError, match="several bottom components"):
-        reward_slopes(run, impulse={"to": 1.0})
 
 
 def test_large_components_by_gauss_seidel_agree_with_elimination() -> None:
@@ -298,14 +271,6 @@ def test_large_components_by_gauss_seidel_agree_with_elimination() -> None:
     p = 0.97 ** np.arange(700.0)
     p /= p.sum()
     assert np.allclose(run.probability, p, atol=1e-12)
-    slope = reward_slopes(run, impulse={"serve": 1.0})["arrive"]
-    more, less = (
-        long_run(Chain.of(Gspn.of(queue(699), {"arrive": a, "serve": 1.0})))
-        for a in (0.9701, 0.9699)
-    )
-    assert slope.derivative == pytest.approx(
-        (more.throughput["serve"] - less.throughput["serve"]) / 2e-4, rel=1e-4
-    )
     rows = np.repeat(np.arange(900), 2)
     columns = np.stack([(np.arange(900) + 1) % 900, (np.arange(900) * 7) % 900], axis=1).ravel()
     nu = stationary(900, rows, columns, np.tile([0.7, 0.3], 900))

@@ -217,9 +217,7 @@ def test_graph_primitives(n: int, pairs: list[tuple[int, int]], data: st.DataObj
         reach |= np.outer(reach[:, k], reach[k])
     labels = graph.components
     assert np.array_equal(labels[:, None] == labels[None, :], reach & reach.T)
-    assert np.array_equal(graph.forward([0]), reach[0]) and np.array_equal(
-        graph.backward([0]), reach[:, 0]
-    )
+    assert np.array_equal(graph.backward([0]), reach[:, 0])
     goal = data.draw(st.integers(0, n - 1))
     path = graph.path(0, np.arange(n) == goal)
     assert (path is not None) == reach[0, goal]

@@ -101,7 +101,7 @@ def test_the_page_says_which_refused_verdicts_change_the_exit_code(
 def test_a_net_file_gives_the_documented_keys(tmp_path: Path) -> None:
     path = tmp_path / "kanban.pnml"
     path.write_text(write_pnml(NetFile(kanban(1))), encoding="utf-8")
-    plain = analyse_command(path, load)
+    plain = analyse_command(path)
     assert plain.code == 0 and set(plain.data) >= PROMISED | NUMBERS
     assert all(plain.data[key] is None for key in NUMBERS)
     data = json.loads(json.dumps(plain.data))
@@ -123,11 +123,11 @@ def test_a_net_file_gives_the_documented_keys(tmp_path: Path) -> None:
     rates.write_text(
         "[rates]\n" + "".join(f"{k} = {v}\n" for k, v in KANBAN_RATES.items()), encoding="utf-8"
     )
-    timed = analyse_command(path, load, rates=rates)
+    timed = analyse_command(path, rates=rates)
     assert set(timed.data) >= PROMISED | NUMBERS
     assert timed.data["throughput"]["tin1"] == pytest.approx(0.0925846346333826, abs=1e-12)
-    assert analyse_command(path, load, view="gspn", rates="unit").data["throughput"]["tin1"] > 0
-    bare = analyse_command(path, load, view="gspn")
+    assert analyse_command(path, view="gspn", rates="unit").data["throughput"]["tin1"] > 0
+    bare = analyse_command(path, view="gspn")
     assert bare.code == 2 and "--rates" in bare.text
 
 
@@ -257,7 +257,7 @@ def test_a_faster_action_saves_the_time_that_the_forecast_says() -> None:
 
 def test_simulation_and_solution_of_the_catching_task_agree() -> None:
     exact = forecast(stochastic_view(load(CATCH), stages=3, timer_stages=3))
-    seen = simulate_command(CATCH, load, np.random.default_rng(5), replicas=400, stages=3)
+    seen = simulate_command(CATCH, np.random.default_rng(5), replicas=400, stages=3)
     assert seen.code == 0
     mean, low, high = seen.data["time"]
     assert low - (high - low) < exact.done.mean < high + (high - low)
@@ -265,7 +265,7 @@ def test_simulation_and_solution_of_the_catching_task_agree() -> None:
         exact.completion_time().quantile(0.9), rel=0.1
     )
     fewer = simulate_command(
-        CATCH, load, np.random.default_rng(5), replicas=200, stages=3, changes=["runs=1"]
+        CATCH, np.random.default_rng(5), replicas=200, stages=3, changes=["runs=1"]
     )
     assert fewer.data["time"][0] < mean / 2
 
@@ -274,9 +274,9 @@ def test_simulating_a_net_needs_a_horizon_and_rates(tmp_path: Path) -> None:
     gspn = Gspn.of(queue(5), {"arrive": 0.8, "serve": 1.0})
     path = tmp_path / "queue.pnml"
     path.write_text(write_pnml(NetFile(gspn.net, "queue", gspn)), encoding="utf-8")
-    assert simulate_command(path, load, np.random.default_rng(1)).code == 2
+    assert simulate_command(path, np.random.default_rng(1)).code == 2
     seen = simulate_command(
-        path, load, np.random.default_rng(1), replicas=200, horizon=300.0, warmup=20.0
+        path, np.random.default_rng(1), replicas=200, horizon=300.0, warmup=20.0
     )
     mean, low, high = seen.data["throughput"]["serve"]
     assert low - 0.01 < 0.7289444010755486 < high + 0.01 and mean > 0
@@ -285,25 +285,25 @@ def test_simulating_a_net_needs_a_horizon_and_rates(tmp_path: Path) -> None:
 
 def test_converting_lists_what_is_not_kept(tmp_path: Path) -> None:
     target = tmp_path / "catch.pnml"
-    outcome = convert_command(CATCH, target, load)
+    outcome = convert_command(CATCH, target)
     assert outcome.code == 0 and any("events" in what for what in outcome.data["not_kept"])
     assert explore(read_net(target).net).edges == explore(load(CATCH).net).edges
-    assert convert_command(target, tmp_path / "catch.net", load).code == 0
-    assert convert_command(target, tmp_path / "catch.xyz", load).code == 2
-    assert convert_command(CATCH, tmp_path / "no" / "where.pnml", load).code == 2
-    chain = convert_command(tmp_path / "catch.pnml", tmp_path / "catch.drn", load)
+    assert convert_command(target, tmp_path / "catch.net").code == 0
+    assert convert_command(target, tmp_path / "catch.xyz").code == 2
+    assert convert_command(CATCH, tmp_path / "no" / "where.pnml").code == 2
+    chain = convert_command(tmp_path / "catch.pnml", tmp_path / "catch.drn")
     assert chain.code == 2 and "rates" in chain.text
 
 
 def test_the_picture_of_the_graph_shows_the_witness(tmp_path: Path) -> None:
     path = tmp_path / "philosophers.pnml"
     path.write_text(write_pnml(NetFile(philosophers(3))), encoding="utf-8")
-    outcome = graph_command(path, load)
+    outcome = graph_command(path)
     root = ElementTree.fromstring(outcome.data["svg"])
     groups = [g.get("class") or "" for g in root.iter("{http://www.w3.org/2000/svg}g")]
     assert sum(g.startswith("m") for g in groups) == 27 and sum("dead" in g for g in groups) == 2
     assert sum(g == "e on" for g in groups) == len(outcome.data["witness"]) == 3
-    task = graph_command(CATCH, load)
+    task = graph_command(CATCH)
     assert "final" in task.data["svg"] and task.data["witness"] == []
     with pytest.raises(ValueError, match="no such edge"):
         graph_svg(explore(philosophers(3)), witness=("done0",))
@@ -353,7 +353,7 @@ def test_rates_files() -> None:
 
 
 def test_missing_files_give_one_line(tmp_path: Path) -> None:
-    outcome = analyse_command(tmp_path / "missing.pnml", load)
+    outcome = analyse_command(tmp_path / "missing.pnml")
     assert outcome.code == 2 and "\n" not in outcome.text and "missing.pnml" in outcome.text
 
 

@@ -244,10 +244,9 @@ def test_paths_are_shortest_and_replayable() -> None:
         assert depth[j] <= depth[i] + 1
 
 
-def test_numbers_and_markings_are_inverse() -> None:
+def test_every_marking_has_one_number() -> None:
     space = explore(kanban(1))
-    assert [space.number(space.marking(i)) for i in range(len(space))] == list(range(len(space)))
-    assert space.number((7,) * 16) is None and space.number((1 << 40,) * 16) is None
+    assert len({space.marking(i) for i in range(len(space))}) == len(space)
     assert space.bounds == (1,) * 16 and space.most_tokens == max(
         sum(space.marking(i)) for i in range(len(space))
     )

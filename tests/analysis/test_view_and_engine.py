@@ -50,7 +50,7 @@ from petrobot.coordinator.engine import (
 from petrobot.coordinator.engine.stimuli import Stimulus
 from petrobot.coordinator.task import Estimate, Executed, Scope, Status, Task
 from petrobot.coordinator.task.conditions import parse
-from petrobot.coordinator.task.file import load, loads
+from petrobot.coordinator.task.file import loads
 from tests.analysis.test_execution_graph import COMMON
 from tests.analysis.test_views import timed
 from tests.engine.test_properties import tasks as any_tasks
@@ -641,7 +641,7 @@ def test_a_figure_that_few_phases_change_is_doubtful(kind: str, tmp_path: Path) 
     )
     task, file = loads(text, "t.toml"), tmp_path / "t.toml"
     file.write_text(text, encoding="utf-8")
-    simulated = simulate_command(file, load, np.random.default_rng(2), replicas=200).text
+    simulated = simulate_command(file, np.random.default_rng(2), replicas=200).text
     assert (" here, 1.5 there (standard error 0)" in simulated) is kind.startswith("two")
     world = Clock(Engine(task), np.random.default_rng(1))
     world.play()

@@ -26,8 +26,8 @@ def test_changed_tokens_equal_those_in_a_file(tmp_path: Path) -> None:
     task = load(CATCH)
     two = replace(task, places={**task.places, "runs": replace(task.places["runs"], tokens=2)})
     edited.write_text(dumps(two), encoding="utf-8")
-    what_if = analyse_command(CATCH, load, view="gspn", stages=2, changes=["runs=2"])
-    as_file = analyse_command(edited, load, view="gspn", stages=2)
+    what_if = analyse_command(CATCH, view="gspn", stages=2, changes=["runs=2"])
+    as_file = analyse_command(edited, view="gspn", stages=2)
     assert what_if.data["states"] == as_file.data["states"] < what_if.data["as_it_is"]["states"]
     assert what_if.data["forecast"]["mean"] == pytest.approx(
         as_file.data["forecast"]["mean"], rel=1e-12
@@ -91,7 +91,7 @@ def test_improvements_improve_the_result() -> None:
 )
 def test_impossible_changes_are_refused(text: str, said: str) -> None:
     """One clear line, and the exit code for bad input."""
-    outcome = analyse_command(CATCH, load, changes=[text])
+    outcome = analyse_command(CATCH, changes=[text])
     assert outcome.code == 2 and said in outcome.text and "what if" in outcome.text
 
 
@@ -99,10 +99,10 @@ def test_nets_with_and_without_rates(tmp_path: Path) -> None:
     """A PNML net: tokens always, rates only if it has any."""
     net = tmp_path / "cycle.net"
     net.write_text("tr work a -> b\ntr rest b -> a\npl a (1)\n", encoding="utf-8")
-    outcome = analyse_command(net, load, view="gspn", rates="unit", changes=["work.rate=3", "a=2"])
+    outcome = analyse_command(net, view="gspn", rates="unit", changes=["work.rate=3", "a=2"])
     assert outcome.data["throughput"]["work"] == pytest.approx(12 / 13, rel=1e-9)
     assert outcome.data["as_it_is"]["throughput"]["work"] == pytest.approx(0.5)
-    assert analyse_command(net, load, changes=["work.rate=3"]).code == 2
+    assert analyse_command(net, changes=["work.rate=3"]).code == 2
     with pytest.raises(NetFileError, match="no place c"):
         change_net(Net.build({"a": 1}, {}), [read_change("c=1")])
 
@@ -113,7 +113,7 @@ def test_simulation_accepts_the_same_changes() -> None:
 
     def mean(*changes: str) -> float:
         random = np.random.default_rng(3)
-        outcome = simulate_command(CATCH, load, random, replicas=300, stages=2, changes=changes)
+        outcome = simulate_command(CATCH, random, replicas=300, stages=2, changes=changes)
         return float(outcome.data["time"][0])
 
     assert mean("runs=2") == pytest.approx(2 * mean("runs=1"), rel=0.1)

@@ -66,7 +66,7 @@ def test_all_events_are_internal_and_conflicts_are_settled_by_variables(task: Ta
 
 
 def test_the_state_space_has_the_required_properties() -> None:
-    data = analyse_command(PATH, load, limits=SearchLimits()).data
+    data = analyse_command(PATH, limits=SearchLimits()).data
     assert data["complete"] and data["states"] < 10_000
     again = data["mended"]  # what holds if the operator repairs what `final_error` leaves
     verdicts = {

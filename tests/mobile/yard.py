@@ -19,6 +19,7 @@ from petrobot.sim.track.drives import RoverBus
 from petrobot.sim.track.rover import RoverBody as Body
 from petrobot.sim.track.sensor import Echo, ReflectorSensor, look
 from petrobot.sim.track.truth import read_track_site
+from tests.bare_ports import BarePorts
 from tests.mobile.conftest import DrawnFloor, DrawnPose
 
 ROVER_FILE = Path(__file__).parents[2] / "services" / "mobile" / "rover.toml"
@@ -48,7 +49,7 @@ class YardBus:
         """Leave."""
 
 
-class YardPorts:
+class YardPorts(BarePorts):
     """What the driver may reach."""
 
     def __init__(self, bus: YardBus) -> None:
@@ -60,19 +61,6 @@ class YardPorts:
         """The bus."""
         return self._bus
 
-    def serial(self, port: str, baud: int) -> Any:
-        raise LookupError("no serial line here")
-
-    def tcp(self, host: str, port: int) -> Any:
-        raise LookupError("no TCP here")
-
-    def write_file(self, path: str, content: bytes) -> None:
-        raise LookupError("no file is written here")
-
-    def images(self) -> Any:
-        """None here."""
-        raise LookupError("no camera stands in this yard")
-
     def stream(self, name: str) -> SetpointReceiver:
         """The stream of sights."""
         assert name == "track_ahead"
@@ -80,10 +68,6 @@ class YardPorts:
 
     def raise_event(self, name: str, **data: Any) -> None:
         """Ignore the event: no task waits for it."""
-
-    def random(self, purpose: str) -> np.random.Generator:
-        """Draws of the device, from a fixed seed."""
-        return np.random.default_rng([*purpose.encode()])
 
     def file(self, path: str) -> bytes:
         """The rover's numbers."""

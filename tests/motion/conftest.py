@@ -18,6 +18,7 @@ from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.motion.arm import PERIOD, Arm
 from petrobot.services.motion.model import nominal_arm
 from petrobot.sim.catching.drives import ArmBus, ratings
+from tests.bare_ports import BarePorts
 
 TABLE = tomllib.loads(
     files("petrobot.services.motion").joinpath("puma560.toml").read_text(encoding="utf-8")
@@ -129,7 +130,7 @@ class Stream:
         return self._newest if self.age <= 3 * self._period + 1e-9 else None
 
 
-class Rig:
+class Rig(BarePorts):
     """Arm, bus and drives in lock step; it is also the arm's `Ports`."""
 
     def __init__(
@@ -163,31 +164,12 @@ class Rig:
     def can(self) -> Wire:
         return self.wire
 
-    def serial(self, port: str, baud: int) -> Any:
-        raise LookupError("no serial line here")
-
-    def tcp(self, host: str, port: int) -> Any:
-        raise LookupError("no TCP here")
-
-    def write_file(self, path: str, content: bytes) -> None:
-        raise LookupError("no file is written here")
-
-    def images(self) -> Any:
-        raise AssertionError("an arm has no images")
-
     def stream(self, name: str) -> Stream:
         assert name == "catch_point"
         return self.stream_port
 
     def raise_event(self, name: str, **data: Any) -> None:
         self.events.append(name)
-
-    def random(self, purpose: str) -> np.random.Generator:
-        """Draws of the device, from a fixed seed."""
-        return np.random.default_rng([*purpose.encode()])
-
-    def file(self, path: str) -> bytes:
-        raise AssertionError(path)
 
     def tick(self, arm_lives: bool = True) -> None:
         """Run one cycle of arm, bus, drives and plant."""

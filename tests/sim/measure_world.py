@@ -32,7 +32,7 @@ def reference() -> float:
     return best
 
 
-class WorldMeter:
+class TimeMeter:
     """Adds up the CPU time of methods, including the functions that they call."""
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ def measure(regime: str, rate: float, parts: bool) -> None:
 
     from petrobot.sim.catching.site import read_site
 
-    bench, meter = Bench(read_site(CELL_FILE), seed=1, regime=regime), WorldMeter()
+    bench, meter = Bench(read_site(CELL_FILE), seed=1, regime=regime), TimeMeter()
     lab = bench.lab
     bench.enable()
     bench.want_images(rate)

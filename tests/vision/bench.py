@@ -18,6 +18,7 @@ from petrobot.services.comm.streams.image import Image
 from petrobot.services.vision.optics import Optics
 from petrobot.sim.catching.camera import PinholeCamera
 from petrobot.sim.catching.truth import read_truth
+from tests.bare_ports import BarePorts
 
 Array = NDArray[np.float64]
 ROOT = Path(__file__).parents[2]
@@ -181,7 +182,7 @@ class CameraBench:
             self.images.put(self._sent.pop(0))
 
 
-class BenchPorts:
+class BenchPorts(BarePorts):
     """The ports of the camera's driver on the bench."""
 
     def __init__(self, bench: CameraBench, files: Mapping[str, bytes] | None = None) -> None:
@@ -192,33 +193,11 @@ class BenchPorts:
     def now(self) -> float:
         return self._bench.now
 
-    def serial(self, port: str, baud: int) -> Any:
-        raise LookupError("no serial line here")
-
-    def tcp(self, host: str, port: int) -> Any:
-        raise LookupError("no TCP here")
-
-    def write_file(self, path: str, content: bytes) -> None:
-        raise LookupError("no file is written here")
-
     def images(self) -> Any:
         return self._bench.images
 
-    def random(self, purpose: str) -> np.random.Generator:
-        """Draws of the device, from a fixed seed."""
-        return np.random.default_rng([*purpose.encode()])
-
     def file(self, path: str) -> bytes:
         return self._files[path]
-
-    def can(self) -> Any:
-        raise AssertionError("a camera has no bus")
-
-    def stream(self, name: str) -> Any:
-        raise AssertionError("a camera takes no set points")
-
-    def raise_event(self, name: str, **data: Any) -> None:
-        raise AssertionError("a camera raises no events")
 
 
 @dataclass

@@ -126,15 +126,6 @@ def test_a_source_that_cannot_be_opened_is_the_error_no_image(context: BenchCont
         def close(self) -> None: ...
 
     class Ports(BenchPorts):
-        def serial(self, port: str, baud: int) -> Any:
-            raise LookupError("no serial line here")
-
-        def tcp(self, host: str, port: int) -> Any:
-            raise LookupError("no TCP here")
-
-        def write_file(self, path: str, content: bytes) -> None:
-            raise LookupError("no file is written here")
-
         def images(self) -> Any:
             return Unplugged()
 

@@ -470,7 +470,6 @@ def judged(
     unknown = PropertyVerdict(None, f"unknown: {space.reason}", complete=False)
     return Qualitative(
         space,
-        Graph(len(space), space.source, space.target, space.row, rooted=True),
         bounds,
         highest if reached else None,
         bounded,

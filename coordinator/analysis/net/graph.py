@@ -101,39 +101,22 @@ class Graph:
         order = np.argsort(self.target, kind="stable")
         return np.searchsorted(self.target[order], np.arange(self.n + 1)).astype(np.int64), order
 
-    def forward(self, seeds: Mask | Sequence[int], edges: Mask | None = None) -> Mask:
-        """Return the vertices reachable from the seeds, seeds included.
-
-        `edges` restricts the search to some edges; by default all count.
-        """
-        return self._spread(seeds, edges, self.row, None, self.target)
-
     def backward(self, seeds: Mask | Sequence[int], edges: Mask | None = None) -> Mask:
         """Return the vertices from which a seed can be reached, seeds included.
 
         `edges` restricts the search to some edges; by default all count.
         """
-        return self._spread(seeds, edges, *self.into, self.source)
-
-    def _spread(
-        self,
-        seeds: Mask | Sequence[int],
-        edges: Mask | None,
-        row: Index,
-        order: Index | None,
-        far: NDArray[np.int32],
-    ) -> Mask:
-        """Breadth-first search, one whole layer of vertices per numpy operation."""
+        # Breadth-first, one whole layer of vertices per numpy operation.
+        row, order = self.into
         reached = np.zeros(self.n, dtype=np.bool_)
         reached[seeds] = True
         front = np.flatnonzero(reached)
         while len(front):
             keep_time("verdicts")
-            at = ranges(row[front], row[front + 1])
-            at = at if order is None else order[at]
+            at = order[ranges(row[front], row[front + 1])]
             if edges is not None:
                 at = at[edges[at]]
-            near = far[at]
+            near = self.source[at]
             front = np.unique(near[~reached[near]])
             reached[front] = True
         return reached
@@ -209,25 +192,22 @@ class Graph:
         inside: Mask = self.components[self.source] == self.components[self.target]
         return inside
 
-    def almost_sure(
-        self, goal: Mask, free: Mask, *, allowed: Mask | None = None, hits: Mask | None = None
-    ) -> Mask:
+    def almost_sure(self, goal: Mask, free: Mask, *, allowed: Mask | None = None) -> Mask:
         """Return the vertices from which some strategy reaches the goal with probability 1.
 
-        The goal is a vertex of `goal` or an edge of `hits`. The strategy may leave out any edge
-        that is `free`; every other edge has a positive probability whenever its source is visited
-        (fairness). Before the goal only `allowed` vertices may be visited.
+        The strategy may leave out any edge that is `free`; every other edge has a positive
+        probability whenever its source is visited (fairness). Before the goal only `allowed`
+        vertices may be visited.
 
         This is almost sure reachability in a Markov decision process (C. Baier, J.-P. Katoen,
         Principles of Model Checking, MIT Press 2008, section 10.6.1), computed as a greatest fixed
         point: start with all vertices, and remove those from which an edge that cannot be left out
         leaves the set, and those from which the goal cannot be reached inside the set.
         """
-        hits = np.zeros(len(self.target), dtype=np.bool_) if hits is None else hits
         winning = goal.copy() if allowed is None else goal | allowed
         if allowed is None:
             winning[:] = True
-        forced = ~free & ~hits
+        forced = ~free
         while True:
             keep_time("verdicts")
             # First the vertices that the environment can push out of the set ...
@@ -236,10 +216,8 @@ class Graph:
                 winning[self.source[leaves]] = False
                 continue
             # ... then those from which the goal is no longer reachable inside it.
-            start = goal & winning
-            start[self.source[hits & winning[self.source]]] = True
             inside = winning[self.source] & winning[self.target]
-            reaching = self.backward(start, inside)
+            reaching = self.backward(goal & winning, inside)
             if np.array_equal(reaching & winning, winning):
                 return winning
             winning &= reaching

@@ -55,7 +55,6 @@ class Qualitative:
     of the part that was found."""
 
     space: Space
-    graph: Graph
     bounds: tuple[int | None, ...]
     """Proven upper bounds by place; if the space is complete, they are reached."""
     most: int | None
@@ -97,7 +96,6 @@ def examine(
     levels = _levels(space, None if in_haste else graph, cover)
     return Qualitative(
         space,
-        graph,
         bounds,
         _most(space, bounds),
         bounded,
@@ -124,10 +122,10 @@ def _most(space: Space, bounds: tuple[int | None, ...]) -> int | None:
     return highest if space.complete or highest == max(space.bounds, default=0) else None
 
 
-def witness(space: Space, i: int, loop: tuple[str, ...] = ()) -> Witness:
+def witness(space: Space, i: int) -> Witness:
     """Return a shortest firing sequence to marking i as a witness."""
     marked = {p: n for p, n in zip(space.net.places, space.marking(i), strict=True) if n}
-    return Witness(tuple(space.path(i)), marked, loop)
+    return Witness(tuple(space.path(i)), marked)
 
 
 def _unknown(space: Space, question: str = "") -> PropertyVerdict:

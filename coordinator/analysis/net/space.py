@@ -124,16 +124,6 @@ class Space:
         return np.array(found, dtype=np.bool_)
 
     @cached_property
-    def _numbers(self) -> dict[int, int]:
-        return {packed: i for i, packed in enumerate(self.layout.join_many(self.words))}
-
-    def number(self, marking: Marking) -> int | None:
-        """Return the number of a marking, or None if it was not found."""
-        if any(n >> w for n, w in zip(marking, self.layout.width, strict=True)):
-            return None
-        return self._numbers.get(self.layout.pack(marking))
-
-    @cached_property
     def source(self) -> NDArray[np.int32]:
         """The marking that each edge leaves, shape (edges,)."""
         return np.repeat(np.arange(len(self), dtype=np.int32), np.diff(self.row))

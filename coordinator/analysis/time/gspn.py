@@ -13,7 +13,7 @@ elimination, and the flow through immediate transitions is known without extra w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from petrobot.coordinator.analysis.limits import keep_time
 from petrobot.coordinator.analysis.net.graph import Graph, Index, Mask, sum_by
 from petrobot.coordinator.analysis.net.space import SearchLimits, Space, explore
-from petrobot.coordinator.task.net import Marking, Net
+from petrobot.coordinator.task.net import Net
 
 Values = NDArray[np.float64]
 
@@ -168,12 +168,10 @@ class Chain:
         *,
         space: Space | None = None,
         limits: SearchLimits | None = None,
-        absorbing: Callable[[Marking], bool] | None = None,
     ) -> Chain:
         """Return the chain of a GSPN; its space is explored unless given.
 
-        Markings in which `absorbing` holds keep no edges. Raises ValueError if the space is not
-        complete (then simulate), and TimelessTrap.
+        Raises ValueError if the space is not complete (then simulate), and TimelessTrap.
         """
         space = space or explore(gspn.net, limits=limits)
         if not space.complete:
@@ -186,24 +184,11 @@ class Chain:
         timed = np.array([r is not None for r in gspn.rate], dtype=np.bool_)
         vanishing = np.zeros(len(space), dtype=np.bool_)
         vanishing[space.source[~timed[label]]] = True
-        kept = np.ones(len(label), dtype=np.bool_)
-        if absorbing is not None:
-            ends = space.where(absorbing)
-            kept = ~ends[space.source]
-            vanishing &= ~ends
         base = np.array(
             [r if r is not None else w for r, w in zip(gspn.rate, gspn.weight, strict=True)]
         )
         amount = base[label] * _degrees(gspn, space, label)
-        chain = cls(
-            gspn,
-            space,
-            space.source[kept],
-            space.target[kept],
-            label[kept],
-            amount[kept],
-            vanishing,
-        )
+        chain = cls(gspn, space, space.source, space.target, label, amount, vanishing)
         chain._refuse_traps()
         return chain
 

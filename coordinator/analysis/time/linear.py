@@ -51,7 +51,7 @@ class SolveOrder:
     """
 
     @classmethod
-    def of(cls, graph: Graph, inside: Mask | None = None) -> SolveOrder:
+    def of(cls, graph: Graph, inside: Mask | None) -> SolveOrder:
         """Return the order for the vertices in `inside` (by default all); the others count as 0."""
         keep = np.ones(graph.n, dtype=np.bool_) if inside is None else inside
         component = graph.components
@@ -311,17 +311,10 @@ class Coarse:
             else np.ones(len(x))
         )
 
-    def inverse(self, value: Values, pinned: bool = False) -> Values:
-        """Return the inverse of I - A aggregated over the blocks, for `correction`.
-
-        `pinned` is for a stochastic A, where solutions differ by a constant: the first block keeps
-        its values.
-        """
-        size, first = np.bincount(self.block, minlength=self.count), int(pinned)
-        matrix = np.diag(size.astype(float)) - self._matrix(value)
-        out = np.zeros_like(matrix)
-        out[first:, first:] = np.linalg.inv(matrix[first:, first:])
-        return out
+    def inverse(self, value: Values) -> Values:
+        """Return the inverse of I - A aggregated over the blocks, for `correction`."""
+        size = np.bincount(self.block, minlength=self.count)
+        return np.asarray(np.linalg.inv(np.diag(size.astype(float)) - self._matrix(value)))
 
     def correction(self, inverse: Values, left: Values) -> Values:
         """Return what to add to x, constant over each block, if x = right + A x has the residual

@@ -7,7 +7,6 @@ ending in each. The result carries the residual of its balance equations.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil, exp, lgamma, log, sqrt
@@ -70,16 +69,6 @@ class LongRun:
             for name, r in zip(self.throughput, rates, strict=True)
             if r is not None
         }
-
-    def reward(
-        self, state: Values | None = None, impulse: Mapping[str, float] | None = None
-    ) -> float:
-        """Return a mean reward per second.
-
-        `state[i]` is earned per second in marking i, `impulse[t]` at each firing of transition t.
-        """
-        total = float(self.probability @ state) if state is not None else 0.0
-        return total + sum(gain * self.throughput[name] for name, gain in (impulse or {}).items())
 
 
 def long_run(chain: Chain) -> LongRun:

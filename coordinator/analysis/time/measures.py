@@ -50,8 +50,8 @@ def value_of(measure: Measure, found: Forecast | LongRun) -> float:
     }
     if isinstance(found, Forecast):
         calls |= {
-            "time": lambda q: found.completion_time().quantile(_number(measure, q, 0.0, 1.0)),
-            "late": lambda s: _late(found, _number(measure, s, 0.0, float("inf"))),
+            "time": lambda q: found.completion_time().quantile(_number(measure, q, 1.0)),
+            "late": lambda s: _late(found, _number(measure, s, float("inf"))),
         }
         numbers = {
             "P_complete": lambda: found.completion_probability,
@@ -101,11 +101,11 @@ def _named(measure: Measure, what: str, name: str, known: dict[str, float]) -> f
     return known[name]
 
 
-def _number(measure: Measure, text: str, above: float, below: float) -> float:
+def _number(measure: Measure, text: str, below: float) -> float:
     try:
         value = float(text)
     except ValueError as error:
         raise _fault(measure, f"expected a number, got {text!r}", FORM) from error
-    if not above < value < below:
-        raise _fault(measure, f"{text} is out of range", f"give more than {above:g}")
+    if not 0.0 < value < below:
+        raise _fault(measure, f"{text} is out of range", "give more than 0")
     return value

@@ -164,7 +164,10 @@ def note_block(folder: Path, block: Block, result: Mapping[str, Any]) -> None:
         block.index,
         *(result[name] for name in ("pid", "cpu_s", "wall_s", "mission_s", "rss_mb")),
     ]
-    _append(folder / TIMES, TIME_COLUMNS, [took])
+    # Without fsync: these costs are only reported, nothing depends on them.
+    rows = [took] if (folder / TIMES).exists() else [TIME_COLUMNS, took]
+    with (folder / TIMES).open("a", encoding="utf-8", newline="") as file:
+        file.write(_lines(rows))
 
 
 def note_sessions(folder: Path, sessions: Iterable[Mapping[str, Any]]) -> None:
@@ -188,13 +191,6 @@ def began(folder: Path) -> str | None:
     """Return when the first session of a campaign began (UTC, ISO 8601); None if it is unknown."""
     known = sessions(folder)
     return known[0]["began_at"] if known else None
-
-
-def _append(path: Path, names: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Append rows without fsync: these costs are only reported, nothing depends on them."""
-    rows = rows if path.exists() else [names, *rows]
-    with path.open("a", encoding="utf-8", newline="") as file:
-        file.write(_lines(rows))
 
 
 def _lines(rows: Iterable[Sequence[Any]]) -> str:

@@ -204,7 +204,7 @@ class CampaignReport:
 
     # --- page ---------------------------------------------------------------------------------
 
-    def html(self, more: Sequence[str] = ()) -> str:
+    def html(self, more: Sequence[str]) -> str:
         """Return the page; `more` are further sections, after the figures."""
         plan = self.plan
         lead = f"{len(self.rows)} of {plan.runs} runs, selector {plan.selector}, seed {plan.seed}"

@@ -53,7 +53,6 @@ def compare(
     one: Iterable[TrialRow],
     other: Iterable[TrialRow],
     weighting: Weighting | None = None,
-    seed: int = 1,
 ) -> dict[str, Any]:
     """Return the differences between the first and the second campaign: positive is better for
     shares, negative for J and time.

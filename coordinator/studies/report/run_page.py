@@ -46,8 +46,8 @@ LONGEST = 600.0
 def report_html(
     result: Mapping[str, Any],
     timeline: Timeline,
-    net_svg: str = "",
-    pictures: Mapping[str, str] | None = None,
+    net_svg: str,
+    pictures: Mapping[str, str] | None,
     measured: Mapping[str, Sequence[str]] | None = None,
 ) -> str:
     """Return the page. `result` is the mission's result; its lists of records become tables.

@@ -103,7 +103,7 @@ class Arm(Driver):
             Link(ports.now, partial(ports.tcp, self.host, port), patience)
             for port, patience in zip(addresses, (SILENT, math.inf, math.inf), strict=True)
         )
-        self._rtde, self._connection = Rtde(OUTPUTS, (SETPOINT, DIGITAL), 125.0), 1
+        self._rtde, self._connection = Rtde(OUTPUTS, (SETPOINT, DIGITAL)), 1
         self._motion = JointMotion(
             self, self._arm.limits, self.top_speed, self.acceleration, self._arm.point
         )
@@ -166,7 +166,7 @@ class Arm(Driver):
         data = self._link.receive(now)
         if self._link.count != self._connection:
             self._connection = self._link.count
-            self._rtde, self._count = Rtde(OUTPUTS, (SETPOINT, DIGITAL), 125.0), 0
+            self._rtde, self._count = Rtde(OUTPUTS, (SETPOINT, DIGITAL)), 0
         try:
             self._rtde.receive(data)
         except RtdeError as fault:

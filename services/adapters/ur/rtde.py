@@ -28,6 +28,10 @@ FORMS: Mapping[str, str] = {
 }
 
 
+RATE = 125.0
+"""How often the controller sends its outputs (Hz)."""
+
+
 class RtdeError(ValueError):
     """The other end does not follow the protocol, or refuses a request; the text says which."""
 
@@ -86,14 +90,14 @@ class Rtde:
     """One connection, from its first byte: requests version and recipes, starts, then receives
     data. `receive` processes bytes, `drain` returns those to send."""
 
-    def __init__(self, outputs: Sequence[str], inputs: Sequence[Sequence[str]], rate: float):
-        """`outputs` are received `rate` times a second; each of `inputs` may be sent."""
+    def __init__(self, outputs: Sequence[str], inputs: Sequence[Sequence[str]]):
+        """`outputs` are received `RATE` times a second; each of `inputs` may be sent."""
         self.data: dict[str, Any] = {}
         """The newest values received."""
         self.count = 0
         """How many data packages were received."""
         self.running = False
-        self._outputs, self._inputs, self._rate = outputs, [tuple(names) for names in inputs], rate
+        self._outputs, self._inputs = outputs, [tuple(names) for names in inputs]
         self._recipe: tuple[int, Recipe] | None = None
         self._sent: list[tuple[int, Recipe]] = []
         self._buffer = bytearray()
@@ -126,7 +130,7 @@ class Rtde:
         elif letter == REQUEST_VERSION:
             if payload != b"\x01":
                 raise RtdeError(f"the controller refuses RTDE protocol {VERSION}: update it")
-            request = struct.pack(">d", self._rate) + ",".join(self._outputs).encode()
+            request = struct.pack(">d", RATE) + ",".join(self._outputs).encode()
             self._out.append(package(OUTPUTS, request))
         elif letter == OUTPUTS:
             self._recipe = payload[0], Recipe(self._outputs, _types(payload))

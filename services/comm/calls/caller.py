@@ -635,7 +635,7 @@ class Caller:
         else:
             self.connecting(now)
 
-    def unreached(self, now: float, trouble: str, *, gone: bool = False) -> None:
+    def unreached(self, now: float, trouble: str, *, gone: bool) -> None:
         """An attempt to connect failed. `gone`: nothing listens at the peer's address.
 
         In that case a process to which we were connected has ended, so its calls end at once. A

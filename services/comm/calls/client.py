@@ -189,8 +189,9 @@ class Client:
             else float(ssl.cert_time_to_seconds(certificate["notAfter"]))
         )
 
-    async def close(self, text: str = "the caller stops") -> None:
+    async def close(self) -> None:
         """Say BYE and disconnect; pending calls end as lost."""
+        text = "the caller stops"
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
@@ -210,7 +211,6 @@ class Client:
         arguments: Mapping[str, Any] = _NO_ARGUMENTS,
         *,
         deadline: float | None = None,
-        parent: str = "",
         seed: int = 0,
     ) -> Outcome:
         """Call a service and return its outcome, which is acknowledged on arrival. Cancelling the
@@ -219,7 +219,7 @@ class Client:
         now = self.now()
         future: asyncio.Future[Outcome] = self._future()
         caller = self.caller
-        waiting = caller.begin(now, id_, service, arguments, deadline, parent, seed, 0, "", future)
+        waiting = caller.begin(now, id_, service, arguments, deadline, "", seed, 0, "", future)
         if waiting >= AT_ONCE:
             self.flush(now)
         elif not self._flushing:

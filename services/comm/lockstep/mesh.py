@@ -521,16 +521,16 @@ class Member:
         for link in self._links.values():
             with contextlib.suppress(PartyLostError, ProtocolError):
                 link.send(Bye(text))
-        self._close(_LINGER)
+        self._close()
 
     def _abandon(self, text: str) -> None:
         for link in self._links.values():
             with contextlib.suppress(PartyLostError, ProtocolError):
                 link.send(Refuse("failed", text[:1000]))
-        self._close(_LINGER)
+        self._close()
 
-    def _close(self, linger: float) -> None:
-        deadline = time.monotonic() + linger
+    def _close(self) -> None:
+        deadline = time.monotonic() + _LINGER
         for link in self._links.values():
             with contextlib.suppress(OSError):
                 link.sock.settimeout(max(deadline - time.monotonic(), 0.001))

@@ -79,12 +79,12 @@ class Credentials:
         secret = ticket.partition(".")[0].encode()
         return hmac.digest(secret, b"petrobot set-point stream", hashlib.sha256) if secret else None
 
-    def tell_ends(self, now: datetime | None = None) -> None:
+    def tell_ends(self) -> None:
         """Report on standard error, once per process, which certificates used here expire soon or
         have expired."""
         if self.folder is None:
             return
-        now = now or datetime.now(UTC)
+        now = datetime.now(UTC)
         command = f"`petrobot keys --tls {self.folder.name}`"
         watch(
             self.folder / f"{self.party}.pem", now, RENEW.format(command=command, name=self.party)

@@ -17,7 +17,7 @@ IN = (("input_int_register_24", "input_double_register_24"),)
 
 def recorded() -> bytes:
     """All bytes that a controller sends to a client from its first package on."""
-    controller, client, heard = UrController(), Rtde(OUT, IN, 125.0), b""
+    controller, client, heard = UrController(), Rtde(OUT, IN), b""
     session = controller.connect(RTDE_PORT)
     for tick in range(20):
         session.receive(client.drain())
@@ -34,7 +34,7 @@ HEARD = recorded()
 
 @given(st.lists(st.integers(0, len(HEARD)), max_size=30))
 def test_it_reads_the_same_from_any_pieces(cuts: list[int]) -> None:
-    whole, pieces = Rtde(OUT, IN, 125.0), Rtde(OUT, IN, 125.0)
+    whole, pieces = Rtde(OUT, IN), Rtde(OUT, IN)
     whole.receive(HEARD)
     for begin, end in zip([0, *sorted(cuts)], [*sorted(cuts), len(HEARD)], strict=True):
         pieces.receive(HEARD[begin:end])
@@ -42,7 +42,7 @@ def test_it_reads_the_same_from_any_pieces(cuts: list[int]) -> None:
 
 
 def test_it_reads_the_same_from_single_bytes() -> None:
-    whole, single = Rtde(OUT, IN, 125.0), Rtde(OUT, IN, 125.0)
+    whole, single = Rtde(OUT, IN), Rtde(OUT, IN)
     whole.receive(HEARD)
     for value in HEARD:
         single.receive(bytes((value,)))
@@ -70,14 +70,14 @@ ACCEPTED = package("V", b"\x01") + package("O", b"\x01DOUBLE,VECTOR6D,INT32,")
     ],
 )
 def test_what_it_refuses(heard: bytes, says: str) -> None:
-    client = Rtde(OUT, IN, 125.0)
+    client = Rtde(OUT, IN)
     with pytest.raises(RtdeError) as fault:
         client.receive(heard)
     assert says in str(fault.value)
 
 
 def test_nothing_is_sent_before_the_start_nor_while_it_is_paused() -> None:
-    client = Rtde(OUT, IN, 125.0)
+    client = Rtde(OUT, IN)
     values = {"input_int_register_24": 7, "input_double_register_24": 0.5}
     client.receive(ACCEPTED + package("I", b"\x05INT32,DOUBLE,"))
     client.drain()
@@ -92,14 +92,14 @@ def test_nothing_is_sent_before_the_start_nor_while_it_is_paused() -> None:
 
 
 def test_data_of_another_recipe_and_texts_are_ignored() -> None:
-    client = Rtde(OUT, IN, 125.0)
+    client = Rtde(OUT, IN)
     client.receive(ACCEPTED + package("U", b"\x02abc") + package("M", b"\x02hi\x00\x01"))
     assert client.count == 0 and client.data == {}
 
 
 @given(st.binary(max_size=60))
 def test_no_bytes_break_it_otherwise(data: bytes) -> None:
-    client = Rtde(OUT, IN, 125.0)
+    client = Rtde(OUT, IN)
     try:
         client.receive(ACCEPTED + data)
     except RtdeError:

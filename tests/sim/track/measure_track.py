@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import defaultdict
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,31 +18,12 @@ sys.path[:0] = [str(Path(__file__).parents[3]), str(Path(__file__).parent)]
 IDLE_TICKS, IMAGES = 20_000, 500
 
 
-class TrackMeter:
-    """Adds up the CPU time of methods, including the functions that they call."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = defaultdict(float)
-
-    def watch(self, thing: object, method: str, name: str) -> None:
-        """Measure a method of an object under a name."""
-        original: Callable[..., Any] = getattr(thing, method)
-
-        def measured(*arguments: Any) -> Any:
-            begun = time.process_time()
-            try:
-                return original(*arguments)
-            finally:
-                self.seconds[name] += time.process_time() - begun
-
-        setattr(thing, method, measured)
-
-
 def measure(regime: str) -> None:
     """One paragraph of figures."""
     from conftest import ROVER_FILE, RoverBench  # type: ignore[import-not-found]
 
     from petrobot.sim.track.truth import read_track_site
+    from tests.sim.measure_world import TimeMeter
 
     bench = RoverBench(read_track_site(ROVER_FILE), seed=1, regime=regime)
     begun = time.process_time()
@@ -53,7 +32,7 @@ def measure(regime: str) -> None:
     prepared = (time.process_time() - begun) / 10.0
     bench.enable()
     bench.want_images(25.0)
-    lab, meter = bench.lab, TrackMeter()
+    lab, meter = bench.lab, TimeMeter()
     meter.watch(lab, "receive", "frames in")
     meter.watch(lab, "advance", "world, frames and images out")
     meter.watch(lab, "picture", "  of it images")
