@@ -647,6 +647,22 @@ def test_what_only_listens_is_not_what_is_stuck() -> None:
     assert found.details[0] == "done: only `n` can fill it, but `low_now` took move"
 
 
+def test_values_are_written_as_in_conditions() -> None:
+    task = make_task(
+        "parts=1 other",
+        {
+            "next": {"in": "parts", "sets": (("seen", parse("true")),)},
+            "far": {"in": "parts", "out": "other", "when": "ready and seen"},
+        },
+        final="parts == 0",
+        variables={"seen": False, "ready": False},
+    )
+    assert judged(task).quasi_live.reason == (
+        "far can never fire: its condition (ready and seen) is never true: "
+        "ready is only ever false and seen is only ever false or true"
+    )
+
+
 def test_a_condition_that_is_never_true_is_why_a_transition_never_fires() -> None:
     task = make_task(
         "parts=1 look! other",

@@ -64,6 +64,7 @@ from petrobot.coordinator.task import Kind, Value
 from petrobot.coordinator.task.compiled import Arcs
 from petrobot.coordinator.task.compiled_task import CompiledTransition
 from petrobot.coordinator.task.conditions import ConditionFault
+from petrobot.coordinator.task.conditions.language import as_literal
 from petrobot.coordinator.task.wording import few
 
 MENDED = "the operator repairs what `final_error` leaves and starts the task again"
@@ -464,7 +465,7 @@ class Progress:
                 if t.when.holds(base | dict(zip(names, chosen, strict=True))):
                     return ""
         only = (
-            f"{name} is only ever {' or '.join(map(repr, seen))}"
+            f"{name} is only ever {' or '.join(map(as_literal, seen))}"
             for name, seen in zip(names, values, strict=True)
         )
         return f"its condition ({t.when}) is never true: {' and '.join(only)}"
