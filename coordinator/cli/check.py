@@ -287,8 +287,8 @@ def _text(name: str, judged: MayRun, report: CheckReport, missing: list[str]) ->
     analysis, told = judged.analysis, list(_told(report, name))
     if missing or not (judged.ok and report.ok):
         held = analysis is not None and not analysis.objections
-        first = next((f.text for f in report.errors if held), "a node is missing" if held else "")
-        yield wrapped(f"{name}: may not run{f': {first}' if first else ''}", 2)
+        why = next((f.key for f in report.errors), "a missing node")
+        yield wrapped(f"{name}: may not run{f' because of {why}' if held else ''}", 2)
     elif analysis is not None and analysis.interrupted:
         yield f"{name}: was not checked to its end (Ctrl-C)"
     else:

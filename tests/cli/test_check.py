@@ -117,8 +117,8 @@ def test_the_first_line_says_why_a_task_may_not_run_if_its_verdicts_hold(
     (tmp_path / "services.toml").write_text(cell, encoding="utf-8")
     text = HEAD + 'lost = { in = ["look:error"], out = ["arm"] }\n'
     code, lines = printed(tmp_path, capsys, text)
-    why = "no node offers the action 'look_once'"
-    assert code == 2 and lines[0] == f"parts.toml: may not run: {why}"
+    why = "primitive_tasks.look.alternatives"
+    assert code == 2 and lines[0] == f"parts.toml: may not run because of {why}"
 
 
 def test_notes_of_one_kind_are_told_once(
