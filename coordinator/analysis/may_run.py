@@ -70,6 +70,9 @@ class Budget:
         return SearchLimits(states=self.markings)
 
 
+LATE = "deadline-too-short"
+"""Code of the finding that runs are ended before they succeed, as their place is declared."""
+
 BUDGET = Budget()
 """The budget of `petrobot check`, `run` and the page. `petrobot analyse` has limits of its own."""
 
@@ -255,7 +258,7 @@ def _late(task: Task) -> list[Finding]:
                 f"declared to take {good.mean:g} s on average"
             )
             remedy = "give the runs more time, or correct the estimates"
-            found.append(Finding(Severity.WARNING, "deadline-too-short", key, text, remedy))
+            found.append(Finding(Severity.WARNING, LATE, key, text, remedy))
     return found
 
 

@@ -282,9 +282,13 @@ class Told(NamedTuple):
 
 def _text(name: str, judged: MayRun, report: CheckReport, missing: list[str]) -> Iterator[str]:
     """Yield the answer first, then the verdicts by name, then what was found, errors first."""
+    from petrobot.coordinator.analysis.may_run import LATE
+
     analysis, told = judged.analysis, list(_told(report, name))
     if missing or not (judged.ok and report.ok):
-        yield f"{name}: may not run"
+        held = analysis is not None and not analysis.objections
+        why = next((f.key for f in report.errors), "a missing node")
+        yield wrapped(f"{name}: may not run{f' because of {why}' if held else ''}", 2)
     elif analysis is not None and analysis.interrupted:
         yield f"{name}: was not checked to its end (Ctrl-C)"
     else:
@@ -292,7 +296,10 @@ def _text(name: str, judged: MayRun, report: CheckReport, missing: list[str]) ->
         open_ = [one for key, one in verdicts.items() if key != "safe" and one.holds is None]
         proved = [one for key, one in verdicts.items() if key != "safe" and one.holds is not None]
         part = "not everything" if proved else "nothing"
-        yield f"{name}: may run{f', but {part} was proved' if open_ else ''}"
+        late = dict.fromkeys(f.key for f in report.findings if f.code == LATE)
+        but = [f"{part} was proved"] if open_ else []
+        but += [f"runs take longer than {listed([*late])} on average"] if late else []
+        yield wrapped(f"{name}: may run{f', but {listed(but)}' if but else ''}", 2)
     if analysis is not None:
         yield from _summary(analysis)
         told += [*_reasons(analysis), *_notes(name, analysis)]

@@ -94,10 +94,13 @@ def with_button(task: Task, broken: str) -> Task:
     )
 
 
-def with_stop(task: Task) -> Task:
-    """Add a stop button, which ends the task with `final_error` where nothing is active."""
+def with_stop(task: Task, *, reset: bool = False) -> Task:
+    """Add a stop button, which ends the task with `final_error` where nothing is active. A second
+    button may `reset` it before."""
     net = {"halt": {"in": "running", "event": "stop", "out": "halted"}}
-    branch = make_task("running=1 halted", net, "stop+")
+    if reset:
+        net["release"] = {"in": "halted", "event": "again", "out": "running"}
+    branch = make_task("running=1 halted", net, "stop+ again+" if reset else "stop+")
     ends = "halted == 1" if task.final_error is None else f"halted == 1 or {task.final_error}"
     return replace(
         task,

@@ -390,10 +390,11 @@ def test_a_branch_that_listens_does_not_hide_what_is_stuck(what: str) -> None:
     assert not answer.ok and any("sound" in line for line in answer.objections())
 
 
+@pytest.mark.parametrize("reset", [False, True])
 @pytest.mark.parametrize("what", STUCK)
-def test_a_stop_button_does_not_hide_what_is_stuck(what: str) -> None:
+def test_a_stop_button_does_not_hide_what_is_stuck(what: str, reset: bool) -> None:
     """It could be pressed all the time, so nothing but a person would end what hangs."""
-    found = judged(with_stop(STUCK[what].task))
+    found = judged(with_stop(STUCK[what].task, reset=reset))
     assert found.deadlock_free.holds and found.sound.holds is False
     assert found.sound.reason.startswith("the task can only give up") or (
         found.sound.details[-1] == "nothing else can happen; only halt ends it"
@@ -407,10 +408,71 @@ def test_a_stop_button_may_stay_unpressed() -> None:
     assert "external-wait" in codes(with_stop(needs))
 
 
+@pytest.mark.parametrize("reset", [False, True])
+def test_a_stop_button_whose_token_others_need_does_not_hide_what_is_stuck(reset: bool) -> None:
+    """Pressed while a run is active, it gives up where that run ends."""
+    release = {"release": {"in": "halted", "event": "again", "out": "running"}}
+    task = make_task(
+        "parts=2 running=1 halted look! held",
+        {
+            "begin": {"in": "parts", "out": "look"},
+            "next": {"in": "look:normal parts running", "out": "look running"},
+            "lost": {"in": "look:error running", "out": "held running"},
+            "halt": {"in": "running", "event": "stop", "out": "halted"},
+            "last": {"in": "look:normal running !parts", "out": "running"},
+            **(release if reset else {}),
+        },
+        "stop+ again+",
+        final="parts == 0 and held == 0 and look == 0",
+        final_error=parse("halted == 1"),
+    )
+    found = judged(task)
+    assert found.deadlock_free.holds and found.sound.holds is False
+    assert found.sound.details[0].startswith("the end asks for held == 0")
+    assert found.sound.details[-1] == "nothing else can happen; only halt ends it"
+
+
+def test_an_event_that_begins_a_wait_is_no_stop_button() -> None:
+    """Each round gives up by itself unless another event comes in time, and none can be left out.
+    After a round was lost, the others are still needed to give up."""
+    task = make_task(
+        "parts=3 turn=1 stored lost waits bad",
+        {
+            "red": {"in": "parts turn", "event": "red", "out": "waits"},
+            "green": {"in": "parts turn", "event": "green", "out": "waits"},
+            "good": {"in": "waits", "event": "came", "out": "stored turn"},
+            "late": {"in": "waits", "after": 5.0, "out": "lost turn"},
+        },
+        "red green came",
+        final="stored == 3",
+        final_error=parse("parts == 0 and lost > 0"),
+    )
+    assert judged(task).sound.holds
+
+
+def test_a_switch_is_no_stop_button() -> None:
+    """A person may switch to manual and back; giving up after an error may wait for the latter."""
+    task = make_task(
+        "parts=2 look! lost auto=1 manual",
+        {
+            "next": {"in": "parts !look !manual", "out": "look"},
+            "seen": {"in": "look:normal"},
+            "bad": {"in": "look:error", "out": "lost"},
+            "to_manual": {"in": "auto", "event": "hand", "out": "manual"},
+            "to_auto": {"in": "manual", "event": "back", "out": "auto"},
+        },
+        "hand back",
+        final="parts == 0 and lost == 0",
+        final_error=parse("parts == 0 and lost > 0"),
+    )
+    assert judged(task).sound.holds
+
+
+@pytest.mark.parametrize("reset", [False, True])
 @pytest.mark.parametrize("halts", [False, True])
-def test_a_stop_button_is_not_a_fault(halts: bool) -> None:
+def test_a_stop_button_is_not_a_fault(halts: bool, reset: bool) -> None:
     """Where it bars what would follow, `final` cannot be reached after it; else it only marks."""
-    task = with_stop(seeded().task)
+    task = with_stop(seeded().task, reset=reset)
     bar = Inhibitor("halted", 1)
     first = replace(task.transitions["next"], inhibitors=(bar,) * halts)
     answer = may_run(replace(task, transitions={**task.transitions, "next": first}), None, Budget())
@@ -583,6 +645,22 @@ def test_what_only_listens_is_not_what_is_stuck() -> None:
     found = judged(replace(task, places={**task.places, "watch": watch})).deadlock_free
     assert found.reason.endswith("the end asks for done == 2 (it holds 1)")
     assert found.details[0] == "done: only `n` can fill it, but `low_now` took move"
+
+
+def test_values_are_written_as_in_conditions() -> None:
+    task = make_task(
+        "parts=1 other",
+        {
+            "next": {"in": "parts", "sets": (("seen", parse("true")),)},
+            "far": {"in": "parts", "out": "other", "when": "ready and seen"},
+        },
+        final="parts == 0",
+        variables={"seen": False, "ready": False},
+    )
+    assert judged(task).quasi_live.reason == (
+        "far can never fire: its condition (ready and seen) is never true: "
+        "ready is only ever false and seen is only ever false or true"
+    )
 
 
 def test_a_condition_that_is_never_true_is_why_a_transition_never_fires() -> None:

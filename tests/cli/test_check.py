@@ -94,6 +94,33 @@ def test_what_was_not_proved_is_said_in_the_first_line(
     assert "by: the mission begins -> next; look ends in error -> lost" in told
 
 
+def test_the_first_line_names_a_time_that_is_too_short(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every verdict holds, and yet the task nearly always gives up."""
+    text = HEAD + 'lost = { in = ["look:error"], out = ["arm"] }\n'
+    text += "[primitive_tasks.look.estimates]\n"
+    text += "success = { share = 1.0, mean = 5.0, cv = 0.1 }\n"
+    short = text.replace('task = "look"', 'task = "look", timeout = 1.0', 1)
+    assert short != text
+    assert printed(tmp_path, capsys, text)[1][0] == "parts.toml: may run"
+    code, lines = printed(tmp_path, capsys, short)
+    why = "runs take longer than places.look.timeout on average"
+    assert code == 0 and lines[0] == f"parts.toml: may run, but {why}"
+
+
+def test_the_first_line_says_why_a_task_may_not_run_if_its_verdicts_hold(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """That no node offers an action is not a fault of the net."""
+    cell = 'schema = 1\n[nodes.robot]\nhost = "127.0.0.1"\nport = 7001\n'
+    (tmp_path / "services.toml").write_text(cell, encoding="utf-8")
+    text = HEAD + 'lost = { in = ["look:error"], out = ["arm"] }\n'
+    code, lines = printed(tmp_path, capsys, text)
+    why = "primitive_tasks.look.alternatives"
+    assert code == 2 and lines[0] == f"parts.toml: may not run because of {why}"
+
+
 def test_notes_of_one_kind_are_told_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

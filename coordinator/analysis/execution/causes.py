@@ -16,7 +16,7 @@ from petrobot.coordinator.engine.firing import Obstacle, in_words, obstacles
 from petrobot.coordinator.task import Kind
 from petrobot.coordinator.task.compiled_task import CompiledTransition
 from petrobot.coordinator.task.conditions import And, Compare, Expression, Literal, Name
-from petrobot.coordinator.task.conditions.language import Node
+from petrobot.coordinator.task.conditions.language import Node, as_literal
 from petrobot.coordinator.task.net import EMPTY, Net
 
 MOST = 4
@@ -240,7 +240,7 @@ def _values(draft: Draft, t: CompiledTransition, firings: Sequence[str]) -> Iter
         last = next((f for f in reversed(firings) if f in setters), None)
         others = [f"`{u}`" for u in setters if u != last]
         only = f"only {', '.join(others)} set{'s' * (len(others) == 1)} it"
-        value = repr(draft.variables.get(name))
+        value = as_literal(draft.variables.get(name))
         if last is not None:
             also = f"otherwise {only}" if others else "nothing else sets it"
             yield f"{name}: `{last}` set it to {value}; {also}"

@@ -35,7 +35,7 @@ from petrobot.coordinator.engine import (
 from petrobot.coordinator.engine.state import ACTIVE
 from petrobot.coordinator.task import End, Executed, Kind, Scope, Status, Task
 from petrobot.coordinator.task.conditions import Compare, Literal, Name, walk
-from petrobot.coordinator.task.conditions.language import equal, is_number, with_values
+from petrobot.coordinator.task.conditions.language import as_literal, equal, is_number, with_values
 from petrobot.coordinator.task.conditions.regions import region_values
 from petrobot.coordinator.task.validation import is_pulse
 
@@ -118,7 +118,7 @@ class Names:
         self.assumptions = tuple(
             [f"{name} may take any value at any time" for name in self.free]
             + [
-                f"the parameter {n} is {v!r}"
+                f"the parameter {n} is {as_literal(v)}"
                 for n, v in parameters.items()
                 if any(n in c.names for c in conditions)
             ]
@@ -244,7 +244,7 @@ class Names:
             now = self.region(name, state.variables.get(name))
             for value in self.different(name):
                 if self.region(name, value) != now:
-                    yield Cause(VariableChanged(name, value), f"{name} becomes {value!r}")
+                    yield Cause(VariableChanged(name, value), f"{name} becomes {as_literal(value)}")
 
     def commands(self, state: State) -> Iterator[Cause]:
         """Yield the operator's moves of one token that the control places allow."""
@@ -310,7 +310,7 @@ class Names:
             executed = done if status is Status.ERROR else [Executed.YES.value]
             for cause, was, *values in product(reasons, executed, *choices):
                 given = {r: v for r, v in zip(read, values, strict=True) if v is not MISSING}
-                told = [f"{read[r]} = {v!r}" for r, v in given.items()]
+                told = [f"{read[r]} = {as_literal(v)}" for r, v in given.items()]
                 if len(reasons) > 1 and (status is Status.ERROR or cause != usual):
                     told.append(f"{REASON}{cause!r}")
                 told += [f"executed = {was}"] if len(executed) > 1 else []

@@ -17,7 +17,7 @@ from the graph as a Markov chain (`chain.py`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -64,6 +64,7 @@ from petrobot.coordinator.task import Kind, Value
 from petrobot.coordinator.task.compiled import Arcs
 from petrobot.coordinator.task.compiled_task import CompiledTransition
 from petrobot.coordinator.task.conditions import ConditionFault
+from petrobot.coordinator.task.conditions.language import as_literal
 from petrobot.coordinator.task.wording import few
 
 MENDED = "the operator repairs what `final_error` leaves and starts the task again"
@@ -312,27 +313,49 @@ class Progress:
         """Transitions by which an external event may end a mission that could still reach `final`
         and has met no error, such as a stop button.
 
-        After them `final` cannot be reached; or they only fill places that nothing empties and that
-        `final` does not name, so that all they ever bring is `final_error`.
+        After them `final` cannot be reached, or not before another event comes, such as the one
+        that resets the button; or all that they ever bring is `final_error`.
         """
         x, known = self.x, self.x.engine.compiled
-        used = {p for arcs in known.net.consume for p, _ in arcs}
-        used |= {p for name, p in known.net.place_index.items() if name in known.task.final.names}
         awaiting = {t.name: {*t.flags, t.pulse} for t in known.transitions if t.flags or t.pulse}
-        given = {t.name: {p for p, *_ in t.produce} for t in known.transitions}
-        marks = {name for name, places in given.items() if places and not places & used}
         good = x.final.copy()
         good[x.expanded :] = True
         can = x.graph.backward(good)
-        found, free = set[str](), (self._nominal & can)[x.source]
+        marks, found, free = self._marks(awaiting), set[str](), (self._nominal & can)[x.source]
         for n in np.unique(x.label[free]).tolist():
-            found |= marks.intersection(awaiting, x.steps[n].firings)
+            found |= marks.intersection(x.steps[n].firings)
         for n in np.unique(x.label[free & ~can[x.target]]).tolist():
             cause = x.steps[n].stimulus
             came = cause.event if isinstance(cause, EventOccurred) else None
             fired = x.steps[n].firings
             found |= {name for name in awaiting if name in fired or came in awaiting[name]}
-        return frozenset(found)
+        # After these the task gives up unless another event comes in time.
+        events = x.firing(awaiting)
+        quiet = x.of_edges(~x.fails & ~events)
+        doomed = quiet.backward(x.given_up) & ~quiet.backward(good)
+        into = free & events & ~x.fails & ~doomed[x.source] & doomed[x.target]
+        fired = (set(x.steps[n].firings) for n in np.unique(x.label[into]).tolist())
+        maybe = set[str]().union(*fired) & set(awaiting)
+        # Those that `final` needs anyhow are no stops.
+        spared = x.of_edges(~x.firing(maybe)).backward(good)[x.source]
+        return frozenset(found | {t for t in maybe if (into & spared & x.firing([t])).any()})
+
+    def _marks(self, awaiting: Iterable[str]) -> set[str]:
+        """Return those of the transitions that only fill places which nothing else empties and
+        `final` does not name, and that `final_error` looks at."""
+        known = self.x.engine.compiled
+        ends, places = known.task.final_error, known.net.place_index
+        wanted = {places[n] for n in (ends.names if ends else ()) if n in places}
+        final = {p for name, p in places.items() if name in known.task.final.names}
+        given = {t.name: {p for p, *_ in t.produce} for t in known.transitions}
+        taken = {t.name: {p for p, _ in known.net.consume[t.index]} for t in known.transitions}
+        marks = {name for name in awaiting if given[name]}
+        while True:
+            used = final.union(*(taken[name] for name in taken if name not in marks))
+            kept = {name for name in marks if not given[name] & used}
+            if kept == marks:
+                return {name for name in marks if (given[name] | taken[name]) & wanted}
+            marks = kept
 
     @cached_property
     def quasi_live(self) -> PropertyVerdict:
@@ -442,7 +465,7 @@ class Progress:
                 if t.when.holds(base | dict(zip(names, chosen, strict=True))):
                     return ""
         only = (
-            f"{name} is only ever {' or '.join(map(repr, seen))}"
+            f"{name} is only ever {' or '.join(map(as_literal, seen))}"
             for name, seen in zip(names, values, strict=True)
         )
         return f"its condition ({t.when}) is never true: {' and '.join(only)}"

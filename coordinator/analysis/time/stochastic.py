@@ -68,7 +68,7 @@ from petrobot.coordinator.task.compiled_task import (
     compile_transitions,
 )
 from petrobot.coordinator.task.conditions import Compare, Expression, Literal, Name, Not, walk
-from petrobot.coordinator.task.conditions.language import Scalar, with_values
+from petrobot.coordinator.task.conditions.language import Scalar, as_literal, with_values
 from petrobot.coordinator.task.conditions.regions import can_hold, region_values
 from petrobot.coordinator.task.net import Marking, Net
 from petrobot.coordinator.task.validation import condition_domains, is_pulse
@@ -595,7 +595,9 @@ class _Derivation:
         while more := {m for n in needed for e in written[n] for m in e.names} - needed:
             needed |= more
         for name in sorted(needed):
-            self.values[name] = {v: f"{name} = {v!r}" for v in sorted(values[name], key=repr)}
+            self.values[name] = {
+                v: f"{name} = {as_literal(v)}" for v in sorted(values[name], key=repr)
+            }
             self.places |= {label: int(v == first[name]) for v, label in self.values[name].items()}
 
     def _raises(self, name: str) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from petrobot.coordinator.task import Kind, Place, Task
+from petrobot.coordinator.task.conditions.language import as_literal
 from petrobot.coordinator.task.wording import Severity
 
 NEVER_MARKED = "never-marked"
@@ -115,4 +116,4 @@ def _in_subnet(task: Task, uses: Mapping[str, str], finding: Finding) -> Finding
 
 
 def _example(witness: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} = {value!r}" for name, value in sorted(witness.items()))
+    return ", ".join(f"{name} = {as_literal(value)}" for name, value in sorted(witness.items()))

@@ -139,6 +139,11 @@ def parse(text: str) -> Expression:
     return Expression(text, _Parser(text).whole())
 
 
+def as_literal(value: object) -> str:
+    """Return a value as a condition writes it: `true` and not `True`."""
+    return next((word for word, known in _WORDS.items() if known is value), repr(value))
+
+
 def rename(expression: Expression, names: Mapping[str, str]) -> Expression:
     """The same condition with other names in place of those in the mapping."""
     text, end = "", 0

@@ -27,6 +27,7 @@ from petrobot.coordinator.task.conditions.language import (
     Node,
     Not,
     Or,
+    as_literal,
     is_number,
     walk,
     with_values,
@@ -239,7 +240,7 @@ def _compare_kinds(node: Compare, domains: Mapping[str, Domain], faults: list[st
             possible = domains[side.name].values
             if possible and other.value not in possible:
                 faults.append(
-                    f"{side.name!r} is never {other.value!r} at column "
+                    f"{side.name!r} is never {as_literal(other.value)} at column "
                     f"{other.at + 1}{nearest(other.value, possible)}"
                 )
 
