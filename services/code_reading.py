@@ -26,7 +26,8 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from petrobot.services import action as actions
-from petrobot.services.comm.location_file import resolve
+from petrobot.services.comm.location_file import MEMORY_CALLS, resolve
+from petrobot.services.comm.location_file.code import SLOW
 from petrobot.services.device import (
     LIMITS,
     Driver,
@@ -63,8 +64,6 @@ INTERFACE = {
 """Methods that a node calls, with their parameters."""
 ANSWERS = ("state", "stopped", "hold", "picture")
 """Methods whose answer a node needs."""
-SLOW = 1.0
-"""Seconds between two steps of a driver above which its unit is probably mistaken."""
 _KINDS = {bool: "bool", int: "int", float: "float", str: "str", list: "list", dict: "dict"}
 
 
@@ -78,8 +77,8 @@ class _Seen:
     """What is probably a fault, in the same form."""
     causes: set[str] = field(default_factory=set)
     """Causes: first arguments of `error`."""
-    values: set[str] = field(default_factory=set)
-    """Names of values of results."""
+    values: dict[str, dict[str, tuple[str, int]]] = field(default_factory=dict)
+    """Names of values of results; by type, as far as it is known, file and line."""
     complete: bool = True
     """Whether the code contains all causes and values as literals."""
     words: set[str] = field(default_factory=set)
@@ -88,6 +87,15 @@ class _Seen:
     events: dict[str, tuple[str, int]] = field(default_factory=dict)
     any_event: bool = False
     """Whether it raises events whose names are not literals."""
+    calls: dict[str, tuple[str, int]] = field(default_factory=dict)
+    """Services that it calls through its context, with file and line."""
+    gets: dict[str, tuple[str, int]] = field(default_factory=dict)
+    """Variables of the global memory that it reads and for which it gives no default."""
+    puts: set[str] = field(default_factory=set)
+    any_put: bool = False
+    """Whether it may write others, too."""
+    lasts: list[tuple[float, str, int, str]] = field(default_factory=list)
+    """Constant times (s) for which it sleeps or waits, with file, line and text of the call."""
     memory: tuple[str, int] | None = None
     """Where it uses the global memory first."""
     device: tuple[str, int, str] | None = None
@@ -158,17 +166,38 @@ class _Code:
         return found
 
     @cached_property
+    def own(self) -> set[str]:
+        """Names that it binds itself, so that they are not the global ones."""
+        stored = {
+            n.id for n in self.nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)
+        }
+        return stored | {n.arg for n in self.nodes if isinstance(n, ast.arg)}
+
+    @cached_property
     def branched(self) -> set[ast.AST]:
         """What is in a branch, so that it may never be executed."""
-        return {inner for node in self.nodes if isinstance(node, ast.If | ast.Try | ast.Match)
-                for inner in ast.walk(node)}  # fmt: skip
+        found = {inner for node in self.nodes if isinstance(node, ast.If | ast.Try | ast.Match)
+                 for inner in ast.walk(node)}  # fmt: skip
+        return found - self.tested
+
+    @cached_property
+    def tested(self) -> set[ast.AST]:
+        """What is executed for the question of a branch that is in no branch itself; without
+        `and` and `or`, and without what may only be compared with None."""
+        found: set[ast.AST] = set()
+        for branch in getattr(self.tree, "body", ()):
+            inner = [*ast.walk(branch.test)] if isinstance(branch, ast.If) else []
+            if not any(isinstance(node, ast.BoolOp | ast.IfExp) for node in inner):
+                found |= {node.value for node in inner if isinstance(node, ast.Attribute)}
+                found |= {node.func for node in inner if isinstance(node, ast.Call)}
+        return found
 
     def value(self, node: ast.AST) -> Any:
         """Return the object of a dotted name or a constant; None if it is not known."""
         if isinstance(node, ast.Constant):
             return node.value
         if isinstance(node, ast.Name):
-            return self.names.get(node.id)
+            return None if node.id in self.own else self.names.get(node.id)
         if isinstance(node, ast.Attribute):
             return getattr(self.value(node.value), node.attr, None)
         return None
@@ -257,6 +286,7 @@ def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
         if not isinstance(node, ast.Call):
             continue
         made = code.value(node.func)
+        _writes(code, node, made, seen)
         if made in MADE:
             _result(code, node, made, seen)
         elif made is actions.Result:
@@ -333,8 +363,11 @@ def _method(code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen) -
             seen.complete = False
         if name in AWAITED and not ports and node not in code.awaited:
             _unawaited(code, node, seen)
-        if name in REMEMBERS and not ports and seen.memory is None:
-            seen.memory = (code.file, node.lineno)
+        if name in REMEMBERS and not ports:
+            seen.memory = seen.memory or (code.file, node.lineno)
+            _remembers(code, node, name, first, seen)
+        if name in ("sleep", "wait") and not ports:
+            _lasts(code, node, name, seen)
         if name == "raise_event" and not isinstance(first, str):
             seen.any_event = True
         if isinstance(first, str):
@@ -342,6 +375,40 @@ def _method(code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen) -
                 seen.streams.setdefault(first, (code.file, node.lineno))
             elif name == "raise_event":
                 seen.events.setdefault(first, (code.file, node.lineno))
+            elif name == "call" and not ports:
+                seen.calls.setdefault(first, (code.file, node.lineno))
+
+
+def _remembers(code: _Code, node: ast.Call, name: str, first: Any, seen: _Seen) -> None:
+    """Record a variable of the global memory that a call reads without a default."""
+    if name == "get" and isinstance(first, str) and len(node.args) == 1 and not node.keywords:
+        seen.gets.setdefault(first, (code.file, node.lineno))
+
+
+def _writes(code: _Code, node: ast.Call, made: Any, seen: _Seen) -> None:
+    """Record what a call may write into the global memory: also through another object than the
+    context, and code that receives the context and is not read."""
+    if isinstance(node.func, ast.Attribute) and node.func.attr in ("put", "compare_and_set"):
+        name = code.value(node.args[0]) if node.args else None
+        seen.any_put |= not isinstance(name, str)
+        seen.puts |= {name} if isinstance(name, str) else set()
+    elif isinstance(node.func, ast.Attribute) and node.func.attr == "call":
+        seen.any_put |= (code.value(node.args[0]) if node.args else None) in (None, *MEMORY_CALLS)
+    given = [*node.args, *(keyword.value for keyword in node.keywords)]
+    if any(ast.unparse(one).rpartition(".")[2] in CONTEXT for one in given):
+        own = str(code.names.get("__name__")).partition(".")[0]
+        seen.any_put |= str(getattr(made, "__module__", "")).partition(".")[0] != own
+
+
+def _lasts(code: _Code, node: ast.Call, name: str, seen: _Seen) -> None:
+    """Record for how long (s) a call sleeps or waits, if that is a constant."""
+    at, key = (0, "seconds") if name == "sleep" else (1, "timeout")
+    given = [*node.args[at : at + 1], *(k.value for k in node.keywords if k.arg == key)]
+    seconds = code.value(given[0]) if given else None
+    if isinstance(code.tree, ast.ClassDef):
+        return  # each method may be used by another action
+    if isinstance(seconds, int | float) and not isinstance(seconds, bool):
+        seen.lasts.append((float(seconds), code.file, node.lineno, ast.unparse(node.func)))
 
 
 def _result(code: _Code, node: ast.Call, made: Callable[..., Any], seen: _Seen) -> None:
@@ -350,7 +417,9 @@ def _result(code: _Code, node: ast.Call, made: Callable[..., Any], seen: _Seen) 
         if keyword.arg is None:
             seen.complete = False
         elif keyword.arg not in ("cause", "text") or made is actions.success:
-            seen.values.add(keyword.arg)
+            kinds = seen.values.setdefault(keyword.arg, {})
+            if kind := _kind(code, keyword.value):
+                kinds.setdefault(kind, (code.file, keyword.value.lineno))
     if made is not actions.error:
         return
     given = [*node.args[:1], *(k.value for k in node.keywords if k.arg == "cause")]
@@ -360,6 +429,22 @@ def _result(code: _Code, node: ast.Call, made: Callable[..., Any], seen: _Seen) 
             seen.causes.add(str(cause))
         else:
             seen.complete = False
+
+
+def _kind(code: _Code, node: ast.expr) -> str:
+    """Return the type of an expression's value; empty if its form does not show it."""
+    match node:
+        case ast.Constant():
+            return _KINDS.get(type(node.value), "")
+        case ast.JoinedStr():
+            return "str"
+        case ast.List() | ast.ListComp():
+            return "list"
+        case ast.Dict() | ast.DictComp():
+            return "dict"
+        case ast.Call(func=ast.Name(id=name)) if name not in code.own and name not in code.names:
+            return name if name in _KINDS.values() else ""
+    return ""
 
 
 def _branches(node: ast.expr) -> Iterator[ast.expr]:
@@ -388,10 +473,11 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
     seen = _Seen()
     is_async = inspect.iscoroutinefunction(thing)
     if inspect.isfunction(inspect.unwrap(thing)):
+        seen.any_put = inspect.unwrap(thing) is not thing or _code(thing) is None
         for code in _reachable(inspect.unwrap(thing)):
             _look(code, seen, is_async)
     else:
-        seen.complete = False
+        seen.complete, seen.any_put = False, True
     first = parameters[0] if parameters else None
     if first is None or first.kind is first.KEYWORD_ONLY or hints.get(first.name) in _KINDS:
         source = inspect.unwrap(thing).__code__
@@ -461,6 +547,10 @@ def _fault_of_method(name: str, method: Callable[..., Any], code: _Code) -> str:
     )
     if name in ANSWERS and not answers and not any(isinstance(n, ast.Raise) for n in code.nodes):
         return "returns nothing; write `return` before its answer"
+    returned = [node.value for node in code.nodes if isinstance(node, ast.Return)]
+    parts = [part for value in returned if isinstance(value, ast.Dict) for part in value.values]
+    if name == "state" and any(isinstance(part, ast.Set | ast.SetComp) for part in parts):
+        return "contains a set, which is not plain data; write a list"
     return ""
 
 
@@ -540,12 +630,17 @@ def _plain(seen: _Seen) -> dict[str, Any]:
         "faults": sorted(set(seen.faults)),
         "doubtful": sorted(set(seen.doubtful)),
         "causes": sorted(seen.causes),
-        "values": sorted(seen.values),
+        "values": seen.values,
         "complete": seen.complete,
         "words": sorted(w for w in seen.words if len(w) <= 100 and w.isidentifier()),
         "streams": seen.streams,
         "events": seen.events,
         "any_event": seen.any_event,
+        "calls": seen.calls,
+        "gets": seen.gets,
+        "puts": sorted(seen.puts),
+        "any_put": seen.any_put,
+        "lasts": seen.lasts,
         "memory": seen.memory,
         "device": seen.device,
     }

@@ -151,18 +151,26 @@ class Key:
         elif self.default is not _Required:
             self.kind = type(self.default)
 
-    def read(self, config: Mapping[str, Any]) -> Any:
-        """Return the key's value in a table. Raises ValueError."""
+    def fault(self, config: Mapping[str, Any]) -> str:
+        """Return what is wrong with the key's value in a table, or with its default; empty if
+        nothing is."""
+        if self.default not in (_Required, None) and not self._fits(self.default):
+            text = f"expected {self._expected()}, found the default {self.default!r:.60}"
+            return f"{text} of its `key`; correct it or the annotation in the driver"
         if self.name not in config:
-            if self.default is _Required:
-                raise ValueError(f"{self.name}: is missing; expected {self._expected()}")
-            return copy(self.default)
+            return f"is missing; give {self._expected()}" if self.default is _Required else ""
         value = config[self.name]
+        return "" if self._fits(value) else f"expected {self._expected()}, found {value!r:.60}"
+
+    def read(self, config: Mapping[str, Any]) -> Any:
+        """Return the key's value in a table that has no fault."""
+        value = config.get(self.name, self.default)
+        return float(value) if self.kind is float and value is not None else copy(value)
+
+    def _fits(self, value: Any) -> bool:
         number = isinstance(value, int | float) and not isinstance(value, bool)
         fits = number if self.kind is float else isinstance(value, self.kind)
-        if not fits or (self.kind is int and not number) or value != value:
-            raise ValueError(f"{self.name}: expected {self._expected()}, found {value!r:.60}")
-        return float(value) if self.kind is float else value
+        return fits and (value == value if number else self.kind is not int)
 
     def _expected(self) -> str:
         words = {
@@ -317,7 +325,7 @@ def read_keys(driver: type, config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of the keys that a driver's class declares. Raises ValueError with every
     key that is missing, unknown or of another type."""
     if faults := _faults_of_keys(driver, config):
-        raise ValueError("; ".join(text for _, text in faults))
+        raise ValueError("; ".join(f"{name}: {text}" for name, text in faults))
     return {name: declared.read(config) for name, declared in keys_of(driver).items()}
 
 
@@ -417,19 +425,17 @@ def _faults_of_keys(driver: type, config: Mapping[str, Any]) -> list[tuple[str, 
             text = f"{driver.__name__} declares the key {name!r}, which has another meaning here"
             faults.append((name, f"{text}; rename it in the driver, such as own_{name}"))
             continue
-        try:
-            declared.read(config)
-        except ValueError as fault:
-            faults.append((name, str(fault)))
+        if fault := declared.fault(config):
+            faults.append((name, fault))
     for name in config:
         if name in own or name in COMMON_KEYS:
             continue
-        text = f"unknown key {name!r}"
+        text = "unknown key"
         if hasattr(driver, name) and name not in RESERVED:
             default = f"{getattr(driver, name)!r:.40}"
             text = f"{driver.__name__} does not read it; write {name} = key({default}) in the class"
         else:
-            text += nearest(name, [*own, *COMMON_KEYS])
+            text += nearest(name, [*own, *COMMON_KEYS]) or nearest(name, own) or "; drop it"
         faults.append((name, text))
     return faults
 

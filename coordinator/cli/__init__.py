@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 from petrobot.services.host.emergency_latch import uptime
 
@@ -201,10 +202,17 @@ def _overview(arguments: Sequence[str]) -> int:
     return 2
 
 
+class _Parser(argparse.ArgumentParser):
+    """Tells a wrong option in one line: the usage of a command has up to 20."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; {self.prog} --help shows its options\n")
+
+
 def _dispatch(command: Subcommand, arguments: Sequence[str], ordered: float) -> int:
     module = importlib.import_module(f"petrobot.coordinator.cli.{command.module or command.name}")
     codes = SHORT_EXIT_CODES if command.name in PLAIN else EXIT_CODES
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog=f"petrobot {command.name}",
         description=module.__doc__,
         epilog=f"example:\n  {module.EXAMPLE}\n\n{codes}",

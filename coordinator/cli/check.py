@@ -111,10 +111,11 @@ def _with_code(task: Task, directory: Directory, judged: MayRun) -> CheckReport:
     """Add findings about the code that the location file names. Raises CommandError for errors in
     that file."""
     from petrobot.coordinator.task.check import CheckReport, Finding, Severity, in_file
-    from petrobot.coordinator.task.check.code import code_findings
+    from petrobot.coordinator.task.check.code import code_findings, given_findings
     from petrobot.coordinator.task.check.completeness import EXTERNAL_WAIT, external_waits
+    from petrobot.coordinator.task.file.errors import key_lines, line_of
     from petrobot.services.comm.location_file import read_text
-    from petrobot.services.comm.location_file.code import code_faults, read_code
+    from petrobot.services.comm.location_file.code import SLOW, code_faults, read_code
 
     code = read_code(directory)
     if faults := code_faults(directory, code, read_text(directory.source)):
@@ -128,9 +129,19 @@ def _with_code(task: Task, directory: Directory, judged: MayRun) -> CheckReport:
     args = {action.name: action.args for action in actions}
     drivers = {device.name: code.get(device.driver, {}) for device in directory.devices.values()}
     raised, complete = _raised(task, directory, code)
-    found = list(
-        code_findings(task, by_action, args, directory.services, [*drivers.values()], raised)
-    )
+    services = _services(directory, code)
+    found = list(code_findings(task, by_action, args, services, [*drivers.values()], raised))
+    lines = key_lines(read_text(directory.source))
+
+    def where(key: str) -> str:
+        return f"{directory.source}:{line_of(key, lines)}: {key}"
+
+    found += given_findings(by_action, args, where)
+    for stream in directory.streams.values():
+        if stream.period > SLOW:
+            text = f"{stream.period:g} s between two set points; 0.05 would be 50 ms"
+            key = where(f"streams.{stream.name}.period")
+            found.append(Finding(Severity.WARNING, "code", key, text))
     if refused := [name for name, facts in drivers.items() if facts.get("dry_run") is False]:
         text = f"--dry-run is refused: the drivers of {listed(refused)} do not obey it"
         remedy = 'obey `self.dry_run` there, and add "dry_run" to `obeys`'
@@ -144,6 +155,18 @@ def _with_code(task: Task, directory: Directory, judged: MayRun) -> CheckReport:
         may_stay = frozenset[str]() if progress is None else progress.may_stay
         warnings += external_waits(task.flat, raised, source, may_stay)
     return CheckReport(in_file(task, (*errors, *known, *warnings)))
+
+
+def _services(
+    directory: Directory, code: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Mapping[str, Any]]:
+    """Return what is known of the services that are not actions. Those without code of their own
+    write nothing into the global memory by themselves."""
+    from petrobot.services.comm.location_file import MEMORY, MEMORY_CALLS
+
+    none: Mapping[str, Any] = {"any_put": False, "puts": ()}
+    found = {n: code.get(s.run, {}) if s.run else none for n, s in directory.services.items()}
+    return found | (dict.fromkeys(MEMORY_CALLS, none) if MEMORY in found else {})
 
 
 def _raised(

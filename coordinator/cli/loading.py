@@ -91,8 +91,12 @@ def estimates_path(given: Path) -> Path:
     """Return an estimates file, given by its path or by the campaign's folder that holds it. Raises
     CommandError."""
     from petrobot.coordinator.studies.campaign.observed import ESTIMATES
+    from petrobot.coordinator.studies.campaign.plan import MANIFEST
 
     if given.is_dir():
+        if (given / MANIFEST).is_file() and not (given / ESTIMATES).is_file():
+            text = f"{given}: this campaign is not finished; the same `petrobot campaign` command"
+            raise CommandError(2, f"{text} continues it")
         if not (given / ESTIMATES).is_file():
             text = f"{given}: this folder holds no {ESTIMATES}; give an estimates file, or a folder"
             raise CommandError(2, f"{text} that `petrobot campaign --out` made")
@@ -106,7 +110,7 @@ def task_path(name: str) -> Path:
     """Return the file of a task, given by its path or by its name. A name is looked up in the
     folder `tasks` here, then among the shipped tasks."""
     path = Path(name)
-    if path.suffix == ".toml" or path.is_file():
+    if path.suffix == ".toml" or (path.is_file() and path.suffix != ".py"):
         from petrobot.coordinator.run.folder import still_there
 
         return still_there(path)
@@ -122,6 +126,8 @@ def task_path(name: str) -> Path:
         text = f"did you mean {name}.toml?"
     elif path.is_dir():
         text = "this is a folder; name the .toml file of the task"
+    elif path.is_file():
+        text = "this is a module; name the .toml file of the task"
     raise CommandError(2, f"no task {name!r}: {text}")
 
 

@@ -28,7 +28,7 @@ REFRESH = 0.1
 LONGEST_TABLE = 24
 WIDEST_TABLE = 9
 """Most columns of a table in the terminal; --json and the report show wider ones."""
-LAST_ERRORS = "last_errors"
+LAST_ERRORS, LAST_FAILURE = "last_errors", "last_failure"
 """Key of the actions that ended in ERROR in a result (`Mission.result`). They are printed as lines,
 not as a table."""
 
@@ -96,11 +96,14 @@ def print_result(result: Mapping[str, Any]) -> None:
         elif key == LAST_ERRORS:
             for row in value:
                 plain.add_row(Text("error", style="dim"), Text(_error(row), style=COLOURS["error"]))
+        elif key == LAST_FAILURE:
+            told = Text(_error(value), style=COLOURS["failure"])
+            plain.add_row(Text("failure", style="dim"), told)
     console.print(plain)
 
 
 def _error(row: Mapping[str, Any]) -> str:
-    """Describe one action that ended in ERROR in one line."""
+    """Describe one action that ended in ERROR or FAILURE in one line."""
     place = f" on {row['node']}" if row["node"] else ""
     why = ": ".join(filter(None, (row["cause"], row["text"])))
     return (

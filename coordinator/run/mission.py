@@ -147,6 +147,8 @@ class MissionTally:
     """Runs that ended in ERROR, by primitive task and cause."""
     examples: dict[str, RunRecorded] = field(default_factory=dict)
     """By the same key the last of them, in the order of their ends."""
+    failure: RunRecorded | None = None
+    """The last run that ended in FAILURE."""
     missing: int = 0
     """Values that a result lacked."""
     first_missing: str = ""
@@ -198,14 +200,7 @@ class MissionTally:
         """Return for each primitive task and cause the last run that ended so, in order: which
         action, on which node, and why."""
         return [
-            {
-                "run": record.run,
-                "primitive_task": record.primitive_task,
-                "action": record.action,
-                "node": _node_of(record.action, directory),
-                "cause": record.cause,
-                "text": record.text,
-            }
+            _row(record, directory)
             for key, record in self.examples.items()
             if self.failed[key] > 0  # a verdict may have taken the last error of a cause away
         ]
@@ -231,6 +226,8 @@ class MissionTally:
             if count > 0:
                 self.examples.pop(key, None)  # a later one goes to the end
                 self.examples[key] = record
+        elif record.status is Status.FAILURE and not record.cancelled:
+            self.failure = record
 
     def _correct(self, corrected: Corrected) -> None:
         run, said = corrected.run, (corrected.status, corrected.cause, corrected.text)
@@ -254,6 +251,18 @@ class MissionTally:
             self.cycles[-1].ended = now
         _forget_oldest(self.cycles)
         self.cycles.append(Cycle(self.begun + 1, now))
+
+
+def _row(record: RunRecorded, directory: Directory) -> dict[str, Any]:
+    """Return which action a run was, on which node, and why it ended so."""
+    return {
+        "run": record.run,
+        "primitive_task": record.primitive_task,
+        "action": record.action,
+        "node": _node_of(record.action, directory),
+        "cause": record.cause,
+        "text": record.text,
+    }
 
 
 def _node_of(action: str, directory: Directory) -> str:
@@ -361,10 +370,11 @@ class Mission:
     def result(self, mode: str, wall_s: float) -> dict[str, Any]:
         """Return the result as the command line writes it; the keys of the score stand beside the
         general ones. `last_errors` says why actions ended in ERROR, also those that the task
-        recovered from."""
+        recovered from. `last_failure` is there if the task ended in ERROR and no action did."""
         finished = self.executor.finished
         failed = finished is None or finished.status is Status.ERROR
         errors = self.tally.last_errors(self.executor.directory)
+        failure = self.tally.failure if failed and not errors else None
         has_goal, met = bool(self.tally.goal_transitions), self.tally.goals
         wanted = self.runs + self.tally.added
         recovered = not failed and (not has_goal or met >= wanted)
@@ -379,6 +389,7 @@ class Mission:
             **({"goals": f"{met} of {wanted}"} if has_goal else {}),
             "happened": self.tally.happened(recovered),
             **({"last_errors": errors} if errors else {}),
+            **({"last_failure": _row(failure, self.executor.directory)} if failure else {}),
             **self.remarks,
         }
         durations = {

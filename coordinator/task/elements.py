@@ -312,6 +312,12 @@ class VariableType(StrEnum):
         }
         return isinstance(value, kinds.get(self, ()))
 
+    def holds(self, other: VariableType) -> bool:
+        """Whether every value of the other type is of this one."""
+        return self in (other, VariableType.ANY) or (
+            self is VariableType.FLOAT and other is VariableType.INT
+        )
+
     @classmethod
     def of(cls, value: Value) -> VariableType:
         """Return the narrowest type that admits the value."""
@@ -336,9 +342,9 @@ class Variable:
     def refused(self, value: Value) -> str:
         """Return in words why the variable cannot have this value; empty if it can."""
         if not self.type.admits(value):
-            return f"no {self.type}"
+            return f"expected {self.type}"
         listed = value is None or not self.values or value in self.values
-        return "" if listed else f"none of {', '.join(self.values)}"
+        return "" if listed else f"expected one of {', '.join(self.values)}"
 
 
 class Parameter(StrEnum):

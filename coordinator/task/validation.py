@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from math import inf, isfinite, prod
 
 from petrobot.coordinator.task.conditions import Expression, Literal, Name
@@ -37,7 +37,7 @@ from petrobot.coordinator.task.elements import (
 from petrobot.coordinator.task.expansion import CircleError
 from petrobot.coordinator.task.macros import macro_faults
 from petrobot.coordinator.task.model import Task
-from petrobot.coordinator.task.wording import Fault, listed, nearest
+from petrobot.coordinator.task.wording import Fault, few, listed, nearest
 
 _IDENTIFIER = re.compile(r"[^\W\d]\w*\Z")
 _RESERVED = frozenset({"and", "or", "not", "true", "false", "none"})
@@ -223,6 +223,10 @@ class _Names:
         self.outer = set() if subnet is None else set(task.places)
         """Places of the task itself: resources that a place of a subnet may hold."""
         self.written = {*task.variables, *(n for n, k in kinds if k is Parameter.VARIABLE)}
+        self.types = {n: VariableType.of(value) for n, value in task.parameters.items()}
+        self.types |= {name: variable.type for name, variable in task.variables.items()}
+        self.types |= {n: VariableType(k) for n, k in kinds if k in {*VariableType}}
+        """Types of what may be read, where they are known."""
         self.read = {*self.written, *task.parameters, *parameters} - self.places
 
 
@@ -356,13 +360,22 @@ def _argument_of_macro(
     names: _Names, key: str, kind: Parameter, value: Value, known: set[str]
 ) -> Iterator[Fault]:
     if kind in (Parameter.PLACE, Parameter.VARIABLE):
-        if value not in known:
+        found = value.variable if isinstance(value, Reference) else value
+        if isinstance(value, Reference):
+            remedy = f"write the name of a {kind} as a text{nearest(found, known)}"
+            remedy = f'write "{found}"' if found in known else remedy
+            yield Fault(key, f"expected a {kind}, found the value of {found!r}", remedy)
+        elif value not in known:
             remedy = f"name one{nearest(str(value), known)}"
             yield Fault(key, f"{value!r} is not a {kind}", remedy)
     elif isinstance(value, Reference):
         if value.variable not in names.read:
             remedy = f"declare it in [variables]{nearest(value.variable, names.read)}"
             yield Fault(key, f"{value.variable!r} is not a variable or parameter", remedy)
+        given = names.types.get(value.variable, VariableType.ANY)
+        if given is not VariableType.ANY and not VariableType(kind).holds(given):
+            text = f"{value.variable} is {given}, and the parameter is {kind}"
+            yield Fault(key, text, "change one of the types")
     elif not is_plain(value) or value is None or not VariableType(kind.value).admits(value):
         yield Fault(key, f"{value!r} is not of type {kind}", "change the value or the type")
 
@@ -577,9 +590,12 @@ def _whole(task: Task) -> Iterator[Fault]:
         return
     yield from _macro_exits(task)
     domains = condition_domains(flat)
+    places = {
+        name for net in (task.places, *(s.places for s in task.subnets.values())) for name in net
+    }
     for t in flat.transitions.values():
         if t.when is not None and not t.expanded_from:
-            yield from _expression(f"{_written_key(task, t)}.when", t.when, domains)
+            yield from _expression(f"{_written_key(task, t)}.when", t.when, domains, places)
         for name, expression in t.sets:
             yield from _value(f"{_written_key(task, t)}.set.{name}", name, expression, domains)
     if flat is not task:
@@ -621,9 +637,18 @@ def _macro_exits(task: Task) -> Iterator[Fault]:
                     )
 
 
-def _expression(key: str, expression: Expression, domains: Mapping[str, Domain]) -> Iterator[Fault]:
+def _expression(
+    key: str,
+    expression: Expression,
+    domains: Mapping[str, Domain],
+    places: Collection[str] = (),
+) -> Iterator[Fault]:
+    unknown = sorted(expression.names - domains.keys())
+    remedy = f"it may read {few(sorted(domains)) or 'variables and parameters'}" if unknown else ""
+    if tokens := [name for name in unknown if name in places]:
+        remedy = f'tokens are tested by arcs: in = ["{tokens[0]}"], or "!{tokens[0]}": it is empty'
     for text in kind_faults(expression, domains):
-        yield Fault(key, f"in {expression.text!r}, {text}", "")
+        yield Fault(key, f"in {expression.text!r}, {text}", remedy)
 
 
 def _value(
@@ -631,11 +656,8 @@ def _value(
 ) -> Iterator[Fault]:
     """A new value that its variable cannot hold."""
     into, tree = domains[name], expression.tree
-    kinds = set(VariableType) if into.kind == VariableType.ANY else {into.kind}
-    if into.kind == VariableType.FLOAT:
-        kinds.add(VariableType.INT)
     if isinstance(tree, Name):
-        if domains[tree.name].kind not in kinds:
+        if not VariableType(into.kind).holds(VariableType(domains[tree.name].kind)):
             text = f"{tree.name} is {domains[tree.name].kind}, {name} is {into.kind}"
             yield Fault(key, text, "change one of the types")
     elif isinstance(tree, Literal):

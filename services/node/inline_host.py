@@ -316,5 +316,5 @@ class InlineHost:
             try:
                 self._driver.stop(now)
                 self._driver.close()
-            except Exception:
-                _log.exception("a driver failed while it was being closed")
+            except Exception as fault:
+                log_fault(_log, fault, "a driver failed while it was being closed")

@@ -192,11 +192,17 @@ class RunContext:
         if not callable(given):
             text = "ctx.wait: expected a function, as in `ctx.wait(lambda: ...)`"
             raise TypeError(f"{text}, found {given!r:.60}")
-        return Wait(ready, None if timeout is None else self._clock() + timeout)
+        return Wait(ready, None if timeout is None else self._after("wait", timeout))
 
     def sleep(self, seconds: float) -> Wait:
         """Awaitable: returns after this number of seconds of the cell's clock."""
-        return Wait(never, self._clock() + seconds)
+        return Wait(never, self._after("sleep", seconds))
+
+    def _after(self, call: str, seconds: float) -> float:
+        given: object = seconds
+        if not isinstance(given, int | float) or given != given:
+            raise ValueError(f"ctx.{call}: expected a number of seconds, found {given!r:.60}")
+        return self._clock() + seconds
 
     def publish(self, stream: str, values: Sequence[float]) -> None:
         """Make `values` the newest set point of a stream. It is sent repeatedly until the run ends

@@ -20,7 +20,7 @@ from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import PICTURE, Driver, picture_of, stop_at_once
 from petrobot.services.node.emergency_stops import Guard
 from petrobot.services.node.ports import ProcessPorts
-from petrobot.services.worker.callables import describe
+from petrobot.services.worker.callables import describe, log_fault
 from petrobot.services.worker.pipe import NewestLink, Pipe
 from petrobot.services.worker.remote import (
     BARRED,
@@ -93,8 +93,8 @@ class DeviceLoop:
         finally:
             try:
                 self._driver.close()
-            except Exception:
-                _log.exception("a driver failed while it was being closed")
+            except Exception as fault:
+                log_fault(_log, fault, "a driver failed while it was being closed")
             if self._worker is not None:
                 self._worker.close()
 

@@ -14,6 +14,7 @@ import pytest
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.operator.session import RunSession
+from petrobot.coordinator.studies.campaign.plan import MANIFEST
 
 CHECK = ["check", "arm_bot.toml"]
 TASK, CELL, CODE = "arm_bot.toml", "services.toml", "arm_bot.py"
@@ -185,6 +186,36 @@ IN_THE_TASK: list[Mistake] = [
     ),
     (
         TASK,
+        "start = { ",
+        'start = { when = "axis == 1", ',
+        r":LINE: .*'axis' is unknown at column 1; tokens are tested by arcs: in = \[\"axis\"\], or",
+    ),
+    (
+        TASK,
+        "start = { ",
+        'start = { when = "fast", ',
+        r":LINE: .*'fast' is unknown at column 1; it may read carry.executed, carry.reason, ",
+    ),
+    (
+        TASK,
+        'kind = "action", tries',
+        "kind = action, tries",
+        r":LINE: TOML: action is a text without quotes; write \"action\"",
+    ),
+    (
+        TASK,
+        '["carry:normal"] }',
+        '["carry:normal", nothing] }',
+        r":LINE: TOML: nothing is a text without quotes",
+    ),
+    (
+        TASK,
+        "args = { to = 0.2 }",
+        "args = { speed = 0.2 }",
+        r":LINE: .*'move' has no argument 'speed'; it has: to",
+    ),
+    (
+        TASK,
         '{ in = ["carry:normal"] }',
         '{ in = ["carry:error"] }',
         r":26: places.carry: no outgoing arc `normal`",
@@ -224,13 +255,32 @@ IN_THE_CELL: list[Mistake] = [
         CELL,
         "speed = 0.5",
         'speed = "fast"',
-        r":LINE: devices.axis.top_speed: .*a number \(m/s\), found 'fast'",
+        r":LINE: devices.axis.top_speed: expected a number \(m/s\), found 'fast'",
     ),
     (
         CELL,
         "speed = 0.5",
         "sped = 0.5",
-        r":LINE: devices.axis.top_sped: unknown key 'top_sped'; did you mean 'top_speed'",
+        r":LINE: devices.axis.top_sped: unknown key; did you mean 'top_speed'",
+    ),
+    (CELL, "top_speed = 0.5", "limit = 1", r"axis.limit: unknown key; known: top_speed, length"),
+    (
+        CELL,
+        "[actions]",
+        '[streams.speed]\nto = "axis"\nperiod = 100\n[actions]',
+        r":11: streams.speed.period: 100 s between two set points; 0.05 would be 50 ms",
+    ),
+    (
+        CELL,
+        'run = "arm_bot:grip"',
+        'run = "arm_bot:grip", args = { slips = "three" }',
+        r"services.toml:LINE: actions.grip.args.slips: .* expects slips: float, found 'three'",
+    ),
+    (
+        CELL,
+        'run = "arm_bot:grip"',
+        'run = "arm_bot:grip", args = { force = 1 }',
+        r":LINE: actions.grip.args: grip has no argument 'force'; known: slips",
     ),
     (
         CELL,
@@ -408,7 +458,7 @@ IN_THE_CODE: list[Mistake] = [
     (
         CODE,
         "await ctx.sleep(0.3)",
-        "await ctx.call('lamp', 1.0)",
+        "await ctx.call('grip', 1.0)",
         r"arm_bot.py:\d+: the result of `ctx.call` is dropped[^|]*`ctx.put`",
     ),
     (
@@ -468,6 +518,32 @@ IN_THE_CODE: list[Mistake] = [
         "raise SystemExit(3)\n\n\nclass Axis",
         r":LINE: .*importing it ended the process|SystemExit",
     ),
+    (CODE, "class Axis", "import nothere\n\n\nclass Axis", r"imports 'nothere' \(arm_bot.py:9\)"),
+    (CODE, "class Axis", "1 / 0\n\n\nclass Axis", r"ZeroDivisionError: .* \(arm_bot.py:9\); corr"),
+    (
+        CODE,
+        'key(1.0, "m, from',
+        'key("one", "m, from',
+        r":7: devices.axis.length: expected a number .*, found the default 'one' of its `key`",
+    ),
+    (
+        CODE,
+        "await ctx.sleep(0.3)",
+        'lamp = await ctx.call("lamp", 1.0)',
+        r"arm_bot.py:\d+: there is no service 'lamp'.*declare \[services.lamp\]",
+    ),
+    (
+        CODE,
+        "await ctx.sleep(0.3)",
+        "await ctx.sleep(30)",
+        r"arm_bot.py:\d+: `ctx.sleep` lasts 30 s, longer than the deadline of grip \(2 s\)",
+    ),
+    (
+        CODE,
+        '{"at": self.at,',
+        '{"at": {self.at},',
+        r"`state` of Axis contains a set, which is not plain data; write a list",
+    ),
     (
         CODE,
         "class Axis",
@@ -475,6 +551,10 @@ IN_THE_CODE: list[Mistake] = [
         r":LINE: .*ended the process \(exit code 3\)",
     ),
 ]
+
+READY = '[services.ready]\nnode = "pc"\nrun = "arm_bot:ready"\n\n'
+ALONE = "def ready(ctx: Context, *, seed: int) -> Result:\n    return success()\n\n\n"
+COMMANDED = '    await ctx.command({"to": to})\n'
 
 BOTH: list[tuple[list[Mistake], str]] = [
     (
@@ -491,7 +571,71 @@ BOTH: list[tuple[list[Mistake], str]] = [
         ],
         r":LINE: task.prepare: there is no service 'ready'.*declare \[services.ready\]",
     ),
+    (
+        [
+            (TASK, "[errors]", 'prepare = "ready"\n\n[errors]', ""),
+            (CELL, "[actions]", f"{READY}[actions]", ""),
+            (CODE, "async def move", f"{ALONE}async def move", ""),
+        ],
+        r":LINE: task.prepare: 'ready' does not take runs.*write .* `ctx, \*, runs, seed`",
+    ),
+    (
+        [(CELL, 'move", device = "axis"', 'move", node = "pc"', ""), (CODE, COMMANDED, "", "")],
+        r"actions.move: uses ctx.device \(arm_bot.py:\d+\) and has no device; write",
+    ),
 ]
+
+WIDTH = (TASK, '"action", tries', '"action", out = { width = "w" }, tries', "")
+TYPED = '[variables.w]\ntype = "float"\n\n[places]'
+MEMORY = '[services.memory]\nnode = "pc"\n\n[actions]'
+READS = (CODE, "await ctx.sleep(0.3)", 'print(await ctx.get("part"))', "")
+
+DOUBTED: list[tuple[list[Mistake], str, list[Mistake]]] = [
+    (
+        [
+            WIDTH,
+            (TASK, "[places]", TYPED, ""),
+            (CODE, "return success()", 'return success(width="wide")', ""),
+        ],
+        r":\d+: places.grip.out.width: 'grip' gives width as str .* variable w is float",
+        [(CODE, '"wide"', "1", "")],
+    ),
+    (
+        [
+            (TASK, "[places]", TYPED.replace("float", "str"), ""),
+            (TASK, "args = { to = 0.2 }", 'args = { to = { var = "w" } }', ""),
+        ],
+        r":\d+: places.fetch.args.to: .* expects to: float, found w, which is str",
+        [(TASK, 'type = "str"', 'type = "int"', "")],
+    ),
+    (
+        [READS, (CELL, "[actions]", MEMORY, "")],
+        r"arm_bot.py:\d+: no action or service writes 'part', so it is None",
+        [(CODE, 'await ctx.command({"to": to})', 'await ctx.put("part", to)', "")],
+    ),
+    (
+        [READS, (CELL, "[actions]", MEMORY, "")],
+        r"no action or service writes 'part'",
+        [(CODE, 'await ctx.command({"to": to})', 'await ctx.put(f"p{to}", to)', "")],
+    ),
+    (
+        [READS, (CELL, "[actions]", MEMORY, "")],
+        r"no action or service writes 'part'",
+        [(CODE, 'await ctx.command({"to": to})', "print(ctx)", "")],
+    ),
+    (
+        [(CODE, "await ctx.sleep(0.3)", "await ctx.sleep(LONG)\n    LONG = 1", "")],
+        "",
+        [(CODE, "class Axis", "LONG = 30.0\n\n\nclass Axis", "")],
+    ),
+]
+"""Mistakes, the warning, and what makes it untrue: then `check` is silent. Some have no warning in
+the first place."""
+
+GRIPPED = (
+    "when = \"grip.status == 'success'\" }\n"
+    'slid = { in = ["grip:normal"], out = ["broken"], when = "grip.status == \'failure\'" }'
+)
 
 HELPER = (
     "async def close(ctx: Context[Remote]) -> None:\n    await ctx.sleep(0.3)\n\n\nasync def grip"
@@ -555,6 +699,29 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
         r"device axis: .*state.at: a Axis is not plain data, returned by `state` \(arm_bot.py:\d+",
     ),
     (
+        [(CODE, "await ctx.sleep(0.3)", 'await ctx.sleep(float("nan"))', "")],
+        0,
+        r"ctx.sleep: expected a number of seconds, found nan in grip \(arm_bot.py:\d+\)",
+    ),
+    (
+        [
+            (TASK, "[places]", '[variables.w]\ntype = "str"\n\n[places]', ""),
+            (TASK, "args = { to = 0.2 }", 'args = { to = 0.2 }, out = { at = "w" }', ""),
+        ],
+        0,
+        r"fetch#1 \(move\) gave at = 0.2, expected str; its variable w is none now",
+    ),
+    (
+        [
+            (CODE, "import Context,", "import failure, Context,", ""),
+            (CODE, 'return error("slipped"', 'return failure("slipped"', ""),
+            (CODE, "< slips", "< 1.0", ""),
+            (TASK, 'out = ["carry"] }', f'out = ["carry"], {GRIPPED}', ""),
+        ],
+        1,
+        r"given up: broken.*failure +grip#1, grip on pc for grip: slipped: the part slipped out",
+    ),
+    (
         [(CODE, "period = 0.01", "period = 10", "")],
         1,
         r"the driver has published nothing for \d.\d s \(does it block, or is its `period` not in",
@@ -566,6 +733,14 @@ ON_THE_LINE: list[tuple[list[str], str]] = [
     (["run", "arm_bt.toml"], r"arm_bt.toml: file: cannot be read: No such file"),
     (["check", "services.toml"], r"file: this is a location file, not a task; name the task"),
     (["log", "last"], r"no run 'last'; /.*/arm_bot/runs holds no run; change to the folder where"),
+    (
+        ["check", "arm_bot.py"],
+        r"no task 'arm_bot.py': this is a module; name the .toml file of the",
+    ),
+    (
+        ["run", "--mode", "fast"],
+        r"^petrobot run: argument --mode: .*realtime.*--help shows its op",
+    ),
     (["check", "."], r"no task '.': this is a folder; name the .toml file of the task"),
     (["run", "armbot"], r"no task 'armbot': give a .toml file, or a task that comes with petrobot"),
     (
@@ -636,6 +811,10 @@ def expect(pattern: str, arguments: list[str], code: int | None = 2) -> None:
 
 WARNINGS = (
     "expects to: str",
+    "expects slips: float",
+    "between two set points",
+    "lasts 30 s",
+    "no service 'lamp'",
     "no action of move returns",
     "also return jammed",
     "raises the event",
@@ -666,7 +845,7 @@ def test_each_mistake_is_reported(
 
 
 @pytest.mark.processes
-@pytest.mark.parametrize(("mistakes", "pattern"), BOTH, ids=["out", "prepare"])
+@pytest.mark.parametrize(("mistakes", "pattern"), BOTH, ids=lambda p: str(p)[-40:])
 def test_mistakes_between_files_are_reported(
     sound: dict[str, str],
     mistakes: list[Mistake],
@@ -677,6 +856,24 @@ def test_mistakes_between_files_are_reported(
     damaged(sound, mistakes, tmp_path)
     monkeypatch.chdir(tmp_path)
     expect(pattern.replace("LINE", r"\d+"), CHECK)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(("mistakes", "told", "true"), DOUBTED, ids=lambda p: str(p)[-40:])
+def test_a_warning_about_code_is_given_only_if_it_is_certain(
+    sound: dict[str, str],
+    mistakes: list[Mistake],
+    told: str,
+    true: list[Mistake],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for edits, warned in ((mistakes, bool(told)), ([*mistakes, *true], False)):
+        damaged(sound, edits, tmp_path)
+        code, words = said(*CHECK)
+        assert (code, "\nwarning" in words) == (0, warned), words
+        assert not warned or re.search(told, re.sub(r"\n +", " ", words)), words
 
 
 @pytest.mark.processes
@@ -767,7 +964,41 @@ AXIS = """class Axis(Rail):
         return {"at": self.at, "arrived": self.stopped()}"""
 """A driver that does not use what the class above it has."""
 
+GIVEN = [
+    *OUTER,
+    (TASK, "[places]", '[variables.w]\ntype = "str"\n\n[places]', ""),
+    (TASK, 'subnet = "hold",', 'subnet = "hold", args = { p = { var = "w" } },', ""),
+    (
+        TASK,
+        'again = { kind = "macro", subnet = "hold",',
+        'again = { kind = "macro", subnet = "hold", args = { p = { var = "w" } },',
+        "",
+    ),
+    (
+        TASK,
+        "[subnets.hold.places]",
+        '[subnets.hold.parameters]\np = "float"\n[subnets.hold.places]',
+        "",
+    ),
+]
+"""A variable that a subnet receives."""
+
 REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
+    (
+        GIVEN,
+        r"places.grip.args.p: w is str, and the parameter is float; change one of the types",
+        [(TASK, 'type = "str"', 'type = "int"', "")],
+    ),
+    (
+        [*GIVEN, (TASK, 'p = "float"', 'p = "variable"', "")],
+        r"places.grip.args.p: expected a variable, found the value of 'w'; write \"w\"",
+        [(TASK, '{ var = "w" }', '"w"', ""), (TASK, '{ var = "w" }', '"w"', "")],
+    ),
+    (
+        [*GIVEN, (TASK, 'p = "float"', 'p = "place"', "")],
+        r"places.grip.args.p: expected a place, found the value of 'w'; write the name of a place",
+        [(TASK, '{ var = "w" }', '"broken"', ""), (TASK, '{ var = "w" }', '"broken"', "")],
+    ),
     (
         SUBNET,
         rf"{NO_BRANCH}[^|]*add to \[subnets.hold.transitions\] one with in = \[\"close:error\"\]",
@@ -921,6 +1152,11 @@ def test_an_interrupted_run_says_how_it_is_continued(
     assert main([*RUN, "--journal", "runs"]) == 130
     told = r"`petrobot resume runs/arm_bot-\S+` continues this run"
     assert bool(re.search(told, capsys.readouterr().err)) == begun
+
+
+def test_an_unfinished_campaign_is_named_as_such(tmp_path: Path) -> None:
+    (tmp_path / MANIFEST).write_text("{}", encoding="utf-8")
+    expect(r"this campaign is not finished; .* continues it", ["learned", "show", str(tmp_path)])
 
 
 CAMPAIGN = ["campaign", TASK, "--services", CELL, "--runs", "2", "--out", "out"]
@@ -1097,7 +1333,7 @@ def test_a_class_that_cannot_be_hashed_is_read_like_any_other(
     ("old", "new", "told"),
     [
         ("await ctx.sleep(0.3)", "await ctx.sleep(0.3", "SyntaxError"),
-        ("from petrobot", "import nothere\nfrom petrobot", "it imports 'nothere', which is not on"),
+        ("from petrobot", "import nothere\nfrom petrobot", "it imports 'nothere' (arm_bot.py:6)"),
     ],
 )
 def test_a_module_that_cannot_be_imported_is_told_once(

@@ -70,7 +70,7 @@ def test_two_devices_do_not_share_a_default() -> None:
 @pytest.mark.parametrize(
     ("config", "words"),
     [
-        ({}, "port: is missing; expected a text (serial port)"),
+        ({}, "port: is missing; give a text (serial port)"),
         ({"port": 3}, "port: expected a text (serial port), found 3"),
         ({"port": "a", "rate": "fast"}, "rate: expected a number (baud), found 'fast'"),
         ({"port": "a", "rate": True}, "rate: expected a number (baud), found True"),
@@ -79,8 +79,8 @@ def test_two_devices_do_not_share_a_default() -> None:
         ({"port": "a", "tries": True}, "tries: expected a whole number, found True"),
         ({"port": "a", "loud": 1}, "loud: expected true or false, found 1"),
         ({"port": "a", "codes": "x"}, "codes: expected a list, found 'x'"),
-        ({"port": "a", "rat": 1}, "unknown key 'rat'; did you mean 'rate'?"),
-        ({"rat": 1}, "port: is missing; expected a text (serial port); unknown key 'rat'"),
+        ({"port": "a", "rat": 1}, "rat: unknown key; did you mean 'rate'?"),
+        ({"rat": 1}, "port: is missing; give a text (serial port); rat: unknown key"),
     ],
 )
 def test_a_wrong_key_is_refused_by_name(config: dict[str, Any], words: str) -> None:

@@ -289,16 +289,17 @@ def test_an_unreadable_file_raises_the_systems_error(tmp_path: Path) -> None:
         ),
         (
             "broken_driver:Driver",
-            "importing 'broken_driver' raises ZeroDivisionError: division by zero; correct the "
-            "module",
+            "importing 'broken_driver' raises ZeroDivisionError: division by zero "
+            "(broken_driver.py:1); correct the module",
         ),
         (
             "ends_itself:main",
-            "importing 'ends_itself' raises SystemExit: 0; correct the module",
+            "importing 'ends_itself' raises SystemExit: 0 (ends_itself.py:3); correct the module",
         ),
         (
             "speechless:main",
-            "importing 'speechless' raises Mute: <exception str() failed>; correct the module",
+            "importing 'speechless' raises Mute: <exception str() failed> (speechless.py:3); "
+            "correct the module",
         ),
         (
             "unfinished:main",

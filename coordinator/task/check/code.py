@@ -7,16 +7,22 @@ Actions of other hosts are not known here and are left out.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any
 
-from petrobot.coordinator.task import Place, PrimitiveTask, Reference, Scope, Task
+from petrobot.coordinator.task import (
+    Place,
+    PrimitiveTask,
+    Reference,
+    Scope,
+    Task,
+    VariableType,
+)
 from petrobot.coordinator.task.check.findings import Finding
 from petrobot.coordinator.task.wording import Severity, listed, nearest
 
 Code = Mapping[str, Mapping[str, Any]]
-"""By action: parameters (name: type or empty), required, open, causes, values, complete, words,
-events, faults; `device`: the same of its driver."""
+"""By action: what `services.code_reading` found in it, and as `device` the same of its driver."""
 RUNTIME = (
     *("bad_arguments", "bad_result", "busy", "cancelled", "command_not_taken", "command_refused"),
     *("deadline", "device_died", "emergency_stop", "exception", "fenced", "hung", "import_failed"),
@@ -38,18 +44,22 @@ def code_findings(
     task: Task,
     code: Code,
     args: Mapping[str, Mapping[str, Any]],
-    services: Mapping[str, Any],
+    services: Mapping[str, Mapping[str, Any]],
     drivers: Collection[Mapping[str, Any]] = (),
     raised: Collection[str] = (),
 ) -> Iterator[Finding]:
     """What does not fit. `args` are the arguments of each action in the location file, `services`
-    what else it offers by name, `drivers` what is known of the drivers of all its devices, and
-    `raised` the events that it is known to raise."""
+    what is known of each other service that it offers, `drivers` what is known of the drivers of
+    all its devices, and `raised` the events that it is known to raise."""
+    given = {"prepare": {*task.parameters, "seed", "runs"}, "score": {"cycles"}}
     for key, service in (("prepare", task.prepare), ("score", task.score)):
         if service and service not in services and service not in args:
             text = f"there is no service {service!r}{nearest(service, services)}"
             remedy = f"declare [services.{service}] in the location file, or drop the key"
             yield Finding(Severity.ERROR, "no-service", f"task.{key}", text, remedy)
+        elif text := _called(key, service, services.get(service, {}), given[key]):
+            remedy = f"write its parameters as `ctx, *, {listed(given[key])}`"
+            yield Finding(Severity.ERROR, "code", f"task.{key}", text, remedy)
     yield from argument_findings(task, code, args)
     used: dict[str, None] = {}
     for place in task.flat.places.values():
@@ -59,11 +69,17 @@ def code_findings(
             used |= dict.fromkeys(known)
             if known and len(known) == len(primitive.alternatives):
                 yield from _values(place, [code[a] for a in known])
+            for action in known:
+                yield from _kinds(task, place, action, code[action])
     for primitive in task.primitive_tasks.values():
         yield from _causes(primitive, code)
+        yield from _too_long(primitive, code)
+    if code.keys() >= args.keys():
+        yield from _never_written(used, code, services.values())
     yield from _unraised(task, code)
     for action in used:
         yield from _events(task, action, code[action])
+        yield from _unknown_services(code[action], {*services, *args})
     yield from _undeclared(task, drivers, raised)
     actions = [code[action] for action in used]
     for kind, severity in (("faults", Severity.ERROR), ("doubtful", Severity.WARNING)):
@@ -72,19 +88,90 @@ def code_findings(
             yield Finding(severity, "code", f"{file}:{line}", text)
 
 
+def _called(key: str, name: str, facts: Mapping[str, Any], given: Collection[str]) -> str:
+    """Return why `prepare` or `score` cannot be called with its arguments; empty if it can, or if
+    its parameters are not known."""
+    if "parameters" not in facts:
+        return ""
+    unknown = [] if facts["open"] else sorted({*given} - {*facts["parameters"]})
+    missing = sorted({*facts["required"]} - {*given})
+    if not unknown and not missing:
+        return ""
+    said = [f"does not take {listed(unknown)}"] if unknown else []
+    said += [f"needs {listed(missing)}, which `{key}` does not give"] if missing else []
+    return f"{name!r} {' and '.join(said)}"
+
+
+def _too_long(primitive: PrimitiveTask, code: Code) -> Iterator[Finding]:
+    """Constant times for which an action sleeps or waits until after its deadline."""
+    for action in primitive.alternatives:
+        for seconds, file, line, call in sorted(code.get(action, {}).get("lasts", ())):
+            if seconds > primitive.deadline:
+                text = f"`{call}` lasts {seconds:g} s, longer than the deadline of {primitive.name}"
+                text += f" ({primitive.deadline:g} s)"
+                remedy = "give less time here, or a later deadline"
+                yield Finding(Severity.WARNING, "code", f"{file}:{line}", text, remedy)
+
+
+def _unknown_services(facts: Mapping[str, Any], known: Collection[str]) -> Iterator[Finding]:
+    """Services that an action calls and no node offers."""
+    for name, (file, line) in facts.get("calls", {}).items():
+        if name not in known:
+            text = f"there is no service {name!r}{nearest(name, known)}"
+            remedy = f"declare [services.{name}] in the location file"
+            yield Finding(Severity.WARNING, "code", f"{file}:{line}", text, remedy)
+
+
+def _never_written(
+    used: Iterable[str], code: Code, others: Iterable[Mapping[str, Any]]
+) -> Iterator[Finding]:
+    """Variables of the global memory that an action reads and no action or service writes: only if
+    the code of all of them is known."""
+    every = [*code.values(), *others]
+    if any(facts.get("any_put", True) for facts in every):
+        return
+    put = {name for facts in every for name in facts["puts"]}
+    for action in used:
+        for name, (file, line) in code[action]["gets"].items():
+            if name not in put:
+                text = f"no action or service writes {name!r}{nearest(name, put)}, so it is None"
+                remedy = f"write it with `ctx.put({name!r}, ...)`, or give a default here"
+                yield Finding(Severity.WARNING, "code", f"{file}:{line}", text, remedy)
+
+
 def argument_findings(
     task: Task, code: Code, args: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[Finding]:
     """Arguments of places that their actions do not have or that do not fit, and those that are
     missing."""
-    for place in task.flat.places.values():
+    flat = task.flat
+    types = {name: VariableType.of(value) for name, value in task.parameters.items()}
+    types |= {variable.name: variable.type for variable in flat.variables.values()}
+    for place in flat.places.values():
         for action in task.primitive_tasks[place.task].alternatives if place.task else ():
             if action in code:
-                yield from _arguments(place, action, code[action], args.get(action, {}))
+                yield from _arguments(place, action, code[action], args.get(action, {}), types)
+
+
+def given_findings(
+    code: Code, args: Mapping[str, Mapping[str, Any]], where: Callable[[str], str]
+) -> Iterator[Finding]:
+    """Arguments of actions in the location file that do not fit; `where` returns a key of that file
+    with file and line."""
+    for action in args.keys() & code.keys():
+        known = code[action].get("parameters", {})
+        for name, value in args[action].items():
+            if name in known and not _fits(value, known[name]):
+                key = where(f"actions.{action}.args.{name}")
+                yield _unlike(key, action, name, known[name], f"{value!r}")
 
 
 def _arguments(
-    place: Place, action: str, facts: Mapping[str, Any], given: Mapping[str, Any]
+    place: Place,
+    action: str,
+    facts: Mapping[str, Any],
+    given: Mapping[str, Any],
+    types: Mapping[str, VariableType],
 ) -> Iterator[Finding]:
     if "parameters" not in facts:
         return
@@ -93,16 +180,34 @@ def _arguments(
         if name not in known:
             if not facts["open"]:
                 text = f"the action {action!r} has no argument {name!r}{nearest(name, known)}"
-                yield Finding(Severity.ERROR, "code", f"{key}.{name}", text, "correct the name")
-        elif not isinstance(value, Reference) and not _fits(value, known[name]):
-            text = f"the action {action!r} expects {name}: {known[name]}, found {value!r}"
-            remedy = "correct the value, or the annotation"
-            yield Finding(Severity.WARNING, "code", f"{key}.{name}", text, remedy)
+                remedy = f"it has: {listed(known)}" if known else "it has none: drop this"
+                yield Finding(Severity.ERROR, "code", f"{key}.{name}", text, remedy)
+        elif isinstance(value, Reference):
+            kind = types.get(value.variable, VariableType.ANY)
+            if not _may_be(kind, known[name]):
+                found = f"{value.variable}, which is {kind}"
+                yield _unlike(f"{key}.{name}", action, name, known[name], found)
+        elif not _fits(value, known[name]):
+            yield _unlike(f"{key}.{name}", action, name, known[name], f"{value!r}")
     for name in facts["required"]:
         if name not in place.args and name not in given:
             text = f"the action {action!r} needs the argument {name!r}"
             remedy = f"give args = {{ {name} = ... }} here or in [actions.{action}]"
             yield Finding(Severity.ERROR, "code", key, text, remedy)
+
+
+def _unlike(key: str, action: str, name: str, kind: str, found: str) -> Finding:
+    text = f"the action {action!r} expects {name}: {kind}, found {found}"
+    remedy = "correct the value, or the annotation"
+    return Finding(Severity.WARNING, "code", key, text, remedy)
+
+
+def _may_be(given: str, wanted: str) -> bool:
+    """Return whether a value of the one type may be one of the other; a number may be a whole
+    one."""
+    numbers = ("int", "float")
+    known = given in _FITS and wanted in _FITS
+    return not known or given == wanted or (given in numbers and wanted in numbers)
 
 
 def _fits(value: Any, kind: str) -> bool:
@@ -121,6 +226,19 @@ def _values(place: Place, facts: list[Mapping[str, Any]]) -> Iterator[Finding]:
             text = f"no action of {place.task} returns a value {name!r}{nearest(name, known)}"
             remedy = f"return it (success({name}=...)), or {variable} is never written"
             yield Finding(Severity.ERROR, "code", f"places.{place.name}.out.{name}", text, remedy)
+
+
+def _kinds(task: Task, place: Place, action: str, facts: Mapping[str, Any]) -> Iterator[Finding]:
+    """Values of results that `out` writes to a variable of another type."""
+    for name, variable in place.out.items():
+        wanted = task.flat.variables[variable].type
+        for kind, (file, line) in facts.get("values", {}).get(name, {}).items():
+            if not _may_be(kind, wanted) and wanted is not VariableType.ANY:
+                text = f"{action!r} gives {name} as {kind} ({file}:{line}), and the variable "
+                key = f"places.{place.name}.out.{name}"
+                text += f"{variable} is {wanted}"
+                remedy = "change one of the types"
+                yield Finding(Severity.WARNING, "code", key, text, remedy)
 
 
 def _causes(primitive: PrimitiveTask, code: Code) -> Iterator[Finding]:

@@ -73,6 +73,8 @@ def _syntax(line: str) -> tuple[str, str]:
         return text, "write all of it in one line, or as a table of its own"
     if word := re.search(r"=\s*(True|False|None)\b", rest):
         return f"{word[1]} is Python", "write true or false, or leave the key out"
+    if word := re.search(r"=\s*(?:\[(?:[^\]=]*,)?\s*)?([A-Za-z_]\w*)\s*(?=[,\]}]|$)", rest):
+        return f"{word[1]} is a text without quotes", f'write "{word[1]}"'
     return "", ""
 
 

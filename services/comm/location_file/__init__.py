@@ -423,6 +423,15 @@ def module_name(name: str) -> str:
     return f"petrobot.{MOVED.get(name, name)}"
 
 
+def _at(fault: BaseException) -> str:
+    """Return file and line of the code that raised an exception while it was imported; empty if no
+    such code was found."""
+    steps = traceback.walk_tb(fault.__traceback__)
+    files = [(frame.f_code.co_filename, line) for frame, line in steps]
+    own = [at for at in files if at[0] not in (__file__, importlib.__file__) and at[0][:1] != "<"]
+    return f" ({Path(own[-1][0]).name}:{own[-1][1]})" if own else ""
+
+
 def resolve(path: str) -> Any:
     """Return the object at an import path "module:name". Raises ImportError with what is missing
     and what to do."""
@@ -432,19 +441,18 @@ def resolve(path: str) -> Any:
     except ImportError as fault:
         missing = fault.name if isinstance(fault, ModuleNotFoundError) else None
         if missing and not f"{module_name(written)}.".startswith(f"{missing}."):
-            text = f"cannot import {written!r}: it imports {missing!r}, which is not on this host"
-            raise ImportError(f"{text}; install it, or correct the name") from fault
+            text = f"cannot import {written!r}: it imports {missing!r}{_at(fault)}, which is not on"
+            raise ImportError(f"{text} this host; install it, or correct the name") from fault
         raise ImportError(
-            f"cannot import {written!r} ({fault}); put it beside the location file, or install "
-            "its package on this host"
+            f"cannot import {written!r} ({fault}){_at(fault)}; put it beside the location file, "
+            "or install its package on this host"
         ) from fault
     except KeyboardInterrupt:
         raise
     except BaseException as fault:  # a module may call sys.exit, and its exceptions may be broken
         words = traceback.TracebackException(type(fault), fault, None)  # also if `str` raises
-        raise ImportError(
-            f"importing {written!r} raises {type(fault).__name__}: {words}; correct the module"
-        ) from fault
+        text = f"importing {written!r} raises {type(fault).__name__}: {words}{_at(fault)}"
+        raise ImportError(f"{text}; correct the module") from fault
     found = getattr(module, attribute, None)
     if not callable(found):
         names = [n for n in vars(module) if not n.startswith("_")]

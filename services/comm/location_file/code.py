@@ -33,6 +33,10 @@ sleep."""
 ADDRESS_SPACE = 4 << 30
 """Address space that the imports may use (bytes)."""
 
+SLOW = 1.0
+"""Seconds between two steps of a driver, or two set points of a stream, above which the unit is
+probably mistaken."""
+
 Facts = Mapping[str, Any]
 """What `PROGRAM` reports about one import path."""
 

@@ -95,10 +95,9 @@ def _check_arguments(directory: Directory, here: Container[str], faults: Faults)
         for name in action.args if known is not None else ():
             if known is not None and name not in known["parameters"]:
                 function = action.run.partition(":")[2]
-                faults.add(
-                    f"actions.{action.name}.args",
-                    f"{function} has no argument {name!r}{nearest(name, known['parameters'])}",
-                )
+                near = nearest(name, known["parameters"]) or "; it has none: drop this"
+                text = f"{function} has no argument {name!r}{near}"
+                faults.add(f"actions.{action.name}.args", text)
 
 
 def signatures(directory: Directory, *, everywhere: bool) -> dict[str, Mapping[str, Any]]:
