@@ -94,12 +94,11 @@ def estimates_path(given: Path) -> Path:
     from petrobot.coordinator.studies.campaign.plan import MANIFEST
 
     if given.is_dir():
-        if (given / MANIFEST).is_file() and not (given / ESTIMATES).is_file():
-            text = f"{given}: this campaign is not finished; the same `petrobot campaign` command"
-            raise CommandError(2, f"{text} continues it")
         if not (given / ESTIMATES).is_file():
-            text = f"{given}: this folder holds no {ESTIMATES}; give an estimates file, or a folder"
-            raise CommandError(2, f"{text} that `petrobot campaign --out` made")
+            remedy = "give an estimates file, or a folder that `petrobot campaign --out` made"
+            if (given / MANIFEST).is_file():
+                remedy = "its campaign is not finished: the same `petrobot campaign` continues it"
+            raise CommandError(2, f"{given}: this folder holds no {ESTIMATES}; {remedy}")
         return given / ESTIMATES
     if not given.exists():
         raise CommandError(2, f"{given}: no such file; `petrobot run ... --learn {given}` makes it")

@@ -447,7 +447,7 @@ def _write(draft: Draft, name: str, value: Any) -> bool:
         _note(draft, "unknown_variable", f"{name!r} is no variable of the task; ignored", name)
         return False
     if refused := variable.refused(value):
-        _warn(draft, "bad_value", f"{name} = {value!r} {refused}; it is none now", name)
+        _warn(draft, "bad_value", f"{name} = {value!r} is {refused}; it is none now", name)
         value = None
     draft.write(name, value)
     return True

@@ -184,8 +184,8 @@ def _write_results(draft: Draft, run: Run, end: RunEnded) -> None:
         value = end.values.get(name)
         refused = task.variables[variable].refused(value)
         if refused or name not in end.values:
-            was = f"gave {name} = {value!r}, {refused}" if name in end.values else f"gave no {name}"
-            text = f"{run.id} ({run.action}) {was}; its variable {variable} is none now"
+            was = f"gave {value!r}, which is {refused}" if name in end.values else "gave nothing"
+            text = f"{run.id} ({run.action}) {was} for {name!r}; variable {variable} is none now"
             draft.report(Severity.WARNING, "bad_value", text, run.id)
             value = None
         draft.write(variable, value)

@@ -342,9 +342,9 @@ class Variable:
     def refused(self, value: Value) -> str:
         """Return in words why the variable cannot have this value; empty if it can."""
         if not self.type.admits(value):
-            return f"expected {self.type}"
+            return f"no {self.type}"
         listed = value is None or not self.values or value in self.values
-        return "" if listed else f"expected one of {', '.join(self.values)}"
+        return "" if listed else f"none of {', '.join(self.values)}"
 
 
 class Parameter(StrEnum):

@@ -122,10 +122,10 @@ def petrobot(
             "list.json is not a forecast: expected an object with schema and sha256",
         ),
         ("forecast work.toml --estimates .", "campaign.json: the key 'regimes' is missing"),
-        ("analyse work.toml --estimates .", "this folder holds no estimates.db; give an estimates"),
+        ("analyse work.toml --estimates .", "this folder holds no estimates.db; its campaign"),
         (
             "learned show .",
-            "this folder holds no estimates.db; give an estimates file, or a folder",
+            "this folder holds no estimates.db; its campaign is not finished",
         ),
         (
             "campaign work.toml --learned nope",

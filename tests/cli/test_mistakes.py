@@ -709,7 +709,7 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
             (TASK, "args = { to = 0.2 }", 'args = { to = 0.2 }, out = { at = "w" }', ""),
         ],
         0,
-        r"fetch#1 \(move\) gave at = 0.2, expected str; its variable w is none now",
+        r"fetch#1 \(move\) gave 0.2, which is no str for .at.; variable w is none",
     ),
     (
         [
@@ -1156,7 +1156,7 @@ def test_an_interrupted_run_says_how_it_is_continued(
 
 def test_an_unfinished_campaign_is_named_as_such(tmp_path: Path) -> None:
     (tmp_path / MANIFEST).write_text("{}", encoding="utf-8")
-    expect(r"this campaign is not finished; .* continues it", ["learned", "show", str(tmp_path)])
+    expect(r"its campaign is not finished: .* continues it", ["learned", "show", str(tmp_path)])
 
 
 CAMPAIGN = ["campaign", TASK, "--services", CELL, "--runs", "2", "--out", "out"]
