@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 from petrobot.services.action import CallFailed, CommandRefused, Result, Status, Wait
@@ -200,7 +201,7 @@ class RunContext:
 
     def _after(self, call: str, seconds: float) -> float:
         given: object = seconds
-        if not isinstance(given, int | float) or given != given:
+        if not isinstance(given, Real) or given != given:
             raise ValueError(f"ctx.{call}: expected a number of seconds, found {given!r:.60}")
         return self._clock() + seconds
 
