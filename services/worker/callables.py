@@ -121,13 +121,16 @@ def _traceback(fault: BaseException) -> str:
     """Return the traceback of an exception after those of the exceptions that led to it.
 
     As Python prints them, but only the lines of user code if there are any, and its message as
-    `words_of` has it.
+    `words_of` has it. An exception of petrobot's own says what is wrong: without lines of user code
+    it needs none.
     """
     parts: list[str] = []
     found: BaseException | None = fault
     while found is not None and len(parts) < CHAIN:
         every = list(traceback.walk_tb(found.__traceback__))
-        shown = [step for step in every if is_users(step[0])] or every
+        shown = [step for step in every if is_users(step[0])]
+        if not shown and not type(found).__module__.startswith("petrobot."):
+            shown = every
         lines = traceback.StackSummary.extract(iter(shown[-FRAMES:])).format()
         parts.append(f"{''.join(lines)}{type(found).__name__}: {words_of(found)}")
         hidden = found.__suppress_context__

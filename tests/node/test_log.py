@@ -5,13 +5,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from petrobot.services.action import Cancelled, Context, Result, success
 from petrobot.services.comm.location_file import parse
+from petrobot.services.comm.protocol.plain import NotPlainError
 from petrobot.services.worker.callables import CHAIN, LONGEST, log_fault
+from petrobot.services.worker.remote import CyclicDriver
 from tests.node.conftest import Bench
 from tests.node.test_processes import CELL, PATIENCE, Operator, operator_of, start_node
 from tests.ports import free_ports
@@ -99,6 +102,19 @@ def test_a_strange_exception_is_logged_in_few_words(
 ) -> None:
     log_fault(logging.getLogger("petrobot.test"), fault, "run %s", "r1")
     assert says in caplog.text and "run r1" in caplog.text and len(caplog.text) < 3 * LONGEST
+
+
+def test_a_message_of_petrobot_needs_no_lines_of_its_own_code(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    driver: Any = SimpleNamespace(stopped=lambda: True, state=lambda: {"at": {1}})
+    with pytest.raises(NotPlainError) as raised:
+        CyclicDriver(driver).state()
+    own = raised.value.with_traceback(raised.tb.tb_next)  # without the line of this test
+    log_fault(logging.getLogger("petrobot.test"), own, "it failed")
+    told = caplog.text
+    assert "a set is not plain data, returned by `state` (test_log.py:" in told
+    assert "remote.py" not in told
 
 
 async def _log_of(folder: Path, level: str, work: Callable[[Operator], Any]) -> str:
