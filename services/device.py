@@ -154,23 +154,28 @@ class Key:
     def fault(self, config: Mapping[str, Any]) -> str:
         """Return what is wrong with the key's value in a table, or with its default; empty if
         nothing is."""
-        if self.default not in (_Required, None) and not self._fits(self.default):
-            text = f"expected {self._expected()}, found the default {self.default!r:.60}"
+        default = self.default
+        if self.kind is list and isinstance(default, tuple):
+            default = [*default]
+        if default is not _Required and default is not None and not self._is_typed(default):
+            text = f"expected {self._expected()}, found the default {default!r:.60}"
             return f"{text} of its `key`; correct it or the annotation in the driver"
         if self.name not in config:
-            return f"is missing; give {self._expected()}" if self.default is _Required else ""
+            return f"is missing; give {self._expected()}" if default is _Required else ""
         value = config[self.name]
-        return "" if self._fits(value) else f"expected {self._expected()}, found {value!r:.60}"
+        nan = isinstance(value, float) and value != value
+        fits = self._is_typed(value) and not nan
+        return "" if fits else f"expected {self._expected()}, found {value!r:.60}"
 
     def read(self, config: Mapping[str, Any]) -> Any:
         """Return the key's value in a table that has no fault."""
         value = config.get(self.name, self.default)
         return float(value) if self.kind is float and value is not None else copy(value)
 
-    def _fits(self, value: Any) -> bool:
+    def _is_typed(self, value: Any) -> bool:
         number = isinstance(value, int | float) and not isinstance(value, bool)
         fits = number if self.kind is float else isinstance(value, self.kind)
-        return fits and (value == value if number else self.kind is not int)
+        return fits and (number or self.kind is not int)
 
     def _expected(self) -> str:
         words = {

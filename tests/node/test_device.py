@@ -91,6 +91,25 @@ def test_a_wrong_key_is_refused_by_name(config: dict[str, Any], words: str) -> N
         made("Scanner", **config)
 
 
+def test_a_default_has_the_type_of_its_key() -> None:
+    """A tuple stands for a list, None and nan for nothing."""
+
+    class Right(Driver):
+        limits: list[float] = key((0.0, 1.0))
+        gains = key((1, 2))
+        offset: float = key(float("nan"))
+        name: str = key(None)
+        share: float = key(1)
+
+    class Wrong(Driver):
+        tries: int = key("three")
+
+    assert read_keys(Right, {})["limits"] == (0.0, 1.0)
+    for config in ({}, {"tries": 3}):
+        with pytest.raises(ValueError, match=r"tries: .* found the default 'three' of its `key`"):
+            read_keys(Wrong, config)
+
+
 def test_keys_of_ports_are_accepted() -> None:
     assert read_keys(Scanner, {"port": "a", "source": "sim", "bitrate": 1})["port"] == "a"
 
