@@ -322,7 +322,8 @@ async def test_a_hanging_action_is_ended_at_its_deadline_while_the_node_answers(
     assert answered >= 2
     assert (await operator.call("add", a=1)).values == {"sum": 2}
     after = await pids(operator, "left", "")
-    assert before != after and not alive(before["actions"])
+    gone = {*before.values()} - {*after.values()}  # any of the node's workers may have run it
+    assert gone and not any(map(alive, gone))
 
 
 async def test_a_hanging_action_that_moves_has_its_device_stopped_first(operator: Operator) -> None:
