@@ -130,15 +130,15 @@ async def works(operator: Operator, name: str) -> None:
 async def test_an_exception_of_a_driver_is_the_runs_error(
     node: OneNode, operator: Operator, name: str
 ) -> None:
-    """The run ends at once with the driver's message, the log has it with a traceback, another run
-    continues, and the device works again."""
+    """The run ends at once with the driver's message, the log has it with a line of the driver,
+    another run continues, and the device works again."""
     innocent = asyncio.create_task(operator.call("good", None, send=[{"go": True}], seconds=0.5))
     end = await operator.call(name, None, send=[{"go": True}, {"break": True}], seconds=15.0)
     assert (end.status, end.cause, end.executed) == ("error", "device_died", "unknown"), end
     assert FAULTS[name] in end.text and end.seconds < 14.0
     assert (await innocent).status == "success"
     log = node.log.read_text()
-    assert ", line " in log and FAULTS[name] in log
+    assert FAULTS[name] in log and (", line " in log or "(drivers.py:" in log)
     await works(operator, name)
 
 
