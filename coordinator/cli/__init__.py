@@ -71,31 +71,32 @@ class Subcommand:
 
     name: str
     summary: str
-    module: str = ""
-    """Name of the module below `coordinator.cli`; empty if it is the name of the command."""
+    home: str = ""
+    """Where it stands below `coordinator.cli`, as `module:Class` if several share a module; empty
+    if it is a module of the command's name."""
 
 
 COMMANDS = (
     Subcommand("run", "run a task"),
     Subcommand("serve", "the operator's page: draw tasks and start them"),
     Subcommand("resume", "continue a run whose coordinator was killed"),
-    Subcommand("watch", "follow the active run", "operate.watch"),
+    Subcommand("watch", "follow the active run"),
     Subcommand(
-        "pause", "pause the active run; each node reports whether its devices hold", "operate.pause"
+        "pause", "pause the active run; each node reports whether its devices hold", "operate:Pause"
     ),
-    Subcommand("continue", "continue the paused run", "operate.continue_"),
-    Subcommand("step", "fire one transition of the paused run", "operate.step"),
+    Subcommand("continue", "continue the paused run", "operate:Continue"),
+    Subcommand("step", "fire one transition of the paused run", "operate:Step"),
     Subcommand(
-        "break", "pause before a transition fires or when a place is entered", "operate.breakpoints"
+        "break", "pause before a transition fires or when a place is entered", "operate:Break"
     ),
-    Subcommand("token", "add or remove tokens of a control place", "operate.tokens"),
-    Subcommand("raise", "raise an external event by hand", "operate.events"),
+    Subcommand("token", "add or remove tokens of a control place", "operate:Token"),
+    Subcommand("raise", "raise an external event by hand", "operate:Raise"),
     Subcommand(
-        "force", "take a token out of an action place, even of an active run", "operate.force"
+        "force", "take a token out of an action place, even of an active run", "operate:Force"
     ),
-    Subcommand("override", "choose the action of a primitive task by hand", "operate.override"),
-    Subcommand("remark", "write a remark into the journal of the active run", "operate.remark"),
-    Subcommand("abort", "abort the active run", "operate.abort"),
+    Subcommand("override", "choose the action of a primitive task by hand", "operate:Override"),
+    Subcommand("remark", "write a remark into the journal of the active run", "operate:Remark"),
+    Subcommand("abort", "abort the active run", "operate:Abort"),
     Subcommand("estop", "emergency stop: stop all devices through their nodes and their bus"),
     Subcommand("log", "print or export a recorded run"),
     Subcommand("film", "make a film of a recorded lock-step run"),
@@ -210,15 +211,18 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _dispatch(command: Subcommand, arguments: Sequence[str], ordered: float) -> int:
-    module = importlib.import_module(f"petrobot.coordinator.cli.{command.module or command.name}")
+    module, _, shared = (command.home or command.name).partition(":")
+    found = importlib.import_module(f"petrobot.coordinator.cli.{module}")
+    if shared:
+        found = getattr(found, shared)()
     codes = SHORT_EXIT_CODES if command.name in PLAIN else EXIT_CODES
     parser = _Parser(
         prog=f"petrobot {command.name}",
-        description=module.__doc__,
-        epilog=f"example:\n  {module.EXAMPLE}\n\n{codes}",
+        description=found.__doc__,
+        epilog=f"example:\n  {found.EXAMPLE}\n\n{codes}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    module.add_arguments(parser)
+    found.add_arguments(parser)
     try:
         options = parser.parse_args(arguments)
     except SystemExit as leaving:
@@ -229,7 +233,7 @@ def _dispatch(command: Subcommand, arguments: Sequence[str], ordered: float) -> 
 
         log_to_stderr(level)
     try:
-        return _run(module.run, options)
+        return _run(found.run, options)
     except CommandError as fault:
         if isinstance(fault.__cause__, BrokenPipeError):
             raise

@@ -105,7 +105,7 @@ def _address(options: argparse.Namespace) -> RunAddress | None:
 async def _tell(address: RunAddress, folder: Path) -> str:
     """Ask the coordinator to abort its run, so that it starts no recovery. Return what happened, in
     words."""
-    from petrobot.coordinator.cli.operate.command import connect
+    from petrobot.coordinator.cli.operate import connect
     from petrobot.coordinator.operator.client import OperatorError
 
     try:

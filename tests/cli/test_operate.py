@@ -30,7 +30,7 @@ from tests.cli.cell import TASK
 from tests.cli.conftest import RUN, Terminal
 from tests.waiting import beat
 
-STEERING = [command.name for command in COMMANDS if command.module.startswith("operate.")]
+STEERING = ["watch", *(one.name for one in COMMANDS if one.home.startswith("operate:"))]
 
 
 async def test_pause_reaches_the_devices_and_continue_releases_them(petrobot: Terminal) -> None:
@@ -269,7 +269,7 @@ async def test_one_operator_holds_the_controls(petrobot: Terminal) -> None:
 
 async def test_controls_are_requested_and_handed_over(petrobot: Terminal) -> None:
     """`--take` waits until the holder hands them over."""
-    from petrobot.coordinator.cli.operate.command import connect
+    from petrobot.coordinator.cli.operate import connect
 
     async with connect(find_address(folder=petrobot.runs), "ana") as ana:
         assert (await ana.command("take_controls"))["ok"]

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.operate import command
+from petrobot.coordinator.cli.operate import add_run_arguments, connected
 from petrobot.services.host.json_text import json_text
 from petrobot.services.host.whole_file import write_whole
 
@@ -25,13 +25,7 @@ ENDED = {"success": 0, "failure": 1, "error": 1, "aborted": 1, "stopped": 1}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    command.add_run_arguments(parser)
-    parser.add_argument(
-        "--as",
-        dest="name",
-        metavar="NAME",
-        help="your name as other operators see it (default: your user name)",
-    )
+    add_run_arguments(parser)
     parser.add_argument(
         "--json", metavar="FILE", help="write each change as a line of JSON (- for standard output)"
     )
@@ -56,14 +50,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 async def _watch(options: argparse.Namespace, out: TextIO) -> int:
-    from petrobot.coordinator.operator.client import OperatorError
-
-    address = command.find(options)
-    try:
-        async with command.connect(address, options.name) as client:
-            return await _follow(client, out, plain=not options.json)
-    except OperatorError as fault:
-        raise CommandError(3, f"{address.run}: {fault}") from fault
+    async with connected(options) as (_, client):
+        return await _follow(client, out, plain=not options.json)
 
 
 async def _follow(client: OperatorClient, out: TextIO, plain: bool) -> int:
