@@ -123,7 +123,9 @@ def main() -> int:
         write(found)
         return 0
     chosen = [p for p in proofs() if options.only is None or p.name in options.only]
-    todo = [p for p in chosen if options.fresh or not stands(p, found)]
+    with ThreadPoolExecutor(options.jobs) as pool:
+        kept_ = list(pool.map(lambda proof: not options.fresh and stands(proof, found), chosen))
+    todo = [proof for proof, holds in zip(chosen, kept_, strict=True) if not holds]
     write(found)
     old = all(found[p.name]["holds"] for p in chosen if p not in todo)
     print(f"{len(chosen) - len(todo)} kept, {len(todo)} to measure")

@@ -86,7 +86,7 @@ def sample(regime: str) -> Callable[[], str]:
 
 
 def _thrown(physics: str, regime: str, throws: int) -> list[dict[str, Any]]:
-    services = KEPT / f"{physics}.services.toml"
+    services = KEPT / f"{physics}_{regime}_{throws}.services.toml"
     text = (ROOT / "services.toml").read_text(encoding="utf-8")
     services.write_text(
         text.replace("[nodes.laboratory]\n", f'[nodes.laboratory]\nphysics = "{physics}"\n'),
