@@ -82,21 +82,31 @@ COMMANDS = (
     Subcommand("resume", "continue a run whose coordinator was killed"),
     Subcommand("watch", "follow the active run"),
     Subcommand(
-        "pause", "pause the active run; each node reports whether its devices hold", "operate:Pause"
+        "pause",
+        "pause the active run; each node reports whether its devices hold",
+        "operate:PauseRun",
     ),
-    Subcommand("continue", "continue the paused run", "operate:Continue"),
-    Subcommand("step", "fire one transition of the paused run", "operate:Step"),
+    Subcommand("continue", "continue the paused run", "operate:ContinueRun"),
+    Subcommand("step", "fire one transition of the paused run", "operate:StepRun"),
     Subcommand(
-        "break", "pause before a transition fires or when a place is entered", "operate:Break"
+        "break",
+        "pause before a transition fires or when a place is entered",
+        "operate:SetBreakpoint",
     ),
-    Subcommand("token", "add or remove tokens of a control place", "operate:Token"),
-    Subcommand("raise", "raise an external event by hand", "operate:Raise"),
+    Subcommand("token", "add or remove tokens of a control place", "operate:ChangeTokens"),
+    Subcommand("raise", "raise an external event by hand", "operate:RaiseByHand"),
     Subcommand(
-        "force", "take a token out of an action place, even of an active run", "operate:Force"
+        "force",
+        "take a token out of an action place, even of an active run",
+        "operate:ForceTransition",
     ),
-    Subcommand("override", "choose the action of a primitive task by hand", "operate:Override"),
-    Subcommand("remark", "write a remark into the journal of the active run", "operate:Remark"),
-    Subcommand("abort", "abort the active run", "operate:Abort"),
+    Subcommand(
+        "override", "choose the action of a primitive task by hand", "operate:OverrideSelector"
+    ),
+    Subcommand(
+        "remark", "write a remark into the journal of the active run", "operate:WriteRemark"
+    ),
+    Subcommand("abort", "abort the active run", "operate:AbortRun"),
     Subcommand("estop", "emergency stop: stop all devices through their nodes and their bus"),
     Subcommand("log", "print or export a recorded run"),
     Subcommand("film", "make a film of a recorded lock-step run"),

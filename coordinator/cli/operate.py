@@ -191,7 +191,7 @@ class OperatorCommand:
         return 0
 
 
-class Pause(OperatorCommand):
+class PauseRun(OperatorCommand):
     """Pause the active run: nothing fires or starts, and each node reports whether its devices
     hold. Exit code 3: a node did not answer, so it could not be paused."""
 
@@ -208,7 +208,7 @@ class Pause(OperatorCommand):
         return 3 if "lost" in answer.get("nodes", {}).values() else 0
 
 
-class Continue(OperatorCommand):
+class ContinueRun(OperatorCommand):
     """Continue the paused run. (`petrobot resume RUN` is for a run whose coordinator was
     killed.)"""
 
@@ -217,7 +217,7 @@ class Continue(OperatorCommand):
     accepted = "continues"
 
 
-class Step(OperatorCommand):
+class StepRun(OperatorCommand):
     """Fire one transition of a paused run, or pause an active one after its next firing."""
 
     EXAMPLE = "petrobot step"
@@ -239,7 +239,7 @@ class Step(OperatorCommand):
         return f"fired {firing['transition']} ({firing['cause']})"
 
 
-class Break(OperatorCommand):
+class SetBreakpoint(OperatorCommand):
     """Pause the active run before a transition fires or when a token enters a place. Without a
     name, list the breakpoints."""
 
@@ -271,7 +271,7 @@ class Break(OperatorCommand):
         return f"breakpoints: {', '.join(breakpoints)}" if breakpoints else "no breakpoints"
 
 
-class Token(OperatorCommand):
+class ChangeTokens(OperatorCommand):
     """Add or remove tokens of a control place: more or fewer runs, another path."""
 
     EXAMPLE = "petrobot token runs +2"
@@ -302,7 +302,7 @@ def _change(text: str) -> int:
     return value
 
 
-class Raise(OperatorCommand):
+class RaiseByHand(OperatorCommand):
     """Raise an external event by hand, instead of a sensor."""
 
     EXAMPLE = "petrobot raise image_tick"
@@ -321,7 +321,7 @@ class Raise(OperatorCommand):
         return f"raised {self.options.event}"
 
 
-class Force(OperatorCommand):
+class ForceTransition(OperatorCommand):
     """Fire an outgoing transition of an action place, even while its run is active. The run counts
     neither as success nor as failure."""
 
@@ -349,7 +349,7 @@ class Force(OperatorCommand):
         return f"fired {self.options.exit}, and took the token out of {self.options.place}"
 
 
-class Override(OperatorCommand):
+class OverrideSelector(OperatorCommand):
     """Choose the action of a primitive task by hand, or let the run choose again."""
 
     EXAMPLE = "petrobot override track_ball predict_kalman"
@@ -378,7 +378,7 @@ class Override(OperatorCommand):
         return f"{self.options.task}: {self.options.action or 'chosen freely again'}"
 
 
-class Remark(OperatorCommand):
+class WriteRemark(OperatorCommand):
     """Write a remark into the journal of the active run; it changes nothing."""
 
     EXAMPLE = 'petrobot remark "a visitor touched the table"'
@@ -392,7 +392,7 @@ class Remark(OperatorCommand):
         return {"text": " ".join(self.options.text)}
 
 
-class Abort(OperatorCommand):
+class AbortRun(OperatorCommand):
     """Abort the active run: its actions are cancelled, their devices stop, and it ends in
     ERROR."""
 
