@@ -56,6 +56,8 @@ from petrobot.coordinator.engine import (
     stimulus_from_plain,
     to_plain,
 )
+from petrobot.coordinator.engine.draft import Draft
+from petrobot.coordinator.engine.firing import match
 from petrobot.coordinator.engine.state import ACTIVE
 from petrobot.coordinator.task import (
     Counts,
@@ -273,6 +275,10 @@ class Journal:
                     ]
                     stuck = sum(r.phase == "stuck" for r in going)
                     assert len(going) - stuck <= place.most_active
+        if state.mode is Mode.RUNNING and state.suspended is None:
+            draft = Draft(self.engine.compiled, state)
+            left = [x.name for x in draft.compiled.transitions if match(draft, x, "")]
+            assert not left, "the engine examines again what a change can make fireable"
         holders = [r for r in state.runs() if r.phase in ACTIVE and r.device and not r.at_once]
         holders += [r for r in state.stopping.values() if r.device and not r.at_once]
         assert max(Counter(r.device for r in holders).values(), default=0) <= 1, (
