@@ -22,7 +22,7 @@ from petrobot.coordinator.analysis.formats.netfile import (
     read_rates,
     unit_rates,
 )
-from petrobot.coordinator.analysis.limits import OutOfTime, until
+from petrobot.coordinator.analysis.limits import OUT_OF_MEMORY, OutOfTime, until
 from petrobot.coordinator.analysis.may_run import BUDGET, Cell, assumed, devices_of
 from petrobot.coordinator.analysis.net.ends_net import ends_net
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
@@ -160,7 +160,7 @@ def analyse_command(
     except OutOfTime as late:  # the input is good, and the answer is not known
         told = f"{_named(path, late)}; give more --seconds"
         return CommandResult(FAULT, told, {"error": told})
-    except MemoryError:
+    except OUT_OF_MEMORY:
         return full
     said += [wrapped(f"note: {note}", 4) for note in notes]
     return CommandResult(
@@ -250,7 +250,7 @@ def _told(found: Analysis, structure: bool) -> tuple[Analysis, dict[str, Any], l
         note, cut = CUT, True
     except OutOfTime:
         note, cut = LATE, found.interrupted
-    except MemoryError:
+    except OUT_OF_MEMORY:
         note, cut = FULL, found.interrupted
     notes = tuple(dict.fromkeys((*found.notes, note)))
     part = replace(found, interrupted=cut, forecast=None, notes=notes)
@@ -405,7 +405,7 @@ def simulate_command(
         return _simulated(name or path.stem, seen, notes)
     except (NetFileError, NoEstimate, ValueError, KeyError, OverflowError) as error:
         return _refused(path, error)
-    except MemoryError:
+    except OUT_OF_MEMORY:
         return full
 
 
@@ -521,7 +521,7 @@ def convert_command(
         write_whole(target, text)
     except (NetFileError, NoEstimate, ValueError, OverflowError) as error:
         return _refused(source, error)
-    except MemoryError:
+    except OUT_OF_MEMORY:
         return full
     except OSError as error:
         return CommandResult(
