@@ -210,6 +210,7 @@ def test_pipe_becomes_iso_pnml() -> None:
     }
     assert [what.split(":")[0] for what in lost] == [
         "capacities",
+        "priorities",
         "rates and weights",
         "numbers of servers",
     ]
