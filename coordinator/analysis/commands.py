@@ -375,7 +375,8 @@ def simulate_command(
 
     A net needs a horizon; for a task it is optional. `changes` as in `whatif`.
     """
-    full = _full(BAD_INPUT, f"{path}: out of memory; use fewer --replicas")
+    told = f"{path}: the memory was used up; use fewer --replicas, or a smaller net"
+    full = _full(BAD_INPUT, told)
     try:
         model, wanted = open_model(path), [read_change(text) for text in changes]
         cell = _cell(model, cell_of)

@@ -294,7 +294,7 @@ def test_memory_that_the_xml_parser_lacks_is_no_fault_of_the_file(
             error.code, error.lineno = expat.errors.codes[expat.errors.XML_ERROR_NO_MEMORY], 3
             raise error
 
-    monkeypatch.setattr(tree.expat, "ParserCreate", lambda **_: Full())
+    monkeypatch.setattr(expat, "ParserCreate", lambda **_: Full())
     with pytest.raises(MemoryError):
         tree.parse_tree("<pnml/>", "net.pnml")
 

@@ -54,7 +54,7 @@ def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> Non
     [
         ("graph_command", ["show", "catch_ball", "--graph"], "too large for this drawing"),
         ("gspn_of", ["show", "catch_ball", "--view", "gspn"], "too large for this drawing"),
-        ("open_model", ["simulate", "catch_ball"], "out of memory; use fewer --replicas"),
+        ("open_model", ["simulate", "catch_ball"], "fewer --replicas, or a smaller net"),
         ("open_model", ["convert", "catch_ball", "out.drn"], "too large for .drn"),
     ],
 )
