@@ -22,7 +22,7 @@ from petrobot.coordinator.analysis.formats.netfile import (
     read_rates,
     unit_rates,
 )
-from petrobot.coordinator.analysis.limits import OutOfTime, until
+from petrobot.coordinator.analysis.limits import OUT_OF_MEMORY, OutOfTime, until
 from petrobot.coordinator.analysis.may_run import BUDGET, Cell, assumed, devices_of
 from petrobot.coordinator.analysis.net.ends_net import ends_net
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
@@ -39,7 +39,7 @@ from petrobot.coordinator.analysis.time.simulate import (
     goal_by_marking,
     simulate,
 )
-from petrobot.coordinator.analysis.time.stochastic import StochasticView, stochastic_view
+from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import MATTERS, TIME
 from petrobot.coordinator.analysis.time.whatif import (
     Change,
@@ -160,7 +160,7 @@ def analyse_command(
     except OutOfTime as late:  # the input is good, and the answer is not known
         told = f"{_named(path, late)}; give more --seconds"
         return CommandResult(FAULT, told, {"error": told})
-    except MemoryError:
+    except OUT_OF_MEMORY:
         return full
     said += [wrapped(f"note: {note}", 4) for note in notes]
     return CommandResult(
@@ -188,7 +188,12 @@ def _tell_measures(
 ) -> tuple[dict[str, float], list[str]]:
     """Return each measure of the user in the last analysis, and the lines that tell it in all.
     Raises NetFileError."""
-    rows = {m.name: _measure_values(m, analyses) for m in map(read_measure, measures)}
+    asked = [read_measure(text) for text in measures]
+    for one in asked:
+        if not one.name or not one.text or sum(other.name == one.name for other in asked) > 1:
+            problem = "two measures have this name" if one.name and one.text else "a part is empty"
+            raise NetFileError("--measure", one.name or one.text, problem, "write NAME=EXPRESSION")
+    rows = {one.name: _measure_values(one, analyses) for one in asked}
     lines = [
         f"  {name:28}" + " -> ".join(f"{value:.6g}" for value in values)
         for name, values in rows.items()
@@ -250,7 +255,7 @@ def _told(found: Analysis, structure: bool) -> tuple[Analysis, dict[str, Any], l
         note, cut = CUT, True
     except OutOfTime:
         note, cut = LATE, found.interrupted
-    except MemoryError:
+    except OUT_OF_MEMORY:
         note, cut = FULL, found.interrupted
     notes = tuple(dict.fromkeys((*found.notes, note)))
     part = replace(found, interrupted=cut, forecast=None, notes=notes)
@@ -275,10 +280,13 @@ def _measured(model: Task | NetFile, measure: Measure | None, cell: Cell | None)
     if measure is None:
         return Measured()
     if not isinstance(model, Task):
-        raise NetFileError(
-            "--estimates", model.name, "this is a net; estimates are of tasks", "give --rates"
-        )
+        raise _no_estimates(model)
     return measure(model, cell)
+
+
+def _no_estimates(net: NetFile) -> NetFileError:
+    problem = "this is a net; estimates are of tasks"
+    return NetFileError("--estimates", net.name, problem, "leave it out; rates are in the file")
 
 
 def _changed(
@@ -340,9 +348,12 @@ def _subject(
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except OSError as error:
-        raise NetFileError(str(path), "file", str(error), "give a readable file") from error
+        problem = error.strerror or str(error)
+        raise NetFileError(str(path), "file", problem, "give a readable file") from error
+    except UnicodeDecodeError as error:
+        raise NetFileError(str(path), "file", str(error), "give a UTF-8 file") from error
 
 
 def simulate_command(
@@ -364,17 +375,18 @@ def simulate_command(
 
     A net needs a horizon; for a task it is optional. `changes` as in `whatif`.
     """
-    full = _full(BAD_INPUT, f"{path}: out of memory; use fewer --replicas")
+    told = f"{path}: the memory was used up; use fewer --replicas, or a smaller net"
+    full = _full(BAD_INPUT, told)
     try:
         model, wanted = open_model(path), [read_change(text) for text in changes]
         cell = _cell(model, cell_of)
         known = _measured(model, measure, cell)
         subject, name, notes = _subject(model, rates, "gspn")
-        goal = lost = view = measured = None
+        goal = lost = task = view = measured = None
         if isinstance(model, Task):
-            model, measured = change_task(model, known, wanted)
+            task, measured = change_task(model, known, wanted)
             view = stochastic_view(
-                model, measured, stages=stages, timer_stages=stages, devices=devices_of(cell)
+                task, measured, stages=stages, timer_stages=stages, devices=devices_of(cell)
             )
             gspn, notes = view.gspn, (*view.assumptions, assumed(cell))
             goal = goal_by_marking(lambda m: view.ended(m) is Status.SUCCESS)
@@ -397,20 +409,20 @@ def simulate_command(
             firings=firings,
             progress=progress,
         )
-        if view is not None:
+        if task is not None and view is not None:
             doubts = [*view.doubts]
             if horizon is None and seen.complete:
-                doubts += _unlike_the_engine(view, measured, devices_of(cell), seen, stages)
+                doubts += _unlike_the_engine(task, measured, devices_of(cell), seen, stages)
             notes = (*(f"doubtful: {text}" for text in doubts), *notes)
         return _simulated(name or path.stem, seen, notes)
     except (NetFileError, NoEstimate, ValueError, KeyError, OverflowError) as error:
         return _refused(path, error)
-    except MemoryError:
+    except OUT_OF_MEMORY:
         return full
 
 
 def _unlike_the_engine(
-    view: StochasticView,
+    task: Task,
     measured: Measured | None,
     devices: Mapping[str, str] | None,
     seen: Simulation,
@@ -420,7 +432,7 @@ def _unlike_the_engine(
     the engine decides conflicts and times have no phases; or why that is not known."""
     assert seen.completed is not None
     try:
-        x = progress_of(OrdinaryView(view.task), BUDGET.steps, measured, devices).x
+        x = progress_of(OrdinaryView(task), BUDGET.steps, measured, devices).x
         if not x.complete:
             raise ValueError("the execution graph is too large")
         plays = played(x, measured)
@@ -500,9 +512,12 @@ def convert_command(
     full = _full(BAD_INPUT, told)
     try:
         model = open_model(source)
-        if exact and (not isinstance(model, Task) or view == "gspn" or measure is not None):
+        if exact and (not isinstance(model, Task) or view is not None or measure is not None):
             told = "the ends net of a task without times; leave out --view and --estimates"
             raise NetFileError("--exact", str(source), f"expected {told}", "or leave out --exact")
+        if measure is not None and view == "ordinary":
+            told = "the ordinary net has no times"
+            raise NetFileError("--estimates", str(source), told, "leave out --view ordinary")
         if isinstance(model, Task):
             form = FORMATS.get(target.suffix.lower())
             timed = measure is not None or (form is not None and form.timed)
@@ -511,6 +526,8 @@ def convert_command(
             known = _measured(model, measure, cell)
             model, lost, assumed = _exported(model, wanted, known, cell)
             which = f" ({WRITTEN[wanted]})"
+        elif measure is not None:
+            raise _no_estimates(model)
         elif view == "gspn" and model.gspn is None:
             raise NetFileError(str(source), "rates", "the file has none", "convert it as it is")
         elif view == "ordinary" and model.gspn is not None:
@@ -521,7 +538,7 @@ def convert_command(
         write_whole(target, text)
     except (NetFileError, NoEstimate, ValueError, OverflowError) as error:
         return _refused(source, error)
-    except MemoryError:
+    except OUT_OF_MEMORY:
         return full
     except OSError as error:
         return CommandResult(

@@ -15,6 +15,12 @@ from contextvars import ContextVar
 _OVERTIME: ContextVar[Callable[[], bool]] = ContextVar("overtime", default=lambda: False)
 
 
+OUT_OF_MEMORY = (MemoryError, SystemError)
+"""What Python raises when the memory is used up. Where none is left to unwind the frames of a
+MemoryError, CPython loses it and raises SystemError instead ("error return without exception
+set")."""
+
+
 class OutOfTime(ArithmeticError):  # noqa: N818 - a fact about a computation
     """The time limit of the analysis passed before a number was known."""
 

@@ -19,7 +19,7 @@ from petrobot.coordinator.analysis.execution.progress import (
     Recovery,
     progress_of,
 )
-from petrobot.coordinator.analysis.limits import OutOfTime, overtime
+from petrobot.coordinator.analysis.limits import OUT_OF_MEMORY, OutOfTime, overtime
 from petrobot.coordinator.analysis.net.coverability import Coverability, coverability, find_pump
 from petrobot.coordinator.analysis.net.deadlocks import (
     PlaceSets,
@@ -581,7 +581,7 @@ def _examined(
             return judge(found[-1], cover=cover)
     except KeyboardInterrupt:
         pass
-    except MemoryError:
+    except OUT_OF_MEMORY:
         reason = "memory limit"
     except OutOfTime:
         reason = "time limit"
@@ -589,7 +589,7 @@ def _examined(
     while found:
         try:
             return judge(replace(found[-1], reason=reason), in_haste=True)
-        except MemoryError:
+        except OUT_OF_MEMORY:
             found.pop()
     start = explore(net, limits=SearchLimits(states=1), engine="integers")
     return judge(replace(start, complete=False, reason=reason), in_haste=True)
@@ -603,7 +603,7 @@ def _long_run(
             space = explore(model.net, limits=limits)
         if space.reason != INTERRUPTED:
             return long_run(Chain.of(model, space=space))
-    except (ValueError, ArithmeticError, MemoryError) as why:
+    except (ValueError, ArithmeticError, *OUT_OF_MEMORY) as why:
         notes.append(f"no long run: {_why(why)}")
         return None
     except KeyboardInterrupt:
@@ -640,8 +640,8 @@ def _analyse_task(
                 shown = proven(n, found.space, ordinary)
     except KeyboardInterrupt:
         notes.append(CUT)
-    except (MemoryError, OutOfTime) as fault:  # what is known by now stays known
-        notes.append(FULL if isinstance(fault, MemoryError) else LATE)
+    except (*OUT_OF_MEMORY, OutOfTime) as fault:  # what is known by now stays known
+        notes.append(LATE if isinstance(fault, OutOfTime) else FULL)
         why = notes[-1]
     judgement = Analysis(
         task.name,
@@ -732,7 +732,7 @@ def _forecast(
     try:
         view = stochastic_view(task, measured, stages=stages, devices=devices)
         found = forecast(view, limits=limits)
-    except (ValueError, ArithmeticError, MemoryError) as why:
+    except (ValueError, ArithmeticError, *OUT_OF_MEMORY) as why:
         if INTERRUPTED in str(why):
             raise KeyboardInterrupt from why
         notes.append(f"no forecast: {_why(why)}")
@@ -771,7 +771,7 @@ def _doubts(
             if progress is None or not progress.x.complete:
                 raise ValueError("the execution graph is not complete")
             doubts += compared(progress)
-        except (ValueError, ArithmeticError, MemoryError) as why:
+        except (ValueError, ArithmeticError, *OUT_OF_MEMORY) as why:
             if INTERRUPTED in str(why):
                 raise KeyboardInterrupt from why
             failed.setdefault(_why(why), what)
@@ -851,7 +851,7 @@ def _figures(figures: Mapping[str, float]) -> str:
 def _why(error: Exception) -> str:
     """Return why something stayed unknown."""
     used_up = "the memory was used up; give more --memory, or simulate instead"
-    return used_up if isinstance(error, MemoryError) else str(error)
+    return used_up if isinstance(error, OUT_OF_MEMORY) else str(error)
 
 
 def missing(forecast: Forecast) -> list[tuple[float, Marking, tuple[str, ...]]]:

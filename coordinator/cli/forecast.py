@@ -128,6 +128,8 @@ def run(options: argparse.Namespace) -> int:
             raise CommandError(
                 2, "give TASK and --estimates CAMPAIGN to forecast, or --compare FORECAST CAMPAIGN"
             )
+        why = "a forecast has no table; give it beside --compare"
+        refuse_idle(options, add_arguments, why, idle={"markdown"})
         return _forecast(options)
     except (ForecastError, CampaignError) as fault:
         raise CommandError(2, str(fault)) from fault

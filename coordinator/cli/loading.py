@@ -203,6 +203,9 @@ def find_cell(given: Path | None, name: str, task: Task) -> Path | None:
 def cell_finder(given: Path | None, name: str) -> Callable[[Task], Cell | None]:
     """Return how a task gets its cell: that of the location file of `find_cell`, None if there is
     none. Raises CommandError."""
+    if given is not None and task_path(name).suffix != ".toml":
+        why = "a net file has no actions, so no location file concerns it; leave it out"
+        raise CommandError(2, f"--services: {name}: {why}")
 
     def of(task: Task) -> Cell | None:
         path = find_cell(given, name, task)

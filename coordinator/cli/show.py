@@ -65,6 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Draw the picture and write it."""
+    from petrobot.coordinator.analysis.limits import OUT_OF_MEMORY
     from petrobot.coordinator.cli.analyse import bounded_memory
 
     _refuse_idle(options)
@@ -75,7 +76,7 @@ def run(options: argparse.Namespace) -> int:
     try:
         with bounded_memory():
             svg = drawn(options)
-    except MemoryError as fault:
+    except OUT_OF_MEMORY as fault:
         text = f"{options.task}: the memory was used up; the net is too large for this drawing"
         raise CommandError(2, text) from fault
     if options.out == "-":

@@ -210,6 +210,7 @@ def test_pipe_becomes_iso_pnml() -> None:
     }
     assert [what.split(":")[0] for what in lost] == [
         "capacities",
+        "priorities",
         "rates and weights",
         "numbers of servers",
     ]
@@ -497,6 +498,18 @@ def test_capacities_are_kept_as_inhibitors(net: Net) -> None:
         return
     one, two = (explore(n, limits=SearchLimits(states=200)) for n in (net, again))
     assert len(one) == len(two) and one.edges == two.edges
+
+
+def test_that_immediate_transitions_come_first_is_lost_without_priorities() -> None:
+    """A format without priorities has markings in which a timed transition fired before an
+    immediate one. So their order is lost, not only their times."""
+    net = Net.build({"a": 1}, {"now": ({"a": 1}, {}), "later": ({"a": 1}, {})})
+    gspn = Gspn.of(net, {"later": 1.0})
+    model = NetFile(gspn.net, gspn=gspn)
+    assert "priorities" in losses(model, ".lola")
+    assert "priorities" not in losses(model, ".net")
+    timed = Gspn.of(net, {"now": 1.0, "later": 1.0})
+    assert "priorities" not in losses(NetFile(timed.net, gspn=timed), ".lola")
 
 
 def test_files_are_chosen_by_their_ending(tmp_path: Path) -> None:

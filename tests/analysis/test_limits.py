@@ -13,11 +13,13 @@ import sys
 from itertools import count
 from pathlib import Path
 from typing import Any
+from xml.parsers import expat
 
 import pytest
 
-from petrobot.coordinator.analysis import report
-from petrobot.coordinator.analysis.commands import analyse_command
+from petrobot.coordinator.analysis import commands, report
+from petrobot.coordinator.analysis.commands import analyse_command, convert_command
+from petrobot.coordinator.analysis.formats import tree
 from petrobot.coordinator.analysis.formats.netfile import NetFile
 from petrobot.coordinator.analysis.formats.pnml import write_pnml
 from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
@@ -265,6 +267,36 @@ def test_a_file_that_is_too_large_for_the_memory_has_a_message(tmp_path: Path) -
     out, complaint = process.communicate(timeout=300)
     assert process.returncode == 1, complaint
     assert "the memory was used up; give more --memory, or fewer --states" in out
+
+
+def test_memory_that_python_cannot_unwind_has_the_same_message(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """CPython loses a MemoryError if there is no memory to unwind its frames."""
+
+    def lost(path: Path) -> NetFile:
+        raise SystemError("error return without exception set")
+
+    path = tmp_path / "net.pnml"
+    monkeypatch.setattr(commands, "open_model", lost)
+    assert "the memory was used up; give more --memory" in analyse_command(path).text
+    assert "the memory was used up" in convert_command(path, tmp_path / "net.net").text
+
+
+def test_memory_that_the_xml_parser_lacks_is_no_fault_of_the_file(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where the memory of expat itself is used up, it reports an error of the XML."""
+
+    class Full:
+        def Parse(self, text: str, final: bool) -> None:  # noqa: N802 - the name in expat
+            error = expat.ExpatError("out of memory: line 3, column 7")
+            error.code, error.lineno = expat.errors.codes[expat.errors.XML_ERROR_NO_MEMORY], 3
+            raise error
+
+    monkeypatch.setattr(expat, "ParserCreate", lambda **_: Full())
+    with pytest.raises(MemoryError):
+        tree.parse_tree("<pnml/>", "net.pnml")
 
 
 def test_a_net_that_cannot_be_solved_can_be_simulated(tmp_path: Path) -> None:

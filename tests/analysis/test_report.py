@@ -36,6 +36,7 @@ from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
 from petrobot.coordinator.analysis.report import Analysis, analyse, heat, missing
 from petrobot.coordinator.analysis.time.gspn import Gspn
+from petrobot.coordinator.analysis.time.measured import Measured
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.task import Estimate, Status, Task
@@ -386,3 +387,91 @@ def test_an_answer_that_a_limit_leaves_open_is_never_no(model: Net | Task) -> No
         except OutOfTime:
             continue
         assert [one for one in found if known[one[0]] is not one[1]] == []
+
+
+def test_a_simulation_of_a_task_with_tries_is_compared_with_the_engine(tmp_path: Path) -> None:
+    """The engine takes the task as it is written, not with the names that short forms add."""
+    path = tmp_path / "tries.toml"
+    path.write_text(
+        """
+schema = 1
+[task]
+name = "tries"
+final = "parts == 0 and lost == 0"
+final_error = "lost == 1"
+[primitive_tasks.grip]
+deadline = 50.0
+estimates = { success = { share = 0.5, mean = 1.0 }, error = { share = 0.5, mean = 1.0 } }
+[places]
+parts = { kind = "control", tokens = 1 }
+lost = { }
+grip = { kind = "action", tries = 3 }
+[transitions]
+start = { in = ["parts"], out = ["grip"] }
+gripped = { in = ["grip:normal"] }
+dropped = { in = ["grip:error"], out = ["lost"] }
+""",
+        encoding="utf-8",
+    )
+    found = simulate_command(path, np.random.default_rng(1), replicas=200)
+    low, high = found.data["completed"][1:]
+    assert low < 1 - 0.5**3 < high
+    assert not [note for note in found.data["notes"] if "doubtful" in note]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"view": "ordinary", "exact": True}, "--exact: "),
+        ({"view": "ordinary", "measure": lambda *_: Measured()}, "the ordinary net has no times"),
+    ],
+)
+def test_convert_ignores_no_option_of_a_task(
+    given: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    found = convert_command(CATCH, tmp_path / "net.pnml", **given)
+    assert found.code == 2 and said in found.text and not (tmp_path / "net.pnml").exists()
+
+
+def test_a_net_file_has_no_estimates(tmp_path: Path) -> None:
+    """Neither `analyse` nor `convert` ignores them."""
+    path = tmp_path / "queue.net"
+    path.write_text("net queue\ntr serve waiting -> free\n", encoding="utf-8")
+    for found in (
+        analyse_command(path, measure=lambda *_: Measured()),
+        convert_command(path, tmp_path / "net.pnml", measure=lambda *_: Measured()),
+    ):
+        assert found.code == 2 and "this is a net; estimates are of tasks" in found.text
+
+
+@pytest.mark.parametrize(
+    ("measures", "said"),
+    [
+        (["a=mean", "a=P_complete"], "a: two measures have this name"),
+        (["=mean"], "mean: a part is empty"),
+        (["a="], "a: a part is empty"),
+    ],
+)
+def test_each_measure_has_a_name_of_its_own(measures: list[str], said: str) -> None:
+    found = analyse_command(CATCH, view="gspn", stages=1, changes=["runs=1"], measures=measures)
+    assert found.code == 2 and f"--measure: {said}" in found.text
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"\xff\xfe[rates]", "rates.toml: file: 'utf-8' codec"),
+        (b'{"serve":' * 100_000, "rates.toml: TOML: nested too deeply"),
+        (b"serve = " + b"[" * 100_000, "rates.toml: TOML: nested too deeply"),
+        (b"\xef\xbb\xbf[rates]\nserve = 2.0\n", ""),
+    ],
+)
+def test_the_fault_of_a_rates_file_names_the_rates_file(
+    content: bytes, said: str, tmp_path: Path
+) -> None:
+    """One with a byte-order mark is read like any other text."""
+    path, rates = tmp_path / "queue.net", tmp_path / "rates.toml"
+    path.write_text("net queue\ntr serve waiting -> free\npl waiting (1)\n", encoding="utf-8")
+    rates.write_bytes(content)
+    found = analyse_command(path, rates=rates)
+    assert said in found.text and (found.code == 2) is bool(said)

@@ -54,6 +54,34 @@ def test_shares_keep_their_proportions() -> None:
     )
 
 
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_several_shares_of_one_action_hold_together(order: tuple[int, int]) -> None:
+    """Each share is the one that was given, whatever comes after it."""
+    task, changes = load(CATCH), ["locate_ball.error.share=0.2", "locate_ball.failure.share=0.3"]
+    _, measured = change_task(task, Measured(), [read_change(changes[i]) for i in order])
+    for key, found in measured.runs.items():
+        shares = {status: one.share for status, one in found.items()}
+        assert shares[Status.ERROR] == 0.2 and shares[Status.FAILURE] == 0.3
+        assert shares[Status.SUCCESS] == pytest.approx(0.5)
+        assert all(change in measured.sources[key] for change in changes)
+
+
+def test_shares_that_add_up_to_one_are_accepted() -> None:
+    """All of the rounded sum of the declared shares may be given to one status."""
+    task = load(CATCH)
+    shares = {Status.SUCCESS: 0.7, Status.FAILURE: 0.2, Status.ERROR: 0.1}
+    assert sum(shares.values()) < 1.0
+    known = {status: Estimate(share, 1.0) for status, share in shares.items()}
+    arm = replace(task.primitive_tasks["recover_arm"], estimates=known)
+    task = replace(task, primitive_tasks={**task.primitive_tasks, "recover_arm": arm})
+    _, measured = change_task(task, Measured(), [read_change("recover_arm.error.share=1")])
+    (found,) = measured.runs.values()
+    assert {s: e.share for s, e in found.items()} == dict.fromkeys(shares, 0.0) | {Status.ERROR: 1}
+    too_many = ["recover_arm.error.share=0.6", "recover_arm.failure.share=0.6"]
+    with pytest.raises(NetFileError, match="only a share of 1 of the runs"):
+        change_task(task, Measured(), [read_change(text) for text in too_many])
+
+
 def test_improvements_improve_the_result() -> None:
     """Fewer errors complete more often; a status that never occurred may be given a share."""
     task = load(CATCH)

@@ -54,7 +54,7 @@ def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> Non
     [
         ("graph_command", ["show", "catch_ball", "--graph"], "too large for this drawing"),
         ("gspn_of", ["show", "catch_ball", "--view", "gspn"], "too large for this drawing"),
-        ("open_model", ["simulate", "catch_ball"], "out of memory; use fewer --replicas"),
+        ("open_model", ["simulate", "catch_ball"], "fewer --replicas, or a smaller net"),
         ("open_model", ["convert", "catch_ball", "out.drn"], "too large for .drn"),
     ],
 )
@@ -175,6 +175,10 @@ COMPARE = ["forecast", "--compare", "forecast.json", "campaigns/new"]
         ([*COMPARE, "--seed", "2"], "--seed: a registered forecast is compared as it is"),
         ([*COMPARE, "--doubtful"], "--doubtful: a registered forecast is compared as it is"),
         (["forecast", "catch_ball", *COMPARE[1:]], "TASK: a registered forecast is compared"),
+        (
+            ["forecast", "catch_ball", "--estimates", "e", "--markdown", "m"],
+            "--markdown: a forecast has no table; give it beside --compare",
+        ),
     ],
 )
 def test_bad_input_is_exit_code_2_and_names_the_fault(
@@ -187,6 +191,16 @@ def test_bad_input_is_exit_code_2_and_names_the_fault(
     monkeypatch.chdir(ROOT)
     assert main(arguments) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [["analyse"], ["simulate"], ["convert", "other.pnml"]])
+def test_a_net_file_has_no_location_file(
+    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "queue.net"
+    path.write_text("net queue\ntr serve waiting -> free\n", encoding="utf-8")
+    assert main([command[0], str(path), *command[1:], "--services", "services.toml"]) == 2
+    assert "queue.net: a net file has no actions" in capsys.readouterr().err
 
 
 def test_unreachable_nodes_are_exit_code_3(

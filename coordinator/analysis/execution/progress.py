@@ -44,7 +44,7 @@ from petrobot.coordinator.analysis.execution.graph import (
     with_operator,
 )
 from petrobot.coordinator.analysis.execution.names import cases
-from petrobot.coordinator.analysis.limits import OutOfTime, overtime
+from petrobot.coordinator.analysis.limits import OUT_OF_MEMORY, OutOfTime, overtime
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.qualitative import FAIR
@@ -773,16 +773,20 @@ class Progress:
                 if back is not None:
                     found[r.name] = (1.0 if r.almost_sure.holds else back[0], back[1])
             return Odds(found, chain.stages, chain.assumptions)
-        except (OutOfTime, ArithmeticError, MemoryError) as why:
-            return Odds({}, 0, (), str(why) or "the memory was used up")
+        except (OutOfTime, ArithmeticError) as why:
+            return Odds({}, 0, (), str(why))
+        except OUT_OF_MEMORY:
+            return Odds({}, 0, (), "the memory was used up")
 
     @cached_property
     def chain(self) -> ExecutionChain | str:
         """The complete execution graph as a Markov chain, or why there is none."""
         try:
             return chain_of(self.x, self.measured)
-        except (NoEstimate, TooLarge, OutOfTime, ArithmeticError, MemoryError) as why:
-            return str(why) or "the memory was used up"
+        except (NoEstimate, TooLarge, OutOfTime, ArithmeticError) as why:
+            return str(why)
+        except OUT_OF_MEMORY:
+            return "the memory was used up"
 
     # --- words -----------------------------------------------------------------------------------
 

@@ -39,7 +39,7 @@ HAS: Mapping[Feature, Callable[[NetFile], bool]] = {
     Feature.POSITIONS: lambda model: bool(model.positions),
     Feature.INHIBITORS: lambda model: any(model.net.inhibit),
     Feature.CAPACITIES: lambda model: any(c is not None for c in model.net.capacity),
-    Feature.PRIORITIES: lambda model: len(_ranks(model)) > 1,
+    Feature.PRIORITIES: lambda model: len(set(model.net.priority)) > 1,
     Feature.UNTIMED: lambda model: model.gspn is None and bool(model.net.transitions),
     Feature.RATES: lambda model: model.gspn is not None,
     Feature.SERVERS: lambda model: (
@@ -51,13 +51,6 @@ HAS: Mapping[Feature, Callable[[NetFile], bool]] = {
     ),
     Feature.BEYOND: lambda model: bool(model.beyond),
 }
-
-
-def _ranks(model: NetFile) -> set[int]:
-    """Return the priorities of the transitions that compete by priority: in a GSPN the immediate
-    ones."""
-    rates = model.gspn.rate if model.gspn else (None,) * len(model.net.priority)
-    return {own for own, rate in zip(model.net.priority, rates, strict=True) if rate is None}
 
 
 KEPT = ""

@@ -441,6 +441,8 @@ def _tables(text: str, file: str) -> dict[str, Any]:
         raise NetFileError(
             file, "TOML", str(error), "write [rates] and TRANSITION = NUMBER below it"
         ) from error
+    except RecursionError as error:
+        raise NetFileError(file, "TOML", "nested too deeply", "flatten it") from error
     return dict(said)
 
 

@@ -22,6 +22,10 @@ DEEPEST = 100
 """The most levels of elements. Real files have about ten; deeper trees exhaust Python's stack."""
 
 
+NO_MEMORY = expat.errors.codes[expat.errors.XML_ERROR_NO_MEMORY]
+"""What expat reports when its own memory is used up, instead of a MemoryError."""
+
+
 class LineElement(Element):
     """An element that knows the line on which it begins."""
 
@@ -96,6 +100,8 @@ class _Parsing:
         try:
             self.parser.Parse(text, True)
         except expat.ExpatError as error:
+            if error.code == NO_MEMORY:
+                raise MemoryError from error
             raise NetFileError(
                 self.file,
                 "XML",

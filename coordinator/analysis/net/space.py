@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from petrobot.coordinator.analysis.limits import OUT_OF_MEMORY
 from petrobot.coordinator.analysis.net.explore import (
     ExplorationEngine,
     Explored,
@@ -267,7 +268,7 @@ def _run(
                 return late
     except TooManyTokens as grown:
         return str(grown)
-    except MemoryError:
+    except OUT_OF_MEMORY:
         return "out of memory"
     if engine.expanded == engine.states:
         return ""

@@ -8,7 +8,7 @@ A change is written SUBJECT=NUMBER:
     locate_ball.locate_hough.success.mean=0.4    the same for one action
     serve.rate=2.5, serve.weight=3               a transition of a net with rates (1/s)
 
-When a share changes, the other shares of the action keep their proportions.
+When shares change, the other shares of the action keep their proportions.
 """
 
 from __future__ import annotations
@@ -27,6 +27,9 @@ FORM = (
     "write PLACE=N, PRIMITIVE.STATUS.share=X (or .mean, .cv), "
     "PRIMITIVE.ACTION.STATUS.mean=X or TRANSITION.rate=X"
 )
+
+ROUNDING = 1e-9
+"""Shares may add up to 1 but for this."""
 
 Runs = dict[tuple[str, str], Mapping[Status, Estimate]]
 
@@ -73,12 +76,19 @@ def change_task(task: Task, measured: Measured, changes: Sequence[Change]) -> tu
     """
     runs: Runs = dict(measured.runs)
     sources = dict(measured.sources)
+    said: dict[tuple[str, str], list[str]] = {}
+    shares: dict[tuple[str, str], dict[Status, Change]] = {}
     for change in changes:
         if len(change.subject) == 1:
             task = _other_tokens(task, change)
-        else:
-            for key in _other_estimate(task, runs, change):
-                sources[key] = f"what if {change.text}"
+            continue
+        for key in _other_estimate(task, runs, change):
+            said.setdefault(key, []).append(change.text)
+            if change.subject[-1] == "share":
+                shares.setdefault(key, {})[Status(change.subject[-2])] = change
+    for key, wanted in shares.items():
+        runs[key] = _with_shares(runs[key], wanted)
+    sources |= {key: f"what if {', '.join(texts)}" for key, texts in said.items()}
     expected = measured.expected | (set(sources) - set(measured.runs))
     return task, replace(measured, runs=runs, sources=sources, expected=expected)
 
@@ -93,7 +103,8 @@ def _other_tokens(task: Task, change: Change) -> Task:
 
 
 def _other_estimate(task: Task, runs: Runs, change: Change) -> list[tuple[str, str]]:
-    """Change the estimates of one action, or of all actions of a primitive task.
+    """Change the estimates of one action, or of all actions of a primitive task, but for shares,
+    which `_with_shares` sets when all changes are known.
 
     What was measured in single places counts before what is known of the primitive task, so it is
     changed as well. Returns the keys of the changed estimates.
@@ -129,19 +140,30 @@ def _altered(
         if key != "share":
             raise change.fault(f"no estimate is known for status {status}; set its share first")
         mean = max((e.mean for e in known.values()), default=1.0)
-        known = {**known, status: Estimate(0.0, mean)}
-    found = {**known, status: replace(known[status], **{key: value})}
-    if key != "share":
-        return found
+        return {**known, status: Estimate(0.0, mean)}
+    if key == "share":
+        return known
+    return {**known, status: replace(known[status], **{key: value})}
+
+
+def _with_shares(
+    known: Mapping[Status, Estimate], wanted: Mapping[Status, Change]
+) -> Mapping[Status, Estimate]:
+    """Return the estimates of an action with the wanted shares. Raises NetFileError."""
     # With preemptions as causes of their own, the shares of the statuses add up to less than 1.
     whole = sum(e.share for e in known.values()) or 1.0
-    rest = sum(e.share for s, e in known.items() if s is not status)
-    if rest == 0 and value < whole:
-        raise change.fault("no other status is known for the remaining share")
-    if value > whole:
-        raise change.fault(f"only a share of {whole:.3g} of the runs ends by itself")
-    scale = (whole - value) / rest if rest else 0.0
-    return {s: e if s is status else replace(e, share=e.share * scale) for s, e in found.items()}
+    rest = sum(e.share for s, e in known.items() if s not in wanted)
+    left = whole - sum(change.value for change in wanted.values())
+    *_, last = wanted.values()
+    if left < -ROUNDING:
+        raise last.fault(f"only a share of {whole:.3g} of the runs ends by itself")
+    if rest == 0 and left > ROUNDING:
+        raise last.fault("no other status is known for the remaining share")
+    scale = max(left, 0.0) / rest if rest else 0.0
+    return {
+        s: replace(e, share=wanted[s].value if s in wanted else e.share * scale)
+        for s, e in known.items()
+    }
 
 
 def change_net(net: Net, changes: Sequence[Change]) -> Net:
