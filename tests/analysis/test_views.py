@@ -148,7 +148,7 @@ def test_a_change_overrides_measurements() -> None:
     shares = {s: e.share for s, e in measured.runs["act", "a"].items()}
     assert shares == pytest.approx({Status.SUCCESS: 0.6, Status.ERROR: 0.2})
     assert stochastic_view(changed, measured).numbers["what if act.error.share=0.2"] == ("act.a",)
-    with pytest.raises(NetFileError, match=r"only a share of 0\.8"):
+    with pytest.raises(NetFileError, match=r"at most 0\.8: other runs are preempted"):
         change_task(task, Measured(runs), [read_change("act.error.share=0.9")])
 
 

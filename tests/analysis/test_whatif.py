@@ -78,7 +78,7 @@ def test_shares_that_add_up_to_one_are_accepted() -> None:
     (found,) = measured.runs.values()
     assert {s: e.share for s, e in found.items()} == dict.fromkeys(shares, 0.0) | {Status.ERROR: 1}
     too_many = ["recover_arm.error.share=0.6", "recover_arm.failure.share=0.6"]
-    with pytest.raises(NetFileError, match="only a share of 1 of the runs"):
+    with pytest.raises(NetFileError, match="add up to at most 1; "):
         change_task(task, Measured(), [read_change(text) for text in too_many])
 
 

@@ -156,7 +156,8 @@ def _with_shares(
     left = whole - sum(change.value for change in wanted.values())
     *_, last = wanted.values()
     if left < -ROUNDING:
-        raise last.fault(f"only a share of {whole:.3g} of the runs ends by itself")
+        most = "1" if whole > 1 - ROUNDING else f"{whole:.3g}: other runs are preempted"
+        raise last.fault(f"the shares of an action add up to at most {most}")
     if rest == 0 and left > ROUNDING:
         raise last.fault("no other status is known for the remaining share")
     scale = max(left, 0.0) / rest if rest else 0.0
