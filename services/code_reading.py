@@ -192,6 +192,26 @@ class _Code:
                 found |= {node.func for node in inner if isinstance(node, ast.Call)}
         return found
 
+    @cached_property
+    def asks_for_device(self) -> bool:
+        """Whether it compares the device of its context with None or asks whether it is there: it
+        may then run without one."""
+        device = {f"{name}.device" for name in CONTEXT}
+        for node in self.nodes:
+            if isinstance(node, ast.Assign) and ast.unparse(node.value) in device:
+                device |= {ast.unparse(target) for target in node.targets}
+        asked: list[ast.AST] = []
+        for node in self.nodes:
+            if isinstance(node, ast.Compare) and ast.unparse(node.comparators[0]) == "None":
+                asked.append(node.left)
+            elif isinstance(node, ast.If | ast.IfExp | ast.While):
+                asked.append(node.test)
+            elif isinstance(node, ast.BoolOp):
+                asked += node.values
+            elif isinstance(node, ast.UnaryOp):
+                asked.append(node.operand)
+        return any(ast.unparse(node) in device for node in asked)
+
     def value(self, node: ast.AST) -> Any:
         """Return the object of a dotted name or a constant; None if it is not known."""
         if isinstance(node, ast.Constant):
@@ -281,7 +301,9 @@ def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
             _ignored(code, node.value.value, seen)
         if isinstance(node, ast.Attribute) and node.attr in ("device", "command"):
             owner = node.value.id if isinstance(node.value, ast.Name) else ""
-            if owner in CONTEXT and seen.device is None and node not in code.branched:
+            if owner in CONTEXT and not (
+                seen.device or node in code.branched or code.asks_for_device
+            ):
                 seen.device = (code.file, node.lineno, f"{owner}.{node.attr}")
         if not isinstance(node, ast.Call):
             continue

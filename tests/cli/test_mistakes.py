@@ -1103,9 +1103,49 @@ REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
         ],
     ),
     (
+        [
+            *OUTER,
+            (TASK, "[places]", '[variables.w]\ntype = "str"\n\n[places]', ""),
+            (TASK, 'subnet = "hold",', 'subnet = "hold", args = { f = 3 },', ""),
+            (
+                TASK,
+                'again = { kind = "macro", subnet = "hold",',
+                'again = { kind = "macro", subnet = "hold", args = { f = 4 },',
+                "",
+            ),
+            (
+                TASK,
+                "[subnets.hold.errors]",
+                '[subnets.hold.parameters]\nf = "int"\n[subnets.hold.errors]',
+                "",
+            ),
+            (TASK, "closed = {", "closed = { when = \"w == f or close.status == 'good'\",", ""),
+        ],
+        r"closed.when: in \"w == f or close.status == 'good'\", == at column 3 compares a str with",
+        [(TASK, "w == f", "f == 3", ""), (TASK, "good", "success", "")],
+    ),
+    (
         [(CELL, 'move", device = "axis"', 'move", node = "pc"', "")],
         r"actions.move: uses ctx.command .*write device = ",
         [(CELL, 'move", node = "pc"', 'move", device = "axis"', "")],
+    ),
+    *(
+        (
+            [
+                (CELL, 'grip", device = "axis"', 'grip", node = "pc"', ""),
+                (CODE, USED, f"{USED}\n    print({used})", ""),
+            ],
+            r"actions.grip: uses ctx.device .*write device = ",
+            [(CODE, f"    {USED}\n", f"    {asked}\n    {USED}\n", "")],
+        )
+        for used, asked in (
+            ("ctx.device", "if ctx.device is None:\n        return success()"),
+            ("ctx.device", "if not ctx.device:\n        return success()"),
+            (
+                "axis := ctx.device",
+                "axis = ctx.device\n    if axis is None:\n        return success()",
+            ),
+        )
     ),
 ]
 """Mistakes, what is found with its remedy, and the remedy followed to the letter."""
