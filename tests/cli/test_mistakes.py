@@ -546,6 +546,54 @@ IN_THE_CODE: list[Mistake] = [
     ),
     (
         CODE,
+        "error, key, success",
+        "error, key",
+        r"arm_bot.py:\d+: `success` is not defined; write `from petrobot import success`",
+    ),
+    (
+        CODE,
+        "return success(at=",
+        "return success(at=at, was=",
+        r"arm_bot.py:\d+: `at` is not defined; .* it",
+    ),
+    (
+        CODE,
+        "    return success()",
+        "    await ctx.sleep(0.1)",
+        r"arm_bot.py:\d+: grip returns no result here; end it with `return success\(\)`",
+    ),
+    (
+        CODE,
+        "return success()",
+        "return success(True)",
+        r"arm_bot.py:\d+: `success\(True\)`: too many positional .*; write `success\(name=value\)`",
+    ),
+    (
+        CODE,
+        'error("slipped", "the part slipped out")',
+        "error()",
+        r"`error\(\)`: missing a required argument: 'cause'; write `error\(\"cause\", \"text\"\)`",
+    ),
+    (
+        CODE,
+        "    await ctx.sleep(0.3)",
+        "    end = ctx.now + 0.3\n    while ctx.now < end:\n        pass",
+        r"arm_bot.py:\d+: this loop never ends, .* not even the clock; .*`await ctx.sleep",
+    ),
+    (
+        CODE,
+        'ctx.device.state["arrived"]',
+        'ctx.device.state["arived"]',
+        r"arm_bot.py:\d+: the state of Axis has no 'arived' \(did you mean 'arrived'.*returns arr",
+    ),
+    (
+        CODE,
+        "async def grip(ctx: Context[Remote]",
+        "class Saw(Driver):\n    pass\n\n\nasync def grip(ctx: Context[Saw]",
+        r"services.toml:\d+: actions.grip.device: its `ctx` is a Context\[Saw\], .* driver is Axis",
+    ),
+    (
+        CODE,
         "class Axis",
         "import os; os._exit(3)\n\n\nclass Axis",
         r":LINE: .*ended the process \(exit code 3\)",
@@ -580,8 +628,27 @@ BOTH: list[tuple[list[Mistake], str]] = [
         r":LINE: task.prepare: 'ready' does not take runs.*write .* `ctx, \*, runs, seed`",
     ),
     (
+        [(CELL, "arm_bot:grip", "arm_bot:Axis", "")],
+        r"actions.grip.run: 'arm_bot:Axis' is a class; name a function: an action is an `async`",
+    ),
+    (
         [(CELL, 'move", device = "axis"', 'move", node = "pc"', ""), (CODE, COMMANDED, "", "")],
         r"actions.move: uses ctx.device \(arm_bot.py:\d+\) and has no device; write",
+    ),
+]
+
+WATCHES = [
+    (
+        TASK,
+        "broken = {}\n",
+        'broken = {}\nwatch = { kind = "action", task = "grip", tokens = 1, listen = true }\n',
+        "",
+    ),
+    (
+        TASK,
+        "[transitions]\n",
+        '[transitions]\nseen = { in = ["watch:normal"], out = ["watch"] }\n',
+        "",
     ),
 ]
 
@@ -591,6 +658,20 @@ MEMORY = '[services.memory]\nnode = "pc"\n\n[actions]'
 READS = (CODE, "await ctx.sleep(0.3)", 'print(await ctx.get("part"))', "")
 
 DOUBTED: list[tuple[list[Mistake], str, list[Mistake]]] = [
+    (
+        WATCHES,
+        r":\d+: places.watch: it listens, and its run keeps axis until .*: carry, fetch, grip wait",
+        [(CELL, 'grip", device = "axis"', 'grip", node = "pc"', "")],
+    ),
+    (
+        [
+            (CODE, 'ctx.device.state["arrived"]', 'ctx.device.state["homed"]', ""),
+            (CODE, '{"at": self.at,', '{**vars(self), "at": self.at,', ""),
+        ],
+        "",
+        [],
+    ),
+    ([(CODE, "    return success()", "    await ctx.wait(lambda: False)", "")], "", []),
     (
         [
             WIDTH,
@@ -810,6 +891,7 @@ def expect(pattern: str, arguments: list[str], code: int | None = 2) -> None:
 
 
 WARNINGS = (
+    "its `ctx` is a Context",
     "expects to: str",
     "expects slips: float",
     "between two set points",
