@@ -424,7 +424,10 @@ def _action_place(names: _Names, key: str, p: Place) -> Iterator[Fault]:
         yield Fault(f"{key}.servers", f"{p.servers} servers", "give 1 or more")
     for name, value in p.args.items():
         if isinstance(value, Reference):
-            if value.variable not in names.read:
+            if value.variable in names.places:
+                text = f"{value.variable!r} is a place, which has no value"
+                yield Fault(f"{key}.args.{name}", text, "name a variable or another parameter")
+            elif value.variable not in names.read:
                 remedy = f"declare it in [variables]{nearest(value.variable, names.read)}"
                 yield Fault(
                     f"{key}.args.{name}",
@@ -565,7 +568,7 @@ def _subnet(task: Task, s: Subnet) -> Iterator[Fault]:
         elif port != "entry" and s.places[place].kind in (Kind.ACTION, Kind.MACRO):
             yield Fault(
                 f"{key}.{port}",
-                f"{place!r} is a {s.places[place].kind} place",
+                f"{place!r} is of kind {s.places[place].kind}",
                 "end in a place without `kind`",
             )
     for name in set(s.places) & set(s.transitions):

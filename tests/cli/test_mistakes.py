@@ -47,6 +47,12 @@ IN_THE_TASK: list[Mistake] = [
     (TASK, "[task]", "[tsk]", r":LINE: tsk: unknown key.*did you mean 'task'\?"),
     (TASK, 'final = "parts == 0"', "", r":5: task.final: missing; give a text"),
     (TASK, '"parts == 0"', '"part == 0"', r":LINE: task.final: in 'part == 0'.*'part'.*parts"),
+    (
+        TASK,
+        "grip:normal",
+        "grip:success",
+        r"none of normal, .*; write grip:normal, and when = \"grip.status == 'success'\"",
+    ),
     (TASK, '"parts == 0"', '"parts = 0"', r":LINE: task.final: .* at column 7 of 'parts = 0'"),
     (
         TASK,
@@ -262,6 +268,12 @@ IN_THE_CELL: list[Mistake] = [
         "speed = 0.5",
         "sped = 0.5",
         r":LINE: devices.axis.top_sped: unknown key; did you mean 'top_speed'",
+    ),
+    (
+        CELL,
+        "top_speed = 0.5",
+        "max_speed = 0.5",
+        r":LINE: devices.axis.max_speed: unknown key; did you mean 'top_speed'",
     ),
     (CELL, "top_speed = 0.5", "limit = 1", r"axis.limit: unknown key; known: top_speed, length"),
     (
@@ -626,6 +638,13 @@ BOTH: list[tuple[list[Mistake], str]] = [
             (CODE, "async def move", f"{ALONE}async def move", ""),
         ],
         r":LINE: task.prepare: 'ready' does not take runs.*write .* `ctx, \*, runs, seed`",
+    ),
+    (
+        [
+            (CELL, "top_speed = 0.5", "depth = 0.5", ""),
+            (CODE, "top_speed: float = key", "depth: float\n    top_speed: float = key", ""),
+        ],
+        r":7: devices.axis.depth: Axis declares only its type; write depth: ... = key\(\) in",
     ),
     (
         [(CELL, "arm_bot:grip", "arm_bot:Axis", "")],
@@ -1064,6 +1083,8 @@ GIVEN = [
     ),
 ]
 """A variable that a subnet receives."""
+SWAPPED = [*GIVEN, *2 * [(TASK, '{ var = "w" }', '"broken"', "")], (TASK, '"str"', '"float"', "")]
+"""A place that it receives, and a variable that it reads."""
 
 REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
     (
@@ -1075,6 +1096,15 @@ REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
         [*GIVEN, (TASK, 'p = "float"', 'p = "variable"', "")],
         r"places.grip.args.p: expected a variable, found the value of 'w'; write \"w\"",
         [(TASK, '{ var = "w" }', '"w"', ""), (TASK, '{ var = "w" }', '"w"', "")],
+    ),
+    (
+        [
+            *SWAPPED,
+            (TASK, 'p = "float"', 'p = "place"', ""),
+            (TASK, 'task = "grip" }', 'task = "grip", args = { slips = { var = "p" } } }', ""),
+        ],
+        r"places.close.args.slips: 'p' is a place, which has no value; name a variable or another",
+        [(TASK, 'var = "p"', 'var = "w"', "")],
     ),
     (
         [*GIVEN, (TASK, 'p = "float"', 'p = "place"', "")],
