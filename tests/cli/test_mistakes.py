@@ -1402,7 +1402,12 @@ TIMER = '[timers.button]\nnode = "pc"\nperiod = 1.0\n\n[nodes]'
     [
         (CODE, "if not self.paused:", RAISED, ""),
         (CELL, "[nodes]", TIMER, ""),
-        (CODE, "if not self.paused:", RAISED.replace('"button"', "NAME"), "if it never comes"),
+        (
+            CODE,
+            "if not self.paused:",
+            RAISED.replace('"button"', '"button".lower()'),
+            "if it never comes",
+        ),
         (CODE, "", "", "no driver, action, service or timer of services.toml raises it"),
     ],
     ids=["by a driver", "by a timer", "by a computed name", "by nobody"],
