@@ -600,8 +600,9 @@ def _whole(task: Task) -> Iterator[Fault]:
     for t in flat.transitions.values():
         key, written = _written(task, t)
         if t.when is not None and not t.expanded_from:
-            when, known = _as_written(written and written.when, t.when, t.name, domains)
-            for fault in _expression(f"{key}.when", when, known, places):
+            own = written.when if written is not None else None
+            when, meanings = _as_written(own, t.when, t.name, domains)
+            for fault in _expression(f"{key}.when", when, meanings, places):
                 if (fault.key, fault.text) not in seen:
                     seen.add((fault.key, fault.text))
                     yield fault
