@@ -12,7 +12,9 @@ top-level package that it uses. If the source does not show everything, `complet
 from __future__ import annotations
 
 import ast
+import builtins
 import difflib
+import dis
 import inspect
 import json
 import os
@@ -23,7 +25,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, get_type_hints
+from types import CodeType
+from typing import Any, get_args, get_type_hints
 
 from petrobot.services import action as actions
 from petrobot.services.comm.location_file import MEMORY_CALLS, resolve
@@ -48,7 +51,12 @@ CONTEXT = ("ctx", "context")
 """Usual names of the context."""
 REMEMBERS = frozenset(("get", "get_versioned", "put", "compare_and_set"))
 """Calls of the context that need the global memory."""
-MADE = (actions.success, actions.failure, actions.error)
+MADE = {
+    actions.success: "success(name=value)",
+    actions.failure: 'failure("cause", "text")',
+    actions.error: 'error("cause", "text")',
+}
+"""What makes a result, and how it is written."""
 API = (actions.__name__, Driver.__module__)
 """Modules of petrobot that define the interface of actions and drivers."""
 METHODS = ("period", "state", "stop", "stopped", "hold", "release", "close")
@@ -96,6 +104,9 @@ class _Seen:
     """Whether it may write others, too."""
     lasts: list[tuple[float, str, int, str]] = field(default_factory=list)
     """Constant times (s) for which it sleeps or waits, with file, line and text of the call."""
+    reads: dict[str, tuple[str, int]] = field(default_factory=dict)
+    """Keys of its device's state that it reads without asking whether they are there, with file and
+    line."""
     memory: tuple[str, int] | None = None
     """Where it uses the global memory first."""
     device: tuple[str, int, str] | None = None
@@ -111,6 +122,8 @@ class _Code:
     file: str
     names: Mapping[str, Any]
     """Values of its global names."""
+    bodies: tuple[CodeType, ...]
+    """The function, or the methods of the class."""
 
     @cached_property
     def nodes(self) -> tuple[ast.AST, ...]:
@@ -192,6 +205,41 @@ class _Code:
                 found |= {node.func for node in inner if isinstance(node, ast.Call)}
         return found
 
+    @cached_property
+    def asks_for_device(self) -> bool:
+        """Whether it compares the device of its context with None or asks whether it is there: it
+        may then run without one."""
+        device = {f"{name}.device" for name in CONTEXT}
+        for node in self.nodes:
+            if isinstance(node, ast.Assign) and ast.unparse(node.value) in device:
+                device |= {ast.unparse(target) for target in node.targets}
+        asked: list[ast.AST] = []
+        for node in self.nodes:
+            if isinstance(node, ast.Compare) and ast.unparse(node.comparators[0]) == "None":
+                asked.append(node.left)
+            elif isinstance(node, ast.If | ast.IfExp | ast.While):
+                asked.append(node.test)
+            elif isinstance(node, ast.BoolOp):
+                asked += node.values
+            elif isinstance(node, ast.UnaryOp):
+                asked.append(node.operand)
+        return any(ast.unparse(node) in device for node in asked)
+
+    @cached_property
+    def asked(self) -> set[Any]:
+        """Constants of which it asks whether something contains them."""
+        return {
+            node.left.value
+            for node in self.nodes
+            if isinstance(node, ast.Compare) and isinstance(node.left, ast.Constant)
+        }
+
+    @cached_property
+    def tried(self) -> set[ast.AST]:
+        """What is inside a `try`, so that an exception may be intended."""
+        tries = (node for node in self.nodes if isinstance(node, ast.Try))
+        return {inner for node in tries for inner in ast.walk(node)}
+
     def value(self, node: ast.AST) -> Any:
         """Return the object of a dotted name or a constant; None if it is not known."""
         if isinstance(node, ast.Constant):
@@ -236,7 +284,10 @@ def _source(thing: Any) -> _Code | None:
         )
         tree = _definitions(file)[thing.__name__, first]
         names = {**vars(sys.modules[thing.__module__]), **dict(_imported(tree))}
-        return _Code(tree, _near(file), names)
+        methods = [thing] if inspect.isfunction(thing) else vars(thing).values()
+        codes = [method.__code__ for method in methods if inspect.isfunction(method)]
+        written = tuple(code for code in codes if code.co_filename == file)  # not by a decorator
+        return _Code(tree, _near(file), names, written)
     except (OSError, TypeError, SyntaxError, KeyError, AttributeError):
         return None
 
@@ -274,6 +325,7 @@ def _reachable(thing: Any) -> Iterator[_Code]:
 
 def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
     """Record the findings in one function or class."""
+    _undefined(code, seen)
     for node in code.nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             seen.words.add(node.value)
@@ -281,13 +333,22 @@ def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
             _ignored(code, node.value.value, seen)
         if isinstance(node, ast.Attribute) and node.attr in ("device", "command"):
             owner = node.value.id if isinstance(node.value, ast.Name) else ""
-            if owner in CONTEXT and seen.device is None and node not in code.branched:
+            if owner in CONTEXT and not (
+                seen.device or node in code.branched or code.asks_for_device
+            ):
                 seen.device = (code.file, node.lineno, f"{owner}.{node.attr}")
+        if isinstance(node, ast.While) and in_action:
+            _loops(code, node, seen)
+        if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
+            name = str(node.slice.value)
+            state = ast.unparse(node.value) in {f"{one}.device.state" for one in CONTEXT}
+            if state and name not in code.asked and node not in code.tried:
+                seen.reads.setdefault(name, (code.file, node.lineno))
         if not isinstance(node, ast.Call):
             continue
         made = code.value(node.func)
         _writes(code, node, made, seen)
-        if made in MADE:
+        if any(made is one for one in MADE):  # what it names need not be hashable
             _result(code, node, made, seen)
         elif made is actions.Result:
             seen.complete = False
@@ -306,6 +367,62 @@ def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
             seen.doubtful.append((code.file, node.lineno, text))
         if isinstance(node.func, ast.Attribute):
             _method(code, node, node.func, seen)
+
+
+def _undefined(code: _Code, seen: _Seen) -> None:
+    """Record global names that are defined nowhere: a NameError once that line is executed."""
+    for name, line in (found for body in code.bodies for found in _globals(body)):
+        if name in code.names or hasattr(builtins, name):
+            continue
+        if name in _bound(code.file):
+            continue
+        close = difflib.get_close_matches(name, code.names, n=1)
+        remedy = f"; did you mean `{close[0]}`?" if close else "; import it, or define it"
+        if hasattr(actions, name):
+            remedy = f"; write `from petrobot import {name}`"
+        seen.faults.append((code.file, line, f"`{name}` is not defined{remedy}"))
+
+
+@cache
+def _bound(file: str) -> frozenset[str]:
+    """Return all names that a file binds anywhere, also under a condition."""
+    found = set[str]()
+    for node in ast.walk(ast.parse(Path(file).read_bytes())):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            found.add(node.id)
+        elif isinstance(node, ast.alias):
+            found.add((node.asname or node.name).partition(".")[0])
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            found.add(node.name)
+    return frozenset(found)
+
+
+def _globals(body: CodeType) -> Iterator[tuple[str, int]]:
+    """Yield the global names that a function reads, each with its line, also in functions in it."""
+    line = body.co_firstlineno
+    for step in dis.get_instructions(body):
+        line = (step.positions and step.positions.lineno) or line
+        if step.opname == "LOAD_GLOBAL":
+            yield step.argval, line
+    for inner in body.co_consts:
+        if isinstance(inner, CodeType):
+            yield from _globals(inner)
+
+
+def _loops(code: _Code, loop: ast.While, seen: _Seen) -> None:
+    """Record a loop of an action that waits, but never gives control away."""
+    inner = [node for part in (loop.test, *loop.body) for node in ast.walk(part)]
+    clocks = {f"{name}.now" for name in CONTEXT}
+    timed = any(ast.unparse(node) in clocks for node in ast.walk(loop.test))
+    endless = isinstance(loop.test, ast.Constant) and bool(loop.test.value)
+    ways_out = (
+        ast.Await | ast.Return | ast.Break | ast.Raise | ast.Yield | ast.AsyncFor | ast.AsyncWith
+    )
+    if (timed or endless) and not any(isinstance(node, ways_out) for node in inner):
+        text = (
+            "this loop never ends, as nothing else runs meanwhile, not even the clock; wait in it"
+        )
+        seen.faults.append((code.file, loop.lineno, f"{text} by `await ctx.sleep(...)`"))
 
 
 def _unawaited(code: _Code, node: ast.Call, seen: _Seen) -> None:
@@ -413,6 +530,15 @@ def _lasts(code: _Code, node: ast.Call, name: str, seen: _Seen) -> None:
 
 def _result(code: _Code, node: ast.Call, made: Callable[..., Any], seen: _Seen) -> None:
     """Record cause and values of `success(...)`, `failure(...)` or `error(...)`."""
+    keywords = {k.arg: None for k in node.keywords if k.arg is not None}
+    if len(keywords) == len(node.keywords) and not any(
+        isinstance(a, ast.Starred) for a in node.args
+    ):
+        try:
+            inspect.signature(made).bind(*node.args, **keywords)
+        except TypeError as fault:
+            text = f"`{ast.unparse(node)}`: {fault}; write `{MADE[made]}`"
+            seen.faults.append((code.file, node.lineno, text))
     for keyword in node.keywords:
         if keyword.arg is None:
             seen.complete = False
@@ -478,6 +604,10 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
             _look(code, seen, is_async)
     else:
         seen.complete, seen.any_put = False, True
+    own = _code(thing) if inspect.isfunction(thing) else None
+    if own is not None and _falls_off(last := own.tree.body[-1]):  # type: ignore[attr-defined]
+        text = f"{thing.__name__} returns no result here; end it with `return success()`"
+        seen.faults.append((own.file, last.end_lineno, text))
     first = parameters[0] if parameters else None
     if first is None or first.kind is first.KEYWORD_ONLY or hints.get(first.name) in _KINDS:
         source = inspect.unwrap(thing).__code__
@@ -488,8 +618,29 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
         "parameters": {p.name: _KINDS.get(hints.get(p.name, object), "") for p in named},
         "required": [p.name for p in named if p.default is p.empty],
         "open": any(p.kind is p.VAR_KEYWORD for p in parameters),
+        "wants": _wanted(hints.get(first.name) if first else None),
         **_plain(seen),
     }
+
+
+def _falls_off(last: ast.stmt) -> bool:
+    """Return whether a function certainly ends without a result after its last statement. What it
+    awaits may last until it is cancelled."""
+    if isinstance(last, ast.Expr) and isinstance(last.value, ast.Await):
+        call = last.value.value
+        name = ast.unparse(call.func) if isinstance(call, ast.Call) else ""
+        owner, _, method = name.rpartition(".")
+        return owner in CONTEXT and method in AWAITED - {"wait"}
+    return isinstance(last, ast.Expr | ast.Assign | ast.AugAssign | ast.AnnAssign | ast.Pass)
+
+
+def _wanted(hint: Any) -> list[str]:
+    """Return the class of the driver that an action's `Context[...]` names, and its path; empty if
+    it names none."""
+    found = next(iter(get_args(hint)), None)
+    if not inspect.isclass(found) or not issubclass(found, Driver) or found is Driver:
+        return []
+    return [found.__name__, f"{found.__module__}:{found.__qualname__}"]
 
 
 def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -497,7 +648,8 @@ def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, An
     table."""
     seen = _Seen()
     if not inspect.isclass(thing):
-        text = "is not a class; a driver is a class derived from `Driver`"
+        name = getattr(thing, "__name__", "it")
+        text = f"{name!r} is not a class; a driver is a class derived from `Driver`"
         return {"keys": {device: [["driver", text]] for device in tables}}
     for code in _reachable(thing):
         _look(code, seen, in_action=False)
@@ -512,7 +664,27 @@ def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, An
     found = {device: _faults_of_driver(thing, **table) for device, table in tables.items()}
     dry = {"dry_run": True} if issubclass(thing, Driver) else {}
     moves = True if seen.streams else None  # set points may move a device without commands
-    return {"keys": found, "dry_run": not faults_of_limits(thing, dry, moves), **_plain(seen)}
+    return {
+        "keys": found,
+        "dry_run": not faults_of_limits(thing, dry, moves),
+        "classes": [f"{base.__module__}:{base.__qualname__}" for base in thing.__mro__],
+        "state": _state(thing),
+        **_plain(seen),
+    }
+
+
+def _state(thing: type) -> list[str] | None:
+    """Return the keys of a cyclic driver's state; None if its source does not show them."""
+    method = getattr(thing, "state", None)
+    if getattr(thing, "period", None) is None or not inspect.isfunction(method):
+        return None
+    code = _code(method)
+    given = [node.value for node in code.nodes if isinstance(node, ast.Return)] if code else []
+    keys = [key for value in given if isinstance(value, ast.Dict) for key in value.keys]
+    if not given or not all(isinstance(value, ast.Dict) for value in given):
+        return None
+    names = [key.value for key in keys if isinstance(key, ast.Constant)]
+    return sorted(map(str, names)) if len(names) == len(keys) else None
 
 
 def _methods(thing: type[Driver], seen: _Seen) -> None:
@@ -641,17 +813,20 @@ def _plain(seen: _Seen) -> dict[str, Any]:
         "puts": sorted(seen.puts),
         "any_put": seen.any_put,
         "lasts": seen.lasts,
+        "reads": seen.reads,
         "memory": seen.memory,
         "device": seen.device,
     }
 
 
 def _read(path: str, tables: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Import one path and return the findings."""
+    """Import one path and return the findings: `classes` says that it is a class."""
     try:
         thing = resolve(path)
     except ImportError as fault:
         return {"import": str(fault)}
+    if tables is None and inspect.isclass(thing):
+        return {"classes": []}
     return _function(thing) if tables is None else _driver(thing, tables)
 
 

@@ -439,8 +439,14 @@ def _faults_of_keys(driver: type, config: Mapping[str, Any]) -> list[tuple[str, 
         if hasattr(driver, name) and name not in RESERVED:
             default = f"{getattr(driver, name)!r:.40}"
             text = f"{driver.__name__} does not read it; write {name} = key({default}) in the class"
-        else:
-            text += nearest(name, [*own, *COMMON_KEYS]) or nearest(name, own) or "; drop it"
+        elif name in driver.__annotations__:
+            text = (
+                f"{driver.__name__} declares only its type; write {name}: ... = key() in the class"
+            )
+        else:  # its own keys come before those of all drivers: `speed` is near many names
+            hint, common = nearest(name, own), nearest(name, COMMON_KEYS)
+            hint = common if "did you mean" in common and "did you mean" not in hint else hint
+            text += hint if "did you mean" in hint else f"{hint}; drop it"
         faults.append((name, text))
     return faults
 

@@ -16,6 +16,7 @@ from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[1]
 SORTER = ROOT / "examples" / "sorter"
+PORTER = ROOT / "examples" / "porter"
 TUTORIAL = ROOT / "docs" / "tutorial.md"
 
 
@@ -56,7 +57,8 @@ def test_the_tutorial_shows_the_files_as_they_are() -> None:
         name = re.match(r"\d\. .*`(\S+)`\n", section)
         for block in re.findall(r"```(?:python|toml)\n(.*?)```", section, re.DOTALL):
             assert name is not None, section
-            lines = iter((SORTER / name[1]).read_text(encoding="utf-8").splitlines())
+            robot = SORTER if (SORTER / name[1]).exists() else PORTER
+            lines = iter((robot / name[1]).read_text(encoding="utf-8").splitlines())
             for line in filter(None, block.splitlines()):
                 assert line in lines, f"{name[1]}: {line}"
                 shown += 1

@@ -111,7 +111,7 @@ def _with_code(task: Task, directory: Directory, judged: MayRun) -> CheckReport:
     """Add findings about the code that the location file names. Raises CommandError for errors in
     that file."""
     from petrobot.coordinator.task.check import CheckReport, Finding, Severity, in_file
-    from petrobot.coordinator.task.check.code import code_findings, given_findings
+    from petrobot.coordinator.task.check.code import code_findings, given_findings, occupied
     from petrobot.coordinator.task.check.completeness import EXTERNAL_WAIT, external_waits
     from petrobot.coordinator.task.file.errors import key_lines, line_of
     from petrobot.services.comm.location_file import read_text
@@ -137,6 +137,7 @@ def _with_code(task: Task, directory: Directory, judged: MayRun) -> CheckReport:
         return f"{directory.source}:{line_of(key, lines)}: {key}"
 
     found += given_findings(by_action, args, where)
+    found += occupied(task, {action.name: action.device for action in actions})
     for stream in directory.streams.values():
         if stream.period > SLOW:
             text = f"{stream.period:g} s between two set points; 0.05 would be 50 ms"

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from math import inf, isfinite, prod
 
-from petrobot.coordinator.task.conditions import Expression, Literal, Name
+from petrobot.coordinator.task.conditions import Expression, Literal, Name, walk
 from petrobot.coordinator.task.conditions.regions import Domain, kind_faults
 from petrobot.coordinator.task.elements import (
     EarlyEvent,
@@ -424,7 +424,10 @@ def _action_place(names: _Names, key: str, p: Place) -> Iterator[Fault]:
         yield Fault(f"{key}.servers", f"{p.servers} servers", "give 1 or more")
     for name, value in p.args.items():
         if isinstance(value, Reference):
-            if value.variable not in names.read:
+            if value.variable in names.places:
+                text = f"{value.variable!r} is a place, which has no value"
+                yield Fault(f"{key}.args.{name}", text, "name a variable or another parameter")
+            elif value.variable not in names.read:
                 remedy = f"declare it in [variables]{nearest(value.variable, names.read)}"
                 yield Fault(
                     f"{key}.args.{name}",
@@ -565,7 +568,7 @@ def _subnet(task: Task, s: Subnet) -> Iterator[Fault]:
         elif port != "entry" and s.places[place].kind in (Kind.ACTION, Kind.MACRO):
             yield Fault(
                 f"{key}.{port}",
-                f"{place!r} is a {s.places[place].kind} place",
+                f"{place!r} is of kind {s.places[place].kind}",
                 "end in a place without `kind`",
             )
     for name in set(s.places) & set(s.transitions):
@@ -593,11 +596,18 @@ def _whole(task: Task) -> Iterator[Fault]:
     places = {
         name for net in (task.places, *(s.places for s in task.subnets.values())) for name in net
     }
+    seen: set[tuple[str, str]] = set()
     for t in flat.transitions.values():
+        key, written = _written(task, t)
         if t.when is not None and not t.expanded_from:
-            yield from _expression(f"{_written_key(task, t)}.when", t.when, domains, places)
+            own = written.when if written is not None else None
+            when, meanings = _as_written(own, t.when, t.name, domains)
+            for fault in _expression(f"{key}.when", when, meanings, places):
+                if (fault.key, fault.text) not in seen:
+                    seen.add((fault.key, fault.text))
+                    yield fault
         for name, expression in t.sets:
-            yield from _value(f"{_written_key(task, t)}.set.{name}", name, expression, domains)
+            yield from _value(f"{key}.set.{name}", name, expression, domains)
     if flat is not task:
         yield from _expanded_arcs(task, flat)
     for key, predicate in (("task.final", task.final), ("task.final_error", task.final_error)):
@@ -674,7 +684,7 @@ def _expanded_arcs(task: Task, flat: Task) -> Iterator[Fault]:
     held = {name for places in nets for p in places.values() for name in p.holds}
     seen: set[tuple[str, str]] = set()
     for t in flat.transitions.values():
-        key = _written_key(task, t)
+        key, _ = _written(task, t)
         for fault in _arcs(key, t, flat.places):
             if (fault.key, fault.text) not in seen:
                 seen.add((fault.key, fault.text))
@@ -683,11 +693,38 @@ def _expanded_arcs(task: Task, flat: Task) -> Iterator[Fault]:
                 yield Fault(fault.key, fault.text, remedy)
 
 
-def _written_key(task: Task, t: Transition) -> str:
-    """The key in the task file of what a flat transition was made from."""
+def _written(task: Task, t: Transition) -> tuple[str, Transition | None]:
+    """The key in the task file of what a flat transition was made from, and that transition as it
+    is written there; None if a place's short form made it."""
     *macros, name = (t.expanded_from or t.name).split(".")
     key, places, transitions = "", task.places, task.transitions
     for macro in macros:
         subnet = task.subnets[places[macro].subnet]
         key, places, transitions = f"subnets.{subnet.name}.", subnet.places, subnet.transitions
-    return f"{key}{'transitions' if name in transitions else 'places'}.{name}"
+    group = "transitions" if name in transitions else "places"
+    return f"{key}{group}.{name}", transitions.get(name)
+
+
+def _as_written(
+    written: Expression | None, full: Expression, transition: str, domains: Mapping[str, Domain]
+) -> tuple[Expression, Mapping[str, Domain]]:
+    """A condition as the subnet of the flat transition writes it, and what each name in it can be:
+    its full form has literals instead of parameters, and names with the macro place before them."""
+    leaves, full_leaves = (
+        [node for node in walk(e.tree) if isinstance(node, Name | Literal)]
+        for e in (written or full, full)
+    )
+    if written is None or len(leaves) != len(full_leaves):
+        return full, domains
+    prefix = transition[: transition.rfind(".") + 1]
+    known = {
+        name.removeprefix(prefix): domain
+        for name, domain in domains.items()
+        if name.startswith(prefix) or "." not in name
+    }
+    for node, meant in zip(leaves, full_leaves, strict=True):
+        if isinstance(node, Name) and isinstance(meant, Literal):
+            known[node.name] = Domain(VariableType.of(meant.value).value)
+        elif isinstance(node, Name) and isinstance(meant, Name) and meant.name in domains:
+            known[node.name] = domains[meant.name]
+    return written, known

@@ -256,8 +256,15 @@ class LockstepNode:
         return self._now
 
     def _place(self, device: str) -> Host:
+        """A device all of whose actions are scripted gets no driver: it may be a real one."""
         directory, driver, reseed = self._directory, None, None
-        if device != GENERAL:
+        own = {
+            a.name: a
+            for a in directory.actions.values()
+            if (a.node, a.device) == (self.name, device)
+        }
+        scripted = bool(own) and own.keys() <= (self._substitutes or {}).keys()
+        if device != GENERAL and not scripted:
             entry = directory.devices[device]
             ports = self._ports[device] = LockstepPorts(
                 directory, entry, self._clock, self._out.append
@@ -267,11 +274,7 @@ class LockstepNode:
             if device not in directory.without_actions(self.name):
                 reseed(0)
         return InlineHost(
-            {
-                a.name: a
-                for a in directory.actions.values()
-                if a.node == self.name and a.device == device
-            },
+            own,
             clock=self._clock,
             driver=driver,
             streams={s.name: s.period for s in directory.streams.values()},

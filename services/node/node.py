@@ -13,6 +13,8 @@ from typing import Any
 
 from petrobot.services.action import Status
 from petrobot.services.comm.calls.callee import (
+    DEADLINE,
+    ORPHAN,
     Callee,
     Inline,
     Offer,
@@ -162,7 +164,7 @@ VERBS = frozenset(
     {"hold", "release", "stop", "status", PICTURE, EMERGENCY_STOP, CLEAR_EMERGENCY, LEASE, SEED}
 )
 """Verbs of a COMMAND."""
-_OWN_CAUSES = ("deadline", "orphan", EMERGENCY_STOP)
+_OWN_CAUSES = (DEADLINE, ORPHAN, EMERGENCY_STOP)
 _WELL_HELD = ("held", "stopped")
 MISSED = (
     "an emergency stop was given and cleared after this caller had connected: nothing that began "
@@ -389,7 +391,8 @@ class Node:
                 cause = order.reason if order.reason in _OWN_CAUSES else "cancelled"
                 service = self.callee.service_of(order.id)
                 if service is not None:
-                    text = self.callee.late(order.id) if cause == "deadline" else order.reason
+                    own = cause in (DEADLINE, ORPHAN)
+                    text = self.callee.why_stopped(order.id, cause) if own else order.reason
                     stop = Cancel(order.id, stop_reason(cause, text))
                     self.places[self._host_of(service)].take(now, stop)
             else:

@@ -89,7 +89,8 @@ class DevicePorts:
         entry = self._directory.streams.get(name)
         if entry is None or entry.to != self._device.name:
             raise ValueError(
-                f"no stream {name!r} leads here; write [streams.{name}] to = {self._device.name!r}"
+                f"no stream {name!r} leads here (write [streams.{name}] to = "
+                f"{self._device.name!r} in {self._directory.source.name})"
             )
         return entry
 

@@ -47,6 +47,12 @@ IN_THE_TASK: list[Mistake] = [
     (TASK, "[task]", "[tsk]", r":LINE: tsk: unknown key.*did you mean 'task'\?"),
     (TASK, 'final = "parts == 0"', "", r":5: task.final: missing; give a text"),
     (TASK, '"parts == 0"', '"part == 0"', r":LINE: task.final: in 'part == 0'.*'part'.*parts"),
+    (
+        TASK,
+        "grip:normal",
+        "grip:success",
+        r"none of normal, .*; write grip:normal, and when = \"grip.status == 'success'\"",
+    ),
     (TASK, '"parts == 0"', '"parts = 0"', r":LINE: task.final: .* at column 7 of 'parts = 0'"),
     (
         TASK,
@@ -262,6 +268,12 @@ IN_THE_CELL: list[Mistake] = [
         "speed = 0.5",
         "sped = 0.5",
         r":LINE: devices.axis.top_sped: unknown key; did you mean 'top_speed'",
+    ),
+    (
+        CELL,
+        "top_speed = 0.5",
+        "max_speed = 0.5",
+        r":LINE: devices.axis.max_speed: unknown key; did you mean 'top_speed'",
     ),
     (CELL, "top_speed = 0.5", "limit = 1", r"axis.limit: unknown key; known: top_speed, length"),
     (
@@ -546,6 +558,54 @@ IN_THE_CODE: list[Mistake] = [
     ),
     (
         CODE,
+        "error, key, success",
+        "error, key",
+        r"arm_bot.py:\d+: `success` is not defined; write `from petrobot import success`",
+    ),
+    (
+        CODE,
+        "return success(at=",
+        "return success(at=at, was=",
+        r"arm_bot.py:\d+: `at` is not defined; .* it",
+    ),
+    (
+        CODE,
+        "    return success()",
+        "    await ctx.sleep(0.1)",
+        r"arm_bot.py:\d+: grip returns no result here; end it with `return success\(\)`",
+    ),
+    (
+        CODE,
+        "return success()",
+        "return success(True)",
+        r"arm_bot.py:\d+: `success\(True\)`: too many positional .*; write `success\(name=value\)`",
+    ),
+    (
+        CODE,
+        'error("slipped", "the part slipped out")',
+        "error()",
+        r"`error\(\)`: missing a required argument: 'cause'; write `error\(\"cause\", \"text\"\)`",
+    ),
+    (
+        CODE,
+        "    await ctx.sleep(0.3)",
+        "    end = ctx.now + 0.3\n    while ctx.now < end:\n        pass",
+        r"arm_bot.py:\d+: this loop never ends, .* not even the clock; .*`await ctx.sleep",
+    ),
+    (
+        CODE,
+        'ctx.device.state["arrived"]',
+        'ctx.device.state["arived"]',
+        r"arm_bot.py:\d+: the state of Axis has no 'arived' \(did you mean 'arrived'.*returns arr",
+    ),
+    (
+        CODE,
+        "async def grip(ctx: Context[Remote]",
+        "class Saw(Driver):\n    pass\n\n\nasync def grip(ctx: Context[Saw]",
+        r"services.toml:\d+: actions.grip.device: its `ctx` is a Context\[Saw\], .* driver is Axis",
+    ),
+    (
+        CODE,
         "class Axis",
         "import os; os._exit(3)\n\n\nclass Axis",
         r":LINE: .*ended the process \(exit code 3\)",
@@ -580,8 +640,34 @@ BOTH: list[tuple[list[Mistake], str]] = [
         r":LINE: task.prepare: 'ready' does not take runs.*write .* `ctx, \*, runs, seed`",
     ),
     (
+        [
+            (CELL, "top_speed = 0.5", "depth = 0.5", ""),
+            (CODE, "top_speed: float = key", "depth: float\n    top_speed: float = key", ""),
+        ],
+        r":7: devices.axis.depth: Axis declares only its type; write depth: ... = key\(\) in",
+    ),
+    (
+        [(CELL, "arm_bot:grip", "arm_bot:Axis", "")],
+        r"actions.grip.run: 'arm_bot:Axis' is a class; name a function: an action is an `async`",
+    ),
+    (
         [(CELL, 'move", device = "axis"', 'move", node = "pc"', ""), (CODE, COMMANDED, "", "")],
         r"actions.move: uses ctx.device \(arm_bot.py:\d+\) and has no device; write",
+    ),
+]
+
+WATCHES = [
+    (
+        TASK,
+        "broken = {}\n",
+        'broken = {}\nwatch = { kind = "action", task = "grip", tokens = 1, listen = true }\n',
+        "",
+    ),
+    (
+        TASK,
+        "[transitions]\n",
+        '[transitions]\nseen = { in = ["watch:normal"], out = ["watch"] }\n',
+        "",
     ),
 ]
 
@@ -591,6 +677,20 @@ MEMORY = '[services.memory]\nnode = "pc"\n\n[actions]'
 READS = (CODE, "await ctx.sleep(0.3)", 'print(await ctx.get("part"))', "")
 
 DOUBTED: list[tuple[list[Mistake], str, list[Mistake]]] = [
+    (
+        WATCHES,
+        r":\d+: places.watch: it listens, and its run keeps axis until .*: carry, fetch, grip wait",
+        [(CELL, 'grip", device = "axis"', 'grip", node = "pc"', "")],
+    ),
+    (
+        [
+            (CODE, 'ctx.device.state["arrived"]', 'ctx.device.state["homed"]', ""),
+            (CODE, '{"at": self.at,', '{**vars(self), "at": self.at,', ""),
+        ],
+        "",
+        [],
+    ),
+    ([(CODE, "    return success()", "    await ctx.wait(lambda: False)", "")], "", []),
     (
         [
             WIDTH,
@@ -810,6 +910,7 @@ def expect(pattern: str, arguments: list[str], code: int | None = 2) -> None:
 
 
 WARNINGS = (
+    "its `ctx` is a Context",
     "expects to: str",
     "expects slips: float",
     "between two set points",
@@ -982,6 +1083,8 @@ GIVEN = [
     ),
 ]
 """A variable that a subnet receives."""
+SWAPPED = [*GIVEN, *2 * [(TASK, '{ var = "w" }', '"broken"', "")], (TASK, '"str"', '"float"', "")]
+"""A place that it receives, and a variable that it reads."""
 
 REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
     (
@@ -993,6 +1096,15 @@ REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
         [*GIVEN, (TASK, 'p = "float"', 'p = "variable"', "")],
         r"places.grip.args.p: expected a variable, found the value of 'w'; write \"w\"",
         [(TASK, '{ var = "w" }', '"w"', ""), (TASK, '{ var = "w" }', '"w"', "")],
+    ),
+    (
+        [
+            *SWAPPED,
+            (TASK, 'p = "float"', 'p = "place"', ""),
+            (TASK, 'task = "grip" }', 'task = "grip", args = { slips = { var = "p" } } }', ""),
+        ],
+        r"places.close.args.slips: 'p' is a place, which has no value; name a variable or another",
+        [(TASK, 'var = "p"', 'var = "w"', "")],
     ),
     (
         [*GIVEN, (TASK, 'p = "float"', 'p = "place"', "")],
@@ -1103,9 +1215,49 @@ REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
         ],
     ),
     (
+        [
+            *OUTER,
+            (TASK, "[places]", '[variables.w]\ntype = "str"\n\n[places]', ""),
+            (TASK, 'subnet = "hold",', 'subnet = "hold", args = { f = 3 },', ""),
+            (
+                TASK,
+                'again = { kind = "macro", subnet = "hold",',
+                'again = { kind = "macro", subnet = "hold", args = { f = 4 },',
+                "",
+            ),
+            (
+                TASK,
+                "[subnets.hold.errors]",
+                '[subnets.hold.parameters]\nf = "int"\n[subnets.hold.errors]',
+                "",
+            ),
+            (TASK, "closed = {", "closed = { when = \"w == f or close.status == 'good'\",", ""),
+        ],
+        r"closed.when: in \"w == f or close.status == 'good'\", == at column 3 compares a str with",
+        [(TASK, "w == f", "f == 3", ""), (TASK, "good", "success", "")],
+    ),
+    (
         [(CELL, 'move", device = "axis"', 'move", node = "pc"', "")],
         r"actions.move: uses ctx.command .*write device = ",
         [(CELL, 'move", node = "pc"', 'move", device = "axis"', "")],
+    ),
+    *(
+        (
+            [
+                (CELL, 'grip", device = "axis"', 'grip", node = "pc"', ""),
+                (CODE, USED, f"{USED}\n    print({used})", ""),
+            ],
+            r"actions.grip: uses ctx.device .*write device = ",
+            [(CODE, f"    {USED}\n", f"    {asked}\n    {USED}\n", "")],
+        )
+        for used, asked in (
+            ("ctx.device", "if ctx.device is None:\n        return success()"),
+            ("ctx.device", "if not ctx.device:\n        return success()"),
+            (
+                "axis := ctx.device",
+                "axis = ctx.device\n    if axis is None:\n        return success()",
+            ),
+        )
     ),
 ]
 """Mistakes, what is found with its remedy, and the remedy followed to the letter."""
@@ -1250,7 +1402,12 @@ TIMER = '[timers.button]\nnode = "pc"\nperiod = 1.0\n\n[nodes]'
     [
         (CODE, "if not self.paused:", RAISED, ""),
         (CELL, "[nodes]", TIMER, ""),
-        (CODE, "if not self.paused:", RAISED.replace('"button"', "NAME"), "if it never comes"),
+        (
+            CODE,
+            "if not self.paused:",
+            RAISED.replace('"button"', '"button".lower()'),
+            "if it never comes",
+        ),
         (CODE, "", "", "no driver, action, service or timer of services.toml raises it"),
     ],
     ids=["by a driver", "by a timer", "by a computed name", "by nobody"],

@@ -178,7 +178,7 @@ def test_the_deadline_is_enforced_whatever_the_action_says(limited_by: str) -> N
     callee.advance(3.0)
     callee.advance(4.0)
     assert callee.orders() == [m.Cancel("1", "deadline")]
-    assert callee.late("1") == "took longer than its deadline of 2 s"
+    assert callee.why_stopped("1", "deadline") == "took longer than its deadline of 2 s"
     callee.finish(4.1, m.Outcome("1", "success", {"p": 1}))
     assert _outcome(callee) == ("error", "deadline", Executed.YES)
 
@@ -200,6 +200,7 @@ def test_an_orphan_is_stopped_after_its_time_unless_its_caller_comes_back() -> N
     assert callee.orders() == [m.Cancel("1", "orphan")], (
         "track has no orphan time and keeps running"
     )
+    assert callee.why_stopped("1", "orphan").startswith("its coordinator was away for 1 s, so")
     callee.finish(4.1, m.Outcome("1", "error", cause="cancelled"))
     _said(callee)
     welcome = callee.link_up(5.0, "coord", COORD)

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from petrobot import Context, Result, success
 from petrobot.services.comm.calls.caller import Caller, Notice
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.location_file import Directory, DirectoryError, parse
@@ -226,6 +227,20 @@ def test_an_action_on_a_cyclic_device() -> None:
     assert end.seconds == pytest.approx(0.2, abs=6 * TICK)
     assert bench.call("go", to=1e6).text == "1000000.0 is beyond the rail; stay within 100 m"
     assert [f.id for f in bench.world.frames[:3]] == [0x181] * 3 and len(bench.world.frames) >= 490
+
+
+def test_a_device_whose_actions_are_all_scripted_gets_no_driver() -> None:
+    """Its driver may need a device that is not here. If one action is not scripted, it is made."""
+    absent = directory(**{"drivers:Slide": "drivers:Absent"})
+
+    async def scripted(ctx: Context, **_arguments: Any) -> Result:
+        return success()
+
+    with pytest.raises(DirectoryError, match="Absent"):
+        Bench(absent, go=scripted)
+    bench = Bench(absent, go=scripted, follow=scripted)
+    assert bench.call("go", 1.0, to=0.2).status == "success"
+    assert bench.call("add", 1.0, a=1, b=2).status == "success"
 
 
 def test_a_stopped_device_starts_no_run_before_it_is_cleared() -> None:

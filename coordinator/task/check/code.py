@@ -11,15 +11,17 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 from petrobot.coordinator.task import (
+    End,
     Place,
     PrimitiveTask,
     Reference,
     Scope,
+    Start,
     Task,
     VariableType,
 )
 from petrobot.coordinator.task.check.findings import Finding
-from petrobot.coordinator.task.wording import Severity, listed, nearest
+from petrobot.coordinator.task.wording import Severity, few, listed, nearest
 
 Code = Mapping[str, Mapping[str, Any]]
 """By action: what `services.code_reading` found in it, and as `device` the same of its driver."""
@@ -80,12 +82,25 @@ def code_findings(
     for action in used:
         yield from _events(task, action, code[action])
         yield from _unknown_services(code[action], {*services, *args})
+    yield from dict.fromkeys(f for action in used for f in _unknown_states(code[action]))
     yield from _undeclared(task, drivers, raised)
     actions = [code[action] for action in used]
     for kind, severity in (("faults", Severity.ERROR), ("doubtful", Severity.WARNING)):
         found = {tuple(one) for facts in (*actions, *drivers) for one in facts.get(kind, ())}
         for file, line, text in sorted(found):
             yield Finding(severity, "code", f"{file}:{line}", text)
+
+
+def _unknown_states(facts: Mapping[str, Any]) -> Iterator[Finding]:
+    """What an action reads of its device's state, and the driver's `state` does not return."""
+    device: Mapping[str, Any] = facts.get("device") or {}
+    known = device.get("state")
+    for name, (file, line) in facts.get("reads", {}).items():
+        if known is not None and name not in known:
+            driver = device["classes"][0].partition(":")[2]
+            text = f"the state of {driver} has no {name!r}{nearest(name, known)}"
+            remedy = f"its `state` returns {listed(known) or 'nothing'}"
+            yield Finding(Severity.ERROR, "code", f"{file}:{line}", text, remedy)
 
 
 def _called(key: str, name: str, facts: Mapping[str, Any], given: Collection[str]) -> str:
@@ -156,14 +171,46 @@ def argument_findings(
 def given_findings(
     code: Code, args: Mapping[str, Mapping[str, Any]], where: Callable[[str], str]
 ) -> Iterator[Finding]:
-    """Arguments of actions in the location file that do not fit; `where` returns a key of that file
-    with file and line."""
-    for action in args.keys() & code.keys():
+    """Arguments and devices of actions in the location file that do not fit; `where` returns a key
+    of that file with file and line."""
+    for action in sorted(args.keys() & code.keys()):
+        wants, classes = code[action].get("wants"), code[action]["device"].get("classes")
+        if wants and classes and wants[1] not in classes:
+            text = f"its `ctx` is a Context[{wants[0]}], and the device's driver is"
+            text += f" {classes[0].partition(':')[2]}"
+            remedy = "correct the device, or the annotation"
+            key = where(f"actions.{action}.device")
+            yield Finding(Severity.WARNING, "code", key, text, remedy)
         known = code[action].get("parameters", {})
         for name, value in args[action].items():
             if name in known and not _fits(value, known[name]):
                 key = where(f"actions.{action}.args.{name}")
                 yield _unlike(key, action, name, known[name], f"{value!r}")
+
+
+def occupied(task: Task, devices: Mapping[str, str]) -> Iterator[Finding]:
+    """Places that listen from the beginning with a device that other places wait for; `devices` by
+    action."""
+    users: dict[str, set[str]] = {}
+    arcs = [arc for t in task.flat.transitions.values() for arc in t.inputs]
+    preempted = {arc.place for arc in arcs if arc.end is End.PREEMPT}
+    for place in task.flat.places.values():
+        if place.task:
+            for action in task.primitive_tasks[place.task].alternatives:
+                users.setdefault(devices.get(action, ""), set()).add(place.name)
+    for device, names in users.items():
+        for name in sorted(names) if device else ():
+            waiting = sorted(
+                other
+                for other in names - {name}
+                if task.primitive_tasks[task.flat.places[other].task].start is not Start.AT_ONCE
+            )
+            place = task.flat.places[name]
+            if place.listen and place.tokens and waiting and name not in preempted:
+                text = f"it listens, and its run keeps {device} until it ends"
+                text += f": {few(waiting)} {'wait' if len(waiting) > 1 else 'waits'} for it"
+                remedy = "let the listening action use a device of its own, or none"
+                yield Finding(Severity.WARNING, "occupied", f"places.{name}", text, remedy)
 
 
 def _arguments(

@@ -7,7 +7,7 @@ import re
 from enum import StrEnum
 from typing import TypeVar
 
-from petrobot.coordinator.task import Counts, End, Inhibitor, Input, Output
+from petrobot.coordinator.task import Counts, End, Inhibitor, Input, Output, Status
 from petrobot.coordinator.task.wording import nearest
 
 W = TypeVar("W", bound=StrEnum)
@@ -68,7 +68,8 @@ def _word(words: type[W], text: str | None, arc: str) -> W | None:
     try:
         return words(text)
     except ValueError:
-        known = ", ".join(words)
-        raise ArcError(
-            f"{arc!r}: {text!r} is none of {known}{nearest(text, list(words))}"
-        ) from None
+        what = f"{arc!r}: {text!r} is none of {', '.join(words)}{nearest(text, list(words))}"
+        place, _, _ = arc.partition(":")
+        if words is End and text in (Status.SUCCESS, Status.FAILURE):
+            what += f"; write {place}:normal, and when = \"{place}.status == '{text}'\""
+        raise ArcError(what) from None

@@ -719,10 +719,13 @@ class Callee:
         run = self._running.get(id_)
         return None if run is None else run.call.service
 
-    def late(self, id_: str) -> str:
-        """Return in words that an active run is over its deadline."""
-        call = self._running[id_].call
-        seconds = self.offers[call.service].deadline if call.deadline is None else call.deadline
+    def why_stopped(self, id_: str, cause: str) -> str:
+        """Return in words why an active run is stopped: it is over its deadline or an orphan."""
+        run = self._running[id_]
+        if cause == ORPHAN:
+            return f"its coordinator was away for {run.orphan_time:g} s, so its node stopped it"
+        deadline = run.call.deadline
+        seconds = self.offers[run.call.service].deadline if deadline is None else deadline
         return f"took longer than its deadline of {seconds:g} s"
 
     def commander(self, id_: str) -> str:

@@ -176,9 +176,10 @@ class Directory:
             if key in table:
                 return str(table[key].node)
         known = [*self.actions, *self.services, *self.devices, *self.timers, *self.streams]
-        raise DirectoryError(
-            (f"{self.source}: nothing is named {name!r}{directory_file.nearest(key, known)}",)
-        )
+        hint = directory_file.nearest(key, known)
+        if key == MEMORY:
+            hint = f'; the global memory is on no node: write [services.{MEMORY}] node = "..."'
+        raise DirectoryError((f"{self.source}: nothing is named {name!r}{hint}",))
 
     def party(self, endpoint: str) -> str:
         """Lock step: return the party of an endpoint; a name that is not in the file is a party

@@ -128,6 +128,9 @@ def code_faults(directory: Directory, code: Mapping[str, Facts], text: str) -> t
         for entry in table.values():
             key = f"{'actions' if entry.name in directory.actions else 'services'}.{entry.name}"
             unread(f"{key}.run", entry.run)
+            if "classes" in code.get(entry.run, {}):
+                text = f"{entry.run!r} is a class; name a function: an action is an `async` one"
+                faults.add(f"{key}.run", text)
     for action in directory.actions.values():
         place = code.get(action.run, {}).get("device")
         if place and not action.device:
