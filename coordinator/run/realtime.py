@@ -107,7 +107,8 @@ class RealtimeMission:
         self.mission = mission
         self._directory = directory
         self._ordered = ordered
-        self._leased: tuple[str, ...] = ()
+        self._leased: list[str] = []
+        """Devices that this run has, in the order in which it took them."""
         self._answers: dict[str, asyncio.Future[Answer]] = {}
         """Answers to come to the requests for devices, by the command's id."""
         self._asked = itertools.count()
@@ -159,14 +160,14 @@ class RealtimeMission:
         both take them in the order of services.toml. A run whose coordinator was killed keeps its
         devices for a while, so they are asked for as long. Raises MissionError if another run has
         one, and UnreachableError if a node does not answer."""
-        self._leased = tuple(device for device in self._directory.devices if device in devices)
         until = self.now() + LEAVE
-        for device in self._leased:
+        for device in (d for d in self._directory.devices if d in devices):
             answer = await self._take_device(device)
             while not answer.ok and "text" in answer.data and self.now() < until:
                 await asyncio.sleep(ASK_AGAIN)
                 answer = await self._take_device(device)
             if answer.ok:
+                self._leased.append(device)
                 continue
             if "text" not in answer.data:
                 node = self._directory.where(device)
@@ -292,7 +293,9 @@ class RealtimeMission:
                     since = split_boot(notice.boot)[2]
                     if self._missed is not None and uptime() - self._ordered > since + TRANSIT:
                         self._missed.append(node)
-                    for device in self._leased:  # a node that was restarted does not know of it
+                    # A restarted node does not know of the devices that the run has. It must not
+                    # ask for those that it only waits for: they come in the order of the file.
+                    for device in self._leased:
                         if self._directory.where(device) == node:
                             self._take_device(device)
                 elif isinstance(notice, Answer) and notice.id in self._answers:
