@@ -42,6 +42,7 @@ from petrobot.services.device import (
     keys_of,
 )
 from petrobot.services.host.json_text import json_text
+from petrobot.services.host.parent_death import die_with
 
 AWAITED = frozenset(
     ("wait", "sleep", "call", "command", "get", "get_versioned", "put", "compare_and_set")
@@ -833,6 +834,7 @@ def _read(path: str, tables: Mapping[str, Any] | None) -> dict[str, Any]:
 def main() -> None:
     """Answer on the original standard output; output of imported code is dropped."""
     asked = json.load(sys.stdin)
+    die_with(asked["parent"])
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     silent = os.open(os.devnull, os.O_WRONLY)
     os.dup2(silent, 1)

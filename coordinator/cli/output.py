@@ -4,10 +4,11 @@ report."""
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -44,6 +45,28 @@ def progress(options: argparse.Namespace) -> Iterator[Callable[[Mission, float],
 
 
 @contextmanager
+def kept_streams() -> Iterator[None]:
+    """Give back the standard output and error that an action has closed or replaced: in lock step
+    actions run in this process, and the result is still to be printed."""
+    streams, copies = (sys.stdout, sys.stderr), dict[int, int]()
+    for number in (1, 2):
+        with suppress(OSError):  # closed from the start
+            copies[number] = os.dup(number)
+    try:
+        yield
+    finally:
+        for number, copy in copies.items():
+            os.dup2(copy, number)
+            os.close(copy)
+        sys.stdout, sys.stderr = (
+            open(number, "w", buffering=1, encoding=stream.encoding, closefd=False)  # noqa: SIM115
+            if stream is not None and stream.closed and number in copies
+            else stream
+            for number, stream in enumerate(streams, 1)
+        )
+
+
+@contextmanager
 def live_progress() -> Iterator[Callable[[Mission, float], None]]:
     """Show a line about the active run, at most every 0.1 s of wall time; calls in between do
     nothing."""
@@ -55,7 +78,7 @@ def live_progress() -> Iterator[Callable[[Mission, float], None]]:
         def watch(mission: Mission, now: float) -> None:
             nonlocal shown
             wall = time.monotonic()
-            if wall - shown >= REFRESH:
+            if wall - shown >= REFRESH and not getattr(sys.stderr, "closed", False):
                 shown = wall
                 live.update(_line(mission, now), refresh=True)
 

@@ -354,9 +354,9 @@ def conduct(
 
 
 async def _lead_lockstep(session: RunSession, options: argparse.Namespace) -> None:
-    from petrobot.coordinator.cli.output import progress
+    from petrobot.coordinator.cli.output import kept_streams, progress
 
-    with progress(options) as watch:
+    with progress(options) as watch, kept_streams():
         await session.lead(watch)
 
 

@@ -105,7 +105,7 @@ class Executor:
         """Subscribe at every node to the events and variables of the task and to verdicts on its
         runs; `fresh`: the mission run begins now."""
         known = self._external | {MEMORY_EVENTS + name for name in self.task.flat.variables}
-        names = sorted(known | {verdict_event(self.mission), STOP_EVENT})
+        names = sorted(known | {verdict_event(self.mission)})
         for caller in self.callers.values():
             caller.subscribe(now, names, fresh=fresh)
 

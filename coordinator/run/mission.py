@@ -26,12 +26,13 @@ from petrobot.coordinator.run.recording import NODE, PREPARED, SCORED, STAGE, Re
 from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.net import Marking
 from petrobot.services.comm.calls.caller import Caller, Notice, PeerLost
-from petrobot.services.comm.calls.events import RunVerdict
+from petrobot.services.comm.calls.events import STOP_EVENT, RunVerdict
 from petrobot.services.comm.location_file import Directory, DirectoryError
 from petrobot.services.comm.protocol.messages import (
     SEED,
     Call,
     Command,
+    Event,
     Feedback,
     Outcome,
     Welcome,
@@ -343,6 +344,7 @@ class Mission:
     def take(self, now: float, node: str, notices: Sequence[Notice]) -> None:
         """Handle what a node's caller noticed. Notices wait until every node is connected: a
         mission never starts with a part of its nodes."""
+        self._refuse_to_begin(node, notices)
         self._note_links(now, node, notices)
         if self.stage is Stage.CONNECTING:
             self._early.extend(
@@ -486,6 +488,21 @@ class Mission:
             store.record(STAGE, {"stage": SCORED, "values": dict(score)})
             store.sync()
             self.score, self.stage = score, Stage.OVER
+
+    def _refuse_to_begin(self, node: str, notices: Sequence[Notice]) -> None:
+        """Raise MissionError if the task has not begun, and a node reports an emergency stop, or
+        that it has cleared one since it was connected."""
+        if self.executor.state.mode is not Mode.FRESH:
+            return  # then the executor aborts
+        for notice in notices:
+            if (isinstance(notice, Event) and notice.name == STOP_EVENT) or (
+                isinstance(notice, Welcome)
+                and split_boot(notice.boot)[1] != self.callers[node].stops
+            ):
+                raise MissionError(
+                    f"emergency stop, as {node} reports: the task was not begun; when the cell is "
+                    "safe, clear the stop and start the task again"
+                )
 
     def _note_links(self, now: float, node: str, notices: Sequence[Notice]) -> None:
         for notice in notices:

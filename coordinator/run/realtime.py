@@ -15,6 +15,7 @@ from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Mission, MissionError, Stage
 from petrobot.services.comm.calls.caller import Notice, PeerLost
 from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.peers import LEASED
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import (
     COORDINATOR,
@@ -107,7 +108,8 @@ class RealtimeMission:
         self.mission = mission
         self._directory = directory
         self._ordered = ordered
-        self._leased: tuple[str, ...] = ()
+        self._leased: list[str] = []
+        """Devices that this run has, in the order in which it took them."""
         self._answers: dict[str, asyncio.Future[Answer]] = {}
         """Answers to come to the requests for devices, by the command's id."""
         self._asked = itertools.count()
@@ -158,19 +160,21 @@ class RealtimeMission:
         """Take the devices for this run. Of two runs that start at once one gets them all, because
         both take them in the order of services.toml. A run whose coordinator was killed keeps its
         devices for a while, so they are asked for as long. Raises MissionError if another run has
-        one, and UnreachableError if a node does not answer."""
-        self._leased = tuple(device for device in self._directory.devices if device in devices)
+        one or an emergency stop holds it, and UnreachableError if a node does not answer."""
         until = self.now() + LEAVE
-        for device in self._leased:
+        for device in (d for d in self._directory.devices if d in devices):
             answer = await self._take_device(device)
-            while not answer.ok and "text" in answer.data and self.now() < until:
+            while answer.data.get("cause") == LEASED and self.now() < until:
                 await asyncio.sleep(ASK_AGAIN)
                 answer = await self._take_device(device)
             if answer.ok:
+                self._leased.append(device)
                 continue
             if "text" not in answer.data:
                 node = self._directory.where(device)
                 raise UnreachableError([node], f"{node} was connected and does not answer")
+            if answer.data["cause"] != LEASED:
+                raise MissionError(answer.data["text"], bad_input=True)
             raise MissionError(
                 f"in use: {answer.data['text']}; wait until that run has ended, or end it with "
                 "`petrobot abort` (after `petrobot resume`, if its coordinator was killed)",
@@ -217,8 +221,9 @@ class RealtimeMission:
     async def run(self, begin: Callable[[float], None] | None = None) -> None:
         """Run the mission to its end. `begin(now)` starts it, or continues a recorded run. Raises
         MissionError, and JournalError if the journal cannot be written."""
-        (begin or self.mission.start)(self._loop.time())
-        self.settle()
+        if self._fault is None:  # an emergency stop may have come before
+            (begin or self.mission.start)(self._loop.time())
+            self.settle()
         self._look_again(self._loop.time() + PERIOD)
         await self._over.wait()
         if remark := self._punctuality.remark():
@@ -292,7 +297,9 @@ class RealtimeMission:
                     since = split_boot(notice.boot)[2]
                     if self._missed is not None and uptime() - self._ordered > since + TRANSIT:
                         self._missed.append(node)
-                    for device in self._leased:  # a node that was restarted does not know of it
+                    # A restarted node does not know of the devices that the run has. It must not
+                    # ask for those that it only waits for: they come in the order of the file.
+                    for device in self._leased:
                         if self._directory.where(device) == node:
                             self._take_device(device)
                 elif isinstance(notice, Answer) and notice.id in self._answers:

@@ -436,7 +436,8 @@ class Node:
             text = f"{self.name} has no device {command.target!r}"
             self.callee.answer(now, command.id, False, {"cause": "unknown_device", "text": text})
         elif command.verb == LEASE:
-            refused = (self.callee.lease(now, command.id, key) for key in keys if key != GENERAL)
+            self._look_for_stops(now)
+            refused = (self._refused_lease(now, command.id, k) for k in keys if k != GENERAL)
             cause, text = next(filter(None, refused), ("", ""))
             told = {"cause": cause, "text": text} if cause else {}
             self.callee.answer(now, command.id, not cause, told)
@@ -455,7 +456,14 @@ class Node:
             if command.verb == EMERGENCY_STOP and devices:
                 # the devices first, the disk then; both before the answer
                 self._commands[command.id].note = self._stops.stop(devices)
-                self._tell_of_stop(now)
+                self.callee.tell_coordinators(STOP_EVENT)
+
+    def _refused_lease(self, now: float, id_: str, device: str) -> tuple[str, str] | None:
+        """Give a device to the caller of a command. Return why not: cause and text; None if it has
+        it."""
+        if device in self._stops:
+            return EMERGENCY_STOP, f"{device}: {IN_EMERGENCY}"
+        return self.callee.lease(now, id_, device)
 
     def _has_ended(self, run: object) -> bool:
         """Whether a run that is to be held is not active any more: a hold would catch the next run,
@@ -476,14 +484,10 @@ class Node:
         fresh, freed = self._stops.look(now)
         if fresh:
             self._stop_places(now, fresh)
-            self._tell_of_stop(now)
+            self.callee.tell_coordinators(STOP_EVENT)
         for key in freed:
             self.places[key].command(now, Command("", CLEAR_EMERGENCY))
         self.callee.stops = self._stops.cleared
-
-    def _tell_of_stop(self, now: float) -> None:
-        """Tell the coordinators, which abort: one may have no run on a stopped device now."""
-        self.callee.raise_event(now, STOP_EVENT, source=self.name)
 
     def _latched(self, device: str) -> dict[str, Any]:
         return {LATCHED: True, STOPS: self._stops.cleared + (device in self._stops)}

@@ -4,12 +4,21 @@ terminal."""
 from __future__ import annotations
 
 import contextlib
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from petrobot.coordinator.analysis import may_run
 from petrobot.coordinator.cli import main
+from petrobot.services.comm.location_file import load
+from petrobot.services.comm.location_file.code import read_code
+from tests.ports import free_ports
+from tests.processes import alive
+from tests.waiting import until
 
 HEAD = """schema = 1
 [task]
@@ -130,3 +139,68 @@ def test_notes_of_one_kind_are_told_once(
     assert code == 0 and lines[0] == "parts.toml: may run"
     (at,) = [i for i, line in enumerate(lines) if "no transition waits for it" in line]
     assert lines[at + 2].startswith("        and 2 more such notes: petrobot check ")
+
+
+NEVER_IMPORTED = """\
+import os, pathlib, threading
+with (pathlib.Path(__file__).parent / "importing.txt").open("a") as file:
+    file.write(f"{os.getpid()}\\n")
+threading.Event().wait()
+"""
+
+
+def cell_of_a_module_that_waits(folder: Path) -> Path:
+    """Write a location file with two actions of a module whose import never ends, and one of a
+    module that is well."""
+    (folder / "waits.py").write_text(NEVER_IMPORTED, encoding="utf-8")
+    well = "async def well(ctx):\n    pass\n"
+    (folder / "well.py").write_text(well, encoding="utf-8")
+    services = folder / "services.toml"
+    services.write_text(
+        f'schema = 1\n[nodes.pc]\nhost = "127.0.0.1"\nport = {free_ports(1)[0]}\n[actions]\n'
+        'look_once = { run = "waits:look", node = "pc" }\n'
+        'look_twice = { run = "waits:look_twice", node = "pc" }\n'
+        'well = { run = "well:well", node = "pc" }\n',
+        encoding="utf-8",
+    )
+    return services
+
+
+@pytest.mark.processes
+def test_a_module_whose_import_never_ends_is_imported_once(tmp_path: Path) -> None:
+    """Each of its actions and drivers waited for the same limit, a minute each."""
+    code = read_code(load(cell_of_a_module_that_waits(tmp_path)), seconds=5.0)
+    assert len((tmp_path / "importing.txt").read_text().split()) == 1
+    for path in ("waits:look", "waits:look_twice"):
+        assert code[path]["import"].startswith("importing it took longer than 5 s"), code
+    assert "import" not in code["well:well"]
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+async def test_an_import_that_never_ends_ends_with_its_check(
+    tmp_path: Path, how: signal.Signals
+) -> None:
+    """Also if `check` is killed: a process that nobody knows of was left running."""
+    text = HEAD + 'lost = { in = ["look:error"], out = ["arm"] }\n'
+    (tmp_path / "parts.toml").write_text(text, encoding="utf-8")
+    cell_of_a_module_that_waits(tmp_path)
+    check = subprocess.Popen(
+        [sys.executable, "-m", "petrobot.coordinator", "check", "parts.toml"],
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    importing = tmp_path / "importing.txt"
+    found = []
+    try:
+        await until(lambda: importing.exists() and importing.read_text(), "the import")
+        found = [int(pid) for pid in importing.read_text().split()]
+        check.send_signal(how)
+        await until(lambda: check.poll() is not None, "the end of check")
+        await until(lambda: not any(map(alive, found)), "the end of the import")
+    finally:
+        check.kill()
+        check.wait()
+        for process in filter(alive, found):
+            os.kill(process, signal.SIGKILL)

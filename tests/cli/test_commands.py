@@ -662,3 +662,25 @@ def test_a_task_may_draw_its_own_pictures() -> None:
     for wrong in ("nowhere:draw", "coordinator:nothing"):
         with pytest.raises(CommandError, match="name a function"):
             pictures_of(replace(task, pictures=wrong), {})
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    "deed",
+    ["sys.stdout.close()", "sys.stdout = io.StringIO()", "sys.stdout.close(); sys.stderr.close()"],
+)
+def test_the_result_is_printed_although_an_action_takes_the_output_away(
+    tmp_path: Path, deed: str
+) -> None:
+    """In lock step the action runs in the process of the command."""
+    assert petrobot("new", "robot", "bot", cwd=tmp_path).returncode == 0
+    code = tmp_path / "bot" / "bot.py"
+    head, move, body = code.read_text(encoding="utf-8").partition("async def move(")
+    signature, end, rest = body.partition("-> Result:\n")
+    deed = f"    import io, sys; {deed}\n"
+    code.write_text(head + move + signature + end + deed + rest, encoding="utf-8")
+    words = ["run", "bot/bot.toml", "--mode", "lockstep", "--journal", "runs"]
+    done = petrobot(*words, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "status" in done.stdout and "success" in done.stdout
+    assert len([*(tmp_path / "runs").glob("*/result.json")]) == 1

@@ -14,13 +14,14 @@ import pytest
 from petrobot.coordinator.cli.loading import load_task
 from petrobot.coordinator.engine import RunRecorded
 from petrobot.coordinator.launch import Setting, local_programs, mission_id, realtime_mission
+from petrobot.coordinator.run import realtime
 from petrobot.coordinator.run.mission import Mission, MissionError
 from petrobot.coordinator.run.realtime import RealtimeMission
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.coordinator.task import Executed, Status
 from petrobot.services.comm.location_file import Directory, load
 from tests.chaos.shuttle_cell import TASK, moves, shuttle_services
-from tests.waiting import beat
+from tests.waiting import beat, until
 
 pytestmark = pytest.mark.processes
 LIMIT = 120.0
@@ -115,6 +116,37 @@ async def test_of_coordinators_that_take_their_devices_at_once_one_gets_all(tmp_
             await waiting
         finally:
             await asyncio.gather(*(shell.close() for shell in (first, *shells)))
+
+
+async def test_a_restarted_node_is_not_asked_for_what_the_run_only_waits_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a run would have the second device while it waits for the first one: of two such runs
+    none would get both, and a run that moves could lose its device to one that never begins."""
+    monkeypatch.setattr(realtime, "LEAVE", LIMIT)
+    directory = load(shuttle_services(tmp_path))
+    first, waiting, other = shells = [
+        RealtimeMission(mission_on(directory, 2), directory) for _ in range(3)
+    ]
+    async with Supervisor(local_programs(directory), tmp_path / "logs") as nodes:
+        try:
+            await asyncio.gather(*(shell.connect(60.0) for shell in shells))
+            await first.lease({"left_hand"})
+            asking = asyncio.create_task(waiting.lease({"left_hand", "right_hand"}))
+            callers = [shell.clients["right"].caller for shell in shells]
+            before = callers[0].boot
+            os.kill(nodes.process_ids()["right"], signal.SIGKILL)
+            await until(
+                lambda: all(c.up and c.boot != before for c in callers), "the restarted node"
+            )
+            async with asyncio.timeout(LIMIT / 2):
+                await other.lease({"right_hand"})
+            assert not asking.done()
+            await asyncio.gather(first.close(), other.close())
+            await asking
+        finally:
+            monkeypatch.undo()  # two of them have left already, and their links are lost
+            await asyncio.gather(*(shell.close() for shell in shells))
 
 
 async def test_an_answer_that_comes_after_ctrl_c_leaves_the_link(tmp_path: Path) -> None:

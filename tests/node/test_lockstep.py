@@ -262,11 +262,17 @@ def test_a_stopped_device_starts_no_run_before_it_is_cleared() -> None:
     assert missed.values == {LATCHED: True, STOPS: 1} and "given and cleared" in missed.text
     assert bench.call("go", to=0.2).status == "success", "its caller knows of the stop by now"
     order(3, "emergency_stop")
+    order(4, "lease")
     refused = bench.call("go", to=0.5)
     assert (refused.status, refused.cause, refused.executed) == ("error", "emergency_stop", "no")
     assert bench.call("look", images=1).status == "success"
     assert refused.values == {LATCHED: True, STOPS: 2}
-    order(4, "clear_emergency")
+    order(5, "clear_emergency")
+    order(6, "lease")
+    stopped, cleared = (
+        n for _, n in coordinator.heard if isinstance(n, Answer) and n.id in ("c/4", "c/6")
+    )
+    assert not stopped.ok and "petrobot estop --clear" in stopped.data["text"] and cleared.ok
     moved = bench.call("go", to=0.3)
     assert (moved.status, moved.values["position"]) == ("success", pytest.approx(0.3))
 

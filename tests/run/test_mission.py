@@ -13,12 +13,13 @@ from petrobot.coordinator.engine.instructions import Marked, Severity
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.run.executor import Executor
 from petrobot.coordinator.run.interfaces import FirstAlternative
-from petrobot.coordinator.run.mission import Cycle, Mission, MissionTally
+from petrobot.coordinator.run.mission import Cycle, Mission, MissionError, MissionTally
 from petrobot.coordinator.run.timeline import Timeline
 from petrobot.coordinator.task import Executed, Status, Task
 from petrobot.coordinator.task.file import loads
 from petrobot.services.action import Status as ActionStatus
 from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.events import STOP_EVENT
 from petrobot.services.comm.location_file import parse
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.scripted import ScriptedRun
@@ -240,21 +241,45 @@ def test_the_user_chooses_the_action(catch_ball: Task) -> None:
     assert (track.status, track.cause) == (Status.ERROR, "not_offered")
 
 
-def test_a_repeated_preparation_says_that_it_may_be_one() -> None:
-    """The call says that it may be a repetition, so a node that has forgotten its oldest calls does
-    not prepare the cell a second time."""
+def prepared_mission() -> tuple[Mission, Caller]:
+    """Return a mission run that has a preparation and is connected to its node, and its caller."""
     text = TASK.replace('name = "toy"', 'name = "toy"\nprepare = "lab_prepare"')
     places = parse(
         SERVICES.replace("ON_RESUME", "rejoin")
         + '[services.lab_prepare]\nrun = "toy:prepare"\nnode = "motion"\n',
         Path("services.toml"),
     )
+    caller = Caller("motion", m.Hello(2, 2, "coordinator", "m", "c1", 1))
+    task = loads(text, "toy")
+    mission = Mission(Executor(task, Engine(task), places, {"motion": caller}, "m"), {}, 1)
+    caller.link_up(0.0, m.Welcome(1, "motion", "n1"))
+    mission.take(0.0, "motion", caller.notices())
+    return mission, caller
+
+
+@pytest.mark.parametrize("prepares", [False, True], ids=["waits for devices", "prepares"])
+@pytest.mark.parametrize("told", ["at once", "when it is back"])
+def test_a_stop_before_the_task_has_begun_ends_the_mission_run(prepares: bool, told: str) -> None:
+    """It did not subscribe to anything yet. Else a task that waits for a button would begin, and
+    not say before the button that it can do nothing."""
+    mission, caller = prepared_mission()
+    if prepares:
+        mission.start(0.0)
+    if told == "at once":
+        caller.receive(1.0, m.Event(STOP_EVENT, "motion", 0))
+    else:
+        caller.link_down(1.0, "cut")
+        caller.link_up(2.0, m.Welcome(1, "motion", "n1+1"))
+    with pytest.raises(MissionError, match="emergency stop, as motion reports: the task was not"):
+        mission.take(2.0, "motion", caller.notices())
+
+
+def test_a_repeated_preparation_says_that_it_may_be_one() -> None:
+    """The call says that it may be a repetition, so a node that has forgotten its oldest calls does
+    not prepare the cell a second time."""
     asked = []
     for resumed in (False, True):
-        caller = Caller("motion", m.Hello(2, 2, "coordinator", "m", "c1", 1))
-        task = loads(text, "toy")
-        mission = Mission(Executor(task, Engine(task), places, {"motion": caller}, "m"), {}, 1)
-        caller.link_up(0.0, m.Welcome(1, "motion", "n1"))
+        mission, caller = prepared_mission()
         if resumed:
             mission.resume(0.0, {})
         else:

@@ -18,10 +18,12 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.cli import main
-from petrobot.coordinator.launch import local_programs
+from petrobot.coordinator.cli.loading import load_task
+from petrobot.coordinator.launch import Setting, local_programs, realtime_mission
 from petrobot.coordinator.operator.emergency_stop import still_stopped
 from petrobot.coordinator.operator.run_address import find_address
 from petrobot.coordinator.run.folder import NoRunError
+from petrobot.coordinator.run.realtime import RealtimeMission
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.services.comm.canopen.cia301 import NmtState
 from petrobot.services.comm.canopen.cia402 import DriveState
@@ -213,8 +215,17 @@ async def test_a_stop_remains_after_its_node_is_killed(tmp_path: Path, answers: 
         cell.ear.forget()
         code, _, err = await finished(cell.task())
         assert code == 2 and "petrobot estop --clear" in err, err
-        code, out, err = await finished(cell.task(PETROBOT_STATE=str(tmp_path / "another host")))
-        assert code == 1, out + err
+        code, _, err = await finished(cell.task(PETROBOT_STATE=str(tmp_path / "another host")))
+        assert code == 2 and "arm: emergency stop: clear it" in err, err
+        mission = realtime_mission(
+            cell.directory, Setting(load_task(str(tmp_path / "sweeping.toml"))), "asks for no lease"
+        )
+        shell = RealtimeMission(mission, cell.directory)
+        await shell.connect(LIMIT)
+        await asyncio.wait_for(shell.run(), LIMIT)
+        await shell.close()
+        assert mission.executor.finished is not None
+        assert mission.executor.finished.reason == "aborted: emergency stop, as motion reports"
         assert without_power(cell.ear) and cell.ear.energised == 0, "not even for a moment"
         assert (await cell.estop("--clear"))[0] == 0
         await cell.sweep()

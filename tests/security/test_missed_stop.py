@@ -21,11 +21,13 @@ from petrobot.coordinator.cli import main
 from petrobot.coordinator.launch import local_programs
 from petrobot.coordinator.operator.run_address import ADDRESS_FILE
 from petrobot.coordinator.operator.station import ARREARS, STOOD_STILL
-from petrobot.coordinator.run.realtime import TRANSIT
+from petrobot.coordinator.run.mission import MissionError
+from petrobot.coordinator.run.realtime import TRANSIT, RealtimeMission
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.services.comm.location_file import load
 from petrobot.services.host.emergency_latch import latch_of
 from tests.chaos.shuttle_cell import moves, shuttle_services
+from tests.integration.test_two_coordinators import mission_on
 from tests.security.test_estop import finished, petrobot
 from tests.waiting import beat, until
 
@@ -37,6 +39,7 @@ schema = 1
 name = "turns"
 runs_place = "turns"
 final = "turns == 0 and free == 1"
+{more}
 [primitive_tasks.fetch]
 goal = "fetched"
 alternatives = ["left_fetch"]
@@ -82,12 +85,23 @@ out = ["free"]
 in = ["carry:error"]
 out = ["free"]
 """
+PREPARATION = """\
+from pathlib import Path
+from petrobot import success
+HERE = Path(__file__).parent
+async def arrange(ctx, *, seed, runs):
+    (HERE / "arranging").touch()
+    await ctx.wait((HERE / "arranged").exists, timeout=60.0)
+    return success()
+"""
 
 
 class Turns:
     """The nodes of two hands, and coordinators that move them in turn."""
 
-    def __init__(self, folder: Path, supervisor: Supervisor) -> None:
+    def __init__(self, folder: Path, supervisor: Supervisor, more: str = "") -> None:
+        """`more`: a line of the task."""
+        self.more = more
         self.folder = folder
         self.supervisor = supervisor
         self._services = ["--services", str(folder / "services.toml")]
@@ -96,7 +110,7 @@ class Turns:
     def task(self, pause: float) -> Path:
         """Write the task, with this pause before each turn (s)."""
         task = self.folder / "turns.toml"
-        task.write_text(TASK.format(pause=pause), encoding="utf-8")
+        task.write_text(TASK.format(pause=pause, more=self.more), encoding="utf-8")
         return task
 
     def start(self, pause: float, *more: str) -> subprocess.Popen[str]:
@@ -278,6 +292,8 @@ async def test_a_start_that_a_frozen_page_reads_after_a_stop_moves_nothing(turns
         assert (answer["ok"], answer["code"], turns.begun()) == (False, "stopped", 0), answer
         assert "order it again" in answer["text"]
         await beat(ARREARS)
+        # On a busy host the test was silent for so long that the controls are free.
+        assert (await give(address, "take_controls"))["ok"]
         answer = await give(address, "start", task="turns")
         assert answer["ok"], answer
         await turns.moving()
@@ -309,6 +325,37 @@ async def test_nodes_that_start_after_a_stop_was_cleared_know_when(tmp_path: Pat
     finally:
         coordinator.terminate()
         coordinator.communicate()
+
+
+async def test_a_stop_during_the_preparation_ends_the_run(tmp_path: Path) -> None:
+    """It was not heard: the task began, and said only at its first movement that it must not move.
+    A run that asks for a stopped device does not even prepare."""
+    services = shuttle_services(tmp_path, fetch=0.03, carry=0.03)
+    (tmp_path / "lab.py").write_text(PREPARATION, encoding="utf-8")
+    table = '[services.arrange]\nrun = "lab:arrange"\nnode = "left"\n'
+    services.write_text(services.read_text() + table, encoding="utf-8")
+    directory = load(services)
+    async with Supervisor(local_programs(directory), tmp_path / "logs") as nodes:
+        turns = Turns(tmp_path, nodes, 'prepare = "arrange"')
+        coordinator = turns.start(0.02)
+        try:
+            await until((tmp_path / "arranging").exists, "the preparation")
+            await turns.estop()
+            code, out, err = await finished(coordinator)
+            assert code == 1 and "emergency stop, as" in err, out + err
+            shell = RealtimeMission(mission_on(directory, 1), directory)
+            await shell.connect(PATIENCE)
+            with pytest.raises(MissionError, match="left_hand: emergency stop"):
+                await shell.lease({"left_hand"})
+            await shell.close()
+            (tmp_path / "arranged").touch()
+            await turns.estop("--clear")
+            assert turns.begun() == 0
+            coordinator = turns.start(0.02)
+            await turns.moving()
+        finally:
+            coordinator.kill()
+            coordinator.communicate()
 
 
 async def test_a_run_that_is_resumed_after_the_stop_moves(turns: Turns) -> None:

@@ -679,6 +679,11 @@ class Callee:
             self._send(peer, event)
         return event
 
+    def tell_coordinators(self, name: str) -> None:
+        """Send a pulse to each connected coordinator, whatever it has subscribed to."""
+        for peer in self._peers.coordinators():
+            self._send(peer, Event(name, self.name, 0))
+
     def answer(self, now: float, id: str, ok: bool, data: Mapping[str, Any] | None = None) -> None:  # noqa: A002
         """Answer a command. Raises ValueError if no such command waits for an answer.
 

@@ -199,7 +199,8 @@ class EventIntake:
 # of that mission run subscribes to this name and acknowledges the event when it has stored it.
 
 STOP_EVENT: Final = "emergency_stop:"
-"""The pulse that a node raises at an emergency stop, for coordinators."""
+"""The pulse that a node sends to all coordinators at an emergency stop: each aborts, also one that
+has no run on a stopped device now, or has not begun yet."""
 VERDICT_EVENTS: Final = "verdict:"
 """Prefix of the names of these events."""
 STATUSES: Final = ("success", "failure", "error")

@@ -32,6 +32,8 @@ class Offer:
 
 
 NODE: Final = "node"
+LEASED: Final = "device_leased"
+"""Cause of a refusal: another caller holds the lease of the device."""
 KNOWN: Final = 256
 """How many callers are remembered after their connection closed."""
 
@@ -70,6 +72,10 @@ class Peers:
         """Return whether this caller is connected."""
         peer = self._peers.get(name)
         return peer is not None and peer.up
+
+    def coordinators(self) -> list[str]:
+        """Return the names of the connected coordinators."""
+        return [n for n, peer in self._peers.items() if peer.up and peer.role == COORDINATOR]
 
     def refusal(self, name: str, hello: Hello) -> Refuse | None:
         """Return why this process is not welcome under this name; None if it is welcome."""
@@ -183,7 +189,7 @@ class Peers:
             )
         holder = self._leases.get(device, name)
         if holder != name and (self._is_near(now, holder) or in_use(device)):
-            return "device_leased", f"{device} accepts orders from {holder} at the moment"
+            return LEASED, f"{device} accepts orders from {holder} at the moment"
         self._leases[device] = name
         return None
 

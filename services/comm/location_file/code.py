@@ -63,17 +63,22 @@ def read_code(directory: Directory, seconds: float = SECONDS) -> dict[str, Facts
     while left := [[path, config] for path, config in asked.items() if path not in known]:
         told, why = _ask(left, seconds)
         known |= {facts["path"]: facts for facts in told}
-        for path, _ in left[len(told) : len(told) + 1]:
-            # its import ended the process; a new process reads the others
-            known[path] = {"import": why}
+        unread = [path for path, _ in left[len(told) :]]
+        # The import of the first one ended the process, and would do so again for the others of its
+        # module. A new process reads the rest.
+        known |= {path: {"import": why} for path in unread if _module(path) == _module(unread[0])}
     return known
+
+
+def _module(path: str) -> str:
+    return path.partition(":")[0]
 
 
 def _ask(paths: list[Any], seconds: float) -> tuple[list[Facts], str]:
     """Return what a new process reports about the paths until it ends, and why it ended before the
     last one. Code that comes with petrobot does not change while this process runs, so it is read
     once."""
-    question = json_text({"sys_path": sys.path, "paths": paths})
+    question = json_text({"parent": os.getpid(), "sys_path": sys.path, "paths": paths})
     if all(path.startswith("petrobot.") for path, _ in paths):
         return _ask_once(question, seconds)
     return _ask_process(question, seconds)
@@ -102,6 +107,11 @@ def _ask_process(question: str, seconds: float) -> tuple[list[Facts], str]:
         os.killpg(process.pid, signal.SIGKILL)
         text, _ = process.communicate()
         why = f"importing it took longer than {seconds:g} s"
+    except BaseException:  # Ctrl-C, which the process does not receive
+        if process.returncode is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        raise
     lines = [line for line in text.splitlines() if line.endswith("}")]
     remedy = "a module may define functions and classes, but must do nothing when it is imported"
     return [json.loads(line) for line in lines], f"{why}; {remedy}"
@@ -118,7 +128,7 @@ def code_faults(directory: Directory, code: Mapping[str, Facts], text: str) -> t
     def unread(key: str, path: str) -> None:
         """Report why a path cannot be imported; a fault of its module is reported once."""
         why = code.get(path, {}).get("import", "")
-        module = (path.partition(":")[0], why)
+        module = (_module(path), why)
         if why and module not in told:
             faults.add(key, why)
         if why.startswith(("importing", "cannot import")):  # the module, not a name in it
