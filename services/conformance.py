@@ -10,6 +10,7 @@ noise).
 from __future__ import annotations
 
 import math
+import os
 import threading
 import time
 from collections import Counter
@@ -39,7 +40,7 @@ SLOWEST, NOISE = 0.05, 5.0
 more than this multiple of its change at rest."""
 LATE_SHARE = 0.02
 """Share of steps that may take longer than the period: a busy computer delays some."""
-WAIT = 0.01
+WAIT = 0.03
 """Seconds that a method may wait if the period is shorter."""
 LEAVING = 2.0
 """Seconds in which the threads of a closed driver must end."""
@@ -192,6 +193,7 @@ class _Check:
         self.longest = 0.0
         self.waits: dict[str, list[float]] = {}
         """By method: how long it waited each time that this was too long (s)."""
+        self.schedule = os.open("/proc/thread-self/schedstat", os.O_RDONLY)
         self.threads = set(threading.enumerate())
         """Threads that are not the driver's."""
         self.leaves: dict[str, Any] = {}
@@ -238,18 +240,22 @@ class _Check:
         return {name: float(value) for name, value in _leaves(state, "", most) if _tells(value)}
 
     def ask(self, method: Callable[..., Any], *given: Any) -> Any:
-        """Call a method that the cycle calls, and note whether it waits. One that only gets too
-        little of a busy processor does not give it up by itself (`ru_nvcsw`)."""
-        idle, before = time.perf_counter() - time.thread_time(), getrusage(RUSAGE_THREAD)
+        """Call a method that the cycle calls, and note whether it waits: gives up the processor by
+        itself (`ru_nvcsw`), and does not only wait for one, as on a busy computer."""
+        idle, before = time.perf_counter() - self.ready(), getrusage(RUSAGE_THREAD).ru_nvcsw
         try:
             return method(*given)
         finally:
-            idle = time.perf_counter() - time.thread_time() - idle
-            after = getrusage(RUSAGE_THREAD)
-            gave = after.ru_nvcsw > before.ru_nvcsw and after.ru_majflt == before.ru_majflt
+            idle = time.perf_counter() - self.ready() - idle
+            slept = getrusage(RUSAGE_THREAD).ru_nvcsw > before
             alone = self.threads.issuperset(threading.enumerate())  # else it may wait for the GIL
-            if idle > max(WAIT, self.period) and gave and alone:
+            if idle > max(WAIT, self.period) and slept and alone:
                 self.waits.setdefault(method.__name__, []).append(idle)
+
+    def ready(self) -> float:
+        """Return how long this thread has run, or waited for a processor (s)."""
+        ran, queued, _ = os.pread(self.schedule, 100, 0).split()  # proc(5)
+        return 1e-9 * (int(ran) + int(queued))
 
     def step(self) -> dict[str, float]:
         """Make one step and measure its time; return the numbers of the state after it."""
@@ -678,6 +684,7 @@ class _Check:
             self.fault(f"stop at the end: {type(fault).__name__}: {fault}")
         finally:
             self.close()
+            os.close(self.schedule)
         end, left = time.monotonic() + LEAVING, set(threading.enumerate()) - self.threads
         for thread in left:
             thread.join(max(0.0, end - time.monotonic()))

@@ -313,9 +313,9 @@ class CatchesUp(Axis):
     def step(self, now: float) -> None:
         self.missed += self.paused
         super().step(now)
-        while self.missed and not self.paused:
-            self.missed -= 1
+        for _ in range(0 if self.paused else self.missed):
             super().step(now)
+        self.missed *= self.paused
 
 
 class GoesOnAfterAStop(Axis):
