@@ -10,6 +10,8 @@ noise).
 from __future__ import annotations
 
 import math
+import os
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,6 +20,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial, wraps
 from inspect import signature
 from itertools import pairwise
+from resource import RUSAGE_THREAD, getrusage
 from typing import Any
 
 from petrobot.services.comm.location_file import Directory
@@ -32,11 +35,25 @@ REST, PART = 20, 0.25
 which it is stopped or held."""
 PLAY = 0.01
 """Share of its movement by which a position may change at rest: noise, and the end of settling."""
-SLOWEST, NOISE = 0.05, 3.0
+SLOWEST, NOISE = 0.05, 5.0
 """A position counts as moving while it changes by more than this share of its fastest step, and by
 more than this multiple of its change at rest."""
 LATE_SHARE = 0.02
 """Share of steps that may take longer than the period: a busy computer delays some."""
+WAIT = 0.03
+"""Seconds that a method may wait if the period is shorter."""
+LEAVING = 2.0
+"""Seconds in which the threads of a closed driver must end."""
+GROWING = 250
+"""Steps of which a state must not grow in each."""
+LONGEST_ROW = 32
+"""Most numbers of a list that tell where the device is: a longer one is a scan or a history."""
+LARGEST_STATE = 100_000
+"""Most items and characters of a state: it is sent after each step."""
+JUMP = 3.0
+"""Multiple of its fastest step by which a position may change at once."""
+NAMED = 6
+"""Most names of a message."""
 STARTING = 2
 """Steps of a movement in which a position may change although `stopped` is still True."""
 UNKNOWN: Command = {"no driver knows this command": True}
@@ -85,6 +102,8 @@ def check_driver(
     check = _Check(_with_ports(make, clock.monotonic), clock, within, first, positions)
     try:
         check.rules(commands, seconds, cable)
+        if isinstance(clock, _Clock):
+            check.seeds(clock, commands)
     except Exception as fault:
         check.fault(f"the driver raised {type(fault).__name__}: {fault}")
     finally:  # also after Ctrl-C: the device may be moving
@@ -146,13 +165,13 @@ class _Clock:
     """Simulated time (s) that passes only in `sleep`."""
 
     def __init__(self) -> None:
-        self._now = 0.0
+        self.passed = 0.0
 
     def monotonic(self) -> float:
-        return self._now
+        return self.passed
 
     def sleep(self, seconds: float) -> None:
-        self._now += seconds
+        self.passed += seconds
 
 
 class _Check:
@@ -172,6 +191,15 @@ class _Check:
         self.found = DriverCheck()
         self.steps = self.late = 0
         self.longest = 0.0
+        self.waits: dict[str, list[float]] = {}
+        """By method: how long it waited each time that this was too long (s)."""
+        self.schedule = os.open("/proc/thread-self/schedstat", os.O_RDONLY)
+        self.threads = set(threading.enumerate())
+        """Threads that are not the driver's."""
+        self.leaves: dict[str, Any] = {}
+        """The last state, by path."""
+        self.sizes: list[Counter[str]] = []
+        """Items and characters of each key of the state, after each step of the present driver."""
         self.driver = make()
         self.period = max(0.0, self.driver.period or 0.0) or 0.01
         self.idle: dict[str, float] = {}
@@ -180,6 +208,8 @@ class _Check:
         """Whether the driver was made and has not been given a command that moves it."""
         self.refusing = ""
         """Why it refused the last command."""
+        self.fastest: dict[str, float] = {}
+        """The largest step of each position in the last movement."""
 
     def fault(self, text: str) -> None:
         if text not in self.found.faults:
@@ -191,21 +221,47 @@ class _Check:
     def numbers(self) -> dict[str, float]:
         """Return the numbers of the state that may tell where the device is, by path."""
         try:
-            state = plain(self.driver.state(), "state")
+            state = plain(self.ask(self.driver.state), "state")
         except Exception as fault:
             self.fault(f"state: expected plain data, got {type(fault).__name__}: {fault}")
             return {}
+        self.leaves = dict(_leaves(state, "", LONGEST_ROW))
+        self.sizes.append(Counter({key: _size(value) for key, value in state.items()}))
+        if self.sizes[-1].total() > LARGEST_STATE:
+            self.fault(
+                f"state: has more than {LARGEST_STATE:,} items and characters, most of them in "
+                f"{self.sizes[-1].most_common(1)[0][0]}: it is sent after each step"
+            )
         if missing := [key for key in self.positions if key not in state]:
             self.fault(f"state: no {', '.join(missing)}, which should tell where it is")
         elif self.positions:
             state = {key: state[key] for key in self.positions}
-        return dict(_leaves(state, ""))
+        most = math.inf if self.positions else LONGEST_ROW
+        return {name: float(value) for name, value in _leaves(state, "", most) if _tells(value)}
+
+    def ask(self, method: Callable[..., Any], *given: Any) -> Any:
+        """Call a method that the cycle calls, and note whether it waits: gives up the processor by
+        itself (`ru_nvcsw`), and does not only wait for one, as on a busy computer."""
+        idle, before = time.perf_counter() - self.ready(), getrusage(RUSAGE_THREAD).ru_nvcsw
+        try:
+            return method(*given)
+        finally:
+            idle = time.perf_counter() - self.ready() - idle
+            slept = getrusage(RUSAGE_THREAD).ru_nvcsw > before
+            alone = self.threads.issuperset(threading.enumerate())  # else it may wait for the GIL
+            if idle > max(WAIT, self.period) and slept and alone:
+                self.waits.setdefault(method.__name__, []).append(idle)
+
+    def ready(self) -> float:
+        """Return how long this thread has run, or waited for a processor (s)."""
+        ran, queued, _ = os.pread(self.schedule, 100, 0).split()  # proc(5)
+        return 1e-9 * (int(ran) + int(queued))
 
     def step(self) -> dict[str, float]:
         """Make one step and measure its time; return the numbers of the state after it."""
         begin = self.now()
         if self.driver.period is not None:
-            self.driver.step(begin)
+            self.ask(self.driver.step, begin)
         numbers = self.numbers()
         took = self.now() - begin
         self.steps, self.late = self.steps + 1, self.late + (took > self.period)
@@ -271,7 +327,8 @@ class _Check:
     def again(self, what: str, **keys: Any) -> None:
         """Close the driver and make another one, with further keys."""
         try:
-            self.driver.close()
+            self.close()
+            self.threads.update(threading.enumerate())  # a library keeps some of its first user
             self.driver, self.fresh = self.make(**keys), True
             self.run(REST * self.period)
         except Exception as fault:
@@ -279,38 +336,124 @@ class _Check:
 
     def refusal(self) -> None:
         try:
-            self.driver.command(self.now(), UNKNOWN)
+            self.ask(self.driver.command, self.now(), UNKNOWN)
         except Exception:  # the rule: any exception refuses
             return
         self.fault(f"command: accepted {dict(UNKNOWN)}; raise ValueError for what it does not know")
 
     def movements(self, there: Command, back: Command, seconds: float) -> None:
         """Make one movement to its end, stop one on its way, and hold and release one."""
+        self.move(back, seconds, judged=False)
+        begin, before = self.numbers(), self.leaves
         positions, took = self.way(there, back, seconds)
         if not positions:
-            self.fault(f"{dict(there)}: no number of state changes: give a command that moves it")
+            self.numbers()
+            still = {name for name, change in self.idle.items() if not change}
+            counts = {n for n, value in before.items() if _tells(value)} - still
+            if all(before[n] == self.leaves.get(n) for n in before.keys() - counts):
+                text = "no number of state changes: give a command that moves it"
+                self.fault(f"{dict(there)}: {text}")
+            else:
+                self.stands(f"after {dict(there)}")
+                self.note(f"stop and hold during {dict(there)}: it changes the state at once")
             return
-        self.stands(f"after {dict(there)}", positions)
-        self.move(back, PART * took)
+        far = {n: begin[n] - v for n, v in self.numbers().items() if n in positions.keys() & begin}
+        fastest = self.fastest
+        self.run(self.within, self.stopped)
+        if self.stopped():
+            self.stands(f"after {dict(there)}", positions)
+        else:  # it may be one that runs until it is stopped, as a pump
+            before = self.numbers()
+            self.stop(f"stop after {dict(there)}", positions)
+            if not _differ(before, self.numbers(), positions, PART):
+                text = f"stopped() is still False after {self.within:g} s"
+                self.fault(f"after {dict(there)}: {text}")
+
+        def begun() -> None:
+            self.move(there, seconds, judged=False)
+            self.move(back, PART * took, judged=False)
+
+        if not self.move(back, PART * took, judged=False):
+            self.note(f"stop and hold during {dict(back)}: it moves nothing after {dict(there)}")
+            return
         self.stop("stop during a movement", positions)
-        self.move(there, seconds)
-        self.move(back, PART * took)
-        answer = self.driver.hold(self.now())
+        begun()
+        answer = self.ask(self.driver.hold, self.now())
         if answer not in ("held", "cannot hold", "stopped"):
             self.fault(f'hold: expected "held", "cannot hold" or "stopped", got {answer!r}')
         if answer in ("held", "stopped"):
             self.run(self.within)
-            if drift := self.run(REST * self.period, positions=positions):
+            if drift := self.run(max(self.within, REST * self.period), positions=positions):
                 self.fault(f"hold: answered {answer!r}, and {_names(drift)} still changes")
-        self.driver.release(self.now())
-        if answer == "held" and not self.run(seconds, positions=positions):
-            self.fault("release: the movement that was held does not continue")
+        before = self.numbers()
+        self.ask(self.driver.release, self.now())
+        if answer == "held":
+            self.follow(back, seconds, before, judged=False)
+            after = self.numbers()
+            arrived = not {n for n in positions if abs(after[n] - begin[n]) > PART * positions[n]}
+            if not arrived and not _differ(before, after, positions, PLAY):
+                self.fault("release: the movement that was held does not continue")
+            jumps = {
+                n
+                for n, way in positions.items()
+                if self.fastest.get(n, 0.0) > max(PART * way, JUMP * fastest.get(n, 0.0))
+            }
+            if jumps:
+                self.fault(f"release: {_names(jumps)} jumps instead of moving on")
+            begun()
+            self.ask(self.driver.hold, self.now())
+            self.stop("stop while it is held", positions)
+            before = self.numbers()
+            self.ask(self.driver.release, self.now())
+            self.run(self.within)
+            if _differ(before, self.numbers(), positions, PART):
+                self.fault("release: the movement that was held and then stopped continues")
         self.stop("stop", positions)
+        self.turned(there, back, seconds, took, far)
         if isinstance(self.driver, QuickStopping):
-            self.move(there, seconds)
-            self.move(back, PART * took)
+            begun()
             self.stop("quick_stop during a movement", positions, self.driver.quick_stop)
             self.again("made again after a quick stop")  # it may need its drives switched on
+        begun()
+        self.again(what := "made again during a movement")
+        self.stop("stop")  # as its node does
+        self.run(self.within)
+        for needed in self.first:
+            self.run(seconds, partial(self.accepts, needed))
+        before = self.numbers()
+        self.run(self.within)
+        if moved := _differ(before, self.numbers(), positions, PART):
+            self.fault(f"{what}: {_names(moved)} changes before it has got a command")
+
+    def turned(
+        self,
+        there: Command,
+        back: Command,
+        seconds: float,
+        took: float,
+        far: Mapping[str, float],
+    ) -> None:
+        """Give a command during the movement of another one: it is refused or obeyed. `far`: how
+        far `back` moves it."""
+        self.move(there, seconds, judged=False)
+        begin = self.numbers()
+        self.move(back, PART * took, judged=False)
+        if not self.accepts(there):
+            self.stop("stop")
+            return
+        self.follow(there, 2.0 * seconds, self.numbers(), judged=False)
+        ways = {n: v - begin[n] for n, v in self.numbers().items() if n in begin and n in far}
+        most = max(map(abs, far.values()), default=0.0)
+        deaf = {
+            n
+            for n, way in ways.items()
+            if abs(far[n]) > PART * most and abs(way) > abs(way - far[n])
+        }
+        if deaf:
+            self.fault(
+                f"{dict(there)}: accepted during {dict(back)}, and {_names(deaf)} moved on as "
+                "before; obey it, or raise ValueError"
+            )
 
     def limits(self, commands: Sequence[Command], seconds: float) -> None:
         """Check that it obeys those of `speed`, `workspace` and `dry_run` that are in its
@@ -343,7 +486,7 @@ class _Check:
             for command in (there, back):
                 before = self.numbers()
                 with suppress(ValueError):
-                    self.driver.command(self.now(), command)
+                    self.ask(self.driver.command, self.now(), command)
                 self.run(took)
                 if moved := _differ(before, self.numbers(), positions, PART):
                     self.fault(f"workspace: {dict(command)} moves it far outside: {_names(moved)}")
@@ -370,19 +513,28 @@ class _Check:
     def move(self, command: Command, seconds: float, judged: bool = True) -> Mapping[str, float]:
         """Give a command and step for so long, or until the device stands still again; return how
         far each position moved."""
-        self.refusing = ""
-        for needed in (*self.first, command) if self.fresh else ():
-            self.run(seconds, partial(self.accepts, needed))  # a new driver may need time
-        if not self.accepts(command):
+        if self.fresh:  # a new driver may need time
+            for needed in (*self.first, command):
+                self.run(seconds, partial(self.accepts, needed))
+        else:
+            self.accepts(command)
+        if self.refusing:
             self.fault(f"{dict(command)}: refused: {self.refusing}")
         judged, self.fresh = judged and not self.fresh, False
-        begin = before = low = high = self.numbers()
+        return self.follow(command, seconds, self.numbers(), judged)
+
+    def follow(
+        self, command: Command, seconds: float, begin: dict[str, float], judged: bool = True
+    ) -> Mapping[str, float]:
+        """Step for so long, or until the device stands still again; return how far each position
+        has moved since `begin`."""
+        before = low = high = begin
         fastest, resting = dict[str, float](), 0
         moved, untrue = set[str](), Counter[str]()
         ways, away = dict[str, float](), set[str]()
         end = self.now() + seconds
         while self.now() < end and resting < REST:
-            still = self.driver.stopped()
+            still = self.stopped()
             after = self.step()
             low = {name: min(value, low.get(name, value)) for name, value in after.items()}
             high = {name: max(value, high.get(name, value)) for name, value in after.items()}
@@ -401,6 +553,7 @@ class _Check:
                 untrue.update(changed)
         found = {name: far for name, far in ways.items() if name in moved and name in away}
         # a position that hardly moves only settles
+        self.fastest = fastest
         least = SLOWEST * max(found.values(), default=0.0)
         found = {name: far for name, far in found.items() if far >= least}
         # each position by itself: one joint may settle while another only begins
@@ -411,10 +564,11 @@ class _Check:
     def accepts(self, command: Command) -> bool:
         """Give a command; return whether it was accepted."""
         try:
-            self.driver.command(self.now(), command)
+            self.ask(self.driver.command, self.now(), command)
         except Exception as fault:
             self.refusing = f"{type(fault).__name__}: {fault}"
             return False
+        self.refusing = ""
         return True
 
     def stop(
@@ -425,40 +579,102 @@ class _Check:
     ) -> None:
         """Stop it twice, by its stop routine or another one."""
         stop = routine or self.driver.stop
-        stop(self.now())
+        self.ask(stop, self.now())
         try:
-            stop(self.now())
+            self.ask(stop, self.now())
         except Exception as fault:
             self.fault(f"{stop.__name__}, a second time: {type(fault).__name__}: {fault}")
         self.stands(what, positions)
 
     def stands(self, what: str, positions: Mapping[str, float] | None = None) -> None:
         """Check that `stopped` is True within the limit, and that no position changes then."""
-        self.run(self.within, self.driver.stopped)
-        if not self.driver.stopped():
+        self.run(self.within, self.stopped)
+        if not self.stopped():
             self.fault(f"{what}: stopped() is still False after {self.within:g} s")
-        elif drift := self.run(REST * self.period, positions=positions):
+        elif drift := self.run(max(self.within, REST * self.period), positions=positions):
             self.fault(f"{what}: stopped() is True, and {_names(drift)} still changes")
+
+    def stopped(self) -> bool:
+        return bool(self.ask(self.driver.stopped))
 
     def cable(
         self, cable: Callable[[bool], None], commands: Sequence[Command], seconds: float
     ) -> None:
-        """Check that without its cable the driver raises or `stopped` is False, and that a new
-        driver works with the cable."""
-        for command in commands[-1:]:
-            self.move(command, seconds)
+        """Check that without its cable the driver raises or `stopped` is False, and that with the
+        cable it works again: the same driver, or if it raised, a new one."""
+        positions: Mapping[str, float] = {}
+        if len(commands) > 1:
+            positions, took = self.way(commands[0], commands[-1], seconds)
+            self.move(commands[-1], PART * took)
         cable(False)
         try:
             self.driver.stop(self.now())
-            self.run(seconds, lambda: not self.driver.stopped())
-            if self.driver.stopped():
+            self.run(seconds, lambda: not self.stopped())
+            if self.stopped():
                 self.fault(f"cable pulled: stopped() is still True after {seconds:g} s")
+            self.run(self.within)
+            raised = False
         except Exception:  # the rule: the node then makes a new driver
-            pass
+            raised = True
         cable(True)
-        self.again("cable put back")
-        for command in commands[:1]:
-            self.move(command, seconds)
+        if raised:
+            self.again("cable put back")
+        steps, before, end = dict[str, list[float]](), self.numbers(), self.now() + seconds
+        while self.now() < end:
+            after = self.step()
+            for name in positions.keys() & before.keys() & after.keys():
+                steps.setdefault(name, []).append(abs(after[name] - before[name]))
+            before = after
+        # without the two largest: values may vanish and come back
+        ways = {name: sum(sorted(far)[:-2]) for name, far in steps.items()}
+        if moved := {name for name, way in ways.items() if way > PART * positions[name]}:
+            self.fault(f"cable put back: {_names(moved)} changes before it has got a command")
+        if not positions:
+            if not self.stopped():
+                self.fault(f"cable put back: stopped() is still False after {seconds:g} s")
+            return
+        for needed in (*self.first, commands[0]):
+            self.run(seconds, partial(self.accepts, needed))
+        if self.refusing:
+            self.again("cable put back")
+            found = self.move(commands[0], seconds)
+        else:
+            found = self.follow(commands[0], seconds, before, judged=False)
+        if not found:
+            self.fault(f"cable put back: {dict(commands[0])} moves nothing")
+
+    def close(self) -> None:
+        """Close the driver. Its state must not have grown all the time."""
+        half = len(self.sizes) // 2
+        for name in self.sizes[-1] if half >= GROWING else ():
+            first, middle, last = (self.sizes[at][name] for at in (0, half, -1))
+            if min(middle - first, last - middle) > half / 2:
+                self.fault(
+                    f"state: {name} grows all the time, and is sent after each step; keep the "
+                    "newest few items"
+                )
+        self.sizes.clear()
+        self.driver.close()
+
+    def seeds(self, clock: _Clock, commands: Sequence[Command]) -> None:
+        """Check that two runs are equal, as their seeds are, if both begin with the same state."""
+        runs = list[list[dict[str, float]]]()
+        for _ in range(2 if isinstance(getattr(self.driver, "ports", None), TestPorts) else 0):
+            clock.passed = 0.0
+            self.close()
+            self.driver = self.make()
+            run = [self.numbers()]
+            for command in (*self.first, *commands):
+                self.accepts(command)
+                run += [self.step() for _ in range(REST)]
+            runs.append(run)
+        pairs = [*zip(*runs, strict=True)]
+        differ = {name for one, other in pairs for name in one if one[name] != other.get(name)}
+        if differ and pairs[0][0] == pairs[0][1]:
+            self.fault(
+                f"two runs with the same seed differ in {_names(differ)}: draw with ports.random, "
+                "and take the time from `now`"
+            )
 
     def end(self) -> None:
         """Stop and close the driver, whatever happened."""
@@ -467,7 +683,18 @@ class _Check:
         except Exception as fault:
             self.fault(f"stop at the end: {type(fault).__name__}: {fault}")
         finally:
-            self.driver.close()
+            self.close()
+            os.close(self.schedule)
+        end, left = time.monotonic() + LEAVING, set(threading.enumerate()) - self.threads
+        for thread in left:
+            thread.join(max(0.0, end - time.monotonic()))
+        if names := {thread.name for thread in left if thread.is_alive()}:
+            self.fault(f"close: leaves a thread behind: {_names(names)}")
+        for name, waits in self.waits.items():
+            self.fault(
+                f"{name}: {len(waits)} calls waited, the longest {max(waits):.3f} s: no method "
+                "that the cycle calls may wait; let a thread do it"
+            )
         if self.late > LATE_SHARE * self.steps:
             self.fault(
                 f"step: {self.late} of {self.steps} took longer than the period of "
@@ -475,15 +702,30 @@ class _Check:
             )
 
 
-def _leaves(value: Any, path: str) -> Iterator[tuple[str, float]]:
+def _leaves(value: Any, path: str, most: float = math.inf) -> Iterator[tuple[str, Any]]:
+    """Yield the values in plain data, by path, without those of lists longer than `most`."""
     if isinstance(value, Mapping):
         for key, part in value.items():
-            yield from _leaves(part, f"{path}.{key}" if path else str(key))
-    elif isinstance(value, list | tuple):
-        for number, part in enumerate(value):
-            yield from _leaves(part, f"{path}[{number}]")
-    elif isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-        yield path, float(value)
+            yield from _leaves(part, f"{path}.{key}" if path else str(key), most)
+    elif isinstance(value, list):
+        for number, part in enumerate(value if len(value) <= most else ()):
+            yield from _leaves(part, f"{path}[{number}]", most)
+    else:
+        yield path, value
+
+
+def _tells(value: Any) -> bool:
+    """Whether a value may tell where the device is."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _size(value: Any) -> int:
+    """Return the number of items and characters in plain data."""
+    if isinstance(value, Mapping):
+        return len(value) + sum(map(_size, value.values()))
+    if isinstance(value, list):
+        return len(value) + sum(map(_size, value))
+    return len(value) if isinstance(value, str | bytes) else 0
 
 
 def _differ(
@@ -495,4 +737,5 @@ def _differ(
 
 
 def _names(found: set[str]) -> str:
-    return ", ".join(sorted(found))
+    shown, more = sorted(found)[:NAMED], len(found) - NAMED
+    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Final
 
 from petrobot.services.action import Cancelled, Context, Result, error, failure, success
+from petrobot.services.comm.streams.image import explained
 from petrobot.services.mobile.camera import FloorCamera, FloorCameraError
 from petrobot.services.mobile.detection import (
     TemplateBank,
@@ -170,7 +171,8 @@ async def _next(
         return error("bad_image", str(fault))
     if image is None:
         camera.end()  # The next run opens the source again.
-        return error("no_image", f"no image for {image_timeout} s", images=watcher.images)
+        text = explained(f"no image for {image_timeout} s", camera.state())
+        return error("no_image", text, images=watcher.images)
     sight = watcher.look(image.pixels)
     ahead = TrackAhead(max(0.0, ctx.now - image.time), sight.confidence, sight.end, thinned(sight))
     ctx.publish(STREAM, ahead.values())

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.services.action import Context, Result, error, provisional, success
+from petrobot.services.comm.streams.image import explained
 from petrobot.services.picking.camera import TableCamera
 from petrobot.services.picking.finding import FINDERS, Finder, Found
 from petrobot.services.picking.model import PickingCell
@@ -50,7 +51,8 @@ async def _locate(ctx: Context[TableCamera], find: Finder, images: int, timeout:
     cell = ctx.device.known
     taken = await ctx.device.take(ctx, images, timeout)
     if len(taken) < images:
-        return error("no_image", f"{len(taken)} of {images} images came")
+        text = f"{len(taken)} of {images} images came"
+        return error("no_image", explained(text, ctx.device.state()))
     parts = confirmed([find(image, cell) for image in taken])
     if not parts:
         return error(
@@ -103,7 +105,8 @@ async def await_tray(
     while ctx.now < due:
         taken = await ctx.device.take(ctx, 1, 1.0)
         if not taken:
-            return error("no_image", "the camera sends no images")
+            text = "the camera sends no images"
+            return error("no_image", explained(text, ctx.device.state()))
         empty = empty + 1 if is_empty(taken[0], cell, tray) else 0
         if empty == 3:
             return success(slots={**(slots or {}), tray: 0})

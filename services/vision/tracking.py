@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from petrobot.services.action import Cancelled, Context, Result, Status, error, failure, success
-from petrobot.services.comm.streams.image import Image
+from petrobot.services.comm.streams.image import Image, explained
 from petrobot.services.vision.camera import Camera, CameraError, Mark
 from petrobot.services.vision.location import BallWindow
 from petrobot.services.vision.prediction import ExitWay, PredictedExit, Predictor, Surface
@@ -168,7 +168,8 @@ class _Chase:
                 if ended is not None:
                     return ended
             elif self._ctx.now >= silent + asked.image_timeout:
-                return error("no_image", f"no image for {asked.image_timeout} s", **self._values())
+                text = explained(f"no image for {asked.image_timeout} s", self._camera.state())
+                return error("no_image", text, **self._values())
             if self._left():
                 return await self._judged()
             self._publish()

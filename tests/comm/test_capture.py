@@ -57,6 +57,7 @@ def test_a_file_is_paced_by_the_clock(film: Path) -> None:
     assert images.newest() is None
     for _ in range(2):  # A second start begins from the first image again.
         images.start(25.0)
+        assert images.condition == ""
         begin = clock[0]
         first = images.newest()
         assert first is not None and (first.sequence, first.time) == (0, begin)
@@ -69,6 +70,7 @@ def test_a_file_is_paced_by_the_clock(film: Path) -> None:
         clock[0] += 5.0
         assert images.newest() is not None, "the last one"
         assert images.newest() is None, "the video has ended"
+        assert images.condition == f"recording {str(film)!r} is over"
     images.stop()
     assert images.newest() is None
     images.close()

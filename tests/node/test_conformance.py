@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import random
+import threading
 import time
+from collections import deque
 from collections.abc import Mapping
 from typing import Any, ClassVar, cast
 
@@ -270,9 +273,99 @@ class Backwards(Axis):
     period = -0.01
 
 
+class WaitsOnce(Axis):
+    """A single step of some hundred, which a busy computer could also have delayed."""
+
+    def step(self, now: float) -> None:
+        super().step(now)
+        if self.cycles == 150:
+            time.sleep(0.05)
+
+
+class WaitsInStop(Axis):
+    def stop(self, now: float) -> None:
+        super().stop(now)
+        time.sleep(0.05)
+
+
+class IgnoresCommands(Axis):
+    """While it moves."""
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        goal, still = self.goal, self.stopped()
+        super().command(now, body)
+        self.goal = self.goal if still else goal
+
+
+class Creeps(Axis):
+    """While it is held, by 5 mm/s."""
+
+    def step(self, now: float) -> None:
+        super().step(now)
+        self.at -= 0.00005 if self.paused else 0.0
+
+
+class CatchesUp(Axis):
+    """After a hold it is where it would have been without."""
+
+    missed = 0
+
+    def step(self, now: float) -> None:
+        self.missed += self.paused
+        super().step(now)
+        for _ in range(0 if self.paused else self.missed):
+            super().step(now)
+        self.missed *= self.paused
+
+
+class GoesOnAfterAStop(Axis):
+    """Its stop forgets the movement that is held, and its release does not."""
+
+    kept = 0.0
+
+    def hold(self, now: float) -> str:
+        self.kept, self.goal = self.goal, self.at
+        return "held"
+
+    def release(self, now: float) -> None:
+        self.goal = self.kept
+
+
+class Grows(Axis):
+    def state(self) -> Mapping[str, Any]:
+        return {**super().state(), "moves": "." * self.cycles}
+
+
+class TooLarge(Axis):
+    def state(self) -> Mapping[str, Any]:
+        return {**super().state(), "image": bytes(100_001)}
+
+
+class LeavesAThread(Axis):
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        super().__init__(config, ports)
+        threading.Thread(target=time.sleep, args=[60], name="reader", daemon=True).start()
+
+
+class DrawsByItself(Axis):
+    def step(self, now: float) -> None:
+        super().step(now)
+        self.at += random.gauss(0.0, 1e-5) if self.at != self.goal else 0.0
+
+
 @pytest.mark.parametrize(
     ("kind", "fault"),
     [
+        (WaitsOnce, "calls waited, the longest 0."),
+        (WaitsInStop, "stop: "),
+        (IgnoresCommands, "{'to': 0.2}: accepted during {'to': 0.0}, and axis[0].at moved on"),
+        (Creeps, "hold: answered 'held', and axis[0].at still changes"),
+        (CatchesUp, "release: axis[0].at jumps instead of moving on"),
+        (GoesOnAfterAStop, "release: the movement that was held and then stopped continues"),
+        (Grows, "state: moves grows all the time"),
+        (TooLarge, "state: has more than 100,000 items and characters, most of them in image"),
+        (LeavesAThread, "close: leaves a thread behind: reader"),
+        (DrawsByItself, "two runs with the same seed differ in axis[0].at"),
         (IgnoresQuickStop, "quick_stop during a movement: stopped() is still False after 1 s"),
         (QuickStopsOnce, "quick_stop, a second time: RuntimeError: already stopped"),
         (Backwards, "period: expected seconds above 0 or None, got -0.01"),
@@ -297,6 +390,91 @@ def test_each_broken_rule_is_named(kind: type[Axis], fault: str) -> None:
     assert kind is not BreaksOnTheWay or BreaksOnTheWay.after[-2:] == ["stop", "close"]
 
 
+class Switched(Axis):
+    """Its drives must be switched on; what was ordered last is kept by its device."""
+
+    on = False
+    ordered: float | None = None
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        if body == {"on": True}:
+            self.on = True
+        elif not self.on:
+            raise ValueError("switch it on first")
+        else:
+            super().command(now, body)
+            type(self).ordered = self.goal
+
+
+class KeepsItsOrder(Switched):
+    """Switched on, it goes on with what the driver before it was given."""
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        super().command(now, body)
+        if "on" in body and self.ordered is not None:
+            self.goal = self.ordered
+
+
+def test_a_new_driver_does_not_go_on_with_the_orders_of_the_one_before() -> None:
+    assert checked(Switched, first=[{"on": True}]).faults == []
+    fault = "made again during a movement: axis[0].at changes before it has got a command"
+    assert fault in checked(KeepsItsOrder, first=[{"on": True}]).faults
+
+
+class Pump(Axis):
+    """It has no position and runs until it is stopped."""
+
+    def step(self, now: float) -> None:
+        goal = 0.0 if self.paused else self.goal
+        self.at += max(-0.01, min(0.01, goal - self.at))
+
+    def stop(self, now: float) -> None:
+        self.goal = 0.0
+
+    def stopped(self) -> bool:
+        return self.at == 0.0
+
+
+class Outputs(Axis):
+    """It switches at once, and nothing moves."""
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        super().command(now, body)
+        self.at = self.goal
+
+
+class RefusesWhileItMoves(Axis):
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        if not self.stopped():
+            raise ValueError("it moves")
+        super().command(now, body)
+
+
+class Remembers(Axis):
+    """Its state has its last 200 positions."""
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        super().__init__(config, ports)
+        self.past = deque[float](maxlen=200)
+
+    def step(self, now: float) -> None:
+        super().step(now)
+        self.past.append(self.at)
+
+    def state(self) -> Mapping[str, Any]:
+        return {**super().state(), "past": [*self.past]}
+
+
+@pytest.mark.parametrize(
+    ("kind", "notes"),
+    [(Pump, "it moves nothing after"), (Outputs, "it changes the state at once"),
+     (RefusesWhileItMoves, ""), (Remembers, "")],
+)  # fmt: skip
+def test_unusual_drivers_that_keep_the_rules_pass(kind: type[Axis], notes: str) -> None:
+    found = checked(kind)
+    assert found.faults == [] and notes in "; ".join(found.notes)
+
+
 class Unplugged(Axis):
     """Its step raises while the cable is unplugged."""
 
@@ -309,9 +487,45 @@ class NoticesNothing(Axis):
         super().step(now)
 
 
+class Survives(Axis):
+    """It does not raise without its cable, and works with it again."""
+
+    def step(self, now: float) -> None:
+        if self.plugged:
+            super().step(now)
+
+    def stopped(self) -> bool:
+        return self.plugged and super().stopped()
+
+
+class StaysAway(Survives):
+    """It accepts commands after its cable was pulled, but it is lost for good."""
+
+    lost = False
+
+    def step(self, now: float) -> None:
+        self.lost = self.lost or not self.plugged
+        if not self.lost:
+            super().step(now)
+
+
+class MovesByItself(Survives):
+    """With its cable again it goes on with the last command."""
+
+    def stop(self, now: float) -> None:
+        if self.plugged:
+            super().stop(now)
+
+
 @pytest.mark.parametrize(
     ("kind", "faults"),
-    [(Unplugged, []), (NoticesNothing, ["cable pulled: stopped() is still True after 5 s"])],
+    [
+        (Unplugged, []),
+        (Survives, []),
+        (NoticesNothing, ["cable pulled: stopped() is still True after 5 s"]),
+        (StaysAway, ["cable put back: {'to': 0.2} moves nothing"]),
+        (MovesByItself, ["cable put back: axis[0].at changes before it has got a command"]),
+    ],
 )
 def test_a_cable_that_is_pulled_and_put_back(kind: type[Axis], faults: list[str]) -> None:
 

@@ -138,6 +138,33 @@ def test_a_source_that_cannot_be_opened_is_the_error_no_image(context: BenchCont
     camera.background.learn(np.zeros((2, 2), np.uint8))
 
 
+def test_no_image_says_why_if_the_source_knows(context: BenchContext) -> None:
+    from petrobot.services.vision import actions
+
+    class Lost:
+        condition = "camera 'x' was lost"
+
+        def start(self, rate: float) -> None: ...
+
+        def stop(self) -> None: ...
+
+        def newest(self) -> Image | None:
+            return None
+
+        def close(self) -> None: ...
+
+    class Ports(BenchPorts):
+        def images(self) -> Any:
+            return Lost()
+
+    lost = BenchContext(context.bench, Camera({}, Ports(context.bench)))
+    ball = {"sequence": 0, "age": 0.1, "sigma": 0.001, "places": [[0.3, 2.0, 0.0], [0.1, 1.9, 0.0]]}
+    found = [run_action(context.bench, actions.locate_background(lost))]
+    found.append(run_action(context.bench, actions.predict_kalman(lost, ball=ball)))
+    texts = [(one.cause, one.text) for one in found]
+    assert texts == [("no_image", f"no image for {t} s: {Lost.condition}") for t in (0.8, 0.5)]
+
+
 def test_the_operators_picture_shows_the_detections(context: BenchContext) -> None:
     """It is the newest image as a JPEG with the detected ball and the path to its predicted exit;
     before the first image there is none."""

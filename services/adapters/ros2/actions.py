@@ -345,7 +345,8 @@ def _result(
     if phase is ExchangePhase.UNANSWERED or phase in RUNNING:
         said = f"no result within {timeout or 0.0:g} s" if late else "it was given up"
         cause = "timeout" if late else "unanswered"
-        return replace(error(cause, f"{said}; its cancel was not answered"), executed="unknown")
+        said += "; its cancel was not answered: look at the robot"
+        return replace(error(cause, said), executed="unknown")
     if late and phase is ExchangePhase.CANCELLED:
         return Result(Status.ERROR, given, "timeout", f"cancelled after {timeout:g} s")
     cause = "failed" if service else str(phase)

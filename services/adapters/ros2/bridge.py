@@ -147,10 +147,11 @@ class Bridge(TopicDriver):
         super().stop(now)
 
     def stopped(self) -> bool:
-        """Return whether rosbridge reports no active goal, and the last set points sent are those
-        of rest."""
+        """Return whether rosbridge has reported the end of each goal, or of a later one of the same
+        action, and the last set points sent are those of rest."""
         goals = (one for one in self.exchanges.open.values() if "action" in one.request)
-        return super().stopped() and not any(one.phase in MOVING for one in goals)
+        moves = self.exchanges.unknown or any(one.phase in MOVING for one in goals)
+        return super().stopped() and not moves
 
     def close(self) -> None:
         self.link.close()

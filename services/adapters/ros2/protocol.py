@@ -162,9 +162,9 @@ class ExchangePhase(StrEnum):
     REJECTED = "rejected"
     """Refused before anything began."""
     UNANSWERED = "unanswered"
-    """Cancelled, but the server has not answered for too long."""
+    """Cancelled, but the server has not answered for too long (see `Exchanges.unknown`)."""
     GONE = "gone"
-    """After LOST: the server has ended it, or had enough time to do so."""
+    """After LOST: the server has ended it, or has not answered for too long."""
 
 
 RUNNING = frozenset({ExchangePhase.PENDING, ExchangePhase.ACTIVE, ExchangePhase.CANCELLING})
@@ -239,6 +239,9 @@ class Exchanges:
 
     def __init__(self, patience: float) -> None:
         self.open: dict[str, Exchange] = {}
+        self.unknown: dict[str, str] = {}
+        """Goals that were given up without a word of their server, which may still move the robot:
+        the name of their action by id."""
         self._patience = patience
         self._own = uuid.uuid4().hex
 
@@ -296,6 +299,7 @@ class Exchanges:
                 continue
             if now - one.heard >= self._patience:
                 one.end(ExchangePhase.UNANSWERED)
+                self.unknown[one.request["id"]] = one.request["action"]
             elif now - one.asked >= REPEAT:
                 sent.append(_cancel(now, one))
         return sent
@@ -310,6 +314,8 @@ class Exchanges:
             return f"operation {words(op):.40}: was not asked for"
         if failed and identity is None:
             return f"rosbridge reports: {message.get('msg')}"
+        if op == "action_result" or failed:
+            self.unknown.pop(str(identity), None)
         one = next((e for e in self.open.values() if e.request["id"] == identity), None)
         if one is None or one.phase not in MOVING:
             return ""
@@ -330,6 +336,9 @@ class Exchanges:
                 one.refuse(said or "rosbridge gives no reason")
             else:
                 one.finish(said, None if op == "service_response" else status)
+                # Servers such as those of Nav2, MoveIt and ros2_control have one goal at a time.
+                action = one.request.get("action")
+                self.unknown = {i: name for i, name in self.unknown.items() if name != action}
         return ""
 
 

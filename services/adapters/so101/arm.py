@@ -302,7 +302,8 @@ class Arm(Driver):
                 text = f"the servo of {joint.name} is in mode {read.mode}: it must be 0 (position)"
                 self._fault("mode", text)
             if read.temperature > self.hottest:
-                self._fault("heat", f"{joint.name} has {read.temperature} deg C")
+                text = f"{joint.name} has {read.temperature} deg C, more than {self.hottest:g}"
+                self._fault("heat", f"{text}: let it cool down")
             if joint.ready and self._on and not read.torque:
                 self._fault("power", f"{joint.name} lost its torque: is its supply too weak?")
                 joint.started = False
@@ -323,8 +324,10 @@ class Arm(Driver):
 
     def _missing(self, now: float) -> str:
         late = now - LOST
-        names = ", ".join(joint.name for joint in self.joints if joint.heard < late)
-        return f"no answer from {names} {self._link.why}".rstrip() if names else ""
+        silent = [joint.name for joint in self.joints if joint.heard < late]
+        if silent == [joint.name for joint in self.joints] and not self._link.why:
+            return "no servo answers: is their supply on, and is this their port?"
+        return f"no answer from {', '.join(silent)} {self._link.why}".rstrip() if silent else ""
 
     def _plan(self, now: float) -> None:
         if self._missing(now):

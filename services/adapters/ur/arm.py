@@ -243,14 +243,15 @@ class Arm(Driver):
         """Return what actions, operator and report see; docs/robots/ur.md explains the keys."""
         data, q = self._rtde.data, self._q()
         there = self._motion.reached(q, IN_PLACE)
+        connected = self._link.up and self._now - self._seen < STALE
         mode = "hold" if there or self._motion.goal is None else "move"
         return {
             "ready": self._enabled,
             "mode": mode if self._enabled else "off",
             "reason": self._reason,
             "faults": {self._fault: self._reason} if self._fault else {},
-            "connected": self._link.up and self._now - self._seen < STALE,
-            "safety": SAFETY.get(data.get("safety_mode", 0), "unknown"),
+            "connected": connected,
+            "safety": SAFETY.get(data.get("safety_mode", 0) if connected else 0, "unknown"),
             "q": q,
             "tool": self._arm.tool(q),
             "at_goal": there,

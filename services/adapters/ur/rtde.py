@@ -60,6 +60,8 @@ class Recipe:
 
     def __init__(self, names: Sequence[str], types: Sequence[str]) -> None:
         """Raises RtdeError for a field that the controller does not have, or that is in use."""
+        if used := [n for n, t in zip(names, types, strict=False) if t == "IN_USE"]:
+            raise RtdeError(f"another client or a fieldbus writes {', '.join(used[:2])}: end it")
         bad = [f"{n} ({t})" for n, t in zip(names, types, strict=False) if t not in FORMS]
         if bad or len(names) != len(types):
             raise RtdeError(f"the controller does not give {', '.join(bad) or 'all fields'}")

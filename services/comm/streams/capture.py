@@ -162,8 +162,6 @@ class RecordedImages:
     """A video file, paced by the clock: image k belongs to the time start + k / rate, and after the
     last one there is none."""
 
-    condition = ""
-
     def __init__(self, path: str, clock: Clock, *, colour: bool = False) -> None:
         self._path = path
         self._clock = clock
@@ -172,6 +170,12 @@ class RecordedImages:
         self._sequence = 0
         self._begin = 0.0
         self._rate = 0.0
+        self._over = False
+
+    @property
+    def condition(self) -> str:
+        """Whether it is over; empty before."""
+        return f"recording {self._path!r} is over" if self._over else ""
 
     def start(self, rate: float) -> None:
         """Deliver the images from the first one on, at this rate (1/s). Raises ConnectionError when
@@ -185,6 +189,7 @@ class RecordedImages:
             self._capture = capture
         self._capture.set(cv2.CAP_PROP_POS_FRAMES, 0)
         self._begin, self._rate, self._sequence = self._clock(), rate, 0
+        self._over = False
 
     def stop(self) -> None:
         """Stop delivering images."""
@@ -203,6 +208,7 @@ class RecordedImages:
         while self._rate and self._sequence <= int((self._clock() - self._begin) * self._rate):
             taken, pixels = self._capture.read()
             if not taken:
+                self._over = True
                 break
             pixels = pixels if self._colour else grey(pixels)
             newest = Image(pixels, self._begin + self._sequence / self._rate, self._sequence)

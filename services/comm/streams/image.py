@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     import numpy as np
@@ -45,6 +46,11 @@ class ImageSource(Protocol):
 
     def close(self) -> None:
         """Release the source."""
+
+
+def explained(text: str, state: Mapping[str, Any]) -> str:
+    """Return a message that images are missing, with the reason if the camera's state has one."""
+    return text if state["source"] == "ok" else f"{text}: {state['source']}"
 
 
 class RequestedImages:

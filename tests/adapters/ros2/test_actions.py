@@ -238,10 +238,11 @@ def test_a_cancelled_lost_goal_does_not_affect_the_next_one() -> None:
     assert [m["op"] for m in link.fake.log[1:]] == ["cancel_action_goal", "send_action_goal"]
 
 
-def test_a_server_that_never_answers_frees_the_device_after_some_time() -> None:
+def test_after_a_server_that_never_answers_it_is_unknown_whether_the_robot_stands() -> None:
     bridge, _ = robot(patience=1.0)
-    assert play("/silent", bridge, timeout=0.2).result.executed == "unknown"
-    assert bridge.stopped()
+    result = play("/silent", bridge, timeout=0.2).result
+    assert result.executed == "unknown" and "look at the robot" in result.text
+    assert not bridge.stopped()
 
 
 @pytest.mark.parametrize(

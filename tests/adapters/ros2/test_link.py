@@ -102,7 +102,7 @@ def test_after_a_cut_link_the_goal_is_cancelled(bridge: Stepped, fake: FakeProce
 
 def test_a_killed_server_and_its_successor() -> None:
     """The new server does not know the goal: the cancel is ignored, and the goal is given up after
-    `patience`."""
+    `patience`. Whether the robot stands is unknown until a later goal has ended."""
     fake = FakeProcess()
     bridge = bridge_to(fake.url, patience=1.2)
     bridge.until(lambda: bridge.connected, "the connection")
@@ -113,8 +113,12 @@ def test_a_killed_server_and_its_successor() -> None:
     successor = FakeProcess(fake.port)
     bridge.until_phase(ExchangePhase.RECALLED)
     bridge.until_phase(ExchangePhase.GONE)
-    assert bridge.stopped()
+    assert not bridge.stopped()
     assert {m["op"] for m in successor.log()} == {"cancel_action_goal"}
+    bridge.goal("/slow")
+    bridge.until_phase(ExchangePhase.ACTIVE)
+    bridge.stop(bridge.now)
+    bridge.until(bridge.stopped, "the end of the later goal")
     bridge.close()
     successor.end()
 

@@ -196,6 +196,27 @@ def test_repeated_cancels_do_not_extend_the_wait() -> None:
     assert len(sent) == 5
 
 
+@pytest.mark.parametrize("late", [True, False])
+def test_an_unanswered_goal_is_unknown_until_the_server_reports_an_end(late: bool) -> None:
+    """Its own, or that of a later goal of the same action."""
+    exchanges = Exchanges(5.0)
+    goal = exchanges.begin(0.0, "run", GOAL)["id"]
+    exchanges.cancel(0.0, "run")
+    exchanges.advance(6.0)
+    exchanges.forget("run")
+    for other in ({**GOAL, "action": "/other"}, {"op": "call_service", "service": "/s"}):
+        answer = exchanges.begin(7.0, "another", other)
+        op = "action_result" if "action" in other else "service_response"
+        exchanges.receive(7.0, {"op": op, "id": answer["id"], "values": {}, "status": 4})
+        exchanges.advance(7.0)
+        assert list(exchanges.unknown) == [goal]
+    ended = goal if late else exchanges.begin(8.0, "later", GOAL)["id"]
+    exchanges.receive(8.0, {"op": "action_feedback", "id": ended, "values": {}})
+    assert exchanges.unknown
+    exchanges.receive(8.0, {"op": "action_result", "id": ended, "values": {}, "status": 4})
+    assert not exchanges.unknown
+
+
 def test_a_second_goal_of_a_run_does_not_prevent_the_cancel_of_the_first() -> None:
     exchanges = Exchanges(5.0)
     lost = exchanges.begin(0.0, "run", GOAL)["id"]

@@ -61,7 +61,10 @@ ACCEPTED = package("V", b"\x01") + package("O", b"\x01DOUBLE,VECTOR6D,INT32,")
             "actual_q (NOT_FOUND)",
         ),
         (package("V", b"\x01") + package("O", b"\x01DOUBLE"), "does not give all fields"),
-        (ACCEPTED + package("I", b"\x00IN_USE,DOUBLE"), "input_int_register_24 (IN_USE)"),
+        (
+            ACCEPTED + package("I", b"\x00IN_USE,DOUBLE"),
+            "a fieldbus writes input_int_register_24",
+        ),
         (ACCEPTED + package("I", b"\x01INT32,DOUBLE") + package("S", b"\x00"), "refuses to start"),
         (ACCEPTED + package("U", b"\x01abc"), "expected 60 bytes of data, got 3"),
         (package("V", b"\x01") + package("O", b""), "cannot be read"),
