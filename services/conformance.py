@@ -193,7 +193,10 @@ class _Check:
         self.longest = 0.0
         self.waits: dict[str, list[float]] = {}
         """By method: how long it waited each time that this was too long (s)."""
-        self.schedule = os.open("/proc/thread-self/schedstat", os.O_RDONLY)
+        try:
+            self.schedule = os.open("/proc/thread-self/schedstat", os.O_RDONLY)
+        except FileNotFoundError:  # a kernel without these statistics
+            self.schedule = -1
         self.threads = set(threading.enumerate())
         """Threads that are not the driver's."""
         self.leaves: dict[str, Any] = {}
@@ -253,7 +256,10 @@ class _Check:
                 self.waits.setdefault(method.__name__, []).append(idle)
 
     def ready(self) -> float:
-        """Return how long this thread has run, or waited for a processor (s)."""
+        """Return how long this thread has run, or waited for a processor (s); only how long it has
+        run where the system does not tell the rest."""
+        if self.schedule < 0:
+            return time.thread_time()
         ran, queued, _ = os.pread(self.schedule, 100, 0).split()  # proc(5)
         return 1e-9 * (int(ran) + int(queued))
 
@@ -684,7 +690,8 @@ class _Check:
             self.fault(f"stop at the end: {type(fault).__name__}: {fault}")
         finally:
             self.close()
-            os.close(self.schedule)
+            if self.schedule >= 0:
+                os.close(self.schedule)
         end, left = time.monotonic() + LEAVING, set(threading.enumerate()) - self.threads
         for thread in left:
             thread.join(max(0.0, end - time.monotonic()))
