@@ -15,7 +15,7 @@ from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Mission, MissionError, Stage
 from petrobot.services.comm.calls.caller import Notice, PeerLost
 from petrobot.services.comm.calls.client import Client
-from petrobot.services.comm.calls.peers import LEASED
+from petrobot.services.comm.calls.peers import LEASED, OVERTAKEN
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import (
     COORDINATOR,
@@ -190,6 +190,12 @@ class RealtimeMission:
         client.flush()
         return answer
 
+    def _look_if_overtaken(self, answer: asyncio.Future[Answer]) -> None:
+        """End the run if it has lost a device: its next action would not know where it stands."""
+        if not answer.cancelled() and answer.result().data.get("cause") == OVERTAKEN:
+            text = answer.result().data["text"]
+            self.fail(MissionError(f"{text}; look at the robot, then resume the run or start anew"))
+
     def _unreached(self, missing: Sequence[str]) -> Iterator[str]:
         """Return why nodes cannot be reached and what to do. Nodes that run and refuse us do not
         have to be started."""
@@ -301,7 +307,7 @@ class RealtimeMission:
                     # ask for those that it only waits for: they come in the order of the file.
                     for device in self._leased:
                         if self._directory.where(device) == node:
-                            self._take_device(device)
+                            self._take_device(device).add_done_callback(self._look_if_overtaken)
                 elif isinstance(notice, Answer) and notice.id in self._answers:
                     asked = self._answers.pop(notice.id)
                     if not asked.done():  # Ctrl-C may have ended the wait for it

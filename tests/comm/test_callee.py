@@ -3,6 +3,8 @@ refuses, which results it keeps, and when it stops a run."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -149,6 +151,25 @@ def test_a_lease_outlives_a_short_break_of_the_link() -> None:
     assert _outcome(callee)[1] == "device_leased"
     callee.receive(3.0, "other", m.Call("3", "move"))
     assert _said(callee) == [m.Accept("3")]
+
+
+def test_a_coordinator_whose_device_another_one_has_used_has_it_no_more() -> None:
+    """It was away too long; a new process of it, as after `resume`, may have the device."""
+    callee = _callee(COORD, m.Hello(2, 2, "coordinator", "other", "o1"))
+    callee.receive(0.0, "coord", m.Call("1", "move", epoch=3))
+    callee.finish(0.5, m.Outcome("1", "success"))
+    callee.link_down(1.0, "coord")
+    callee.receive(3.0, "other", m.Call("2", "move"))
+    callee.finish(3.5, m.Outcome("2", "success"))
+    callee.link_down(3.6, "other", leaves=True)
+    callee.link_up(4.0, "coord", COORD, local=True)
+    _said(callee)
+    callee.receive(4.1, "coord", m.Call("3", "move", epoch=3))
+    assert _outcome(callee) == ("error", "device_overtaken", Executed.NO)
+    callee.link_down(5.0, "coord")
+    callee.link_up(6.0, "coord", replace(COORD, boot="new", epoch=4), local=True)
+    callee.receive(6.1, "coord", m.Call("4", "move", epoch=4))
+    assert _said(callee) == [m.Accept("4")]
 
 
 def test_a_caller_never_receives_the_result_of_another_caller() -> None:

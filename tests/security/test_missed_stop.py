@@ -1,5 +1,5 @@
-"""A coordinator that was frozen while an emergency stop was given and cleared, with real processes:
-whenever it was frozen, nothing moves until an operator starts something."""
+"""A coordinator that was frozen while an emergency stop was given and cleared, or while another run
+used its devices, with real processes: whenever it was frozen, it moves nothing afterwards."""
 
 from __future__ import annotations
 
@@ -233,6 +233,31 @@ async def test_what_was_frozen_before_a_stop_moves_nothing_after_it_is_cleared(
         finally:
             coordinator.kill()
             coordinator.communicate()
+
+
+async def test_a_run_whose_devices_another_one_has_used_moves_nothing_more(turns: Turns) -> None:
+    """It was frozen between two turns. `resume` continues it."""
+    coordinator = turns.start(0.5)
+    try:
+        run = await turns.connected(coordinator)
+        await turns.moving()
+        coordinator.send_signal(signal.SIGSTOP)
+        other = turns.start(0.02, "--runs", "3")
+        code, out, err = await finished(other)
+        assert code == 0, out + err
+        then = turns.begun()
+        coordinator.send_signal(signal.SIGCONT)
+        code, out, err = await finished(coordinator)
+        assert (code, turns.begun()) == (1, then) and "while" in err and "resume" in err, out + err
+    finally:
+        coordinator.kill()
+        coordinator.communicate()
+    coordinator = turns.resume(run)
+    try:
+        await turns.moving()
+    finally:
+        coordinator.kill()
+        coordinator.communicate()
 
 
 @pytest.mark.parametrize("command", ["run", "resume"])

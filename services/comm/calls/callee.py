@@ -17,9 +17,9 @@ It is used both in real time (`server.py` drives it) and in lock step. The node 
   both ends a quarter of the time that a short call takes.
 
 Refusals are outcomes with status error and executed = no: unknown_service, local_only, old_epoch,
-device_leased, device_needs_coordinator, cancelled (before it began), and busy from the node's
-runner. With executed = unknown: rebooted (meant for another boot), and forgotten (its result, or
-perhaps even its id, is no longer kept).
+device_leased, device_overtaken, device_needs_coordinator, cancelled (before it began), and busy
+from the node's runner. With executed = unknown: rebooted (meant for another boot), and forgotten
+(its result, or perhaps even its id, is no longer kept).
 """
 
 from __future__ import annotations

@@ -34,8 +34,11 @@ class Offer:
 NODE: Final = "node"
 LEASED: Final = "device_leased"
 """Cause of a refusal: another caller holds the lease of the device."""
+OVERTAKEN: Final = "device_overtaken"
+"""Cause of a refusal: this coordinator lost the device while it was away, and another one has used
+it since, so nobody knows where it stands."""
 KNOWN: Final = 256
-"""How many callers are remembered after their connection closed."""
+"""How many callers are remembered after their connection closed, and how many lost leases."""
 
 
 @dataclass(slots=True)
@@ -63,6 +66,9 @@ class Peers:
         self._lease_time = lease
         self._peers: dict[str, Peer] = {}
         self._leases: dict[str, str] = {}
+        self._overtaken: dict[tuple[str, str], str] = {}
+        """Which caller took a device from an absent coordinator, by device and the coordinator's
+        boot: a new process of it (`resume`) may have the device again."""
 
     def get(self, name: str) -> Peer | None:
         """Return what is known about this caller."""
@@ -187,9 +193,21 @@ class Peers:
                 "device_needs_coordinator",
                 f"{device} only accepts orders from a coordinator, not from node {name}",
             )
+        if (other := self._overtaken.get((device, peer.boot))) is not None:
+            return (
+                OVERTAKEN,
+                f"{other} has used {device} while {name} was away for more than "
+                f"{self._lease_time:g} s",
+            )
         holder = self._leases.get(device, name)
-        if holder != name and (self._is_near(now, holder) or in_use(device)):
-            return LEASED, f"{device} accepts orders from {holder} at the moment"
+        if holder != name:
+            if self._is_near(now, holder) or in_use(device):
+                return LEASED, f"{device} accepts orders from {holder} at the moment"
+            absent = self._peers.get(holder)
+            if absent is not None and absent.role == COORDINATOR:
+                self._overtaken[device, absent.boot] = name
+                if len(self._overtaken) > KNOWN:
+                    del self._overtaken[next(iter(self._overtaken))]
         self._leases[device] = name
         return None
 
