@@ -103,7 +103,7 @@ def compile_task(task: Task, devices: Mapping[str, str]) -> Compiled:
         reading=_index((x.index, sorted(x.when.names)) for x in transitions if x.when is not None),
         waiting=_index((net.transition_index[t.name], t.events) for t in flat.transitions.values()),
         kept=frozenset(e.name for e in flat.events.values() if e.early is EarlyEvent.KEEP),
-        contested=_contested(transitions),
+        contested=contested_places(transitions),
         devices=dict(devices),
         domains=condition_domains(flat),
         free=frozenset(flat.variables)
@@ -144,7 +144,9 @@ def _firing_limit(flat: Task, net: Net) -> int:
     return min(1_000 + len(net.transitions) * tokens, FIRINGS_OF_A_FINITE_NET)
 
 
-def _contested(transitions: Sequence[CompiledTransition]) -> dict[int, frozenset[int]]:
+def contested_places(transitions: Sequence[CompiledTransition]) -> dict[int, frozenset[int]]:
+    """Return, by transition, the places for whose tokens it competes with others of its rank, where
+    no draw by weight decides."""
     takers: dict[int, list[CompiledTransition]] = {}
     for x in transitions:
         for p, _ in x.plain:

@@ -8,7 +8,7 @@ from itertools import product
 
 import numpy as np
 
-from petrobot.coordinator.analysis.time.measured import is_cause
+from petrobot.coordinator.analysis.time.measured import EMERGENCY, FIELDS, is_cause
 from petrobot.coordinator.learning.waits import memory_of
 from petrobot.coordinator.studies.forecast.history import STATUSES, RunVocabulary, reads_variables
 from petrobot.coordinator.task import (
@@ -16,6 +16,7 @@ from petrobot.coordinator.task import (
     EarlyEvent,
     End,
     EventMemory,
+    Executed,
     Kind,
     Status,
     Task,
@@ -23,7 +24,7 @@ from petrobot.coordinator.task import (
 )
 from petrobot.coordinator.task.compiled import CompiledNet
 from petrobot.coordinator.task.compiled_task import CompiledTransition, compile_transitions
-from petrobot.coordinator.task.conditions import ConditionFault
+from petrobot.coordinator.task.conditions import ConditionFault, Literal, walk
 
 
 @dataclass(frozen=True)
@@ -70,11 +71,6 @@ class Move:
         before, yields = self.transition.rank
         return -2 * before - yields
 
-    @property
-    def weight(self) -> float:
-        """Share of its firings among those of equal priority that are enabled with it."""
-        return 1.0 if self.transition.weight is None else self.transition.weight
-
 
 @dataclass(frozen=True)
 class Structure:
@@ -91,8 +87,9 @@ class Structure:
     assumptions: tuple[str, ...]
 
     @classmethod
-    def of(cls, task: Task) -> Structure:
-        """Raises ValueError for what cannot be played, with the remedy."""
+    def of(cls, task: Task, whole: bool = True) -> Structure:
+        """`whole`: by which transition each run left its place was measured. Raises ValueError for
+        what cannot be played, with the remedy."""
         flat = task.flat
         vocabulary = RunVocabulary.of(flat)
         for place in flat.places.values():
@@ -102,9 +99,8 @@ class Structure:
                 )
         for t in flat.transitions.values():
             _refuse_unknown_preemption(t)
-        assumptions: list[str] = []
         moves = tuple(
-            _move(flat, vocabulary, t, compiled, assumptions)
+            _move(flat, vocabulary, t, compiled)
             for t, compiled in zip(
                 flat.transitions.values(), compile_transitions(flat), strict=True
             )
@@ -113,7 +109,18 @@ class Structure:
         if flat.runs_place:
             initial[flat.net.place_index[flat.runs_place]] = 1
         indices = tuple(flat.net.place_index[name] for name in vocabulary.places)
-        return cls(flat, vocabulary, moves, initial, flat.net.compiled, indices, tuple(assumptions))
+        source = (
+            "how often its condition holds is taken from the runs that it took"
+            if whole
+            else "its condition is taken to hold as for runs that were executed, and that no "
+            "emergency stop ended"
+        )
+        assumptions = tuple(
+            f"{m.name}: {source}"
+            for t, m in zip(flat.transitions.values(), moves, strict=True)
+            if reads_variables(t) and (whole or m.allowed is not None)
+        )
+        return cls(flat, vocabulary, moves, initial, flat.net.compiled, indices, assumptions)
 
 
 def _move(
@@ -121,7 +128,6 @@ def _move(
     vocabulary: RunVocabulary,
     t: Transition,
     compiled: CompiledTransition,
-    assumptions: list[str],
 ) -> Move:
     net = flat.net
     number_of = {net.place_index[name]: q for q, name in enumerate(vocabulary.places)}
@@ -129,10 +135,6 @@ def _move(
         end: tuple(number_of[a.place] for a in compiled.actions if a.end is end)
         for end in (End.NORMAL, End.ERROR, End.GOING)
     }
-    if reads_variables(t):
-        assumptions.append(
-            f"{t.name}: how often its condition holds is taken from the runs that it took"
-        )
     waits_known = [flat.events[e].mean_wait for e in t.events]
     means = [mean for mean in waits_known if mean is not None]
     return Move(
@@ -180,19 +182,32 @@ def _refuse_unknown_preemption(t: Transition) -> None:
 
 
 def _allowed(t: Transition, places: list[str]) -> np.ndarray | None:
-    if t.when is None or reads_variables(t):
+    """Return which statuses a condition admits. If it asks why a run ended, too, as that of a retry
+    does: of runs that were executed, and that no emergency stop ended."""
+    if t.when is None or _reads_unknown(t, places):
         return None
     out = np.zeros((len(STATUSES),) * len(places), np.bool_)
     for combination in product(range(len(STATUSES)), repeat=len(places)):
         values = {
-            f"{place}.status": str(STATUSES[s])
+            f"{place}.{field}": value
             for place, s in zip(places, combination, strict=True)
+            for field, value in zip(
+                ("status", *FIELDS), (str(STATUSES[s]), "", str(Executed.YES)), strict=True
+            )
         }
         try:
             out[combination] = t.when.holds(values)
         except ConditionFault:
             out[combination] = False
     return out
+
+
+def _reads_unknown(t: Transition, places: list[str]) -> bool:
+    """Return whether a condition depends on a variable, or on a cause of the action's own."""
+    assert t.when is not None
+    known = {f"{place}.{field}" for place in places for field in ("status", *FIELDS)}
+    literals = {node.value for node in walk(t.when.tree) if isinstance(node, Literal)}
+    return not (t.when.names <= known and literals <= {*Status, *Executed, EMERGENCY})
 
 
 SUCCESS, ERROR = STATUSES.index(Status.SUCCESS), STATUSES.index(Status.ERROR)

@@ -5,8 +5,9 @@ This is the generalised semi-Markov process of docs/forecast.md: when a token en
 an action is chosen, then how and when its run will end is drawn in one draw (competing risks: of
 itself with a status, or preempted by an event or a timer); transitions that wait for events or
 timers race with their measured waits, or with the rates of their events; everything else fires at
-once, also what preempts a run because another one has ended. Runs wait for their devices, and
-tokens for the run before them, as in the engine: in the order in which they came.
+once, also what preempts a run because another one has ended. Runs wait for their devices, tokens
+for the run before them, and transitions for a token that others want, too, as in the engine: first
+come, first served.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.analysis.net.columns import concession
+from petrobot.coordinator.engine.compiled import contested_places
 from petrobot.coordinator.studies.forecast.distributions import Drawer, Mask
 from petrobot.coordinator.studies.forecast.history import CENSORED, STATUSES, Codes, Seen, Values
 from petrobot.coordinator.studies.forecast.net_arrays import ERROR, SUCCESS, Move, Structure
@@ -25,6 +27,7 @@ from petrobot.coordinator.task import Counts, EarlyEvent, EventMemory, Start, St
 from petrobot.coordinator.task.net import Marking
 
 IDLE, GOING, DONE = 0, 1, 2
+_NEVER, _LEAST = np.iinfo(np.int64).max, np.iinfo(np.int64).min
 LONGEST = 10_000
 """After so many firings at one time, or so many steps, a trial counts as one that never ends."""
 Choices = Mapping[str, Mapping[str, float]]
@@ -82,6 +85,15 @@ class Play:
         free = [m for m in structure.moves if all(known[q] for q in m.starts)]
         self._quick = [m for m in free if not m.waits]
         self._slow = [m for m in free if m.waits and not m.cause]
+        contested = contested_places([m.transition for m in structure.moves])
+        self._contests = [
+            (i, place, weight)
+            for i, m in enumerate(self._quick)
+            for place, weight in m.transition.plain
+            if place in contested.get(m.number, ())
+        ]
+        """Transitions (indices in `_quick`) that compete for tokens; of which place; how many."""
+        self._since, self._steps = np.full((len(self._contests), n), _NEVER), 0
         self._column = np.arange(n)
         self._replicate = replicate
         self._tokens = np.repeat(structure.initial[:, None], n, axis=1)
@@ -145,26 +157,52 @@ class Play:
 
     def _settle(self) -> None:
         """Fire what needs no time until nothing does."""
+        pending = np.zeros((len(self._quick), len(self._column)), np.bool_)
         for _ in range(LONGEST):
             able = np.array([self._enabled(m) for m in self._quick])
-            priority = np.array([m.priority for m in self._quick])[:, None]
-            highest = np.where(able, priority, np.iinfo(np.int64).min).max(axis=0)
-            able &= priority == highest
             some: Mask = np.asarray(able.any(axis=0))
             if not some.any():
+                self._note_waits()
                 return
-            weight = able * np.array([m.weight for m in self._quick])[:, None]
-            bounds = np.cumsum(weight, axis=0)
-            draw = self._drawer.chance(len(some)) * bounds[-1]
-            chosen = np.where(some, (bounds <= draw).sum(axis=0), -1)
+            # What one firing makes fireable comes after what was fireable with it.
+            pending = np.where((able & pending).any(axis=0), able & pending, able)
+            chosen = np.where(some, self._first(pending), -1)
             for i, move in enumerate(self._quick):
                 columns = np.flatnonzero(chosen == i)
                 if len(columns):
                     self._fire(move, columns)
+                    pending[i, columns] = False
         raise ValueError(
             f"{self._s.task.name}: transitions fire for ever without time going on; run "
             "petrobot check"
         )
+
+    def _first(self, able: Mask) -> Codes:
+        """Return which of the fireable transitions fires next in each column. As in the engine:
+        priority, then a draw by weight, or the one that has waited longest for a token, at a tie
+        the first in the file."""
+        priority = np.array([m.priority for m in self._quick])[:, None]
+        able = able & (priority == np.where(able, priority, _LEAST).max(axis=0))
+        since = np.full(able.shape, _NEVER - 1)
+        for k, (i, _, _) in enumerate(self._contests):
+            since[i] = np.minimum(since[i], self._since[k])
+        head: Codes = np.where(able, since, _NEVER).argmin(axis=0)
+        drawn = np.array([m.transition.weight is not None for m in self._quick])
+        weights = np.array([m.transition.weight or 0.0 for m in self._quick])[:, None]
+        bounds = np.cumsum(able * weights, axis=0)
+        draw = self._drawer.chance(able.shape[1]) * bounds[-1]
+        return np.where(drawn[head], (bounds <= draw).sum(axis=0), head)
+
+    def _note_waits(self) -> None:
+        """Note since which step each transition lacks nothing but tokens of one contested place."""
+        self._steps += 1
+        for k, (i, place, weight) in enumerate(self._contests):
+            there = self._tokens[place].copy()
+            self._tokens[place] = np.maximum(there, weight)
+            lacking = self._enabled(self._quick[i]) & (there < weight)
+            self._tokens[place] = there
+            known = np.minimum(self._since[k], self._steps)
+            self._since[k] = np.where(lacking, known, _NEVER)
 
     def _enabled(self, m: Move) -> Mask:
         out = concession(self._s.rule, self._tokens, m.number)
@@ -177,8 +215,11 @@ class Play:
         for q, _, takes_done in m.preempt:
             out &= (self._phase[q] != IDLE) if takes_done else (self._phase[q] == GOING)
         if m.allowed is not None:
-            ended = [np.clip(self._status[q], 0, None) for q in m.normal + m.error]
-            out &= m.allowed[tuple(ended)]
+            runs = m.normal + m.error
+            ended = [np.clip(self._status[q], 0, None) for q in runs]
+            # a run whose measured transition is known shows that the condition held
+            known = [self._want[q] == m.number for q in runs]
+            out &= m.allowed[tuple(ended)] | np.any(known, axis=0)
         return out
 
     def _wanted(self, q: int, m: Move) -> Mask:
@@ -410,5 +451,6 @@ class Play:
         for name in (
             "_tokens", "_phase", "_status", "_want", "_preempted", "_end",
             "_due", "_action", "_outcome", "_took", "_came", "_beyond", "_device", "_turn",
+            "_since",
         ):  # fmt: skip
             setattr(self, name, getattr(self, name)[:, kept])

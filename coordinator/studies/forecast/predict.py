@@ -29,6 +29,7 @@ from petrobot.coordinator.studies.forecast.history import Codes, Training, Value
 from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
 from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
 from petrobot.coordinator.studies.forecast.residual import (
+    condition_doubts,
     doubts,
     event_doubts,
     measured,
@@ -279,6 +280,7 @@ def _from_net(training: Training, request: Request, random: np.random.Generator)
         "doubts": [
             *doubts(residual, whole, request.point),
             *event_doubts(training),
+            *condition_doubts(training, net.structure.moves),
             *order_doubts(training),
         ],
         **_net_told(
@@ -311,7 +313,10 @@ class _SimulatedNet:
 
     def __init__(self, training: Training) -> None:
         """Raises ValueError for a net that cannot be simulated."""
-        self.structure, self.runs = Structure.of(training.task), RunDistributions(training)
+        self.structure, self.runs = (
+            Structure.of(training.task, training.whole),
+            RunDistributions(training),
+        )
         self._training = training
         # steps after which a simulated trial counts as endless
         longest = max(len(trial.runs) + len(trial.waits) for trial in training.trials)

@@ -4,7 +4,7 @@ compare them with the training trials."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from petrobot.coordinator.studies.forecast.history import (
     Values,
     reads_variables,
 )
+from petrobot.coordinator.studies.forecast.net_arrays import Move
 from petrobot.coordinator.studies.forecast.play import Choices, Played
 from petrobot.coordinator.studies.forecast.shares import holm
 from petrobot.coordinator.task import EarlyEvent, EventMemory
@@ -292,6 +293,20 @@ def event_doubts(training: Training) -> list[str]:
                 "does not know"
             )
     return list(dict.fromkeys(out))
+
+
+def condition_doubts(training: Training, moves: Iterable[Move]) -> list[str]:
+    """Return in words which conditions an estimates file leaves open: it does not contain by which
+    transitions runs left their places."""
+    if training.whole:
+        return []
+    transitions = training.task.flat.transitions
+    return [
+        f"{m.name}: an estimates file does not tell how often its condition holds, so it is taken "
+        "to hold always; give a campaign's folder"
+        for m in moves
+        if m.allowed is None and reads_variables(transitions[m.name])
+    ]
 
 
 def doubts(residual: Sequence[Mapping[str, Any]], played: Played, trials: int) -> list[str]:

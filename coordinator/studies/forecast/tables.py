@@ -187,7 +187,9 @@ def agreement_text(found: Mapping[str, Any]) -> str:
     if not found["same_task_file"]:
         lines.append("note: the task file has changed between training and these runs")
     lines.append(
-        "agrees" if found["agrees"] else "DISAGREES: at least one test differs at 1 % (Holm)"
+        "agrees: no test differs at 1 % (Holm)"
+        if found["agrees"]
+        else "DISAGREES: at least one test differs at 1 % (Holm)"
     )
     return "\n".join(lines)
 

@@ -3,6 +3,7 @@ dead ends, each against values computed by hand."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -25,7 +26,7 @@ from petrobot.coordinator.studies.forecast.distributions import Drawer, RunDistr
 from petrobot.coordinator.studies.forecast.history import Training
 from petrobot.coordinator.studies.forecast.net_arrays import Structure
 from petrobot.coordinator.studies.forecast.play import Play, Played
-from petrobot.coordinator.studies.forecast.residual import doubts
+from petrobot.coordinator.studies.forecast.residual import condition_doubts, doubts
 from petrobot.coordinator.task import Status, Task
 from petrobot.coordinator.task.file import loads
 from tests.studies.forecast.conftest import with_transitions
@@ -531,3 +532,96 @@ def test_waits_of_an_older_table_stay_in_the_durations() -> None:
     runs = [entry("a", 1.0, taken="a_done"), entry("b", 3.0, taken="b_done")]
     used = {"run_a": "arm", "run_b": "arm"}
     assert Training.of(task, [Trial(1, 0.0, runs=runs)], devices=used).devices == {}
+
+
+SHARED = """
+[places.arm]
+kind = "resource"
+tokens = 1
+[places.a_over]
+kind = "control"
+[places.b_over]
+kind = "control"
+[places.a_waits]
+kind = "control"
+[places.b_waits]
+kind = "control"
+[places.c_waits]
+kind = "control"
+[primitive_tasks.c]
+goal = "c"
+alternatives = ["run_c"]
+deadline = 99.0
+[places.c]
+kind = "action"
+task = "c"
+begin: jobs -> {begin}
+get_a: a_waits, arm -> a
+get_b: b_waits, arm -> b
+get_c: c_waits, arm -> c
+a_done: a:normal -> arm, {after_a}
+b_done: b:normal -> arm, b_over
+c_done: c:normal -> arm
+both: a_over, b_over -> end
+a_lost: a:error -> end
+b_lost: b:error -> end
+c_lost: c:error -> end
+"""
+
+
+@pytest.mark.parametrize(
+    ("begin", "after_a"),
+    [
+        ("c_waits, b_waits, a_waits", "a_over"),
+        # a wants the arm again at once, but b has waited since the beginning
+        ("b_waits, a_waits", "a_over, a_waits"),
+    ],
+)
+def test_a_contested_token_goes_to_who_came_first_and_then_to_the_first_in_the_file(
+    begin: str, after_a: str
+) -> None:
+    """a uses the arm for 1 s and then b for 2 s, as in the engine; c would take it for 4 s."""
+    text = SHARED.replace("{begin}", begin).replace("{after_a}", after_a)
+    runs = [entry("a", 1.0), entry("b", 2.0), entry("c", 4.0)]
+    played = play(text, [Trial(1, 0.0, runs=runs)], n=50)
+    assert played.time.tolist() == [3.0] * 50
+
+
+def test_an_estimates_file_forecasts_every_try_of_a_place() -> None:
+    """Each of three tries succeeds half the time, so 7 of 8 trials get through. The file does not
+    tell which transition took a run; the condition of a retry holds for runs that were executed."""
+    text = """
+[places.lost]
+kind = "control"
+begin: jobs -> a
+done: a:normal -> end
+a_lost: a:error -> lost
+b_done: b:normal -> end
+b_lost: b:error -> lost
+"""
+    keys = with_transitions(HEAD.replace("{task}", GOAL) + text)
+    task = loads(keys.replace('\ntask = "a"', '\ntask = "a"\ntries = 3'), "net.toml")
+    trials = [Trial(1, 0.0, runs=[entry("a", 1.0, status)]) for status in ("success", "error")]
+    training = Training.of(task, trials, whole=False)
+    drawer = Drawer(RunDistributions(training), {}, np.ones((1, 2)), np.random.default_rng(1))
+    structure = Structure.of(task, whole=False)
+    played = Play(structure, drawer, choices_of(training), np.zeros(4000, np.int64)).run()
+    assert np.mean(played.completed) == pytest.approx(7 / 8, abs=0.02)
+    assert condition_doubts(training, structure.moves) == []
+    assert any(text.startswith("a.retry: its condition") for text in structure.assumptions)
+
+
+def test_an_estimates_file_that_leaves_a_condition_open_is_doubtful() -> None:
+    """Which way a run leaves is decided by a cause that the file does not have for each run."""
+    text = """
+begin: jobs -> a
+done: a:normal -> end
+again: a:error -> b; when = "a.reason == 'slipped'"
+a_lost: a:error -> end; when = "a.reason != 'slipped'"
+b_done: b:normal -> end
+b_lost: b:error -> end
+"""
+    training = Training.of(task_of(text), [Trial(1, 0.0, runs=[entry("a", 1.0)])], whole=False)
+    found = condition_doubts(training, Structure.of(training.task, whole=False).moves)
+    assert [doubt.partition(":")[0] for doubt in found] == ["again", "a_lost"]
+    assert condition_doubts(replace(training, whole=True), Structure.of(training.task).moves) == []
