@@ -74,12 +74,12 @@ class TaskStore:
         return sorted(self._own() | self._behind())
 
     def listed(self) -> list[dict[str, object]]:
-        """Return all task files: {name, own, shipped}; one with both is the user's copy of a
-        shipped one."""
+        """Return all task files, the user's own first: {name, own, shipped}; one with both is the
+        user's copy of a shipped one."""
         own, behind = self._own(), self._behind()
         return [
             {"name": name, "own": name in own, "shipped": name in behind}
-            for name in sorted(own | behind)
+            for name in (*sorted(own), *sorted(behind - own))
         ]
 
     def read(self, name: str) -> TaskText:

@@ -371,3 +371,15 @@ async def test_an_outdated_drawing_is_answered_without_an_error(
         while not older.done():
             assert (await post("/api/check"))[0] == 200
     assert await older == (200, {"superseded": True})
+
+
+def test_the_user_s_own_tasks_come_before_those_of_petrobot(tmp_path: Path) -> None:
+    """The designer opens the first task: that of a newcomer's robot, not one that its nodes cannot
+    run."""
+    for folder, name in (("own", "deliver"), ("own", "track"), ("shipped", "catch")):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / f"{name}.toml").write_text("schema = 1\n[task]\n")
+    (tmp_path / "shipped" / "track.toml").write_text("schema = 1\n[task]\n")
+    listed = store.TaskStore(tmp_path / "own", tmp_path / "shipped").listed()
+    assert [entry["name"] for entry in listed] == ["deliver", "track", "catch"]
+    assert listed[1] == {"name": "track", "own": True, "shipped": True}

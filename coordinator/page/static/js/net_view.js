@@ -6,7 +6,7 @@ import { Flights } from "./flights.js";
 import { iconPath } from "./icons.js";
 import { Ground } from "./labels.js";
 
-const KIND_WORD = { action: "Action place", resource: "Resource place", control: "Control place", macro: "Macro place" };
+const KIND_WORD = { action: "Action place", resource: "Resource place", control: "Control place", macro: "Macro place", plain: "Plain place" };
 const LABEL_MOST = 24;
 const ZOOM = [0.12, 3];
 const FLASH_MS = 550;
@@ -142,7 +142,7 @@ export class NetView {
   }
 
   name(element) {
-    const what = element.shape === "place" ? KIND_WORD[element.kind] : "Transition";
+    const what = element.shape === "place" ? KIND_WORD[element.kind ?? "plain"] : "Transition";
     const held = element.shape === "place" ? `, ${tokens(element.tokens)}` : "";
     const more = element.state ? `, ${element.state}` : "";
     const alarm = element.alarm ? `, ${element.alarm} in an error branch` : "";
