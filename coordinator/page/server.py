@@ -170,7 +170,10 @@ async def _live(request: web.Request) -> web.StreamResponse:
     )
     if not socket.can_prepare(request).ok:
         raise web.HTTPUpgradeRequired(text="this address speaks WebSocket")
-    await socket.prepare(request)
+    try:
+        await socket.prepare(request)
+    except ConnectionError:  # The client left before it was answered, as when we were frozen.
+        return web.Response()
     session = Session(socket, page_state.port, page_state.encode_once, page_state.commands)
     page_state.sessions.add(session)
     try:

@@ -7,6 +7,7 @@ import asyncio
 import gzip
 import io
 import json
+import socket
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -264,6 +265,28 @@ async def test_a_replayed_command_is_carried_out_once(page: Page, stage: Stage) 
         )
         == 1
     )
+
+
+async def test_a_client_that_left_before_its_answer_is_no_fault(
+    page: Page, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A coordinator that was frozen finds requests whose clients have gone; its log had a traceback
+    for each."""
+    lines = (
+        "GET /api/live HTTP/1.1",
+        f"Host: 127.0.0.1:{port_of(page)}",
+        f"Authorization: {bearer(page)['Authorization']}",
+        "Connection: Upgrade",
+        "Upgrade: websocket",
+        "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==",
+    )
+    for _ in range(8):
+        with socket.create_connection(("127.0.0.1", port_of(page))) as gone:
+            gone.sendall("\r\n".join((*lines, "", "")).encode())
+    async with joined(page) as ana:
+        assert ana.state["you"], "others are served"
+    assert not [entry for entry in caplog.records if entry.exc_info]
 
 
 async def test_a_name_alone_does_not_identify_a_client(page: Page, stage: Stage) -> None:
