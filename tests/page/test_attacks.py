@@ -285,7 +285,7 @@ async def test_a_client_that_left_before_its_answer_is_no_fault(
         with socket.create_connection(("127.0.0.1", port_of(page))) as gone:
             gone.sendall("\r\n".join((*lines, "", "")).encode())
     async with joined(page) as ana:
-        assert ana.state["you"], "others are served"
+        assert (await ana.command("take_controls"))["ok"], "others are served"
     assert not [entry for entry in caplog.records if entry.exc_info]
 
 
