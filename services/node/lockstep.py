@@ -41,6 +41,7 @@ from petrobot.services.node.inline_host import Host, InlineHost
 from petrobot.services.node.node import GENERAL, Node
 from petrobot.services.node.ports import DevicePorts
 from petrobot.services.node.watchdog import Watchdog
+from petrobot.services.scripted import Scripted
 from petrobot.services.worker.callables import describe
 from petrobot.services.worker.remote import DeviceError
 from petrobot.services.worker.runner import Hung
@@ -263,7 +264,8 @@ class LockstepNode:
             for a in directory.actions.values()
             if (a.node, a.device) == (self.name, device)
         }
-        scripted = bool(own) and own.keys() <= (self._substitutes or {}).keys()
+        substitutes = self._substitutes or {}
+        scripted = bool(own) and all(isinstance(substitutes.get(a), Scripted) for a in own)
         if device != GENERAL and not scripted:
             entry = directory.devices[device]
             ports = self._ports[device] = LockstepPorts(

@@ -385,7 +385,9 @@ class DrawsByItself(Axis):
     ],
 )
 def test_each_broken_rule_is_named(kind: type[Axis], fault: str) -> None:
-    found = checked(kind).faults
+    check = checked(kind)
+    # On a very busy computer a wait is only noted: it may not be the driver's.
+    found = [*check.faults, *(check.notes if kind in (WaitsOnce, WaitsInStop) else ())]
     assert any(fault in one for one in found), found
     assert kind is not BreaksOnTheWay or BreaksOnTheWay.after[-2:] == ["stop", "close"]
 

@@ -38,6 +38,7 @@ from petrobot.services.comm.protocol.messages import (
     Outcome,
 )
 from petrobot.services.node.lockstep import LockstepNode
+from petrobot.services.scripted import Scripted, ScriptedRun
 
 CELL = """\
 schema = 1
@@ -232,12 +233,15 @@ def test_an_action_on_a_cyclic_device() -> None:
 def test_a_device_whose_actions_are_all_scripted_gets_no_driver() -> None:
     """Its driver may need a device that is not here. If one action is not scripted, it is made."""
     absent = directory(**{"drivers:Slide": "drivers:Absent"})
+    scripted = Scripted([ScriptedRun()])
 
-    async def scripted(ctx: Context, **_arguments: Any) -> Result:
+    async def wrapped(ctx: Context, **_arguments: Any) -> Result:
         return success()
 
     with pytest.raises(DirectoryError, match="Absent"):
         Bench(absent, go=scripted)
+    with pytest.raises(DirectoryError, match="Absent"):
+        Bench(absent, go=wrapped, follow=wrapped)
     bench = Bench(absent, go=scripted, follow=scripted)
     assert bench.call("go", 1.0, to=0.2).status == "success"
     assert bench.call("add", 1.0, a=1, b=2).status == "success"

@@ -86,7 +86,7 @@ hang_moving.deadline = 0.3
 crash_arm = {{ run = "toy_cell.actions:segfault", task = "move", device = "slide" }}
 lead = {{ run = "toy_cell.actions:lead", task = "see", device = "eye" }}
 eye_pid = {{ run = "toy_cell.actions:pid", task = "see", device = "eye" }}
-hang_eye = {{ run = "toy_cell.actions:hang", task = "see", device = "eye", deadline = 0.2 }}
+hang_eye = {{ run = "toy_cell.actions:hang", task = "see", device = "eye", deadline = 1.0 }}
 add = {{ run = "toy_cell.actions:add", task = "sum", node = "left" }}
 nap = {{ run = "toy_cell.actions:nap", task = "sum", node = "left", orphan_time = 0.2 }}
 relay = {{ run = "toy_cell.actions:relay", task = "sum", node = "left" }}
@@ -400,7 +400,7 @@ async def test_a_device_without_cycle_has_one_process(operator: Operator) -> Non
     found = await pids(operator, "right", "eye")
     assert found == {"actions": (await operator.call("eye_pid")).values["pid"]}
     end = await operator.call("hang_eye")
-    assert end.cause == "deadline"
+    assert (end.cause, end.executed) == ("deadline", "yes")
     assert (await operator.call("eye_pid")).values["pid"] != found["actions"]
 
 

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -134,7 +135,9 @@ def test_set_points_reach_the_robot(tmp_path: Path, fake: FakeProcess, mode: str
     assert result["happened"] == "3 runs", result  # nothing `unexpected`
     if mode == "realtime":
         speeds = [message["msg"]["linear"]["x"] for message in fake.log("publish")]
-        assert set(speeds) == {0.5, 0.0} and speeds.count(0.0) == 1 and len(speeds) > 3
+        assert set(speeds) == {0.5, 0.0} and speeds[-1] == 0.0 and len(speeds) > 3
+        # On a busy host the stream may pause: then the set point of rest is sent once, too.
+        assert (0.0, 0.0) not in pairwise(speeds)
 
 
 @pytest.mark.processes

@@ -105,8 +105,8 @@ def wheel(bus: Bus, on: bool) -> None:
     [
         (overload, "overload", "shoulder_lift"),
         (unplugged, "missing", "elbow_flex"),
-        (spoilt, "missing", "no answer"),
-        (late, "missing", "no answer"),
+        (spoilt, "missing", "no servo answers"),
+        (late, "missing", "no servo answers"),
         (wheel, "mode", "wrist_flex"),
     ],
 )
