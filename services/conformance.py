@@ -42,9 +42,9 @@ LATE_SHARE = 0.02
 """Share of steps that may take longer than the period: a busy computer delays some."""
 WAIT = 0.03
 """Seconds that a method may wait if the period is shorter."""
-BUSY = 3.0
-"""How many times as long as it runs the check may wait for a processor: beyond that also locks of
-the system are slow, and a wait tells nothing of the driver."""
+BUSY = 0.3
+"""Share of its running time that the check may wait for a processor: beyond that also locks of the
+system are slow, and a wait tells nothing of the driver."""
 LEAVING = 2.0
 """Seconds in which the threads of a closed driver must end."""
 GROWING = 250
