@@ -194,7 +194,8 @@ class Nodes:
         for name, process in self.processes.items():
             assert process.stdout is not None
             line = process.stdout.readline()
-            assert "ready" in line, f"{name}: {line!r}"
+            why = "" if line else process.communicate(timeout=PATIENCE)[1]
+            assert "ready" in line, f"{name}: {line!r} {why}"
 
     def _start(self, name: str, mock: str) -> subprocess.Popen[str]:
         return start_node(name, self.file, *(["--mock", mock] if mock else []))
