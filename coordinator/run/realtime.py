@@ -194,7 +194,7 @@ class RealtimeMission:
         """End the run if it has lost a device: its next action would not know where it stands."""
         if not answer.cancelled() and answer.result().data.get("cause") == OVERTAKEN:
             text = answer.result().data["text"]
-            self.fail(MissionError(f"{text}; look at the robot, then resume the run or start anew"))
+            self.fail(MissionError(f"{text}; look at the robot, then resume or start again"))
 
     def _unreached(self, missing: Sequence[str]) -> Iterator[str]:
         """Return why nodes cannot be reached and what to do. Nodes that run and refuse us do not

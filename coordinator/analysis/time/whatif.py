@@ -29,7 +29,7 @@ FORM = (
 )
 
 ROUNDING = 1e-9
-"""Shares may add up to 1 but for this."""
+"""How far the sum of shares may differ from 1."""
 
 Runs = dict[tuple[str, str], Mapping[Status, Estimate]]
 
@@ -103,7 +103,7 @@ def _other_tokens(task: Task, change: Change) -> Task:
 
 
 def _other_estimate(task: Task, runs: Runs, change: Change) -> list[tuple[str, str]]:
-    """Change the estimates of one action, or of all actions of a primitive task, but for shares,
+    """Change the estimates of one action, or of all actions of a primitive task, except the shares,
     which `_with_shares` sets when all changes are known.
 
     What was measured in single places counts before what is known of the primitive task, so it is

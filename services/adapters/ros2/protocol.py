@@ -162,7 +162,7 @@ class ExchangePhase(StrEnum):
     REJECTED = "rejected"
     """Refused before anything began."""
     UNANSWERED = "unanswered"
-    """Cancelled, but the server has not answered for too long (see `Exchanges.unknown`)."""
+    """Cancelled, but the server has been silent for too long (see `Exchanges.unknown`)."""
     GONE = "gone"
     """After LOST: the server has ended it, or has not answered for too long."""
 
