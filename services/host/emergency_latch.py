@@ -6,9 +6,9 @@ commands (`*`: all). The node writes it, and checks it before each run on a devi
 per second. `petrobot estop` writes it for a node of its own host that does not answer. A file that
 cannot be read or understood counts as `*`: in doubt, devices stay stopped.
 
-Beside it another file counts the stops that were cleared, and says when the last one was. It
-stays, so that a caller that was frozen from before a stop until after it was cleared is still known
-to have missed it.
+Beside it another file counts the stops that were cleared, and says when the last one was, and with
+which stop each device was last cleared. It stays, so that a caller or a node that was frozen from
+before a stop until after it was cleared is still known to have missed it.
 
 The file is in `$PETROBOT_STATE`; else in `.petrobot` beside services.toml; else, if that cannot be
 written or is where petrobot is installed, in a folder of the user (`$XDG_STATE_HOME` or
@@ -20,9 +20,9 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from petrobot.services.host.whole_file import make_folder, write_whole
 
@@ -35,6 +35,16 @@ INSTALLED = Path(__file__).parents[2].resolve()
 
 class LatchError(OSError):
     """The latch cannot be written or removed; the text names file and reason."""
+
+
+class Cleared(NamedTuple):
+    """The stops of a node that were cleared."""
+
+    count: int = 0
+    at: float = 0.0
+    """When the last one was cleared (`uptime`); 0: unknown, or before the last boot."""
+    devices: Mapping[str, int] = {}
+    """For each device the number of the stop that was last cleared for it."""
 
 
 class Latch:
@@ -57,10 +67,10 @@ class Latch:
         return self._write(".stopped", sorted(self.stopped() | set(devices)))
 
     @property
-    def cleared(self) -> tuple[int, float]:
-        """How many stops were cleared, and when the last one was (`uptime`). Files that cannot be
-        read do not count."""
-        return max(_cleared(path.with_suffix(".cleared")) for path in self.paths)
+    def cleared(self) -> Cleared:
+        """The stops that were cleared. Files that cannot be read do not count."""
+        found = (_cleared(path.with_suffix(".cleared")) for path in self.paths)
+        return max(found, key=lambda one: (one.count, one.at))
 
     def _write(self, suffix: str, lines: list[str]) -> Path:
         """Write a file in the first folder in which that is possible, and return it."""
@@ -78,9 +88,14 @@ class Latch:
         """Allow these devices to move again; `all_devices` is what `ALL` stands for. Raises
         LatchError, and then nothing is cleared."""
         stopped = self.stopped()
-        left = (set(all_devices) if ALL in stopped else set(stopped)) - set(devices)
+        named = set(all_devices) if ALL in stopped else set(stopped)
+        left = named - set(devices)
         if stopped:  # Counted first: a stop that is not counted must not be cleared.
-            self._write(".cleared", [str(self.cleared[0] + 1), str(uptime())])
+            before = self.cleared
+            number = before.count + 1
+            known = {**before.devices, **dict.fromkeys(sorted(named & set(devices)), number)}
+            by_device = [f"{device} {last}" for device, last in known.items()]
+            self._write(".cleared", [str(number), str(uptime()), *by_device])
         if left:
             self.stop(left)
         for path in self.paths:
@@ -128,13 +143,16 @@ def uptime() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
-def _cleared(path: Path) -> tuple[int, float]:
+def _cleared(path: Path) -> Cleared:
     try:
-        number, *at = path.read_text(encoding="ascii").split()
+        number, *lines = path.read_text(encoding="utf-8").splitlines()
+        at = float(lines[0]) if lines else 0.0
+        pairs = (line.split() for line in lines[1:])
+        devices = {device: int(last) for device, last in pairs}
         # A time after now is of before the last boot, which was at 0.
-        return int(number), next((then for then in map(float, at) if then <= uptime()), 0.0)
+        return Cleared(int(number), at if at <= uptime() else 0.0, devices)
     except (OSError, ValueError):
-        return 0, 0.0
+        return Cleared()
 
 
 def _write(path: Path, names: list[str]) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Iterable, Sequence
 
-from petrobot.services.host.emergency_latch import ALL, Latch, LatchError, uptime
+from petrobot.services.host.emergency_latch import ALL, Cleared, Latch, LatchError, uptime
 from petrobot.services.worker.remote import EMERGENCY_STOP, NODE_SILENT
 
 _log = logging.getLogger(__name__)
@@ -77,12 +77,12 @@ class EmergencyStops:
         self._devices = tuple(devices)
         self._latch = latch
         self._stopped: set[str] = set()
-        self.cleared, self._cleared_at = (0, 0.0) if latch is None else latch.cleared
+        self.cleared, self._cleared_at, _ = Cleared() if latch is None else latch.cleared
         """How many stops were cleared, and when the last one was. A caller that knows of fewer
         slept through one."""
         self._counted = dict.fromkeys(self._devices, self.cleared)
         """How many stops were cleared when each device was last stopped or cleared by this node: if
-        the latch says more, another process has cleared it."""
+        it was cleared with a later one, another process has cleared it."""
 
     def __contains__(self, device: str) -> bool:
         return device in self._stopped
@@ -104,15 +104,18 @@ class EmergencyStops:
 
     def look(self, now: float) -> tuple[list[str], list[str]]:
         """Return the devices that the latch has stopped since the last call, and those that another
-        process has cleared, because this one did not answer: this one, or a process of the device,
-        may have seen the stop before."""
+        process has cleared, because this one did not answer. Perhaps only a process of the device
+        has seen that stop, or nobody: runs that began before it are active, and none that began
+        later, since the node looks before each run."""
         if self._latch is None:
             return [], []
         self.due = now + LOOK if self._devices else NEVER
-        self._count(*self._latch.cleared)  # before the devices: that is the order of clearing
+        cleared = self._latch.cleared  # before the devices: that is the order of clearing
+        self._count(cleared)
         stopped = self._latch.stopped()
         on_disk = [d for d in self._devices if d in stopped or ALL in stopped]
-        freed = [d for d, n in self._counted.items() if n < self.cleared and d not in on_disk]
+        last = cleared.devices
+        freed = [d for d, n in self._counted.items() if last.get(d, 0) > n and d not in on_disk]
         self._stopped.difference_update(freed)
         self._counted |= dict.fromkeys(freed, self.cleared)
         return self._add(on_disk), freed
@@ -121,7 +124,7 @@ class EmergencyStops:
         """Stop these devices. Return why that could not be stored on disk; empty if it was."""
         self._add(devices)
         if self._latch is not None:  # a clearing that has already begun does not mean this stop
-            self._counted |= dict.fromkeys(devices, self._latch.cleared[0])
+            self._counted |= dict.fromkeys(devices, self._latch.cleared.count)
         try:
             if self._latch is not None and devices:
                 self._latch.stop(devices)
@@ -142,15 +145,15 @@ class EmergencyStops:
         except LatchError as fault:
             return str(fault)
         if not self._stopped.isdisjoint(devices):
-            self._count(self.cleared + 1, uptime())
+            self._count(Cleared(self.cleared + 1, uptime()))
         if self._latch is not None:
-            self._count(*self._latch.cleared)
+            self._count(self._latch.cleared)
         self._stopped.difference_update(devices)
         self._counted = dict.fromkeys(self._devices, self.cleared)
         return ""
 
-    def _count(self, cleared: int, at: float) -> None:
-        self.cleared, self._cleared_at = max((self.cleared, self._cleared_at), (cleared, at))
+    def _count(self, found: Cleared) -> None:
+        self.cleared, self._cleared_at = max((self.cleared, self._cleared_at), found[:2])
 
     def _add(self, devices: Iterable[str]) -> list[str]:
         fresh = [device for device in devices if device not in self._stopped]

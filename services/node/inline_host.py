@@ -115,6 +115,8 @@ class InlineHost:
         self._cyclic = CyclicDriver(driver) if driver is not None and driver.period else None
         self._remote = RemoteDriver(self._post, clock)
         self._outside = remote if isinstance(remote, RemoteDriver) else None
+        self._bars = 0
+        """How often the device was stopped and barred, as far as is known here."""
         self.failed = ""
         """Why the driver failed: what it raised, and where. Its runs have ended, and no other
         begins."""
@@ -158,6 +160,7 @@ class InlineHost:
                 Outcome(order.id, Status.ERROR, {}, "not_ready", self.failed, Executed.NO)
             )
             return
+        self._end_barred(now)  # a run that begins now is not ended by a stop that is over
         if self._reseed is not None and isinstance(order, Call):
             self._reseed(order.seed)
         held = self._runner.held and bool(self._runner.runs)
@@ -273,9 +276,7 @@ class InlineHost:
             self._fail(now, fault)
 
     def _advance(self, now: float) -> None:
-        if self._outside is not None and (barred := self._outside.barred):
-            for run in self._runner.runs:
-                self._runner.take(now, Cancel(run, stop_reason(barred, BARRED[barred])))
+        self._end_barred(now)
         held = self._runner.held and bool(self._runner.runs)
         self._runner.advance(now)
         if held and not self._runner.runs:
@@ -294,6 +295,15 @@ class InlineHost:
             due += self._driver.period
         self._next_step = due
         self._runner.commands_taken(now)
+
+    def _end_barred(self, now: float) -> None:
+        """End the runs if the device, whose driver is in another process, was stopped there."""
+        if self._outside is None:
+            return
+        before, (self._bars, cause) = self._bars, self._outside.last_bar
+        if barred := self._outside.barred or (cause if self._bars > before else ""):
+            for run in self._runner.runs:
+                self._runner.take(now, Cancel(run, stop_reason(barred, BARRED[barred])))
 
     def due(self) -> float | None:
         """When `advance` has something to do at the latest (s)."""

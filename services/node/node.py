@@ -443,6 +443,7 @@ class Node:
             self.callee.answer(now, command.id, not cause, told)
         else:
             if command.verb == CLEAR_EMERGENCY:
+                self._look_for_stops(now)  # what is cleared unseen would end no run
                 why = self._stops.clear(keys)
                 self.callee.stops = self._stops.cleared
                 if why:
@@ -479,11 +480,11 @@ class Node:
             self.places[key].command(now, Command("", EMERGENCY_STOP))
 
     def _look_for_stops(self, now: float) -> None:
-        """Stop and free what the latch on disk says; it may have been set and cleared while this
-        process was frozen."""
+        """Stop and free what the latch on disk says. If it was set and cleared while this process
+        was frozen, the runs of that time end, too: their devices have stopped without them."""
         fresh, freed = self._stops.look(now)
-        if fresh:
-            self._stop_places(now, fresh)
+        if fresh or freed:
+            self._stop_places(now, (*fresh, *freed))
             self.callee.tell_coordinators(STOP_EVENT)
         for key in freed:
             self.places[key].command(now, Command("", CLEAR_EMERGENCY))

@@ -76,6 +76,8 @@ class DeviceLoop:
         self._guard = guard
         self._worker: NewestLink | None = None
         self._stopping: dict[str, float] = {}
+        self._cleared: list[str] = []
+        """Commands to be answered once the worker was sent the state."""
         self._overruns = 0
         self._latest = 0.0
         self._tell_due = 0.0
@@ -176,8 +178,11 @@ class DeviceLoop:
                     state.state,
                     state.refusal,
                     state.barred,
+                    state.last_bar,
                 ]
             )
+        while self._cleared:  # a call that follows the answer must not meet the state before
+            self._tell(self._cleared.pop(0), "cleared")
         for id_, until in list(self._stopping.items()):
             if state.stopped or now >= until:
                 del self._stopping[id_]
@@ -230,7 +235,7 @@ class DeviceLoop:
             self._tell(id_, "stopped" if self._driver.stopped() else "stopping")
         elif verb == CLEAR_EMERGENCY:
             self._cyclic.clear_emergency()
-            self._tell(id_, "cleared")
+            self._cleared.append(id_)
         elif verb == "hold":
             self._tell(id_, self._driver.hold(now))
         elif verb == "release":

@@ -61,6 +61,9 @@ class DeviceState:
     barred: str = ""
     """Cause for which the device was stopped and accepts no commands (a key of `BARRED`); empty if
     it accepts them."""
+    last_bar: tuple[int, str] = (0, "")
+    """How often that has happened since its actions' end was linked, and the last cause: an end
+    that was not scheduled may read no state of the time in which it was barred."""
 
 
 @runtime_checkable
@@ -148,6 +151,12 @@ class RemoteDriver:
         return self._newest.barred
 
     @property
+    def last_bar(self) -> tuple[int, str]:
+        """How often the device was stopped for such a cause, and the last one."""
+        number, cause = self._newest.last_bar
+        return number, cause
+
+    @property
     def state(self) -> Mapping[str, Any]:
         """The driver's newest published state."""
         return self._newest.state
@@ -197,9 +206,12 @@ class CyclicDriver:
         self._handled = 0
         self._refusal = (0, "")
         self._emergency = self._silent = False
+        self._last_bar = (0, "")
 
     def emergency_stop(self, now: float) -> None:
         """Stop at once, and refuse every command until `clear_emergency`."""
+        if not self._emergency:
+            self._last_bar = (self._last_bar[0] + 1, EMERGENCY_STOP)
         self._emergency = True
         stop_at_once(self.driver, now)
 
@@ -210,6 +222,8 @@ class CyclicDriver:
     def node_silent(self, now: float) -> None:
         """Stop, and refuse every command until `node_speaks`: with a silent node, nothing could
         stop the device."""
+        if not self._silent:
+            self._last_bar = (self._last_bar[0] + 1, NODE_SILENT)
         self._silent = True
         self.driver.stop(now)
 
@@ -268,11 +282,12 @@ class CyclicDriver:
                 raise
             place = f"{Path(code.co_filename).name}:{code.co_firstlineno}"
             raise NotPlainError(f"{fault}, returned by `state` ({place})") from None
-        return DeviceState(self._handled, refused, stopped, state, self._refusal, self.barred)
+        bars = (self.barred, self._last_bar)
+        return DeviceState(self._handled, refused, stopped, state, self._refusal, *bars)
 
     def forget(self) -> None:
         """Start again with the numbers of a new actions' end."""
-        self._handled, self._refusal = 0, (0, "")
+        self._handled, self._refusal, self._last_bar = 0, (0, ""), (0, "")
 
 
 class DirectDevice:

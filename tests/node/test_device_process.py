@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.action import success
+from petrobot.services.action import Context, Result, success
 from petrobot.services.comm.location_file import ActionEntry
 from petrobot.services.comm.protocol.messages import (
     Answer,
@@ -28,7 +28,13 @@ from petrobot.services.worker.pipe import (
     Pipe,
     link_pair,
 )
-from petrobot.services.worker.remote import CyclicDriver, DeviceCommand, RemoteDriver
+from petrobot.services.worker.remote import (
+    EMERGENCY_STOP,
+    NODE_SILENT,
+    CyclicDriver,
+    DeviceCommand,
+    RemoteDriver,
+)
 from tests.node.conftest import Clock
 from tests.waiting import Limit
 
@@ -107,6 +113,38 @@ def test_a_hold_ends_with_runs_that_were_stopped_before_they_began(by: str) -> N
     place.advance(0.0)
     ends = {report.id: report.status for report in place.reports() if isinstance(report, Outcome)}
     assert ends == {"held": "error", "next": "success"}
+
+
+@pytest.mark.parametrize("cause", [EMERGENCY_STOP, NODE_SILENT])
+def test_a_run_ends_whose_device_was_stopped_while_its_process_did_not_look(cause: str) -> None:
+    """Only the newest state counts, and it says that the device accepts commands again. A run that
+    begins later goes on."""
+    clock, cyclic = Clock(), CyclicDriver(Stub())
+    remote = RemoteDriver(lambda command: None, clock)
+    remote.take(cyclic.state())
+
+    async def wait(ctx: Context) -> Result:
+        await ctx.sleep(9.0)
+        return success()
+
+    entry = ActionEntry("act", "tests:none", "task", "here", "base")
+    place = InlineHost({"act": entry}, clock=clock, remote=remote, substitutes={"act": wait})
+    place.take(0.0, Call("before", "act"))
+    place.advance(0.0)
+    if cause == EMERGENCY_STOP:
+        cyclic.emergency_stop(0.0)
+        cyclic.clear_emergency()
+    else:
+        cyclic.node_silent(0.0)
+        cyclic.node_speaks()
+    remote.take(cyclic.state())
+    assert remote.barred == ""
+    place.advance(clock.now)
+    (end,) = (report for report in place.reports() if isinstance(report, Outcome))
+    assert (end.id, end.status, end.cause) == ("before", "error", cause)
+    place.take(0.0, Call("after", "act"))
+    place.advance(clock.now)
+    assert place.runs == ("after",) and not list(place.reports())
 
 
 class Ports:

@@ -195,6 +195,30 @@ async def test_the_emergency_stop_of_a_frozen_node(moved: Moved, operator: Opera
     await usable(operator, "tool")
 
 
+@pytest.mark.processes
+@pytest.mark.parametrize("name", ["base", "tool"])
+async def test_a_stop_that_was_cleared_while_the_node_was_frozen_ends_the_run(
+    moved: Moved, operator: Operator, name: str
+) -> None:
+    """Also if the process of the device did not look in between. Only the run of that device."""
+    latch = latch_of(moved.node.file, "only")
+    other = "tool" if name == "base" else "base"
+    stopped, innocent = await moving(moved, operator, name), await moving(moved, operator, other)
+    with frozen(moved):
+        await asyncio.to_thread(latch.stop, [f"the_{name}"])
+        await asyncio.to_thread(latch.clear, [f"the_{name}"], ["the_base", "the_tool"])
+    end = await stopped
+    assert (end.status, end.cause) == ("error", "emergency_stop"), end
+    assert moved.lines(name)[-1][1] == "stopped"
+    if innocent.done():  # on a busy host, the node was frozen for too long
+        assert innocent.result().cause in GONE
+    else:
+        assert moved.moves(other)
+        await operator.command("only", "stop", f"the_{other}")
+        assert (await innocent).cause == "stopped"
+    await usable(operator, name)
+
+
 @pytest.mark.proof
 @pytest.mark.processes
 async def test_how_soon_devices_of_a_frozen_node_stop(moved: Moved, operator: Operator) -> None:

@@ -131,20 +131,22 @@ def test_cleared_stops_are_counted_and_the_count_stays(tmp_path: Path) -> None:
 
 
 def test_a_stop_that_another_process_has_cleared_is_cleared(tmp_path: Path) -> None:
-    """Also one that only the processes of the devices have seen, but none that was given while it
-    was being cleared, and none whose file is only gone."""
+    """Also one that only the processes of the devices have seen, but none of another device, none
+    that was given while it was being cleared, and none whose file is only gone."""
     stops, other = EmergencyStops(DEVICES, latch(tmp_path)), latch(tmp_path)
     stops.stop(DEVICES)
     other.clear(["arm"], DEVICES)
     assert stops.look(1.0) == ([], ["arm"]) and [*stops.names] == ["camera", "gripper"]
     other.clear(DEVICES, DEVICES)
-    assert stops.look(2.0)[1] == list(DEVICES) and [*stops.names] == []
+    assert stops.look(2.0)[1] == ["camera", "gripper"] and [*stops.names] == []
     other.stop([ALL])
     other.clear(DEVICES, DEVICES)
     assert stops.look(3.0) == ([], list(DEVICES)) and stops.look(4.0) == ([], [])
     other.stop([ALL])
     counted = other.paths[0].with_suffix(".cleared")
-    counted.write_text(f"{other.cleared[0] + 1}\n")  # as far as the other process has come
+    # As far as the other process has come:
+    counted.write_text("\n".join(["5", "1.0", *(f"{device} 5" for device in DEVICES), ""]))
+    assert other.cleared == (5, 1.0, dict.fromkeys(DEVICES, 5))
     stops.stop(DEVICES)
     for path in other.paths:
         path.unlink(missing_ok=True)
@@ -155,8 +157,15 @@ def test_a_stop_that_another_process_has_cleared_is_cleared(tmp_path: Path) -> N
 
 @pytest.mark.parametrize(
     ("text", "known"),
-    [("2\n1.5\n", (2, 1.5)), ("2\n", (2, 0.0)), (f"2\n{1e12}\n", (2, 0.0)), ("?", (0, 0.0))],
-    ids=["now", "without a time", "before the last boot", "unreadable"],
+    [
+        ("2\n1.5\n", (2, 1.5)),
+        ("2\n", (2, 0.0)),
+        (f"2\n{1e12}\n", (2, 0.0)),
+        ("?", (0, 0.0)),
+        ("2\n1.5\narm", (0, 0.0)),
+        ("2\n1.5\narm x\n", (0, 0.0)),
+    ],
+    ids=["now", "without a time", "before the last boot", "unreadable", "cut off", "damaged"],
 )
 def test_when_the_last_stop_was_cleared(
     tmp_path: Path, text: str, known: tuple[int, float]
@@ -166,9 +175,9 @@ def test_when_the_last_stop_was_cleared(
     one.stop([ALL])
     one.clear(DEVICES, DEVICES)
     path = one.paths[0].with_suffix(".cleared")
-    assert one.cleared[0] == 1 and 0.0 <= uptime() - one.cleared[1] < 60.0
+    assert one.cleared.count == 1 and 0.0 <= uptime() - one.cleared.at < 60.0
     path.write_text(text)
-    assert one.cleared == known
+    assert one.cleared == (*known, {})
 
 
 def test_a_stop_that_cannot_be_counted_is_not_cleared(tmp_path: Path) -> None:
