@@ -40,7 +40,7 @@ class LatchError(OSError):
 class Cleared(NamedTuple):
     """The stops of a node that were cleared."""
 
-    count: int = 0
+    number: int = 0
     at: float = 0.0
     """When the last one was cleared (`uptime`); 0: unknown, or before the last boot."""
     devices: Mapping[str, int] = {}
@@ -70,7 +70,7 @@ class Latch:
     def cleared(self) -> Cleared:
         """The stops that were cleared. Files that cannot be read do not count."""
         found = (_cleared(path.with_suffix(".cleared")) for path in self.paths)
-        return max(found, key=lambda one: (one.count, one.at))
+        return max(found, key=lambda one: (one.number, one.at))
 
     def _write(self, suffix: str, lines: list[str]) -> Path:
         """Write a file in the first folder in which that is possible, and return it."""
@@ -92,7 +92,7 @@ class Latch:
         left = named - set(devices)
         if stopped:  # Counted first: a stop that is not counted must not be cleared.
             before = self.cleared
-            number = before.count + 1
+            number = before.number + 1
             known = {**before.devices, **dict.fromkeys(sorted(named & set(devices)), number)}
             by_device = [f"{device} {last}" for device, last in known.items()]
             self._write(".cleared", [str(number), str(uptime()), *by_device])

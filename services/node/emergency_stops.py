@@ -124,7 +124,7 @@ class EmergencyStops:
         """Stop these devices. Return why that could not be stored on disk; empty if it was."""
         self._add(devices)
         if self._latch is not None:  # a clearing that has already begun does not mean this stop
-            self._counted |= dict.fromkeys(devices, self._latch.cleared.count)
+            self._counted |= dict.fromkeys(devices, self._latch.cleared.number)
         try:
             if self._latch is not None and devices:
                 self._latch.stop(devices)

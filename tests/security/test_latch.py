@@ -175,7 +175,7 @@ def test_when_the_last_stop_was_cleared(
     one.stop([ALL])
     one.clear(DEVICES, DEVICES)
     path = one.paths[0].with_suffix(".cleared")
-    assert one.cleared.count == 1 and 0.0 <= uptime() - one.cleared.at < 60.0
+    assert one.cleared.number == 1 and 0.0 <= uptime() - one.cleared.at < 60.0
     path.write_text(text)
     assert one.cleared == (*known, {})
 

@@ -337,7 +337,7 @@ async def test_nodes_that_start_after_a_stop_was_cleared_know_when(tmp_path: Pat
         assert await asyncio.to_thread(main, turns.estop_command()) == 3
         await beat(2 * TRANSIT)
         await turns.estop("--clear")
-        assert latch_of(directory.source, "left").cleared.count == 1
+        assert latch_of(directory.source, "left").cleared.number == 1
         coordinator.send_signal(signal.SIGCONT)
         code, out, err = await finished(coordinator)
         assert (code, turns.begun()) == (1, 0), out + err
