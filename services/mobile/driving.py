@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from petrobot.services.action import (
     Cancelled,
+    CommandRefused,
     Context,
     Result,
     Status,
@@ -29,8 +30,6 @@ from petrobot.services.mobile.sight import TrackEnd
 
 RENEW: Final = 0.1
 """Seconds between repeated motion commands; the driver rests if it receives none for 0.4 s."""
-ANSWER: Final = 0.5
-"""Seconds within which the driver must accept a command."""
 TAKE_OVER: Final = 0.34
 """m before the end of the line at which following is finished: the next action begins on the
 move."""
@@ -67,12 +66,10 @@ async def enable_drives(ctx: Context, *, timeout: float = 8.0, forget: bool = Fa
     With `forget` the map of the track is emptied: the rover has been carried elsewhere.
     """
     until = ctx.now + timeout
-    why = await _command(ctx, {"do": "reset"})
-    if why:
-        return error("refused", why)
+    await ctx.command({"do": "reset"})
     if forget:
-        await _command(ctx, {"do": "forget"})
-        await _command(ctx, {"do": "stretch"})
+        await ctx.command({"do": "forget"})
+        await ctx.command({"do": "stretch"})
     if not await ctx.wait(lambda: bool(ctx.device.state["enabled"]), max(0.0, until - ctx.now)):
         return _trouble(ctx.device.state) or error(
             "timeout", f"the drives were not enabled within {timeout} s"
@@ -133,9 +130,7 @@ async def _home(
         return where is not None
 
     drive = _Drive(ctx, "feed_forward", speed, timeout)
-    stuck = await drive.start(gates)
-    if stuck is not None:
-        return stuck
+    await drive.start(gates)
     if not found():
         await drive.until(lambda state: success() if found() else None, REFLECTOR_PATIENCE)
     if where is None:
@@ -162,9 +157,7 @@ async def dead_reckon(
     """
     end, gates = _geometry(ctx, line_end)
     drive = _Drive(ctx, "feed_forward", speed, timeout)
-    stuck = await drive.start(gates)
-    if stuck is not None:
-        return stuck
+    await drive.start(gates)
     square, _ = ctx.device.state["element"]
     length = square if curvature == 0.0 else 0.5 * math.pi / abs(curvature)
     last = Pose(*paths.arc(end, curvature, length)[-1], end.heading + curvature * length)
@@ -196,9 +189,7 @@ async def _search(
 ) -> Result:
     end, gates = _geometry(ctx, line_end)
     drive = _Drive(ctx, "feed_forward", speed, timeout)
-    stuck = await drive.start(gates)
-    if stuck is not None:
-        return stuck
+    await drive.start(gates)
     ended = await _where_it_stands(drive)
     for ahead, turns in LOOKS:
         place = Pose(*end.floor(ahead, 0.0), end.heading)
@@ -215,10 +206,9 @@ async def stop_at_t(
     ERROR as the driver reports."""
     end = Pose(*map(float, line_end))
     drive = _Drive(ctx, "feed_forward", speed, timeout)
-    stuck = await drive.start((), look=False)
-    if stuck is None:
-        await _command(ctx, {"do": "plan", "points": paths.arc(end, 0.0, STOP_AT)})
-        stuck = await drive.until(lambda state: success() if _stands(state) else None, timeout)
+    await drive.start((), look=False)
+    await ctx.command({"do": "plan", "points": paths.arc(end, 0.0, STOP_AT)})
+    stuck = await drive.until(lambda state: success() if _stands(state) else None, timeout)
     await drive.rest()
     if stuck.cause:
         return stuck
@@ -305,7 +295,7 @@ def _found(ctx: Context, result: Result, judged: bool) -> Result:
 
 async def _along(drive: _Drive, plan: paths.Points) -> Result:
     """Drive along a plan until the track is seen again and near, or the plan is finished."""
-    await _command(drive.ctx, {"do": "plan", "points": plan})
+    await drive.ctx.command({"do": "plan", "points": plan})
     result = await drive.until(_recovered, drive.left())
     if not result.cause:
         return result
@@ -344,10 +334,9 @@ async def _go(drive: _Drive, to: Pose, rate: float) -> Result | None:
         if ended is not None:
             return ended
         x, y, _ = ctx.device.state["pose"]
-        await _command(
-            ctx, {"do": "forget"}
-        )  # The path leads off the line: what was seen of the line would pull the rover back.
-    await _command(ctx, {"do": "plan", "points": [(x, y), *paths.straight((x, y), (to.x, to.y))]})
+        # The path leads off the line: what was seen of the line would pull the rover back.
+        await ctx.command({"do": "forget"})
+    await ctx.command({"do": "plan", "points": [(x, y), *paths.straight((x, y), (to.x, to.y))]})
 
     def judge(state: Mapping[str, Any]) -> Result | None:
         if state["regained"]:
@@ -402,11 +391,12 @@ async def _join(drive: _Drive) -> Result | None:
     if not state["sights"]:
         return None
     way = paths.join(Pose(*state["pose"]), Pose(*state["entry"]), 0.0)
-    await _command(drive.ctx, {"do": "plan", "points": way})
+    await drive.ctx.command({"do": "plan", "points": way})
     result = await drive.until(_recovered, min(15.0, drive.left()))
     if result.cause != "no_track":
         return result
-    return await drive.again()
+    await drive.again()
+    return None
 
 
 class _Drive:
@@ -422,20 +412,18 @@ class _Drive:
         """Return the seconds that the run may still take."""
         return max(0.0, self._until - self.ctx.now)
 
-    async def start(self, gates: Sequence[Pose], *, look: bool = True) -> Result | None:
-        """Begin a new stretch that leads through one of the gates; return the result of the run if
-        the driver refuses."""
+    async def start(self, gates: Sequence[Pose], *, look: bool = True) -> None:
+        """Begin a new stretch that leads through one of the gates."""
         self._stretch |= {"gates": [tuple(gate) for gate in gates], "look": look}
-        return await self.again()
+        await self.again()
 
-    async def again(self) -> Result | None:
+    async def again(self) -> None:
         """Begin the stretch again: what was seen was not a part of it."""
-        why = await _command(self.ctx, self._stretch)
-        return error("refused", why) if why else None
+        await self.ctx.command(self._stretch)
 
     async def rest(self) -> None:
         """Brake and stand."""
-        await _command(self.ctx, {"do": "rest"})
+        await self.ctx.command({"do": "rest"})
 
     async def until(
         self, judge: Judge, timeout: float, body: Mapping[str, Any] | None = None
@@ -447,9 +435,12 @@ class _Drive:
         while ctx.now <= until:
             if ctx.now - renewed >= RENEW:
                 renewed = ctx.now
-                why = await _command(ctx, wanted)
-                if why:
-                    return _trouble(ctx.device.state) or error("refused", why)
+                try:
+                    await ctx.command(wanted)
+                except CommandRefused:
+                    if trouble := _trouble(ctx.device.state):
+                        return trouble
+                    raise
             state = ctx.device.state
             result = _trouble(state) or judge(state)
             if result is not None:
@@ -491,12 +482,3 @@ def _trouble(state: Mapping[str, Any]) -> Result | None:
         cause, wheel, code, text = state["faults"][0]
         return error(cause, text, wheel=wheel, code=code)
     return None
-
-
-async def _command(ctx: Context, body: Mapping[str, Any]) -> str:
-    """Send a command and wait until the driver has processed it; return why it was refused, empty
-    if it was not."""
-    number = ctx.device.send(body)
-    if not await ctx.wait(lambda: ctx.device.handled >= number, ANSWER):
-        return "the driver does not answer"
-    return str(ctx.device.refused)

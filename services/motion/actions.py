@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from petrobot.services.action import (
     Cancelled,
+    CommandRefused,
     Context,
     Result,
     Status,
@@ -31,8 +32,6 @@ GRACE: Final = 0.3
 first."""
 CYCLE: Final = 0.004
 """Seconds per cycle of the driver: waiting less makes no sense."""
-ANSWER: Final = 0.5
-"""Seconds within which the driver must accept a command."""
 NOW: Final = 0.1
 """Seconds before the arrival from which a better prediction is not awaited any more."""
 IN_FLIGHT: Final = 0.2
@@ -154,9 +153,7 @@ async def reset_and_home(ctx: Context, *, speed: float = 0.3, timeout: float = 1
     drives stay in fault.
     """
     until = ctx.now + timeout
-    why = await _command(ctx, {"do": "reset"})
-    if why:
-        return error("refused", why)
+    await ctx.command({"do": "reset"})
     if not await ctx.wait(lambda: bool(ctx.device.state["enabled"]), max(0.0, until - ctx.now)):
         return _trouble(ctx.device.state) or error(
             "arm_timeout", f"the drives were not enabled within {timeout} s"
@@ -213,9 +210,8 @@ class _Following:
         """Follow until `judge(state, seconds)` returns a result, the driver reports a fault, or
         `timeout` s have passed."""
         ctx = self._ctx
-        why = await self._renew()
-        if why:
-            return _trouble(ctx.device.state) or error("refused", why)
+        if trouble := await self._renew():
+            return trouble
         begun, seen, result = ctx.now, -1, None
         before = ctx.device.state["q"]
 
@@ -231,10 +227,11 @@ class _Following:
         while ctx.now - begun <= timeout:
             if await ctx.wait(judged, min(self._renewed + RENEW, begun + timeout) - ctx.now):
                 break
-            await self._renew()
+            if trouble := await self._renew():
+                return trouble
         return result or error("arm_timeout", f"nothing came of following in {timeout} s")
 
-    async def _renew(self) -> str:
+    async def _renew(self) -> Result | None:
         self._renewed = self._ctx.now
         return await _command(self._ctx, {"do": "follow", **self._how})
 
@@ -302,20 +299,21 @@ def _trouble(state: Mapping[str, Any]) -> Result | None:
     return None
 
 
-async def _command(ctx: Context, body: Mapping[str, Any]) -> str:
-    """Send a command and wait until the driver has processed it; return why it was refused, empty
-    if it was not."""
-    number = ctx.device.send(body)
-    if not await ctx.wait(lambda: ctx.device.handled >= number, ANSWER):
-        return "the servo does not answer"
-    return str(ctx.device.refused)
+async def _command(ctx: Context, body: Mapping[str, Any]) -> Result | None:
+    """Send a command; return the driver's fault if that is why it is refused."""
+    try:
+        await ctx.command(body)
+    except CommandRefused:
+        if trouble := _trouble(ctx.device.state):
+            return trouble
+        raise
+    return None
 
 
 async def _go(ctx: Context, pose: str, speed: float, until: float) -> Result | None:
     """Move to a named pose; return None when it is reached, else the result of the action."""
-    why = await _command(ctx, {"do": "move", "pose": pose, "speed": speed})
-    if why:
-        return _trouble(ctx.device.state) or error("refused", why)
+    if trouble := await _command(ctx, {"do": "move", "pose": pose, "speed": speed}):
+        return trouble
 
     def over() -> bool:
         state = ctx.device.state

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from petrobot.services.action import Cancelled, Result, Status, Wait
+from petrobot.services.action import Cancelled, CommandRefused, Result, Status, Wait
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.motion.arm import PERIOD, Arm
 from petrobot.services.motion.model import nominal_arm
@@ -290,6 +290,12 @@ class ArmPlay:
 
     def sleep(self, seconds: float) -> Wait:
         return Wait(lambda: False, self.now + seconds)
+
+    async def command(self, body: Mapping[str, Any]) -> None:
+        number = self.device.send(body)
+        assert await self.wait(lambda: self.device.handled >= number, 1.0)
+        if self.device.refused:
+            raise CommandRefused(self.device.refused)
 
     def play(
         self,

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.action import Status
+from petrobot.services.action import CommandRefused, Status
 from petrobot.services.comm.canopen.cia402 import DriveFault
 from petrobot.services.motion import actions
 from petrobot.services.motion.kinematics import Puma
@@ -269,9 +269,8 @@ def test_actions_report_that_the_drives_are_off(make_rig: Any, make_play: Any) -
     rig.run(0.5)
     play = make_play(rig)
     for action in (actions.intercept_tilted(play), actions.empty_and_home(play)):
-        result = play.play(action)
-        assert (result.status, result.cause) == (Status.ERROR, "refused")
-        assert "not enabled" in result.text
+        with pytest.raises(CommandRefused, match="not enabled"):
+            play.play(action)
 
 
 def test_reset_and_home_turns_a_full_cup_over(play: Any) -> None:
