@@ -82,7 +82,9 @@ class Operation:
         self._all_held = asyncio.Event()
         self._stopping: asyncio.Task[None] | None = None
         self._live = mode == "realtime"
-        began = shell.now()
+        store = self.executor.store
+        # Times on the page are those of the journal, if there is one.
+        began = store.origin if isinstance(store, JournalStore) else shell.now()
         where = {name: entry.node for name, entry in self.executor.directory.actions.items()}
         self.publisher = ChangePublisher(self.feed, self.executor.task, where, began)
         self.publisher.begin(
@@ -94,17 +96,24 @@ class Operation:
             nodes=dict(self.feed.state["nodes"]),
         )
         if self.executor.state.stimuli:
-            self.publisher.recover(began, self.executor.state)
+            self.publisher.recover(shell.now(), self.executor.state)
         self.executor.observers.extend([self.publisher, self])
         self.watching = Watching(shell, self.feed, selector, began, lambda: self.feed.watched)
         trials = TrialWatch(self.executor.task, self.executor.directory, self.feed)
         self.executor.observers.extend([self.watching, trials])
+        self.feed.clock = self._time
 
     async def close(self) -> None:
         """Stop asking the nodes."""
+        self.feed.clock = None
         if self._stopping is not None:
             await asyncio.gather(self._stopping, return_exceptions=True)
         await self.watching.close()
+
+    def _time(self) -> float:
+        """Return the mission's clock (s); before and after the run it stands still."""
+        active = self.mission.stage is Stage.RUNNING
+        return self.shell.now() - self.publisher.origin if active else self.feed.state["time"]
 
     # --- an observer of the executor ----------------------------------------------------------
 

@@ -251,11 +251,21 @@ class ChangePublisher:
             "deadline": start.deadline,
             "progress": 0.0,
             "state": "running",
+            "held_since": None,
+            "held_for": 0.0,
         }
         self.feed.emit("run_started", time=time, run=run)
 
     def _state(self, time: float, run: str, state: str) -> None:
-        self.feed.emit("run_progress", time=time, id=run, state=state)
+        """Publish the state of a run. Its deadline stands still from the answer `held` on, also
+        while it is asked again, until it continues or is stopped."""
+        known, changed = self.feed.state["runs"].get(run, {}), dict[str, Any](state=state)
+        since = known.get("held_since")
+        if state == "held" and since is None:
+            changed["held_since"] = round(time, 4)
+        elif state in ("running", "stopping") and since is not None:
+            changed |= {"held_since": None, "held_for": round(known["held_for"] + time - since, 4)}
+        self.feed.emit("run_progress", time=time, id=run, **changed)
 
     def _answered(self, time: float, held: RunHeld) -> None:
         self._state(time, held.run, _AFTER_HOLD[held.answer])

@@ -59,6 +59,20 @@ async def test_the_run_can_be_controlled_while_it_is_active(cell: Cell) -> None:
         find_address(None, cell.runs)
 
 
+async def test_times_on_the_page_are_those_of_the_journal(cell: Cell) -> None:
+    """Of each firing; and a snapshot has the time now, although nothing has happened since."""
+    started = await cell.say("start", task="moving")
+    await cell.until(lambda: cell.state["mission"]["state"] == "running")
+    await cell.say("pause")
+    before = cell.state["time"]
+    await cell.until(lambda: cell.station.snapshot()["time"] > before + 0.2)
+    await cell.say("resume")
+    await cell.ended()
+    shown = [(f["transition"], f["at"]) for f in cell.state["firings"]]
+    records = opened(cell.runs / started["run"] / JOURNAL, started["run"])["records"]
+    assert shown == [(f["transition"], r["t"]) for r in records for f in r["firings"]]
+
+
 async def test_a_start_that_is_impossible_is_refused_with_the_reason(cell: Cell) -> None:
     """Tried without a task, with an unknown or faulty task, with bad parameters, during a run, and
     by a client without the controls."""
