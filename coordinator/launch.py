@@ -246,12 +246,14 @@ def resumed_mission(
     observers: Sequence[Observer],
     now: float,
     selector: Selector | None = None,
+    see: Callable[[float], Sequence[Observer]] = lambda origin: (),
 ) -> tuple[Mission, Callable[[float], None]]:
     """Return a mission run as its journal left it, and the function that continues it once the
     nodes are connected.
 
     A selector that learns has to be among the observers too: the recorded steps bring it to where
-    it was. Raises ReplayError when the engine does not derive what the journal says.
+    it was. `see` makes further observers from the origin of the journal's clock. Raises ReplayError
+    when the engine does not derive what the journal says.
     """
     header = journal.header
     engine = as_recorded(engine, header)
@@ -276,7 +278,7 @@ def resumed_mission(
         task, engine, directory, callers, header["mission"], header["seed"], chosen, store
     )
     mission = Mission(executor, header["parameters"], header["runs"])
-    executor.observers.extend(observers)
+    executor.observers.extend([*observers, *see(origin)])
     for step in steps:
         mission.replay(origin + step.time, step)
     return mission, lambda now: mission.resume(now, stages(journal))

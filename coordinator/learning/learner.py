@@ -206,22 +206,22 @@ class LearningSelector(FirstAlternative):
         return self.learning.choose(task, context, alternatives, rng)
 
     def figures(self, task: str) -> Mapping[str, Mapping[str, float]]:
-        """Return the probability of each alternative in the current context, and its R, C and J
-        where they are known."""
-        selector = self.learning.selectors.get(task)
+        """Return the probability of each alternative in the current context, and of those with
+        runs there R, C and J by the definition of `learned show`, with the intervals of R and J;
+        `best` marks the lowest J if it is not so by chance."""
+        selector, context = self.learning.selectors.get(task), self.context
         if selector is None:
             return {}
-        batch, shares = selector.learner(self.context), selector.probabilities(self.context)
-        known = {
-            "reliability": batch.reliability(),
-            "cost": batch.mean_cost(),
-            "j": batch.objective(),
-        }
+        shares = selector.probabilities(context)
+        judged = self.learning.compared(task, context)
         shown: dict[str, dict[str, float]] = {}
-        for i, action in enumerate(selector.actions):
-            shown[action] = {"probability": shares[action]}
-            if batch.runs[0, i] > 0:
-                shown[action] |= {name: float(values[0, i]) for name, values in known.items()}
+        for f in judged.figures:
+            shown[f.action] = {"probability": shares[f.action]}
+            if f.runs > 0:
+                shown[f.action] |= {"reliability": f.reliability, "cost": f.cost, "j": f.j}
+                shown[f.action] |= {"reliability_low": f.lower, "reliability_high": f.upper}
+                shown[f.action] |= {"j_low": f.j_lower, "j_high": f.j_upper}
+                shown[f.action]["best"] = f.action == judged.best and judged.clear
         return shown
 
     # --- observer -----------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from petrobot.coordinator.learning.estimate import (
     TrialsKey,
     TrialSums,
 )
-from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.learning.objective import Comparison, Question, compare
 from petrobot.coordinator.learning.records import (
     Choice,
     Correction,
@@ -201,6 +201,14 @@ class Learning:
             return self.joint.best(context)[primitive_task]
         p = self.selectors[primitive_task].learned(context)
         return max(p, key=lambda action: p[action])
+
+    def compared(self, primitive_task: str, context: str) -> Comparison:
+        """Compare the alternatives of a primitive task by all their runs in one context."""
+        found = {}
+        for action in self.task.primitive_tasks[primitive_task].alternatives:
+            key = TallyKey(primitive_task, action, context)
+            found[action] = {context: self.known.tally(key).merged(self.gained.tally(key))}
+        return compare(found, replace(self.question(primitive_task), target=None))
 
     @property
     def estimates(self) -> Estimates:

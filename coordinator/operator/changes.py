@@ -75,7 +75,7 @@ def _progress(state: State, change: Change) -> None:
     if run is not None:
         state["runs"][change["id"]] = {
             **run,
-            **{k: change[k] for k in ("progress", "state", "data") if k in change},
+            **{k: change[k] for k in _OF_A_RUN if k in change},
         }
 
 
@@ -98,6 +98,8 @@ def _whole(state: State, change: Change) -> None:
     state[change["kind"]] = change[change["kind"]]
 
 
+_OF_A_RUN = ("progress", "state", "data", "held_since", "held_for")
+"""What a `run_progress` may change."""
 _TABLES: Mapping[str, str] = {
     "node": "nodes",
     "event": "events",

@@ -45,6 +45,8 @@ from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Stage
 from petrobot.coordinator.run.realtime import credentials_of
 from petrobot.coordinator.run.recording import JournalStore
+from petrobot.coordinator.task import Task
+from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import Feedback
 
 _log = logging.getLogger(__package__)
@@ -54,6 +56,17 @@ ANSWERS = 1.5
 _BEFORE = (Stage.CONNECTING, Stage.PREPARING)
 _MAY_COME_EARLY = (SetBreakpoints, Override)
 """Commands that only configure the run and move nothing."""
+
+
+class Shown:
+    """What operators see of a run's net and trials. It observes the executor; of a resumed run it
+    has seen the recorded steps, too."""
+
+    def __init__(self, feed: Feed, task: Task, directory: Directory, origin: float) -> None:
+        """`origin` is the time at which the mission's clock was 0 (s)."""
+        where = {name: entry.node for name, entry in directory.actions.items()}
+        self.publisher = ChangePublisher(feed, task, where, origin)
+        self.trials = TrialWatch(task, directory, feed)
 
 
 class Operation:
@@ -68,13 +81,14 @@ class Operation:
         *,
         starts: bool = False,
         mode: str = "realtime",
+        shown: Shown | None = None,
     ) -> None:
         """`feed` and `controls` belong to a page that outlives this run; `starts` tells whether the
-        page can start another one."""
+        page can start another one. `shown` is what is known of a resumed run."""
         self.shell = shell
         self.mission = shell.mission
         self.executor = shell.mission.executor
-        self.feed = feed or Feed()
+        self.feed = shown.publisher.feed if shown is not None else feed or Feed()
         self.controls = controls or Controls(self.feed)
         self._refusals: list[str] = []
         self._holding: dict[str, str] = {}
@@ -82,29 +96,41 @@ class Operation:
         self._all_held = asyncio.Event()
         self._stopping: asyncio.Task[None] | None = None
         self._live = mode == "realtime"
-        began = shell.now()
-        where = {name: entry.node for name, entry in self.executor.directory.actions.items()}
-        self.publisher = ChangePublisher(self.feed, self.executor.task, where, began)
-        self.publisher.begin(
-            self.executor.mission,
-            mode,
-            starts=starts,
-            controls=self.controls.plain(),
-            selectors=shown_selectors(self.executor.task, selector),
-            nodes=dict(self.feed.state["nodes"]),
-        )
-        if self.executor.state.stimuli:
-            self.publisher.recover(began, self.executor.state)
-        self.executor.observers.extend([self.publisher, self])
-        self.watching = Watching(shell, self.feed, selector, began, lambda: self.feed.watched)
-        trials = TrialWatch(self.executor.task, self.executor.directory, self.feed)
-        self.executor.observers.extend([self.watching, trials])
+        store, task, directory = self.executor.store, self.executor.task, self.executor.directory
+        # Times on the page are those of the journal, if there is one.
+        origin = store.origin if isinstance(store, JournalStore) else shell.now()
+        selectors = shown_selectors(task, selector, self.executor.state.overrides)
+        if shown is None:
+            shown = Shown(self.feed, task, directory, origin)
+            shown.publisher.begin(
+                self.executor.mission,
+                mode,
+                starts=starts,
+                controls=self.controls.plain(),
+                selectors=selectors,
+                nodes=dict(self.feed.state["nodes"]),
+            )
+            self.executor.observers.append(shown.publisher)
+            self.executor.observers.append(shown.trials)
+        else:
+            for name, about in selectors.items():
+                self.feed.emit("selector", name=name, selector=about)
+        self.publisher = shown.publisher
+        self.watching = Watching(shell, self.feed, selector, origin, lambda: self.feed.watched)
+        self.executor.observers.extend([self, self.watching])
+        self.feed.clock = self._time
 
     async def close(self) -> None:
         """Stop asking the nodes."""
+        self.feed.clock = None
         if self._stopping is not None:
             await asyncio.gather(self._stopping, return_exceptions=True)
         await self.watching.close()
+
+    def _time(self) -> float:
+        """Return the mission's clock (s); before and after the run it stands still."""
+        active = self.mission.stage is Stage.RUNNING
+        return self.shell.now() - self.publisher.origin if active else self.feed.state["time"]
 
     # --- an observer of the executor ----------------------------------------------------------
 

@@ -27,6 +27,9 @@ class Feed:
         self._tickets = 0
         self._read = -math.inf
         """When a snapshot was read last."""
+        self.clock: Callable[[], float] | None = None
+        """The mission's clock (s) while a run is active. Without it the time is that of the last
+        change that had one, which may be long ago."""
 
     @property
     def state(self) -> State:
@@ -39,11 +42,11 @@ class Feed:
         return bool(self._receivers) or monotonic() - self._read < READ_FOR
 
     def emit(self, kind: str, *, time: float | None = None, **fields: Any) -> None:
-        """Publish a change. `time` is the mission's clock (s); without it the clock stays."""
+        """Publish a change. `time` is the mission's clock (s), by default its time now."""
         if kind not in KINDS:
             raise ValueError(f"no change of kind {kind!r}")
         change = {"kind": kind, "sequence": self._state["sequence"] + 1, **fields}
-        change["time"] = self._state["time"] if time is None else time
+        change["time"] = self._now() if time is None else time
         apply(self._state, change)
         for receive in tuple(self._receivers.values()):
             receive(change)
@@ -61,7 +64,11 @@ class Feed:
     def snapshot(self) -> dict[str, Any]:
         """Return a copy of the whole state."""
         self._read = monotonic()
-        return copy_state(self._state)
+        return {**copy_state(self._state), "time": self._now()}
+
+    def _now(self) -> float:
+        known: float = self._state["time"]
+        return known if self.clock is None else max(known, self.clock())
 
     def subscribe(self, receive: Receive) -> Callable[[], None]:
         """Call `receive` with every later change, until the returned function is called."""

@@ -36,10 +36,16 @@ IN_CURVES = {"probability": "probability", "j": "J"}
 """Figures of the alternatives that have a curve, and their names on it."""
 
 
-def shown_selectors(task: Task, selector: FirstAlternative) -> dict[str, Any]:
-    """Return every primitive task's alternatives with their estimates."""
+def shown_selectors(
+    task: Task, selector: FirstAlternative, fixed: Mapping[str, str]
+) -> dict[str, Any]:
+    """Return every primitive task's alternatives with their estimates, and the one that the
+    operator `fixed`."""
     return {
-        name: {"alternatives": shown_alternatives(task, selector, name), "override": None}
+        name: {
+            "alternatives": shown_alternatives(task, selector, name),
+            "override": fixed.get(name),
+        }
         for name in task.primitive_tasks
     }
 

@@ -34,6 +34,8 @@ from petrobot.coordinator.learning.session import (
     plant_of,
     session_of,
 )
+from petrobot.coordinator.operator.commands import Shown
+from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.session import (
     LOCKSTEP,
     REALTIME,
@@ -224,14 +226,28 @@ def resume(found: Recorded, observers: Sequence[Observer], ordered: float) -> Ru
     replayed = [*observers, *([learning.selector] if learning is not None else [])]
     lockstep = then["mode"] == LOCKSTEP
     now = 0.0 if lockstep else asyncio.get_running_loop().time()
+    shown: list[Shown] = []
+
+    def see(origin: float) -> Sequence[Observer]:
+        shown.append(Shown(Feed(), found.task, found.directory, origin))
+        shown[0].publisher.begin(then["mission"], REALTIME, starts=False)
+        return shown[0].publisher, shown[0].trials
+
     mission, begin = resumed_mission(
-        found.directory, found.task, found.engine, found.journal, replayed, now, selector
+        found.directory, found.task, found.engine, found.journal, replayed, now, selector, see
     )
     if lockstep:
         member, party = lockstep_member(found.directory, mission, None, begin)
         return LockstepSession(party, selector, learning, folder, member=member, resumed=True)
     return RealtimeSession(
-        found.directory, mission, selector, learning, folder, begin=begin, ordered=ordered
+        found.directory,
+        mission,
+        selector,
+        learning,
+        folder,
+        begin=begin,
+        shown=shown[0],
+        ordered=ordered,
     )
 
 

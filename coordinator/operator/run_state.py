@@ -20,7 +20,6 @@ from petrobot.coordinator.engine import (
     Marked,
     Mode,
     Paused,
-    Phase,
     RaiseEvent,
     ReleaseRun,
     Report,
@@ -31,7 +30,6 @@ from petrobot.coordinator.engine import (
     State,
     Stimulus,
 )
-from petrobot.coordinator.engine.state import ACTIVE
 from petrobot.coordinator.operator.changes import empty_state
 from petrobot.coordinator.operator.event_texts import (
     firing_of,
@@ -47,7 +45,6 @@ from petrobot.coordinator.task.wording import Severity
 from petrobot.services.comm.protocol.messages import Feedback
 
 _AFTER_HOLD = {Hold.HELD: "held", Hold.CANNOT: "running", Hold.STOPPED: "stopping"}
-_GOING = ACTIVE | {Phase.STOPPING, Phase.STUCK}
 _LEVEL = {Severity.NOTE: "info", Severity.WARNING: "warning", Severity.ERROR: "error"}
 
 
@@ -190,31 +187,6 @@ class ChangePublisher:
             )
         self._seen = state
 
-    def recover(self, now: float, state: State) -> None:
-        """Take over and publish the whole state that another process left."""
-        time = now - self.origin
-        self._marking(time, (-1,) * len(state.marking), state.marking)
-        self.feed.emit("mission", time=time, mission={"firings": state.firings})
-        for run in (*state.runs(), *state.stopping.values()):
-            if run.phase in _GOING:
-                primitive = self.task.primitive_task_of(run.place)
-                self._started(
-                    time,
-                    StartRun(
-                        run.id,
-                        run.place,
-                        primitive.name,
-                        run.action,
-                        run.arguments,
-                        primitive.deadline,
-                    ),
-                )
-                if run.phase not in (Phase.RUNNING, Phase.STARTING):
-                    self._state(time, run.id, "held" if run.phase is Phase.HELD else "stopping")
-        if state.mode is Mode.PAUSED:
-            self._paused(time, Paused("as another process left it"))
-        self.settled(now, state)
-
     # --- in the terms of the protocol ---------------------------------------------------------
 
     def _fired(self, time: float, fired: Fired) -> None:
@@ -251,11 +223,21 @@ class ChangePublisher:
             "deadline": start.deadline,
             "progress": 0.0,
             "state": "running",
+            "held_since": None,
+            "held_for": 0.0,
         }
         self.feed.emit("run_started", time=time, run=run)
 
     def _state(self, time: float, run: str, state: str) -> None:
-        self.feed.emit("run_progress", time=time, id=run, state=state)
+        """Publish the state of a run. Its deadline stands still from the answer `held` on, also
+        while it is asked again, until it continues or is stopped."""
+        known, changed = self.feed.state["runs"].get(run, {}), dict[str, Any](state=state)
+        since = known.get("held_since")
+        if state == "held" and since is None:
+            changed["held_since"] = round(time, 4)
+        elif state in ("running", "stopping") and since is not None:
+            changed |= {"held_since": None, "held_for": round(known["held_for"] + time - since, 4)}
+        self.feed.emit("run_progress", time=time, id=run, **changed)
 
     def _answered(self, time: float, held: RunHeld) -> None:
         self._state(time, held.run, _AFTER_HOLD[held.answer])

@@ -27,7 +27,7 @@ from typing import Any, ClassVar, Final
 from petrobot.coordinator.engine import Mode, Override, SetBreakpoints, Stimulus
 from petrobot.coordinator.launch import local_nodes
 from petrobot.coordinator.learning.session import LearningSession
-from petrobot.coordinator.operator.commands import Operation
+from petrobot.coordinator.operator.commands import Operation, Shown
 from petrobot.coordinator.operator.controls import Controls
 from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.observation import Shell
@@ -93,6 +93,7 @@ class RunSession(ABC):
         self._resumed = resumed
         self._led = False
         self._first: tuple[Stimulus, ...] = ()
+        self._shown: Shown | None = None
         self._begun = time.perf_counter()
         self._seconds = 0.0
 
@@ -111,7 +112,13 @@ class RunSession(ABC):
         fixed = (Override(primitive, action) for primitive, action in (choices or {}).items())
         self._first = (*((SetBreakpoints(tuple(sorted(stops))),) if stops else ()), *fixed)
         self.operation = Operation(
-            self._attended(), self.selector, feed, controls, starts=starts, mode=self.mode
+            self._attended(),
+            self.selector,
+            feed,
+            controls,
+            starts=starts,
+            mode=self.mode,
+            shown=self._shown,
         )
         return self.operation
 
@@ -239,12 +246,14 @@ class RealtimeSession(RunSession):
         observers: Sequence[Observer] = (),
         *,
         begin: Callable[[float], None] | None = None,
+        shown: Shown | None = None,
         ordered: float = math.inf,
     ) -> None:
-        """`begin` makes a resumed mission continue; `ordered` as for `RunRequest`."""
+        """`begin` makes a resumed mission continue, `shown` is what operators see of its recorded
+        steps; `ordered` as for `RunRequest`."""
         super().__init__(mission, selector, learning, folder, observers, resumed=begin is not None)
         self.shell = RealtimeMission(mission, directory, credentials_of(directory), ordered)
-        self._begin = begin or mission.start
+        self._begin, self._shown = begin or mission.start, shown
 
     def _attended(self) -> Shell:
         return self.shell

@@ -360,7 +360,7 @@ class Station:
     def _kept(self, task: Task) -> dict[str, Any]:
         """Return the parts of the snapshot that outlive a mission run."""
         nodes = dict(self.feed.state["nodes"])
-        selectors = shown_selectors(task, FirstAlternative())
+        selectors = shown_selectors(task, FirstAlternative(), {})
         return {"nodes": nodes, "controls": self.controls.plain(), "selectors": selectors}
 
     # --- commands while idle ------------------------------------------------------------------

@@ -356,6 +356,12 @@ def test_the_summary_shows_what_was_learned(task: Task) -> None:
     assert shown["pick_blind"]["j"] > shown["pick_slow"]["j"] > 0
     assert shown["pick_slow"]["cost"] == pytest.approx(0.35, abs=0.06)
     assert selector.figures("nothing of the kind") == {}
+    told = compare(selector.learning.estimates.of("pick"), selector.learning.question("pick"))
+    for f in told.figures:
+        own = shown[f.action]
+        assert (own["reliability"], own["cost"], own["j"]) == (f.reliability, f.cost, f.j)
+        assert (own["j_low"], own["j_high"]) == pytest.approx((f.j_lower, f.j_upper), nan_ok=True)
+        assert own["best"] == (f.action == told.best and told.clear)
 
 
 async def test_the_operators_page_shows_the_state_of_learning(task: Task) -> None:

@@ -5,12 +5,17 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import os
+import shutil
+from pathlib import Path
 
 import pytest
 
 from petrobot.coordinator.operator.history import opened
+from petrobot.coordinator.operator.prepare import resume
 from petrobot.coordinator.operator.run_address import RunAddress, find_address
+from petrobot.coordinator.operator.start_from import read_recorded
 from petrobot.coordinator.run.folder import JOURNAL, RESULT, NoRunError
 from petrobot.coordinator.run.journal import read_journal
 from tests.operator.conftest import TASK, Cell
@@ -57,6 +62,43 @@ async def test_the_run_can_be_controlled_while_it_is_active(cell: Cell) -> None:
     assert result["status"] == "success"
     with pytest.raises(NoRunError):
         find_address(None, cell.runs)
+
+
+async def test_times_on_the_page_are_those_of_the_journal(cell: Cell) -> None:
+    """Of each firing; and a snapshot has the time now, although nothing has happened since."""
+    started = await cell.say("start", task="moving")
+    await cell.until(lambda: cell.state["mission"]["state"] == "running")
+    await cell.say("pause")
+    before = cell.state["time"]
+    await cell.until(lambda: cell.station.snapshot()["time"] > before + 0.2)
+    await cell.say("resume")
+    await cell.ended()
+    shown = [(f["transition"], f["at"]) for f in cell.state["firings"]]
+    records = opened(cell.runs / started["run"] / JOURNAL, started["run"])["records"]
+    assert shown == [(f["transition"], r["t"]) for r in records for f in r["firings"]]
+
+
+async def test_a_resumed_run_is_shown_as_it_was(cell: Cell, tmp_path: Path) -> None:
+    """Its coordinator was killed in a pause. What the journal tells is shown as before: firings,
+    when each run started and since when it is held, why the net is paused."""
+    run = (await cell.say("start", task="moving", runs=9))["run"]
+    await cell.until(lambda: len(cell.state["ended"]) > 2)
+    assert (await cell.say("override_selector", primitive_task="pick", action="pick_part"))["ok"]
+    assert (await cell.say("pause"))["ok"]
+    before = cell.station.snapshot()
+    shutil.copytree(cell.runs / run, tmp_path / "killed")
+    session = resume(read_recorded(tmp_path / "killed" / JOURNAL), (), math.inf)
+    after = session.operate().snapshot()
+    await session.abandon()
+    assert before["runs"] and before["reports"] and 0.0 < after["time"] <= before["time"]
+    for shown in (before, after):
+        for name in shown["runs"]:
+            shown["runs"][name]["progress"] = 0.0  # the journal has none
+    said = ("marking", "runs", "ended", "firings", "events", "selectors", "reports", "breakpoints")
+    assert {key: after[key] for key in said} == {key: before[key] for key in said}
+    assert after["mission"]["state"] == "running"
+    assert after["mission"]["firings"] == before["mission"]["firings"]
+    assert after["paused"]["reason"] == before["paused"]["reason"]
 
 
 async def test_a_start_that_is_impossible_is_refused_with_the_reason(cell: Cell) -> None:

@@ -559,6 +559,29 @@ async def test_a_click_is_not_lost_when_updates_arrive_during_it(
     await expect(selected).to_contain_text("1 of")
 
 
+async def test_the_clock_of_a_run_stands_still_while_it_is_held(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """As its deadline does; that of a run which cannot be held goes on, as its deadline does, and
+    so does the mission's clock. A page that connects later shows the same."""
+    tab = await opened(browser, page)
+    run = {"place": "look", "primitive_task": "look", "action": "a", "node": "vision", "why": ""}
+    run |= {"started": 0.0, "deadline": 20.0, "progress": 0.1}
+    held = {"id": "x#1", "state": "held", "held_since": 9.0, "held_for": 2.0}
+    free = {"id": "x#2", "state": "running", "held_since": None, "held_for": 2.5}
+    paused = {"reason": "by ana", "at": 9.0, "nodes": {"vision": "held"}}
+    for which in (held, free):
+        stage.feed.emit("run_started", time=11.4, run={**run, **which})
+    stage.feed.emit("paused", time=11.4, paused=paused)
+    stage.feed.emit("mission", time=11.4, mission={"state": "running"})
+    for window in (tab, await opened(browser, page)):
+        cards = window.get_by_role("region", name="Running now").get_by_role("listitem")
+        await expect(cards.filter(has_text="running")).to_contain_text(re.compile(r"1\d\.\d s of"))
+        await expect(cards.filter(has_text="held")).to_contain_text("7.00 s of 20.0 s")
+        state = window.get_by_role("status", name="Mission state")
+        await expect(state).to_contain_text(re.compile(r"Paused.*1[2-9]\.\d s"))
+
+
 async def test_the_browser_applies_changes_as_the_server_does(browser: Browser, page: Page) -> None:
     """The two implementations of the rules, in Python and in the page, reach the same state on
     random sequences of changes."""

@@ -339,6 +339,11 @@ async def test_a_page_whose_script_does_not_arrive_says_so(browser: Browser, pag
     await expect(tab.get_by_role("alert")).to_be_visible()
 
 
+COLOURS = (
+    "(b) => (({ color, backgroundColor: ground }) => ({ color, ground }))(getComputedStyle(b))"
+)
+
+
 async def test_after_a_restart_with_another_key_old_windows_say_what_to_do(
     browser: Browser, stage: Stage, tasks: Path, tmp_path: Path
 ) -> None:
@@ -355,6 +360,8 @@ async def test_after_a_restart_with_another_key_old_windows_say_what_to_do(
         await expect(bar).to_contain_text("restarted and has a new key")
         await expect(bar).not_to_contain_text("Trying again")
         await expect(bar.get_by_role("link")).to_be_visible()
+        shade = await bar.get_by_role("button", name="Open").evaluate(COLOURS)
+        assert shade["color"] != shade["ground"]
         beside = await tab.context.new_page()
         await beside.goto(again.url)
         await expect(bar).to_be_hidden()

@@ -55,7 +55,7 @@ def _fields(draw: st.DrawFn, kind: str, number: int, going: list[str]) -> dict[s
     if kind == "run_progress":
         return {
             "id": draw(st.sampled_from(going)),
-            draw(st.sampled_from(["progress", "state"])): draw(SMALL),
+            draw(st.sampled_from(["progress", "state", "held_since", "held_for"])): draw(SMALL),
         }
     if kind == "run_ended":
         return {"id": going.pop(), "status": "success", "ended": number}
@@ -184,6 +184,21 @@ def test_a_reset_sends_every_client_a_snapshot() -> None:
     assert pending.stale
     assert feed.snapshot()["mission"]["id"] == "two"
     assert feed.snapshot()["sequence"] == 2
+
+
+def test_a_change_and_a_snapshot_have_the_time_of_the_clock() -> None:
+    """Also when they report nothing of the net: a client computes the time of its runs from it."""
+    feed, seen = Feed(), list[dict[str, Any]]()
+    feed.subscribe(seen.append)
+    feed.emit("variable", time=1.0, name="a", value=1)
+    feed.clock = lambda: 7.5
+    feed.emit("device", name="arm", device={"state": "up"})
+    assert seen[-1]["time"] == feed.state["time"] == 7.5
+    feed.clock = lambda: 9.0
+    assert feed.snapshot()["time"] == 9.0
+    feed.clock = None
+    feed.emit("device", name="arm", device={"state": "up"})
+    assert feed.snapshot()["time"] == 7.5
 
 
 def test_a_script_that_reads_snapshots_counts_as_watching(monkeypatch: pytest.MonkeyPatch) -> None:

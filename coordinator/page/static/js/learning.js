@@ -5,6 +5,8 @@ import { attribute, fill, h, text, words } from "./dom.js";
 
 const MEASURES = [["probability", "probability of choice"], ["J", "objective J"]];
 const figure = (value, digits = 3) => (value === undefined || value === null || !Number.isFinite(value) ? "–" : String(+value.toPrecision(digits)));
+/** A figure with its 95 % interval, as far as that is known. */
+const measured = (value, low, high) => (Number.isFinite(value) && Number.isFinite(low) && Number.isFinite(high) ? `${figure(value)} (${figure(low)} to ${figure(high)})` : figure(value));
 
 /** J of each primitive task as it is chosen now: by its override, else by its probabilities. */
 export function objectives(selectors) {
@@ -80,11 +82,11 @@ export class Learning {
     if (!known.length) return;
     const head = ["Primitive task", "Alternative", "Probability", "R", "C", "J", ""].map((name) => h("th", { scope: "col" }, name));
     const rows = known.flatMap(([name, selector]) => {
-      const best = Math.min(...selector.alternatives.map((a) => a.j).filter(Number.isFinite));
+      const lowest = Math.min(...selector.alternatives.map((a) => a.j).filter(Number.isFinite));
       return selector.alternatives.map((a, i) => h("tr", {}, h("th", { scope: "row" }, i ? "" : words(name)), h("td", {}, words(a.action)),
-        [a.probability, a.reliability, a.cost, a.j].map((value) => h("td", { class: "number" }, figure(value))),
-        h("td", {}, [a.action === selector.override ? "fixed by the operator" : "", a.j === best ? "lowest J" : ""].filter(Boolean).join(", "))));
+        [figure(a.probability), measured(a.reliability, a.reliability_low, a.reliability_high), figure(a.cost), measured(a.j, a.j_low, a.j_high)].map((value) => h("td", { class: "number" }, value)),
+        h("td", {}, [a.action === selector.override ? "fixed by the operator" : "", a.j !== lowest ? "" : a.best ? "lowest J" : "lowest J, but the difference may be chance"].filter(Boolean).join(", "))));
     });
-    fill(this.table, h("caption", {}, "What is known about the alternatives (J = 1 − R + ρC, the lowest is best)"), h("thead", {}, h("tr", {}, head)), h("tbody", {}, rows));
+    fill(this.table, h("caption", {}, "What is known about the alternatives (J = 1 − R + ρC, the lowest is best; with 95 % intervals)"), h("thead", {}, h("tr", {}, head)), h("tbody", {}, rows));
   }
 }

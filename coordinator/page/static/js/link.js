@@ -67,6 +67,7 @@ export class Link {
     if (!socket || socket !== this.socket) return;
     this.socket = null;
     this.meet();
+    this.state.time = this.now(this.heardAt); // the clock stops where it was heard of last
     this.connected = false;
     this.note("connection");
     for (const answer of this.answers.values()) answer({ ok: false, code: "lost", text: "the connection was lost" });
@@ -205,10 +206,10 @@ export class Link {
   }
 
   /** The mission's clock now (s): in real time it advances between messages, in lock step only with messages. */
-  now() {
-    const { mission, time, paused } = this.state;
-    const goes = mission.mode === "realtime" && ["running", "stopping"].includes(mission.state) && !paused && this.connected;
-    return goes ? time + (performance.now() - this.receivedAt) / 1000 : time;
+  now(at = performance.now()) {
+    const { mission, time } = this.state;
+    const goes = mission.mode === "realtime" && ["running", "stopping"].includes(mission.state) && this.connected; // in a pause, too
+    return goes ? time + Math.max(0, at - this.receivedAt) / 1000 : time;
   }
 
   /** Send a command; resolves with the server's answer {ok, code, text, ...}. */

@@ -9,7 +9,7 @@ import { Learning, objectives } from "./learning.js";
 import { Selected } from "./selected.js";
 import { Selectors } from "./selectors.js";
 import { alarms, drawnOn, labelsOf, runsOn, sheetOf, tokensOf, trailOf } from "./sheet.js";
-import { Timeline } from "./timeline.js";
+import { activeTime, Timeline } from "./timeline.js";
 
 const FIRINGS_SHOWN = 25;
 const FIRINGS_MS = 240;
@@ -193,8 +193,9 @@ export class Live {
   cardClock(node, now) {
     const { run } = node;
     const limit = run.deadline ? ` of ${seconds(run.deadline)}` : "";
-    text(node.parts.time, Number.isFinite(run.started) ? `${seconds(Math.max(0, now - run.started))}${limit}` : "");
-    attribute(node, "data-late", run.deadline && now - run.started > 0.8 * run.deadline ? "" : null);
+    const used = activeTime(run, now);
+    text(node.parts.time, Number.isFinite(run.started) ? `${seconds(used)}${limit}` : "");
+    attribute(node, "data-late", run.deadline && used > 0.8 * run.deadline ? "" : null);
   }
 
   paintClocks(now) {

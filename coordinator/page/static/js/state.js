@@ -14,6 +14,7 @@ const NAMED = {
   report: ["reports", "report"],
   selector: ["selectors", "selector"],
 };
+const OF_A_RUN = ["progress", "state", "data", "held_since", "held_for"];
 const WHOLE = new Set(["breakpoints", "paused", "controls", "result"]);
 
 function append(state, key, entry, kept) {
@@ -34,7 +35,7 @@ const RULES = {
   run_started: (state, c) => (state.runs[c.run.id] = c.run),
   run_progress(state, c) {
     const run = state.runs[c.id];
-    if (run) state.runs[c.id] = { ...run, ...pick(c, ["progress", "state", "data"]) };
+    if (run) state.runs[c.id] = { ...run, ...pick(c, OF_A_RUN) };
   },
   run_ended(state, c) {
     const run = state.runs[c.id];

@@ -6,6 +6,9 @@ let [LANE, LEFT, HEAD] = [24, 150, 20]; // px at the usual type size; all grow w
 const LANES_AT_MOST = 12;
 const STEPS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600];
 
+/** How long a run was active until then (s). While it is held its deadline stands still, and so does this. */
+export const activeTime = (run, until) => Math.max(0, (run.held_since ?? until) - run.started - (run.held_for ?? 0));
+
 export class Timeline {
   constructor(chosen) {
     this.canvas = h("canvas", { class: "timeline", role: "img", "aria-label": "Timeline of the runs up to now" });
@@ -140,7 +143,9 @@ export class Timeline {
     if (!bar) return;
     const { run } = bar;
     const reason = run.reason?.text || run.reason?.code;
-    text(this.tip, [`${words(run.action)} on ${run.node}`, `${seconds(bar.end - run.started)}, ${run.status ?? run.state ?? "running"}`, reason].filter(Boolean).join(" · "));
+    const active = activeTime(run, bar.end);
+    const held = bar.end - run.started - active;
+    text(this.tip, [`${words(run.action)} on ${run.node}`, `${seconds(active)}, ${run.status ?? run.state ?? "running"}`, held >= 0.01 ? `held for ${seconds(held)}` : "", reason].filter(Boolean).join(" · "));
     const box = this.root.getBoundingClientRect();
     this.tip.style.left = `${Math.min(event.clientX - box.left + 12, box.width - 260)}px`;
     this.tip.style.top = `${event.clientY - box.top + 14}px`;
