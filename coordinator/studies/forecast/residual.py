@@ -167,6 +167,12 @@ ORDER = 0.1
 """Rank correlation from which such a dependence matters."""
 
 
+RARE = 5
+"""Number of trials from which a branch is no longer rare. The interval of the mean holds in 97 % of
+cases where three trials of a long branch are expected, but in 86 % where two are (300 trials, 50
+times as long): often none comes. Five are seen then in only one of 20 cases."""
+
+
 LIKELY = 0.05
 """p-value of the asymptotic test above which no permutations are drawn."""
 PERMUTATIONS = 20_000
@@ -254,6 +260,53 @@ def order_doubts(training: Training) -> list[str]:
         for (words, r, _), p in zip(found, together, strict=True)
         if p < ORDER_LEVEL and abs(r) > ORDER
     ]
+
+
+def rare_doubts(
+    training: Training, weights: Values, figures: Mapping[str, Mapping[str, Any]]
+) -> list[str]:
+    """Return in words whether mean or quantile of the time rest on a few trials of a rare branch:
+    those that entered a place, or whose run left it by a certain transition."""
+    time = measured(training).time
+    kept = ~np.isnan(time) & (weights > 0)
+    if not training.whole or not kept.any():
+        return []
+    groups: dict[frozenset[int], str] = {}
+    for name, members in _branches(training).items():
+        own = frozenset(i for i in members if kept[i])
+        if 0 < len(own) < RARE and len(own) < kept.sum():
+            groups.setdefault(own, name)  # places come first
+    mean, late = float(np.average(time[kept], weights=weights[kept])), figures["q90"]["confidence"]
+    found = []
+    for own, name in groups.items():
+        rest = kept.copy()
+        rest[list(own)] = False
+        without = float(np.average(time[rest], weights=weights[rest]))
+        share = abs(mean - without) / mean if mean > 0.0 else 0.0
+        told = f"the mean time ({mean:.4g} s, {without:.4g} s without them)"
+        longest = (1.0 + OFF_TIME) * time[rest].max()
+        reached = late is not None and min(late[1], time[list(own)].max()) > longest
+        on = [told] * (share > OFF_TIME) + ["the 90 % quantile"] * bool(reached)
+        if on:
+            found.append((share, len(own), name, " and ".join(on)))
+    # Branches that follow each other have nearly the same trials: the first says it for all.
+    return [
+        f"{on} rests on {few} of the training's {kept.sum()} trials, those with {name}: so few do "
+        "not tell how often such trials come; train with more"
+        for _, few, name, on in sorted(found, reverse=True)[:1]
+    ]
+
+
+def _branches(training: Training) -> dict[str, set[int]]:
+    """Return the trials that entered each action place, and then those of each transition that took
+    a run."""
+    places, taken = dict[str, set[int]](), dict[str, set[int]]()
+    for i, trial in enumerate(training.trials):
+        for run in trial.runs:
+            places.setdefault(f"a run in {run.place}", set()).add(i)
+            if run.taken:
+                taken.setdefault(run.taken, set()).add(i)
+    return places | taken
 
 
 def event_doubts(training: Training) -> list[str]:
