@@ -29,8 +29,11 @@ from petrobot.coordinator.studies.forecast.history import Codes, Training, Value
 from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
 from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
 from petrobot.coordinator.studies.forecast.residual import (
+    chosen_so,
     condition_doubts,
     doubts,
+    durations,
+    entered,
     event_doubts,
     measured,
     order_doubts,
@@ -119,11 +122,32 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         **found,
         "product": product_rule(training, request.choices),
         "dependence": dependences(training),
-        "routing": routing(training, request.choices),
+        **_by_place(training, request.choices),
         "choice_runs": {name: sum(actions.values()) for name, actions in counts.items()},
         "asked": asked,
         "not_back": sum(t.completed and t.time is None for t in training.trials),
         "notes": _never_entered(training),
+    }
+
+
+def _by_place(training: Training, choices: Choices) -> dict[str, Any]:
+    """Return how tokens left each place, in how many trials they came there, and how long the runs
+    of each action took. An estimates file tells none of them."""
+    if not training.whole:
+        return {"routing": {}}
+    laws = [
+        {
+            "place": place,
+            "action": action,
+            **_law(times, even := np.ones(len(times)), design_effect(times, even, mission)),
+        }
+        for (place, action), (times, mission) in durations(training, choices).items()
+    ]
+    return {
+        "routing": routing(training, choices),
+        "entered": entered(training, choices),
+        "chosen_trials": len(chosen_so(training, choices)),
+        "durations": laws,
     }
 
 
