@@ -519,9 +519,7 @@ def convert_command(
             told = "the ordinary net has no times"
             raise NetFileError("--estimates", str(source), told, "leave out --view ordinary")
         if isinstance(model, Task):
-            form = FORMATS.get(target.suffix.lower())
-            timed = measure is not None or (form is not None and form.timed)
-            wanted = view or ("exact" if exact else "gspn" if timed else "ordinary")
+            wanted = written_view(target, view, exact, measure is not None)
             cell = _cell(model, cell_of if wanted == "gspn" else None)
             known = _measured(model, measure, cell)
             model, lost, assumed = _exported(model, wanted, known, cell)
@@ -551,6 +549,13 @@ def convert_command(
     lines += [f"assumed: {what}" for what in assumed]
     data = {"source": str(source), "target": str(target), "not_kept": lost, "assumed": assumed}
     return CommandResult(OK, "\n".join(lines), data)
+
+
+def written_view(target: Path, view: str | None, exact: bool, measured: bool) -> str:
+    """Return which net of a task `convert_command` writes, a key of `WRITTEN`."""
+    form = FORMATS.get(target.suffix.lower())
+    timed = measured or (form is not None and form.timed)
+    return view or ("exact" if exact else "gspn" if timed else "ordinary")
 
 
 WRITTEN = {

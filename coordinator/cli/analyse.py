@@ -20,6 +20,7 @@ from petrobot.coordinator.cli.loading import (
     task_path,
     write_json,
 )
+from petrobot.coordinator.cli.options import refuse_idle
 from petrobot.services.host.command_line import number, whole
 from petrobot.services.host.whole_file import make_folder, write_whole
 
@@ -111,6 +112,9 @@ def run(options: argparse.Namespace) -> int:
     from petrobot.coordinator.analysis.commands import analyse_command
     from petrobot.coordinator.analysis.net.space import SearchLimits
 
+    if options.view == "ordinary":
+        why = "the ordinary view has no times; leave it out, or --view"
+        refuse_idle(options, add_arguments, why, idle={"rates", "measure"})
     longest = options.seconds or None
     limits = SearchLimits(
         states=options.states, seconds=longest, memory=options.memory << 20, clock=time.monotonic

@@ -188,6 +188,9 @@ def run(options: argparse.Namespace) -> int:
         elif options.task is None:
             raise CommandError(2, "give a TASK, or --resume FOLDER")
         else:
+            if options.cluster:
+                why = "the workers are those of --cluster; leave this out"
+                refuse_idle(options, add_arguments, why, idle={"workers"})
             task = load_task(options.task)
             options.services = cell_path(options.services, options.task, task)
             _refuse_unfit(task, options)

@@ -13,6 +13,7 @@ from petrobot.coordinator.cli.loading import (
     measurements,
     task_path,
 )
+from petrobot.coordinator.cli.options import refuse_idle
 
 EXAMPLE = "petrobot convert catch_ball catch_ball.pnml"
 
@@ -52,12 +53,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Convert the file, and list what could not be kept."""
-    from petrobot.coordinator.analysis.commands import convert_command
+    from petrobot.coordinator.analysis.commands import convert_command, written_view
     from petrobot.coordinator.cli.analyse import bounded_memory, give
 
+    measured = options.estimates is not None
+    view = written_view(options.target, options.view, options.exact, measured)
+    source = task_path(options.source)
+    if source.suffix == ".toml" and view != "gspn":
+        why = f"its devices are of the stochastic view, and the {view} net is written; add --view"
+        refuse_idle(options, add_arguments, f"{why} gspn, or leave it out", idle={"services"})
     with bounded_memory():  # a chain (`.drn`) may be far larger than its net
         found = convert_command(
-            task_path(options.source),
+            source,
             options.target,
             view=options.view,
             exact=options.exact,

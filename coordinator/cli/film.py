@@ -7,6 +7,7 @@ import argparse
 from pathlib import Path
 
 from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.options import refuse_idle
 from petrobot.coordinator.cli.recorded_runs import recorded
 from petrobot.services.host.command_line import number, whole
 
@@ -66,6 +67,9 @@ def run(options: argparse.Namespace) -> int:
     from petrobot.coordinator.studies.report.film import NoFilmError, images, refuse_file, write
     from petrobot.coordinator.studies.report.raster import RasterError
 
+    if options.out.suffix.lower() != ".webp":
+        why = "only a .webp film has a quality; leave it out, or name the film .webp"
+        refuse_idle(options, add_arguments, why, idle={"quality"})
     span = {"begin": options.begin, "seconds": options.seconds}
     try:
         refuse_file(options.out)

@@ -130,6 +130,9 @@ def run(options: argparse.Namespace) -> int:
             )
         why = "a forecast has no table; give it beside --compare"
         refuse_idle(options, add_arguments, why, idle={"markdown"})
+        if options.out is None:
+            why = "nothing is registered without --out FILE; add that, or leave this out"
+            refuse_idle(options, add_arguments, why, idle={"doubtful"})
         return _forecast(options)
     except (ForecastError, CampaignError) as fault:
         raise CommandError(2, str(fault)) from fault

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import add_services_argument, load_directory
+from petrobot.coordinator.cli.options import refuse_idle
 from petrobot.services.comm.protocol.messages import COORDINATOR
 
 if TYPE_CHECKING:
@@ -40,6 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the key or the certificates. Existing files are kept, except certificates that expire
     within 30 days."""
+    if options.tls is not None:
+        why = "it is for the shared key, and --tls makes certificates; leave one out"
+        refuse_idle(options, add_arguments, why, idle={"file"})
     directory = load_directory(options.services)
     print(
         _certificates(directory, options.tls)

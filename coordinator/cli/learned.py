@@ -19,6 +19,7 @@ from petrobot.coordinator.cli.learned_show import (
     task_line,
 )
 from petrobot.coordinator.cli.loading import estimates_path, load_task, write_json
+from petrobot.coordinator.cli.options import refuse_idle
 from petrobot.services.host.command_line import number, probability
 
 # `learned task`: R, C and J of primitive tasks and of a whole task, from an estimates file through
@@ -177,7 +178,18 @@ EXAMPLE = (
     "petrobot learned show learned.db --target 0.95\n  petrobot learned merge "
     "learned.db other_machine.db"
 )
-VERBS = ("show", "task", "merge", "freeze", "thaw", "reset")
+_FILES = {"verb", "file", "more"}
+_SHOWN = {*_FILES, "context", "plant", "cost", "target", "budget", "rho", "json"}
+HEEDED: dict[str, set[str]] = {
+    "show": _SHOWN,
+    "task": _SHOWN,
+    "merge": _FILES,
+    "freeze": _FILES,
+    "thaw": _FILES,
+    "reset": {*_FILES, "plant", "selectors"},
+}
+"""The options that each verb uses."""
+VERBS = tuple(HEEDED)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -240,6 +252,8 @@ def run(options: argparse.Namespace) -> int:
     """Do what was asked for, and return the exit code."""
     from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, said
 
+    why = f"learned {options.verb} makes no use of it; leave it out"
+    refuse_idle(options, add_arguments, why, heeded=HEEDED[options.verb])
     file = EstimatesFile(options.file)
     try:
         if options.verb == "merge":

@@ -66,8 +66,10 @@ def refuse_idle(
     and what to do."""
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    for name, default in vars(parser.parse_args([])).items():
-        if getattr(options, name) != default and (name in idle or (heeded and name not in heeded)):
+    for action in parser._actions:  # parse_args([]) would ask for the arguments without --
+        name, default = action.dest, action.default
+        given = getattr(options, name, default) != default
+        if given and (name in idle or (heeded and name not in heeded)):
             said = "TASK" if name == "task" else f"--{name.replace('_', '-')}"
             raise CommandError(2, f"{said}: {why}")
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import load_task, pictures_of, write_json
+from petrobot.coordinator.cli.options import refuse_idle
 from petrobot.services.host.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
@@ -67,6 +68,9 @@ def run(options: argparse.Namespace) -> int:
     from petrobot.coordinator.studies.campaign.plan import MANIFEST, CampaignError
 
     folder = Path(options.subject)
+    if options.against is None:
+        why = "it is of a comparison; add --against CAMPAIGN, or leave it out"
+        refuse_idle(options, add_arguments, why, idle={"rho_of", "json"})
     try:
         if (folder / MANIFEST).exists():
             page, pictures, target = _campaign(folder, options)

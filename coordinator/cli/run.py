@@ -256,6 +256,7 @@ def run(options: argparse.Namespace) -> int:
     lockstep = options.mode == "lockstep"
     if lockstep:
         _refuse_idle(options, "a run in lock step starts its own nodes; leave it out", "up")
+        _refuse_idle(options, "a run in lock step serves no page; leave it out", "page_port")
     elif not options.join:
         _refuse_idle(
             options, "only for --mode lockstep; in real time, nodes are joined", "processes"

@@ -16,6 +16,7 @@ from petrobot.coordinator.cli.loading import (
     measurements,
     task_path,
 )
+from petrobot.coordinator.cli.options import refuse_idle
 from petrobot.services.host.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -107,7 +108,10 @@ def _net(options: argparse.Namespace) -> str:
 
 def _refuse_idle(options: argparse.Namespace) -> None:
     """Raise CommandError for an option that this drawing would ignore."""
-    timed = not options.graph and (options.heat or options.view == "gspn")
+    if options.graph:
+        why = "the reachability graph has no such choice; leave it out, or --graph"
+        refuse_idle(options, add_arguments, why, heeded={"task", "graph", "out"})
+    timed = options.heat or options.view == "gspn"
     for name in ("estimates", "services"):
         if getattr(options, name) is not None and not timed:
             raise CommandError(2, f"--{name} is for --heat and --view gspn; add one of them")

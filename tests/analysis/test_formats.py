@@ -428,6 +428,8 @@ def test_tina_nets() -> None:
     assert model.net.consume[0] == ((0, 2), (1, 3)) and model.net.produce[0] == ((1, 4), (2, 1))
     assert model.net.inhibit[0] == ((2, 2),) and model.net.priority == (1, 0)
     assert model.labels == {"t1": "go", "p": "start"} and model.name == "my net"
+    empty = parse_tina("net {}\npl p : {}\nlb p {}\n")
+    assert not empty.labels and not empty.name and "net" not in write_tina(empty)
 
 
 @pytest.mark.parametrize(
@@ -551,6 +553,12 @@ def test_dot_and_drn() -> None:
     drn, _ = written(NetFile(gspn.net, gspn=gspn), Path("net.drn"))
     assert "@nr_states\n160\n" in drn and drn.count("\taction 0") == 160
     rates = [float(line.split(":")[1]) for line in drn.splitlines() if line.startswith("\t\t")]
+    names = Net.build({"init": 1, "a b": 0, "a_b": 0}, {"t": ({"init": 1}, {"a b": 1, "a_b": 1})})
+    drn = FORMATS[".drn"].write(NetFile(names, gspn=Gspn.of(names, {"t": 1.0})))
+    assert re.findall("state . .*", drn) == [
+        "state 0 !1.0 init init_2",
+        "state 1 !1.0 deadlock a_b a_b_2",
+    ]
     chain = Chain.of(gspn)
     assert sum(rates) == pytest.approx(float(chain.amount.sum()))
 
@@ -662,9 +670,9 @@ def models(draw: st.DrawFn) -> NetFile:
     spots = st.floats(-1e4, 1e4).map(lambda x: round(x, 3))
     return NetFile(
         net,
-        draw(st.sampled_from(["", "a net"])),
+        draw(st.sampled_from(["", "a net", "a\nnet"])),
         gspn,
-        {name: draw(st.sampled_from(["text", "<&>", "a b"])) for name in draw(some)},
+        {name: draw(st.sampled_from(["text", "<&>", "a b", "a\nb"])) for name in draw(some)},
         {name: (draw(spots), draw(spots)) for name in draw(some)},
     )
 
@@ -682,7 +690,7 @@ def test_what_is_not_listed_as_lost_is_kept(model: NetFile, ending: str) -> None
     lost = {what.split(":")[0] for what in losses(model, ending)}
     one, two = again.gspn, model.gspn
     kept = {
-        Feature.NAME: again.name == model.name,
+        Feature.NAME: again.name == model.name or not model.name,
         Feature.LABELS: dict(again.labels) == dict(model.labels),
         Feature.POSITIONS: all(again.positions.get(n) == at for n, at in model.positions.items()),
         Feature.INHIBITORS: sum(map(len, again.net.inhibit)) >= sum(map(len, model.net.inhibit)),

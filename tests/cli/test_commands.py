@@ -176,6 +176,34 @@ COMPARE = ["forecast", "--compare", "forecast.json", "campaigns/new"]
         ([*COMPARE, "--doubtful"], "--doubtful: a registered forecast is compared as it is"),
         (["forecast", "catch_ball", *COMPARE[1:]], "TASK: a registered forecast is compared"),
         (
+            ["forecast", "catch_ball", "--estimates", "e", "--doubtful"],
+            "--doubtful: nothing is registered without --out FILE",
+        ),
+        ([*LOCKSTEP, "--page-port", "8000"], "--page-port: a run in lock step serves no page"),
+        (["show", "catch_ball", "--graph", "--errors"], "--errors: the reachability graph has"),
+        (
+            ["show", "catch_ball", "--graph", "--services", "s"],
+            "--services: the reachability",
+        ),
+        (["learned", "freeze", "x.db", "--json", "-"], "--json: learned freeze makes no use of it"),
+        (["learned", "reset", "x.db", "--rho", "1"], "--rho: learned reset makes no use of it"),
+        (["learned", "show", "x.db", "--selectors"], "--selectors: learned show makes no use"),
+        (["report", "runs", "--json", "-"], "--json: it is of a comparison; add --against"),
+        (["keys", "--tls", "k", "--file", "f"], "--file: it is for the shared key"),
+        (["film", "last", "--out", "x.gif", "--quality", "9"], "--quality: only a .webp film"),
+        (
+            ["campaign", "catch_ball", "--cluster", "tcp://127.0.0.1:1", "--workers", "7"],
+            "--workers: the workers are those of --cluster",
+        ),
+        (
+            ["convert", "catch_ball", "x.pnml", "--services", "s.toml"],
+            "--services: its devices are of the stochastic view, and the ordinary net is written",
+        ),
+        (
+            ["analyse", "x.net", "--view", "ordinary", "--rates", "unit"],
+            "--rates: the ordinary view has no times",
+        ),
+        (
             ["forecast", "catch_ball", "--estimates", "e", "--markdown", "m"],
             "--markdown: a forecast has no table; give it beside --compare",
         ),

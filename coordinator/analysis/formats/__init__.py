@@ -70,6 +70,8 @@ class Format:
     tool: str = ""
     """The tools that it is for."""
     says: Mapping[Feature, str] = field(default_factory=dict)
+    text: Callable[[str], str] = str
+    """How a name of a net or a display name is written."""
     names: Pattern[str] | None = None
     """The names that the format allows; others are replaced."""
     timed: bool = False
@@ -95,7 +97,7 @@ FORMATS: Mapping[str, Format] = {
             Feature.RATES: OWN_DATA,
             Feature.SERVERS: OWN_DATA,
         },
-        pnml.XML_ID,
+        names=pnml.XML_ID,
     ),
     ".net": Format(
         tina.write_tina,
@@ -108,6 +110,7 @@ FORMATS: Mapping[str, Format] = {
             Feature.PRIORITIES: KEPT,
             Feature.CAPACITIES: AS_INHIBITORS,
         },
+        tina.one_line,
         tina.ANY_NAME,
     ),
     ".pnpro": Format(
@@ -123,7 +126,7 @@ FORMATS: Mapping[str, Format] = {
             Feature.CAPACITIES: AS_INHIBITORS,
             Feature.UNTIMED: "written as immediate transitions of weight 1",
         },
-        greatspn.IDENTIFIER,
+        names=greatspn.IDENTIFIER,
         timed=True,
     ),
     ".lola": Format(
@@ -134,7 +137,7 @@ FORMATS: Mapping[str, Format] = {
             Feature.INHIBITORS: "kept where the place has a capacity, left out elsewhere",
             Feature.CAPACITIES: "written as complementary places with the same effect",
         },
-        exports.LOLA_NAME,
+        names=exports.LOLA_NAME,
     ),
     ".dot": Format(
         exports.write_dot,
@@ -183,6 +186,10 @@ def _losses(model: NetFile, target: Format, ending: str) -> Iterator[str]:
             yield str(feature)
         elif target.says[feature] != KEPT:
             yield f"{feature}: {target.says[feature]}"
+    texts = {Feature.NAME: [model.name], Feature.LABELS: [*model.labels.values()]}
+    for feature, kept in texts.items():
+        if feature in target.says and any(target.text(text) != text for text in kept):
+            yield f"{feature}: line ends are written as spaces"
     if not in_place:
         yield from model.beyond
         if target.names is not None:

@@ -113,7 +113,7 @@ def write_drn(chain: Chain) -> str:
     """Return the DRN text of a chain. Raises NetFileError if its initial marking is vanishing.
 
     States are labelled `init`, `deadlock`, and with the name of each marked place, in which
-    everything but letters, digits and _ is replaced by _.
+    everything but letters, digits and _ is replaced by _. A number follows if two would be alike.
     """
     if chain.vanishing[0]:
         remedy = "a CTMC starts in a tangible marking; give the first transition a rate"
@@ -123,7 +123,10 @@ def write_drn(chain: Chain) -> str:
     marked = np.stack(
         [chain.space.tokens(p)[made.tangible] > 0 for p in range(len(chain.space.net.places))]
     )
-    names = [_identifier(name) for name in chain.space.net.places]
+    names, taken = list[str](), {"init", "deadlock"}
+    for name in chain.space.net.places:
+        names.append(unused(_identifier(name), taken))
+        taken.add(names[-1])
     lines = [
         "// A GSPN's chain over its tangible markings, rates in 1/s",
         "@type: CTMC",

@@ -193,7 +193,7 @@ class _TinaReading:
         for name, (_, draft.line) in self.labels.items():
             if name not in draft.places and name not in draft.transitions:
                 raise draft.fault(f"label of {name}", "no such node", "name a place or transition")
-        labels = {n: text for n, (text, _) in self.labels.items() if text != n}
+        labels = {n: text for n, (text, _) in self.labels.items() if text not in ("", n)}
         return NetFile(
             draft.net(), self.name, None, labels, {}, tuple(draft.notes), tuple(self.beyond)
         )
@@ -291,9 +291,14 @@ def _number(text: str) -> int:
 
 
 def _quoted(name: str) -> str:
-    """Return a name or label as it is written; a line end in a label becomes a space."""
-    name = " ".join(name.splitlines())
+    """Return a name or label as it is written."""
+    name = one_line(name)
     return name if PLAIN.match(name) else "{" + re.sub(r"([\\{}])", r"\\\1", name) + "}"
+
+
+def one_line(text: str) -> str:
+    """Return a name or label as a file of TINA can hold it: a line end becomes a space."""
+    return " ".join(text.splitlines())
 
 
 ANY_NAME = re.compile(r"[^\n\r\x0b\x0c\x1c-\x1e\x85\u2028\u2029]+")
@@ -308,7 +313,7 @@ def write_tina(model: NetFile) -> str:
     """
     model, _ = model.with_names(ANY_NAME)
     net: Net = model.net
-    lines = [f"net {_quoted(model.name or 'net')}"]
+    lines = [f"net {_quoted(model.name)}"] * bool(model.name)
     for t, name in enumerate(net.transitions):
         label = f" : {_quoted(model.labels[name])}" if name in model.labels else ""
         below = thresholds(net, t)

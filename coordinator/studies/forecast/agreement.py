@@ -22,7 +22,14 @@ from petrobot.coordinator.learning.statistics import wilson
 from petrobot.coordinator.studies.forecast.direct import SCORES
 from petrobot.coordinator.studies.forecast.history import Training, Values
 from petrobot.coordinator.studies.forecast.predict import SHARES, figures
-from petrobot.coordinator.studies.forecast.residual import measured, routing, ways_table
+from petrobot.coordinator.studies.forecast.residual import (
+    all_on_one_side,
+    durations,
+    entered,
+    measured,
+    routing,
+    ways_table,
+)
 from petrobot.coordinator.studies.forecast.shares import (
     holm,
     predictive_interval,
@@ -51,14 +58,15 @@ def agreement(forecast: Mapping[str, Any], regimes: Mapping[str, Training]) -> d
             f"{', '.join(forecast['regimes'])}"
         )
     rows: list[dict[str, Any]] = []
-    controls, laws, ways = [], [], []
+    controls, laws, ways, took = [], [], [], []
     for name in common:
         said, training = forecast["regimes"][name], regimes[name]
         rows += [_row(name, figure, said, training) for figure in FAMILY]
         controls.append(_product(name, said, training))
         laws.append(_law(name, said, training))
-        ways += _routing(name, said["routing"], routing(training))
-    tested = [row for row in (*rows, *laws, *ways) if row["p"] is not None]
+        ways += _routing(name, said, training)
+        took += _durations(name, said, training)
+    tested = [row for row in (*rows, *laws, *ways, *took) if row["p"] is not None]
     for row, p in zip(tested, holm([row["p"] for row in tested]), strict=True):
         row["p_holm"] = p
         row["agrees"] = p >= LEVEL
@@ -67,6 +75,7 @@ def agreement(forecast: Mapping[str, Any], regimes: Mapping[str, Training]) -> d
         "negative_control": controls,
         "law": laws,
         "routing": ways,
+        "durations": took,
         "agrees": all(row["agrees"] for row in tested),
         "equivalent": all(row["equivalent"] for row in rows if row["figure"] in EQUIVALENT),
         "product_rejected": [row["regime"] for row in controls if row["rejected"]],
@@ -187,26 +196,24 @@ def _product(regime: str, said: Mapping[str, Any], training: Training) -> dict[s
 
 
 def _law(regime: str, said: Mapping[str, Any], training: Training) -> dict[str, Any]:
-    """Compare the measured and the forecast distribution of the time by Kolmogorov's two-sample
-    test, in its asymptotic form; ties make it conservative."""
-    played = measured(training)
-    times = np.sort(played.time[~np.isnan(played.time)])
-    row: dict[str, Any] = {
-        "regime": regime,
-        "distance": None,
-        "limit": None,
-        "p": None,
-        "p_holm": None,
-        "agrees": None,
-    }
-    if not len(times) or not said["law"]["s"]:
+    """Compare the measured and the forecast distribution of the time."""
+    time = measured(training).time
+    law = {"trials": said["training_trials"], **said["law"]}
+    return {"regime": regime, **_distance(law, time[~np.isnan(time)])}
+
+
+def _distance(law: Mapping[str, Any], measured_times: Values) -> dict[str, Any]:
+    """Compare times with a distribution by Kolmogorov's two-sample test, in its asymptotic form;
+    ties make it conservative."""
+    row: dict[str, Any] = dict.fromkeys(("distance", "limit", "p", "p_holm", "agrees"))
+    times = np.sort(measured_times)
+    if not len(times) or not law["s"]:
         return row
-    grid, q = np.array(said["law"]["s"]), np.array(said["law"]["q"])
+    grid, q = np.array(law["s"]), np.array(law["q"])
     at = np.searchsorted(times, grid, side="right") / len(times)
     below = np.searchsorted(times, grid, side="left") / len(times)
     distance = float(np.max(np.maximum(q - at, 0.0) + np.maximum(below - q, 0.0)))
-    known = said["law"].get("trials", said["training_trials"])
-    new = len(times) / said["law"].get("likeness", 1.0)
+    known, new = law["trials"], len(times) / law.get("likeness", 1.0)
     size = math.sqrt(known * new / (known + new))
     return row | {
         "distance": round(distance, 4),
@@ -215,22 +222,36 @@ def _law(regime: str, said: Mapping[str, Any], training: Training) -> dict[str, 
     }
 
 
-def _routing(
-    regime: str, before: Mapping[str, Any], after: Mapping[str, Any]
-) -> list[dict[str, Any]]:
+def _durations(regime: str, said: Mapping[str, Any], training: Training) -> list[dict[str, Any]]:
+    """Compare how long the runs of each action take in each place: the total may hide it."""
+    new = durations(training)
+    return [
+        {
+            "regime": regime,
+            **{key: law[key] for key in ("place", "action")},
+            **_distance(law, new.get((law["place"], law["action"]), (np.zeros(0),))[0]),
+        }
+        for law in said.get("durations", ())  # older files have none
+    ]
+
+
+def _routing(regime: str, said: Mapping[str, Any], training: Training) -> list[dict[str, Any]]:
     """Test for each place, by chi-square, whether tokens left it by the same transitions equally
-    often in training and new trials."""
+    often in training and new trials; and if only one of them entered it, whether that is chance."""
+    before, after = said["routing"], routing(training)
+    seen = said.get("entered", {}), entered(training)  # older files do not contain it
+    trials = said.get("chosen_trials", 0), len(training.trials)
     rows = []
-    for place in before:
-        table = ways_table(before[place], after.get(place, {}))
-        if table.shape[1] > 1 and table.sum(axis=1).min() > 0:
-            rows.append(
-                {
-                    "regime": regime,
-                    "place": place,
-                    "p": float(chi2_contingency(table).pvalue),
-                    "p_holm": None,
-                    "agrees": None,
-                }
-            )
+    for place in sorted({*before, *after}):
+        table = ways_table(before.get(place, {}), after.get(place, {}))
+        if table.sum(axis=1).all():
+            p = float(chi2_contingency(table).pvalue) if table.shape[1] > 1 else None
+        elif trials[0]:
+            side = int(place in after)
+            p = all_on_one_side(seen[side][place], trials[side], trials[1 - side])
+        else:
+            p = None
+        if p is not None:
+            row = {"regime": regime, "place": place, "p": p, "p_holm": None, "agrees": None}
+            rows.append(row)
     return rows

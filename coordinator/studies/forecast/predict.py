@@ -29,11 +29,15 @@ from petrobot.coordinator.studies.forecast.history import Codes, Training, Value
 from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
 from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
 from petrobot.coordinator.studies.forecast.residual import (
+    chosen_so,
     condition_doubts,
     doubts,
+    durations,
+    entered,
     event_doubts,
     measured,
     order_doubts,
+    rare_doubts,
     residuals,
     routing,
 )
@@ -118,11 +122,32 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         **found,
         "product": product_rule(training, request.choices),
         "dependence": dependences(training),
-        "routing": routing(training, request.choices),
+        **_by_place(training, request.choices),
         "choice_runs": {name: sum(actions.values()) for name, actions in counts.items()},
         "asked": asked,
         "not_back": sum(t.completed and t.time is None for t in training.trials),
         "notes": _never_entered(training),
+    }
+
+
+def _by_place(training: Training, choices: Choices) -> dict[str, Any]:
+    """Return how tokens left each place, in how many trials they came there, and how long the runs
+    of each action took. An estimates file tells none of them."""
+    if not training.whole:
+        return {"routing": {}}
+    laws = [
+        {
+            "place": place,
+            "action": action,
+            **_law(times, even := np.ones(len(times)), design_effect(times, even, mission)),
+        }
+        for (place, action), (times, mission) in durations(training, choices).items()
+    ]
+    return {
+        "routing": routing(training, choices),
+        "entered": entered(training, choices),
+        "chosen_trials": len(chosen_so(training, choices)),
+        "durations": laws,
     }
 
 
@@ -155,15 +180,18 @@ def _refuse_unmeasured(training: Training, choices: Choices, asked: list[str]) -
 
 def _never_entered(training: Training) -> list[str]:
     """Note the action places that no training run entered, with what that is worth."""
-    entered = set(training.runs.place.tolist())
-    n = len(training.trials)
-    return [
-        f"no training run entered {place}: forecast with probability 0"
-        # the rule of three, exactly: (1 - p)^n = 5 %
-        + (f" (below {1.0 - 0.05 ** (1.0 / n):.2g} per trial, 95 %)" if training.whole else "")
-        for q, place in enumerate(training.vocabulary.places)
-        if q not in entered
-    ]
+    entered, task = set(training.runs.place.tolist()), training.task
+    most = 1.0 - 0.05 ** (1.0 / len(training.trials))  # rule of three, exactly: (1 - p)^n = 5 %
+    out = []
+    for q, place in enumerate(training.vocabulary.places):
+        if q not in entered:
+            longest = task.primitive_task_of(place).deadline
+            out.append(
+                f"no training run entered {place}: forecast with probability 0"
+                + f" (below {most:.2g} per trial, 95 %; runs of its deadline, {longest:g} s, would "
+                f"add up to {most * longest:.2g} s to the mean time)" * training.whole
+            )
+    return out
 
 
 # --- figures straight from the trials ---
@@ -192,11 +220,12 @@ def _from_trials(
         found["mean"] = mean_figure(times, own, runs, random, likeness)
         found["q90"] = quantile_figure(times, own, runs, 0.9, late)
         likeness = max(likeness, late)
+    told = {name: found.get(name, NO_FIGURE) for name in (*SHARES, *TIMES)}
     return {
         "from": TRIALS,
-        "figures": {name: found.get(name, NO_FIGURE) for name in (*SHARES, *TIMES)},
+        "figures": told,
         "law": _law(times, own, likeness),
-        "doubts": order_doubts(training),
+        "doubts": [*order_doubts(training), *rare_doubts(training, weights, told)],
         **_beside(training, request),
     }
 
@@ -270,18 +299,20 @@ def _from_net(training: Training, request: Request, random: np.random.Generator)
     point, n = figures(whole), len(training.trials)
     times = whole.time[whole.completed]
     law = _law(times, np.ones(len(times)))
+    told = {
+        **{name: _net_share(point[name], samples[name], request.runs, n) for name in SHARES},
+        **{name: _net_time(point[name], samples[name], request.runs, n) for name in TIMES},
+    }
     return {
         "from": NET,
-        "figures": {
-            **{name: _net_share(point[name], samples[name], request.runs, n) for name in SHARES},
-            **{name: _net_time(point[name], samples[name], request.runs, n) for name in TIMES},
-        },
+        "figures": told,
         "law": {**law, "trials": float(n)},
         "doubts": [
             *doubts(residual, whole, request.point),
             *event_doubts(training),
             *condition_doubts(training, net.structure.moves),
             *order_doubts(training),
+            *rare_doubts(training, np.ones(n), told),
         ],
         **_net_told(
             residual,

@@ -168,12 +168,7 @@ def agreement_text(found: Mapping[str, Any]) -> str:
                 f"distribution of the time, regime {law['regime'] or '-'}: "
                 f"distance {law['distance']}, p = {_p(law)}: {verdict}"
             )
-    odd = [row for row in found["routing"] if not row["agrees"]]
-    lines += [
-        f"outgoing transitions of {row['place']}, regime {row['regime'] or '-'}: "
-        f"p = {row['p_holm']:.1e}: DISAGREES"
-        for row in odd
-    ]
+    lines += _disagreeing(found)
     for regime, doubts in found["doubts"].items():
         lines += [
             f"note: registered although doubtful, regime {regime or '-'}: {doubt}"
@@ -192,6 +187,23 @@ def agreement_text(found: Mapping[str, Any]) -> str:
         else "DISAGREES: at least one test differs at 1 % (Holm)"
     )
     return "\n".join(lines)
+
+
+def _disagreeing(found: Mapping[str, Any]) -> list[str]:
+    """Return a line for each place and action that differs."""
+    told = {
+        f"outgoing transitions of {row['place']}, regime {row['regime'] or '-'}: ": row
+        for row in found["routing"]
+    } | {
+        f"duration of {row['action']} in {row['place']}, regime {row['regime'] or '-'}: "
+        f"distance {row['distance']}, ": row
+        for row in found["durations"]
+    }
+    return [
+        f"{what}p = {row['p_holm']:.1e}: DISAGREES"
+        for what, row in told.items()
+        if row["agrees"] is False
+    ]
 
 
 def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -227,7 +239,9 @@ def agreement_markdown(found: Mapping[str, Any]) -> str:
         (law["regime"] or "-", _number(law["distance"]), _number(law["limit"]))
         for law in found["law"]
     ]
-    return "\n".join([*lines, *_markdown([("regime", "distance", "limit"), *laws])]) + "\n"
+    lines += _markdown([("regime", "distance", "limit"), *laws])
+    odd = [f"- {line}" for line in _disagreeing(found)]
+    return "\n".join([*lines, *([""] * bool(odd)), *odd]) + "\n"
 
 
 def _markdown(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -24,7 +24,7 @@ from petrobot.coordinator.studies.forecast.distributions import RunDistributions
 from petrobot.coordinator.studies.forecast.history import ForecastError, Training
 from petrobot.coordinator.studies.forecast.predict import Request, figures, predict
 from petrobot.coordinator.studies.forecast.registered import read, register, write
-from petrobot.coordinator.studies.forecast.residual import measured
+from petrobot.coordinator.studies.forecast.residual import durations, measured
 from petrobot.coordinator.studies.forecast.shares import (
     holm,
     predictive_interval,
@@ -104,6 +104,51 @@ def test_the_comparison_rejects_a_changed_world(pair: Task, make_trials: Make) -
         for i, t in enumerate(make_trials(RUNS, np.random.default_rng(8)))
     ]
     assert not agreement({"regimes": {"": made}}, {"": Training.of(pair, fewer)})["agrees"]
+
+
+def test_a_changed_duration_that_the_total_hides_is_named(pair: Task, make_trials: Make) -> None:
+    """The second run ends with the signal, so it makes up for a longer first one; runs of one
+    trial count once. An older file, without durations, is still compared."""
+    made = forecast(pair, make_trials(1000, np.random.default_rng(6)))
+    same = make_trials(RUNS, np.random.default_rng(7))
+    longer = [
+        replace(
+            t,
+            runs=[
+                replace(t.runs[0], took=t.runs[0].took + 0.1),
+                *(replace(r, begun=r.begun + 0.1, took=r.took - 0.1) for r in t.runs[1:]),
+            ],
+        )
+        for t in same
+    ]
+    old = {key: value for key, value in made.items() if key != "durations"}
+    for said, trials, differing in (
+        (made, same, []),
+        (made, longer, ["first_a", "second_a"]),
+        (old, longer, []),
+    ):
+        found = agreement({"regimes": {"": said}}, {"": Training.of(pair, trials)})
+        assert all(row["agrees"] is not False for row in (*found["rows"], *found["law"]))
+        named = [row["action"] for row in found["durations"] if row["agrees"] is False]
+        assert named == differing and found["agrees"] is not bool(differing)
+    alike = [replace(t, runs=[t.runs[0]] * 3 + t.runs[1:]) for t in same]
+    times, _ = durations(Training.of(pair, alike))["first", "first_a"]
+    assert times.tolist() == [round(t.runs[0].took, 4) for t in same]
+
+
+def test_a_place_that_only_one_side_entered_differs_unless_by_chance(
+    pair: Task, make_trials: Make
+) -> None:
+    """Its runs cannot be compared, but how many trials entered it can."""
+    trials = make_trials(1000, np.random.default_rng(6), dependence=0.0)
+    for entering, agrees in ((3, True), (60, False)):
+        few = [t if i < entering else replace(t, runs=t.runs[:1]) for i, t in enumerate(trials)]
+        alone = [replace(t, runs=t.runs[:1]) for t in trials]
+        for known, new in ((few, alone), (alone, few)):
+            made = forecast(pair, known)
+            found = agreement({"regimes": {"": made}}, {"": Training.of(pair, new)})
+            rows = [row["agrees"] for row in found["routing"] if row["place"] == "second"]
+            assert rows == [agrees]
 
 
 def test_unfolding_keeps_the_spread_of_the_time(pair: Task, make_trials: Make) -> None:

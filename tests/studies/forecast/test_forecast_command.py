@@ -256,7 +256,7 @@ def test_a_place_that_training_never_entered_forbids_nothing(
 
 
 def test_an_estimates_file_is_counted_in_runs(
-    make_trials: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    write_campaign: Write, make_trials: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """60 trials of about two runs each are neither 60 trials nor as many trials as runs there."""
     from petrobot.coordinator.studies.campaign.observed import estimates_of, write_estimates
@@ -271,6 +271,13 @@ def test_an_estimates_file_is_counted_in_runs(
     shown = capsys.readouterr().out
     assert f"from {sum(len(t.runs) for t in trials)} runs of an estimates file" in shown
     assert "by simulating the net" in shown and "trials, by" not in shown
+    # such a file names the transitions of preempted runs only: no shares to compare with
+    out = tmp_path / "f.json"
+    assert main(["forecast", str(own), "--estimates", str(path), *QUICK, "--out", str(out)]) == 0
+    new = write_campaign("new", TASK, make_trials(200, np.random.default_rng(2)), 2)
+    capsys.readouterr()
+    main(["forecast", "--compare", str(out), str(new), "--json", "-"])
+    assert json.loads(capsys.readouterr().out)["routing"] == []
 
 
 def test_services_say_where_the_new_trials_run(

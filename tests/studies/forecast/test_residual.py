@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from scipy.stats import rankdata, spearmanr
 
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast import residual
+from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.history import Training
 from petrobot.coordinator.studies.forecast.play import Played
+from petrobot.coordinator.studies.forecast.predict import Request, predict
 from petrobot.coordinator.studies.forecast.residual import (
     doubts,
     measured,
@@ -25,6 +28,7 @@ from tests.studies.forecast.test_preempting import ONE_WAY, one_way, trials_of
 
 pytestmark = pytest.mark.once
 
+SIDE = ("goals", "completed", "all_success", "time")
 NOTHING = Played(np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros(0, np.bool_), np.zeros(0))
 
 
@@ -85,6 +89,24 @@ def test_the_distance_is_the_largest_difference_of_shares_or_relative_difference
     )
 
 
+def test_a_place_that_only_one_side_entered_is_no_doubt_if_that_may_be_chance() -> None:
+    """One trial of the training entered it, none of four times as many simulated ones; or half of
+    the training did."""
+    training = Training.of(loads(ONE_WAY, "scan.toml"), trials_of(one_way, 200, 3))
+    real = measured(training)
+    for entering, doubtful in ((1, False), (100, True)):
+        trials = [
+            replace(t, runs=t.runs[: 1 + (i < entering)]) for i, t in enumerate(training.trials)
+        ]
+        few = Training.of(training.task, trials)
+        last = trials[0].runs[1].place
+        ways = {place: counts for place, counts in routing(few).items() if place != last}
+        played = replace(real, **{f: np.repeat(getattr(real, f), 4) for f in SIDE}, ways=ways)
+        (row,) = (r for r in residuals(few, played) if r["of"] == f"ways out of {last}")
+        assert (row["p_holm"] < 0.01) is doubtful
+        assert row["off"] == entering / 200
+
+
 def timed(times: np.ndarray, goals: np.ndarray) -> Training:
     """Trials with these times and goals."""
     trials = [
@@ -130,6 +152,31 @@ def test_trials_at_the_same_time_are_doubtful() -> None:
         one = Training.of(training.task, trials)
         assert overlapping(one) == found
         assert [doubt[:2] for doubt in order_doubts(one)] == [str(found)] * (found > 0)
+
+
+@pytest.mark.parametrize(
+    ("few", "of", "seconds", "told"),
+    [
+        (2, 300, 60.0, "the mean time (1.393 s, 1 s without them) rests on 2 of"),
+        (5, 300, 60.0, ""),  # enough to tell how often they come
+        (2, 300, 5.0, ""),  # little of the mean
+        (2, 20, 1.3, "the 90 % quantile rests on 2 of"),
+        (0, 300, 60.0, ""),
+    ],
+)
+def test_figures_that_rest_on_a_few_trials_of_a_rare_branch_are_doubtful(
+    few: int, of: int, seconds: float, told: str
+) -> None:
+    """The reason contains the figure with and without these trials."""
+    trials = []
+    for i in range(of):
+        long = i % (of // max(few, 1)) == 1 and few > 0
+        time, taken = (seconds, "lost") if long else (1.0, "found")
+        runs = [RunEntry("locate", "locate_a", 0.0, time, "success", taken=taken)]
+        trials.append(Trial(1, 0.0, time, True, 1, runs=runs))
+    known = Training.of(loads(ONE_WAY, "scan.toml"), trials)
+    said = predict(known, Request(100, choices_of(known), net=False))["doubts"]
+    assert [told in doubt and "those with lost: " in doubt for doubt in said] == [True] * bool(told)
 
 
 def test_independent_trials_are_seldom_doubtful() -> None:
