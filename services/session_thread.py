@@ -124,7 +124,8 @@ class SessionThread:
         self._task, self._stopped = asyncio.ensure_future(work), ""
         (fault,) = list[Any](await asyncio.gather(self._task, return_exceptions=True))
         await asyncio.sleep(0)  # closed transports release their sockets
-        return self._stopped or (str(fault) or type(fault).__name__ if fault else "")
+        silent = "it does not answer" if isinstance(fault, TimeoutError) else type(fault).__name__
+        return self._stopped or (str(fault) or silent if fault else "")
 
     def _put(self, session: int, item: Any) -> None:
         if session == self._opened and self._open:

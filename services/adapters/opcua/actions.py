@@ -48,6 +48,14 @@ async def handshake(
     def lost() -> bool:
         return not device.state["up"]
 
+    def known() -> bool:
+        state = device.state
+        return lost() or acknowledge in state["values"] or acknowledge in state["faults"]
+
+    await ctx.wait(known, timeout)  # a session begins without values
+    if not lost() and acknowledge not in device.state["values"]:
+        why = device.state["faults"].get(acknowledge, "the server reports no value")
+        return error("not_acknowledged", f"{acknowledge}: {why}; nothing was requested")
     if acknowledged():
         return error("already_acknowledged", f"{acknowledge} is {expect!r} before the request")
     try:

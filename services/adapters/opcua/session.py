@@ -23,6 +23,8 @@ HEARTBEAT: Final = "i=2258"
 show that the server still serves the subscription."""
 BEAT: Final = 500.0
 """Time between two of these (ms)."""
+KEPT: Final = 30_000
+"""How long the server keeps the session of a driver that was killed (ms): a small PLC has few."""
 LARGEST: Final = 40_000
 """Characters of all values together, which are published each cycle."""
 CHANGED: Final = "nodes of the server have changed"
@@ -61,8 +63,8 @@ class OpcUaSession(Driver):
         self.faults = {"session": "no session yet"}
         self._asked = self._done = 0
         self._write_fault = ""
-        self._stop_due = False
-        """Whether it was stopped while there was no session."""
+        self._stop_due, self._stop_number = False, 0
+        """Whether `on_stop` is not written yet, and the number of its write."""
         self._session = SessionThread(self._serve)
 
     def _check_keys(self) -> None:
@@ -121,6 +123,7 @@ class OpcUaSession(Driver):
                     self._done, self._write_fault = self._asked, UNKNOWN
             elif kind == "done":
                 self._done, self._write_fault = self._done + 1, item
+                self._stop_due = self._stop_due and self._done != self._stop_number
             elif kind == "bad":
                 name, text = item
                 self.faults[name] = f"{self.nodes[name]}: {text}"
@@ -147,17 +150,19 @@ class OpcUaSession(Driver):
         }
 
     def stop(self, now: float) -> None:
-        """Write `on_stop`; without a session, as soon as there is one."""
-        self._stop_due = "session" in self.faults
-        if self.on_stop and not self._stop_due:
+        """Write `on_stop`; without a session, or if it ends before, in the next one."""
+        self._stop_due = bool(self.on_stop)
+        if self._stop_due and "session" not in self.faults:
             self._write(dict(self.on_stop))
+            self._stop_number = self._asked
 
     def stopped(self) -> bool:
-        """Whether there is a session and the server reports the values of `on_stop`."""
+        """Whether there is a session, the server has all that was written, and it reports the
+        values of `on_stop`."""
         rest = self.dry_run or all(
             self.values.get(name) == value for name, value in self.on_stop.items()
         )
-        return rest and "session" not in self.faults
+        return rest and self._done == self._asked and "session" not in self.faults
 
     def close(self) -> None:
         self._session.close(self.patience)
@@ -166,7 +171,7 @@ class OpcUaSession(Driver):
 
     async def _serve(self, session: SessionThread) -> None:
         """One session."""
-        from asyncua import Client, ua
+        from asyncua import Client
         from asyncua.crypto import security_policies
         from asyncua.crypto.uacrypto import CertProperties
 
@@ -178,39 +183,61 @@ class OpcUaSession(Driver):
             )
             policy = security_policies.SecurityPolicyBasic256Sha256
             await client.set_security(policy, mine, secret, server_certificate=server)
+        client.session_timeout = KEPT
         async with client:
-            nodes: dict[str, tuple[Any, Any]] = {}
-            faults: dict[str, str] = {}
-            heard = _Notifications(session, LARGEST // max(1, len(self.nodes)))
-            subscription = await client.create_subscription(1000 * self.interval, heard)
-            heartbeat = client.get_node(HEARTBEAT)
-            await subscription.subscribe_data_change(heartbeat, sampling_interval=BEAT)
-            for name, text in self.nodes.items():
-                try:
-                    node = client.get_node(text)
-                    kind = await node.read_data_type_as_variant_type()
-                    heard.names[node.nodeid] = name
-                    await subscription.subscribe_data_change(node)
-                    nodes[name] = node, kind
-                except (ua.UaError, ValueError) as fault:
-                    faults[name] = f"{text}: {fault}"
-            session.opened(faults)
-            while True:
-                try:
-                    values = await session.get(LOOK)
-                except TimeoutError:
-                    await client.check_connection()
-                    if heard.silent() > self.patience + BEAT / 1000:
-                        raise ConnectionError(
-                            "the server no longer serves the subscription"
-                        ) from None
-                    continue
-                if values is None:
-                    return
+            try:
+                await self._serve_session(client, session)
+            except (TimeoutError, ConnectionError):
+                # A frozen server would not answer the goodbye either. asyncua may already take
+                # itself for disconnected, and then leaves this socket open.
+                if protocol := client.uaclient.protocol:
+                    protocol.disconnect_socket()
+                raise
+
+    async def _serve_session(self, client: Any, session: SessionThread) -> None:
+        """Subscribe to the nodes; write what is sent until the session shall end."""
+        from asyncua import ua
+
+        nodes: dict[str, tuple[Any, Any]] = {}
+        faults: dict[str, str] = {}
+        heard = _Notifications(session, LARGEST // max(1, len(self.nodes)))
+        subscription = await client.create_subscription(1000 * self.interval, heard)
+        heartbeat = client.get_node(HEARTBEAT)
+        await subscription.subscribe_data_change(heartbeat, sampling_interval=BEAT)
+        for name, text in self.nodes.items():
+            try:
+                node = await _node(client, text)
+                kind = await node.read_data_type_as_variant_type()
+                heard.names[node.nodeid] = name
+                await subscription.subscribe_data_change(node)
+                nodes[name] = node, kind
+            except (ua.UaError, ValueError) as fault:
+                faults[name] = f"{text}: {fault}"
+        session.opened(faults)
+        while True:
+            try:
+                values = await session.get(LOOK)
+            except TimeoutError:
+                values = {}
+            if values is None:
+                return
+            if values:
                 wrong = await _written(values, nodes, faults)
                 session.tell("done", wrong)
                 if wrong.endswith(CHANGED):
                     raise ConnectionError(CHANGED)  # so that types are read and values sent again
+            await client.check_connection()
+            if heard.silent() > self.patience + BEAT / 1000:
+                raise ConnectionError("the server no longer serves the subscription")
+
+
+async def _node(client: Any, text: str) -> Any:
+    """Return a node. The index of a namespace may change when the server restarts; its name,
+    `nsu=NAME`, does not. Raises ValueError for an unknown one."""
+    space, _, identifier = text.partition(";")
+    if space.startswith("nsu="):
+        text = f"ns={await client.get_namespace_index(space[4:])};{identifier}"
+    return client.get_node(text)
 
 
 class _Notifications:
@@ -257,8 +284,12 @@ async def _written(
         if name not in nodes:
             return f"{name}: {faults[name]}"
         node, kind = nodes[name]
-        wanted[name] = node, ua.Variant(value, kind)
+        items = value if isinstance(value, list) else [value]
         try:
+            # As a Boolean, any text would be encoded as True.
+            if kind is ua.VariantType.Boolean and any(item not in (False, True) for item in items):
+                raise ValueError(value)
+            wanted[name] = node, ua.Variant(value, kind)
             variant_to_binary(wanted[name][1])  # one that cannot be encoded would end the session
         except Exception:
             text = f"{name}: expected {kind.name}, found {value!r:.40}"
@@ -283,7 +314,10 @@ async def _changed(node: Any, kind: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as a driver's state may have it: dates, identifiers and structures as text."""
+    """Return a value as a driver's state may have it: dates, identifiers and structures as text.
+    In text that the server has not sent as UTF-8, other bytes become question marks."""
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    return value if isinstance(value, bool | int | float | str | bytes) else str(value)
+    if isinstance(value, bool | int | float | bytes):
+        return value
+    return str(value).encode(errors="replace").decode()

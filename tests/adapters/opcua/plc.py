@@ -80,11 +80,13 @@ async def serve(port: str, *security: str) -> None:
         nodes[name] = node
     async with server:
         print("ready", flush=True)
+        served = False
         while True:
             manner, request = await nodes["manner"].get_value(), await nodes["request"].get_value()
             if manner == "good" or (manner in ("stuck", "blind") and request):
                 await nodes["done"].write_value(bool(request))
-            elif manner == "blind":
+                served = bool(request)
+            elif manner == "blind" and served:
                 await trouble(server, nodes, manner)
             if manner in ("retyped", "gone", "forgotten", "bad"):
                 await nodes["manner"].write_value("good")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import ipaddress
+import signal
 import subprocess
 import sys
 import time
@@ -24,6 +25,8 @@ from tests.waiting import Limit
 PLC = Path(__file__).with_name("plc.py")
 NAMES = ("request", "done", "sensor", "count", "speed", "manner")
 NODES = {name: f"ns=2;s=Cell.{name}" for name in NAMES}
+LATIN = {"errors": "surrogateescape"}
+"""How asyncua decodes text that is not UTF-8."""
 ASK: dict[str, Any] = {"request": "request", "acknowledge": "done"}
 
 
@@ -126,6 +129,8 @@ def test_values_writes_events_and_a_restart(cell: Cell) -> None:
     # a value that does not fit its node is refused by name and type; the session continues
     assert "count: expected Int16" in done(driver, {"count": 70000})
     assert "count: expected Int16" in done(driver, {"count": "seven"})
+    assert "count: expected Int16" in done(driver, {"count": None})
+    assert "sensor: expected Boolean" in done(driver, {"sensor": "false"})  # not True
     assert done(driver, {"sensor": False}) == "" and done(driver, {"sensor": True}) == ""
     limit = Limit("two events")
     while len(cell.desk.events) < 2 and limit.left():
@@ -161,13 +166,19 @@ def test_a_handshake_and_its_errors(cell: Cell) -> None:
     assert played(cancel_after=0.3) == ("error", "cancelled")
     request_is(False)
     assert done(driver, {"manner": "blind"}) == ""
-    await_(driver, lambda state: "done" in state["faults"], "the bad status")
     assert played(timeout=0.5) == ("error", "not_withdrawn")  # nobody knows whether it has ended
+    number = driver.state()["asked"]
+    assert played(timeout=0.5) == ("error", "not_acknowledged")  # nor whether it would be new
+    assert driver.state()["asked"] == number
     assert done(driver, {"manner": "good"}) == ""
     await_(driver, complete, "all values")
     assert done(driver, {"manner": "stuck"}) == ""
     assert played(timeout=0.5) == ("error", "not_withdrawn")
     assert played() == ("error", "already_acknowledged")
+    late = cell.driver(interval=0.5)  # the values come some time after the session
+    await_(late, lambda state: state["up"], "a session")
+    found = rehearse(handshake, device=late, world=pace, limit=20.0, **ASK)
+    assert found.result.cause == "already_acknowledged" and late.state()["asked"] == 0
     assert done(driver, {"request": True}) == ""
     request_is(True)
     assert not driver.stopped()
@@ -196,6 +207,28 @@ def test_a_stop_without_a_session_is_made_up_for(cell: Cell) -> None:
 
 
 @pytest.mark.processes
+def test_a_stop_that_a_frozen_server_has_not_taken_is_repeated(cell: Cell) -> None:
+    cell.power(True)
+    assert cell.plc is not None
+    driver = cell.driver(on_stop={"request": False, "count": 7}, patience=1.0)
+    await_(driver, complete, "all values")
+    assert done(driver, {"count": 7}) == "" and await_(
+        driver, lambda state: state["values"]["count"] == 7, "the value"
+    )
+    assert driver.stopped()
+    cell.plc.send_signal(signal.SIGSTOP)
+    driver.command(0.0, {"write": {"request": True}})
+    driver.stop(0.0)
+    assert not driver.stopped()  # the server still has to take both writes
+    state = await_(driver, lambda state: not state["up"], "the loss")
+    assert "it does not answer" in state["faults"]["session"]
+    assert "unknown whether" in state["write_fault"] and not driver.stopped()
+    cell.power(True)
+    await_(driver, lambda state: state["values"].get("count") == 7, "count = 7")
+    assert driver.stopped()
+
+
+@pytest.mark.processes
 def test_it_keeps_the_rules_of_drivers(cell: Cell) -> None:
     cell.power(True)
     found = check_driver(cell.driver, cable=cell.power, within=30.0, seconds=30.0)
@@ -215,6 +248,9 @@ def test_values_of_any_type_are_plain(cell: Cell) -> None:
     driver.step(0.0)
     told = plain(driver.state())["values"]["count"]
     assert told == ["2026-11-23 00:00:00", ["2026-11-24 00:00:00"], 3]
+    heard.datachange_notification(SimpleNamespace(nodeid="node"), b"F\xfcll".decode(**LATIN), data)
+    driver.step(0.0)
+    assert plain(driver.state())["values"]["count"] == "F?ll"
     heard.datachange_notification(SimpleNamespace(nodeid="node"), None, data)
     driver.step(0.0)
     assert "no value" in driver.state()["faults"]["count"] and not driver.state()["values"]
@@ -238,11 +274,14 @@ def test_in_a_dry_run_nothing_is_written(cell: Cell) -> None:
 @pytest.mark.processes
 def test_a_wrong_node_is_named_and_the_others_work(cell: Cell) -> None:
     cell.power(True)
-    wrong = {"lost": "ns=2;s=Cell.lost", "odd": "Cell.odd"}
-    driver = cell.driver(nodes={**NODES, **wrong})
+    wrong = {"lost": "ns=2;s=Cell.lost", "odd": "Cell.odd", "far": "nsu=urn:far;s=Cell.count"}
+    driver = cell.driver(nodes={**NODES, "count": "nsu=urn:test;s=Cell.count", **wrong})
     state = await_(driver, complete, "all values")
-    assert set(state["faults"]) == {"lost", "odd"} and "ns=2;s=Cell.lost" in state["faults"]["lost"]
+    assert set(state["faults"]) == set(wrong) and "ns=2;s=Cell.lost" in state["faults"]["lost"]
     assert done(driver, {"count": 3}) == "" and "lost: " in done(driver, {"lost": 1})
+    ask = {**ASK, "acknowledge": "lost"}
+    result = rehearse(handshake, device=driver, world=pace, **ask).result
+    assert result.cause == "not_acknowledged" and "nothing was requested" in result.text
     result = rehearse(write, device=driver, world=pace, values={"count": 1.5}).result
     assert (result.status, result.cause) == ("error", "write_failed")
 
@@ -354,7 +393,13 @@ def test_what_comes_after_a_lost_subscription_is_new(cell: Cell) -> None:
     driver = cell.driver(patience=2.0)
     await_(driver, complete, "all values")
     driver.command(0.0, {"write": {"manner": "forgotten"}})
-    state = await_(driver, lambda state: not state["up"], "the loss")
+
+    def lost(state: Any) -> bool:
+        if state["up"] and state["done"] == state["asked"]:  # writes do not hide the loss
+            driver.command(0.0, {"write": {"sensor": True}})
+        return not state["up"]
+
+    state = await_(driver, lost, "the loss")
     assert "no longer serves the subscription" in state["faults"]["session"]
     assert state["values"] == {}
     await_(driver, complete, "all values")
