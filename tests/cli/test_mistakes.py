@@ -576,6 +576,18 @@ IN_THE_CODE: list[Mistake] = [
     ),
     (
         CODE,
+        "    return success()",
+        "    return True",
+        r"arm_bot.py:\d+: `return True` is not a result; write `return success\(\)`",
+    ),
+    (
+        CODE,
+        "    return success()",
+        "    return success",
+        r"arm_bot.py:\d+: `return success` is not a result; write `return success\(\)`",
+    ),
+    (
+        CODE,
         "return success()",
         "return success(True)",
         r"arm_bot.py:\d+: `success\(True\)`: too many positional .*; write `success\(name=value\)`",
@@ -616,7 +628,25 @@ READY = '[services.ready]\nnode = "pc"\nrun = "arm_bot:ready"\n\n'
 ALONE = "def ready(ctx: Context, *, seed: int) -> Result:\n    return success()\n\n\n"
 COMMANDED = '    await ctx.command({"to": to})\n'
 
+MEMORY = (CELL, "[actions]", '[services]\nmemory = { node = "pc" }\n\n[actions]', "")
+LAMP = (CELL, "[actions]", '[streams]\nlamp = { to = "axis", period = 0.1 }\n\n[actions]', "")
+
 BOTH: list[tuple[list[Mistake], str]] = [
+    *(
+        (
+            [MEMORY, (CODE, "    return success()", f"    {one}", "")],
+            r"arm_bot.py:\d+: `ctx.get` does nothing without `await`; write `await ctx.get",
+        )
+        for one in (
+            'return success(parts=ctx.get("parts", 0))',
+            'return success(parts=ctx.get("parts", 0) + 1)',
+            'await ctx.put("parts", ctx.get("parts", 0))\n    return success()',
+        )
+    ),
+    (
+        [LAMP, (CODE, "await ctx.sleep(0.3)", 'ctx.publish("lamp", {"on": 1.0})', "")],
+        r"`ctx.publish\('lamp', {'on': 1.0}\)`: .* write `ctx.publish\('lamp', \[...\]\)`",
+    ),
     (
         [
             (TASK, '"action", tries', '"action", out = { width = "w" }, tries', ""),

@@ -422,7 +422,9 @@ class Play:
         verdicts = np.array(
             [self._judge(tuple(self._tokens[:, i].tolist())) for i in first], np.int64
         )
-        busy = (self._phase[self._awaited] == GOING).any(axis=0)
+        phase, want = self._phase[self._awaited], self._want[self._awaited]
+        # an ended one whose measured transition is not enabled goes another way first: `_free`
+        busy = ((phase == GOING) | ((phase == DONE) & (want >= 0))).any(axis=0)
         return np.where(busy, 0, verdicts[inverse.ravel()])
 
     def _keys(self) -> Codes:
