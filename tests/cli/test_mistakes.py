@@ -794,7 +794,7 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
     (
         [(CODE, 'ctx.command({"to": to})', "ctx.device.go(to)", "")],
         1,
-        r"'go' in move \(arm_bot.py:\d+\); its driver runs in another process: .*ctx.command",
+        r"'go' in move \(arm_bot.py:\d+\); its driver runs in another process: .*command.*state",
     ),
     (
         [

@@ -240,7 +240,7 @@ b_lost: b:error -> end
         Trial(1, 0.0, runs=[entry("a", 4.0, taken="done")], waits=[Waited("rung", wait)])
         for wait in (1.0, 3.0)
     ]
-    played = play(text, trials, task='final = "end == 1"')
+    played = play(text, trials, keys='final = "end == 1"')
     assert set(played.time.tolist()) == {5.0, 2.0}
     assert np.mean(played.time == 2.0) == pytest.approx(0.5, abs=0.05)
 
