@@ -632,6 +632,20 @@ MEMORY = (CELL, "[actions]", '[services]\nmemory = { node = "pc" }\n\n[actions]'
 LAMP = (CELL, "[actions]", '[streams]\nlamp = { to = "axis", period = 0.1 }\n\n[actions]', "")
 
 BOTH: list[tuple[list[Mistake], str]] = [
+    (
+        [
+            (TASK, '"parts == 0"', '"part == 0"', ""),
+            (CELL, "top_speed", "topspeed", ""),
+        ],
+        r"arm_bot.toml:\d+: task.final: .*\nservices.toml:\d+: devices.axis.topspeed: unknown key",
+    ),
+    (
+        [
+            (CELL, "port = 7501", "prt = 7501", ""),
+            (CELL, "axis = {", "move = {", ""),
+        ],
+        r"services.toml:\d+: nodes.pc.prt: .*\nservices.toml:\d+: actions.move: the name is taken",
+    ),
     *(
         (
             [MEMORY, (CODE, "    return success()", f"    {one}", "")],

@@ -255,7 +255,7 @@ def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
         )
     if not faults.lines:
         _check_places(tables, faults, memory)
-        _check_names(tables, faults)
+    _check_names(tables, faults)
     return tables, _digest(data), faults.lines
 
 
