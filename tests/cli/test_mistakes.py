@@ -874,7 +874,7 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
 """Mistakes that only a run shows, its exit code, and what its end says."""
 
 ON_THE_LINE: list[tuple[list[str], str]] = [
-    (["run", "arm_bt.toml"], r"arm_bt.toml: file: cannot be read: No such file"),
+    (["run", "arm_bt.toml"], r"arm_bt.toml: file: cannot be read: No .*mean 'arm_bot.toml'"),
     (["check", "services.toml"], r"file: this is a location file, not a task; name the task"),
     (["log", "last"], r"no run 'last'; /.*/arm_bot/runs holds no run; change to the folder where"),
     (
