@@ -142,11 +142,16 @@ class _Code:
 
     @cached_property
     def awaited(self) -> set[ast.AST]:
-        """Calls that are awaited, or passed on to code that may await them."""
+        """Calls that are awaited, or passed on to code that may await them: not operands, and not
+        what a result or the context receives as a value."""
         waits = {n.id for a in self.nodes if isinstance(a, ast.Await) for n in ast.walk(a.value)
                  if isinstance(n, ast.Name)}  # fmt: skip
-        found: set[ast.AST] = set()
+        found, values = set[ast.AST](), set[ast.AST]()
         for node in self.nodes:
+            if isinstance(node, ast.BinOp | ast.Compare | ast.UnaryOp):
+                values |= {*ast.iter_child_nodes(node)}
+            elif isinstance(node, ast.Call) and self._takes_values(node):
+                values |= {*node.args, *(k.value for k in node.keywords)}
             if isinstance(node, ast.Await | ast.Return | ast.Yield):
                 found |= set(ast.walk(node))
             elif isinstance(node, ast.Lambda):
@@ -165,7 +170,13 @@ class _Code:
                 isinstance(t, ast.Name) and t.id in waits for t in node.targets
             ):
                 found.add(node.value)
-        return found
+        return found - values
+
+    def _takes_values(self, node: ast.Call) -> bool:
+        """Whether a call makes a result, or is one of the context that takes plain data."""
+        owner, _, name = ast.unparse(node.func).rpartition(".")
+        made = self.value(node.func)
+        return any(made is one for one in MADE) or (owner in CONTEXT and name != "wait")
 
     @cached_property
     def kept(self) -> set[ast.AST]:
@@ -490,11 +501,21 @@ def _method(code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen) -
             seen.any_event = True
         if isinstance(first, str):
             if name in ("publish", "withdraw", "stream"):
+                _set_points(code, node, seen)
                 seen.streams.setdefault(first, (code.file, node.lineno))
             elif name == "raise_event":
                 seen.events.setdefault(first, (code.file, node.lineno))
             elif name == "call" and not ports:
                 seen.calls.setdefault(first, (code.file, node.lineno))
+
+
+def _set_points(code: _Code, node: ast.Call, seen: _Seen) -> None:
+    """Record set points that are certainly not a list."""
+    given = [*node.args[1:2], *(k.value for k in node.keywords if k.arg == "values")]
+    if any(_kind(code, value) not in ("", "list") for value in given):
+        call = f"{ast.unparse(node.func)}({ast.unparse(node.args[0])}"
+        text = f"`{ast.unparse(node)}`: set points are a list of numbers; write `{call}, [...])`"
+        seen.faults.append((code.file, node.lineno, text))
 
 
 def _remembers(code: _Code, node: ast.Call, name: str, first: Any, seen: _Seen) -> None:
@@ -609,6 +630,10 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
     if own is not None and _falls_off(last := own.tree.body[-1]):  # type: ignore[attr-defined]
         text = f"{thing.__name__} returns no result here; end it with `return success()`"
         seen.faults.append((own.file, last.end_lineno, text))
+    for value in _returned(own.tree) if own is not None else ():
+        if isinstance(value, ast.Constant) or any(own.value(value) is one for one in MADE):
+            text = f"`return {ast.unparse(value)}` is not a result; write `return success()`"
+            seen.faults.append((own.file, value.lineno, text))
     first = parameters[0] if parameters else None
     if first is None or first.kind is first.KEYWORD_ONLY or hints.get(first.name) in _KINDS:
         source = inspect.unwrap(thing).__code__
@@ -622,6 +647,15 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
         "wants": _wanted(hints.get(first.name) if first else None),
         **_plain(seen),
     }
+
+
+def _returned(function: ast.AST) -> Iterator[ast.expr]:
+    """Return what a function returns, without the functions inside it."""
+    for node in ast.iter_child_nodes(function):
+        if isinstance(node, ast.Return) and node.value is not None:
+            yield node.value
+        elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            yield from _returned(node)
 
 
 def _falls_off(last: ast.stmt) -> bool:

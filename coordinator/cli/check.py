@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Check the task. Return 0 if it may run, 2 if it may not, 3 if only a node that it needs is
     missing."""
-    task = load_task(options.task)
+    task = _task_of(options)
     services = find_cell(options.services, options.task, task)
     if options.live:
         services = cell_path(services, options.task, task)
@@ -92,6 +92,36 @@ def run(options: argparse.Namespace) -> int:
     )
 
 
+def _task_of(options: argparse.Namespace) -> Task:
+    """Read the task. Of a faulty one, tell the faults of its location file, too: both files can
+    then be corrected together."""
+    try:
+        return load_task(options.task)
+    except CommandError as fault:
+        written = task_path(options.task)
+        services = options.services or written.parent / "services.toml"
+        try:
+            if written.is_file() and services.is_file():
+                _cell_with_code(services)
+        except CommandError as more:
+            raise CommandError(fault.code, f"{fault}\n{more}") from fault
+        raise
+
+
+def _cell_with_code(services: Path) -> tuple[Directory, Mapping[str, Mapping[str, Any]]]:
+    """Return a location file, and what is known of the code that it names. Raises CommandError for
+    their faults."""
+    from petrobot.services.comm.location_file import read_text
+    from petrobot.services.comm.location_file.code import code_faults, read_code
+
+    directory = load_directory(services)
+    refuse_misplaced(directory)
+    code = read_code(directory)
+    if faults := code_faults(directory, code, read_text(directory.source)):
+        raise CommandError(2, "\n".join(faults))
+    return directory, code
+
+
 def _checked(task: Task, services: Path | None) -> tuple[MayRun, CheckReport]:
     """Return the judgement of the task in the cell of a location file, and its findings with a
     note about that file."""
@@ -101,25 +131,22 @@ def _checked(task: Task, services: Path | None) -> tuple[MayRun, CheckReport]:
         judged = may_run(task, None, BUDGET)
         said = f"{MISSING_CELL}: whether nodes offer the actions was not checked"
         return judged, _noted(judged.report, said)
-    directory = load_directory(services)
-    refuse_misplaced(directory)
+    directory, code = _cell_with_code(services)
     judged = may_run(task, cell_of(directory), BUDGET)
-    return judged, _with_code(task, directory, judged)
+    return judged, _with_code(task, directory, code, judged)
 
 
-def _with_code(task: Task, directory: Directory, judged: MayRun) -> CheckReport:
-    """Add findings about the code that the location file names. Raises CommandError for errors in
-    that file."""
+def _with_code(
+    task: Task, directory: Directory, code: Mapping[str, Mapping[str, Any]], judged: MayRun
+) -> CheckReport:
+    """Add findings about the code that the location file names."""
     from petrobot.coordinator.task.check import CheckReport, Finding, Severity, in_file
     from petrobot.coordinator.task.check.code import code_findings, given_findings, occupied
     from petrobot.coordinator.task.check.completeness import EXTERNAL_WAIT, external_waits
     from petrobot.coordinator.task.file.errors import key_lines, line_of
     from petrobot.services.comm.location_file import read_text
-    from petrobot.services.comm.location_file.code import SLOW, code_faults, read_code
+    from petrobot.services.comm.location_file.code import SLOW
 
-    code = read_code(directory)
-    if faults := code_faults(directory, code, read_text(directory.source)):
-        raise CommandError(2, "\n".join(faults))
     actions = directory.actions.values()
     by_action = {
         action.name: {**code[action.run], "device": code.get(_driver(directory, action.device), {})}

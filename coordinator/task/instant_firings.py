@@ -20,16 +20,25 @@ def endless(task: Task) -> set[str]:
     are none, every such sequence ends.
 
     Of the transitions that wait for nothing, those are dropped again and again that drain a place
-    which no other of them fills: they can fire only finitely often. The others may fire for
-    ever.
+    which no other of them fills, or that fill a place which inhibits them and which no other of
+    them drains: they can fire only finitely often. The others may fire for ever.
     """
     net = task.net
     changes = dict(zip(net.transitions, net.compiled.changes, strict=True))
+    barred = {
+        t: {p for p, _ in inhibitors}
+        for t, inhibitors in zip(net.transitions, net.inhibit, strict=True)
+    }
     loose = {t.name for t in task.transitions.values() if is_timeless(t)}
     while True:
         filled = {p for t in loose for p, change in changes[t] if change > 0}
+        drained = {p for t in loose for p, change in changes[t] if change < 0}
         finite = {
-            t for t in loose if any(change < 0 and p not in filled for p, change in changes[t])
+            t
+            for t in loose
+            for p, change in changes[t]
+            if (change < 0 and p not in filled)
+            or (change > 0 and p in barred[t] and p not in drained)
         }
         if not finite:
             return loose

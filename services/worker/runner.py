@@ -527,7 +527,8 @@ class Runner:
             return ""
         owner = vars(AttributeError)["obj"].__get__(fault)  # not what a subclass calls `obj`
         if owner is not None and owner is self._refusing:
-            return "; its driver runs in another process: write `await ctx.command({...})`"
+            remedy = "write `await ctx.command({...})`, or read `ctx.device.state`"
+            return f"; its driver runs in another process: {remedy}"
         return ""
 
     def _returned(self, now: float, run: Execution, returned: Any) -> None:

@@ -854,6 +854,24 @@ def test_a_loop_that_never_ends_is_not_sound() -> None:
     )
 
 
+def test_a_watching_run_that_keeps_the_task_from_its_end_is_named() -> None:
+    """As a watcher of a button does whose place does not say `listen`."""
+    net = {
+        "begin": {"in": "go", "out": "act"},
+        "good": {"in": "act:normal", "out": "done"},
+        "bad": {"in": "act:error", "out": "done"},
+        "again": {"in": "watch:normal", "out": "watch"},
+        "anew": {"in": "watch:error", "out": "watch"},
+    }
+    task = make_task("go=1 act! watch!=1 done", net, final="done == 1")
+    assert judged(task).sound.details[0] == (
+        "the task would end, but waits for the run in watch; if it may be cancelled then, write "
+        "listen = true there"
+    )
+    places = {**task.places, "watch": replace(task.places["watch"], listen=True)}
+    assert judged(replace(task, places=places)).sound.holds
+
+
 @pytest.mark.parametrize("readings", range(12))
 def test_what_is_not_judged_in_time_is_unknown(readings: int) -> None:
     """The time is used up at some reading of the clock, also in the middle of a verdict."""

@@ -576,6 +576,18 @@ IN_THE_CODE: list[Mistake] = [
     ),
     (
         CODE,
+        "    return success()",
+        "    return True",
+        r"arm_bot.py:\d+: `return True` is not a result; write `return success\(\)`",
+    ),
+    (
+        CODE,
+        "    return success()",
+        "    return success",
+        r"arm_bot.py:\d+: `return success` is not a result; write `return success\(\)`",
+    ),
+    (
+        CODE,
         "return success()",
         "return success(True)",
         r"arm_bot.py:\d+: `success\(True\)`: too many positional .*; write `success\(name=value\)`",
@@ -616,7 +628,39 @@ READY = '[services.ready]\nnode = "pc"\nrun = "arm_bot:ready"\n\n'
 ALONE = "def ready(ctx: Context, *, seed: int) -> Result:\n    return success()\n\n\n"
 COMMANDED = '    await ctx.command({"to": to})\n'
 
+MEMORY = (CELL, "[actions]", '[services]\nmemory = { node = "pc" }\n\n[actions]', "")
+LAMP = (CELL, "[actions]", '[streams]\nlamp = { to = "axis", period = 0.1 }\n\n[actions]', "")
+
 BOTH: list[tuple[list[Mistake], str]] = [
+    (
+        [
+            (TASK, '"parts == 0"', '"part == 0"', ""),
+            (CELL, "top_speed", "topspeed", ""),
+        ],
+        r"arm_bot.toml:\d+: task.final: .*\nservices.toml:\d+: devices.axis.topspeed: unknown key",
+    ),
+    (
+        [
+            (CELL, "port = 7501", "prt = 7501", ""),
+            (CELL, "axis = {", "move = {", ""),
+        ],
+        r"services.toml:\d+: nodes.pc.prt: .*\nservices.toml:\d+: actions.move: the name is taken",
+    ),
+    *(
+        (
+            [MEMORY, (CODE, "    return success()", f"    {one}", "")],
+            r"arm_bot.py:\d+: `ctx.get` does nothing without `await`; write `await ctx.get",
+        )
+        for one in (
+            'return success(parts=ctx.get("parts", 0))',
+            'return success(parts=ctx.get("parts", 0) + 1)',
+            'await ctx.put("parts", ctx.get("parts", 0))\n    return success()',
+        )
+    ),
+    (
+        [LAMP, (CODE, "await ctx.sleep(0.3)", 'ctx.publish("lamp", {"on": 1.0})', "")],
+        r"`ctx.publish\('lamp', {'on': 1.0}\)`: .* write `ctx.publish\('lamp', \[...\]\)`",
+    ),
     (
         [
             (TASK, '"action", tries', '"action", out = { width = "w" }, tries', ""),
@@ -764,7 +808,7 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
     (
         [(CODE, 'ctx.command({"to": to})', "ctx.device.go(to)", "")],
         1,
-        r"'go' in move \(arm_bot.py:\d+\); its driver runs in another process: .*ctx.command",
+        r"'go' in move \(arm_bot.py:\d+\); its driver runs in another process: .*command.*state",
     ),
     (
         [
@@ -830,7 +874,7 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
 """Mistakes that only a run shows, its exit code, and what its end says."""
 
 ON_THE_LINE: list[tuple[list[str], str]] = [
-    (["run", "arm_bt.toml"], r"arm_bt.toml: file: cannot be read: No such file"),
+    (["run", "arm_bt.toml"], r"arm_bt.toml: file: cannot be read: No .*mean 'arm_bot.toml'"),
     (["check", "services.toml"], r"file: this is a location file, not a task; name the task"),
     (["log", "last"], r"no run 'last'; /.*/arm_bot/runs holds no run; change to the folder where"),
     (

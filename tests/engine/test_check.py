@@ -134,6 +134,12 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
             lambda t: t("x=1 y", {"t": {"in": "x", "out": "y"}, "u": {"in": "y", "out": "x"}}),
         ),
         ("timeless-cycle", E, "transitions.t", lambda t: t("y", {"t": {"out": "y"}})),
+        (
+            "timeless-cycle",
+            E,
+            "transitions.t",
+            lambda t: t("y", {"t": {"in": "!y", "out": "y"}, "u": {"in": "y"}}),
+        ),
         ("external-wait", W, "places.x", lambda t: t("x=1", {"t": {"in": "x", "event": "e"}}, "e")),
         (
             "external-wait",
@@ -301,9 +307,19 @@ def test_invariant_that_excludes_two_transitions(
     assert any(t.startswith("t and u") for t in pairs), "the operator may add the second one"
 
 
-def test_counting_loop_is_no_timeless_cycle(task: Tasks) -> None:
-    net = {"t": {"in": "x k", "out": "x"}, "u": {"in": "x !k", "out": "y"}}
-    assert "timeless-cycle" not in found(task("x=1 k=3 y", net))
+@pytest.mark.parametrize(
+    ("places", "net"),
+    [
+        ("x=1 k=3 y", {"t": {"in": "x k", "out": "x"}, "u": {"in": "x !k", "out": "y"}}),
+        ("y", {"t": {"in": "!y*2", "out": "y"}}),
+        # the run that it starts inhibits it
+        ("a! x", {"t": {"in": "!x !a", "out": "a"}, "u": {"in": "a:normal", "out": "x"}}),
+    ],
+)
+def test_a_loop_that_counts_or_bars_itself_is_no_timeless_cycle(
+    places: str, net: dict[str, Any], task: Tasks
+) -> None:
+    assert "timeless-cycle" not in found(task(places, net))
 
 
 def test_places_that_wait_together_are_one_finding(task: Tasks) -> None:

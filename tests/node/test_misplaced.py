@@ -230,6 +230,21 @@ def test_names_that_only_running_the_module_defines_are_accepted(
         )
 
 
+def test_a_module_that_another_of_its_name_hides_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.path", [*sys.path, str(tmp_path)])
+    (tmp_path / "twin_lab").mkdir()
+    (tmp_path / "twin_lab" / "__init__.py").touch()
+    own = tmp_path / "twin_lab.py"
+    own.write_text("def look(ctx): ...\n")
+    text = SHIPPED.read_text(encoding="utf-8")
+    run = text.replace("petrobot.services.vision.actions:locate_background", "twin_lab:look", 1)
+    (line,) = misplaced(parse(run, SHIPPED))
+    assert "'twin_lab' has no 'look'" in line
+    assert line.endswith(f"__init__.py hides {own}: give yours another name")
+
+
 def test_a_file_in_another_code_is_refused_with_its_line(tmp_path: Path) -> None:
     """A byte-order mark is accepted; Latin-1 is refused."""
     path = tmp_path / "services.toml"

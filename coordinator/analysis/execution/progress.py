@@ -60,6 +60,7 @@ from petrobot.coordinator.engine import (
     RemoveTokens,
     State,
 )
+from petrobot.coordinator.engine.step import at_end
 from petrobot.coordinator.task import Kind, Value
 from petrobot.coordinator.task.compiled import Arcs
 from petrobot.coordinator.task.compiled_task import CompiledTransition
@@ -306,7 +307,20 @@ class Progress:
             fired = {name for n in np.unique(x.label[leaves]) for name in x.steps[n].firings}
             ways = sorted(self._stops & fired)
             goes_on += f"; only {few(ways) if ways else 'a further error'} ends it"
-        return self._no(reason, first, (*why.details, goes_on))
+        return self._no(reason, first, (*self._awaited(inside), *why.details, goes_on))
+
+    def _awaited(self, states: Mask) -> tuple[str, ...]:
+        """Return for which runs the task waits where an end holds in one of these states."""
+        x, known = self.x, self.x.engine.compiled
+        for i in np.flatnonzero(states)[:EXAMINED].tolist():
+            state = x.states[i]
+            if at_end(known, state.marking) is not None:
+                waits = {r.place for r in state.runs() if r.phase is not Phase.DONE}
+                waits = {place for place in waits if not known.task.places[place].listen}
+                if waits:
+                    text = f"the task would end, but waits for the run in {few(sorted(waits))}"
+                    return (f"{text}; if it may be cancelled then, write listen = true there",)
+        return ()
 
     @cached_property
     def _stops(self) -> frozenset[str]:

@@ -4,7 +4,6 @@ action."""
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -136,8 +135,13 @@ class Summary:
     options: Mapping[str, Any] = field(default_factory=dict)
     """Options of the campaign's plan: target reliability and rho, if they were given."""
     mission_s: dict[int, float] = field(default_factory=dict)
-    seen: dict[int, tuple[str, int, list[int]]] = field(default_factory=dict)
-    """By block: its regime, its seed, and a digest of what happened in each of its trials."""
+    seen: dict[int, tuple[str, int, int]] = field(default_factory=dict)
+    """By block: its regime, its seed, and a digest of what happened in it so far."""
+    after: dict[int, Any] = field(default_factory=dict)
+    """What happened after a digest, while nothing else has happened after it."""
+    drawn: set[str] = field(default_factory=set)
+    """Regimes in which something draws from the seed: after the same runs, different things
+    happened."""
 
     @classmethod
     def of(
@@ -168,30 +172,25 @@ class Summary:
 
     def _see(self, row: TrialRow) -> None:
         """Keep what the seed of a block may change: which runs there were, how they ended, when,
-        and with which values."""
-        runs = () if row.trial is None else row.trial.runs
-        told = [
-            (r.place, r.action, r.begun, r.took, r.status, r.cause, *r.values.items()) for r in runs
-        ]
-        _, _, trials = self.seen.setdefault(row.block, (row.regime, row.seed, []))
-        trials.append(hash(tuple(told)))
+        and with which values. Which action was chosen is no sign of a draw of the task."""
+        regime, seed, digest = self.seen.get(row.block, (row.regime, row.seed, hash(row.regime)))
+        for r in () if row.trial is None else row.trial.runs:
+            end = (r.took, r.status, r.cause, *r.values.items())
+            if regime not in self.drawn:
+                told = [(digest, (r.place, r.begun)), (hash((digest, r.action)), end)]
+                if any(self.after.setdefault(one, what) != what for one, what in told):
+                    self.drawn.add(regime)
+            digest = hash((digest, r.place, r.action, r.begun, end))
+        self.seen[row.block] = (regime, seed, digest)
 
     def copies(self) -> list[list[int]]:
-        """Return the seeds of blocks in one regime that are copies of each other, as they are when
-        nothing draws from the seed.
-
-        Where trials last one of a few times, blocks are equal by chance; but then other blocks have
-        the same trials, too, in another order.
-        """
-        groups: dict[tuple[str, tuple[int, ...]], set[int]] = {}
-        for regime, seed, trials in self.seen.values():
-            groups.setdefault((regime, tuple(trials)), set()).add(seed)
-        common = Counter((regime, one) for regime, trials in groups for one in set(trials))
-        return [
-            sorted(seeds)
-            for (regime, trials), seeds in groups.items()
-            if len(seeds) > 1 and any(common[regime, one] == 1 for one in trials)
-        ]
+        """Return the seeds of blocks in one regime that are copies of each other. Where something
+        draws from the seed, blocks are equal only by chance, as where it draws one of few ends."""
+        groups: dict[tuple[str, int], set[int]] = {}
+        for regime, seed, digest in self.seen.values():
+            if regime not in self.drawn:
+                groups.setdefault((regime, digest), set()).add(seed)
+        return [sorted(seeds) for seeds in groups.values() if len(seeds) > 1]
 
     def asked(self) -> dict[str, Question]:
         """Return by what the actions of each primitive task are judged."""

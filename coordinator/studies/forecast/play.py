@@ -118,6 +118,11 @@ class Play:
                 for p in structure.vocabulary.places
             ]
         )
+        self._awaited = [
+            i
+            for i, p in enumerate(structure.vocabulary.places)
+            if not structure.task.places[p].listen
+        ]
         self._device, self._turn = np.full((q, n), -1), np.zeros((q, n), np.int64)
         """By run: its device, and its number among those that wait for one; 0 if it does not."""
         self._turns = 0
@@ -411,12 +416,16 @@ class Play:
 
     def _over(self) -> Codes:
         """Return by column whether the trial ended as designed (1), was given up (-1) or is still
-        active (0)."""
+        active (0). As in the engine, a trial does not end while a run is active that does not only
+        listen."""
         _, first, inverse = np.unique(self._keys(), return_index=True, return_inverse=True)
         verdicts = np.array(
             [self._judge(tuple(self._tokens[:, i].tolist())) for i in first], np.int64
         )
-        return verdicts[inverse.ravel()]
+        phase, want = self._phase[self._awaited], self._want[self._awaited]
+        # an ended one whose measured transition is not enabled goes another way first: `_free`
+        busy = ((phase == GOING) | ((phase == DONE) & (want >= 0))).any(axis=0)
+        return np.where(busy, 0, verdicts[inverse.ravel()])
 
     def _keys(self) -> Codes:
         """One number for each column's marking: its digits in a base above every count of

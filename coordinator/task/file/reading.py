@@ -192,9 +192,9 @@ def load(path: str | Path) -> Task:
     try:
         data = path.read_bytes()
     except OSError as error:
-        fault = Fault(
-            "file", f"cannot be read: {error.strerror}", "check the path and its permissions"
-        )
+        near = nearest(path.name, [other.name for other in path.parent.glob("*.toml")])
+        remedy = f"check the path and its permissions{near}"
+        fault = Fault("file", f"cannot be read: {error.strerror}", remedy)
         raise TaskFileError(str(path), [fault], [0]) from error
     if len(data) > LARGEST:
         raise TaskFileError(

@@ -728,7 +728,8 @@ class Callee:
         """Return in words why an active run is stopped: it is over its deadline or an orphan."""
         run = self._running[id_]
         if cause == ORPHAN:
-            return f"its coordinator was away for {run.orphan_time:g} s, so its node stopped it"
+            away = f"its coordinator was away for {run.orphan_time:g} s"
+            return f"{away}, so its node stopped it (`orphan_time` in services.toml)"
         deadline = run.call.deadline
         seconds = self.offers[run.call.service].deadline if deadline is None else deadline
         return f"took longer than its deadline of {seconds:g} s"

@@ -9,6 +9,8 @@ import re
 import sys
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from importlib.machinery import PathFinder
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from petrobot.services.comm.protocol.messages import COORDINATOR
@@ -37,9 +39,13 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def nearest_in(module: str, name: str, names: Iterable[str]) -> str:
-    """Return the same hint for a name that a module does not have; Python's own module hides one of
-    the user that has its name."""
+    """Return the same hint for a name that a module does not have. A package, an installed module
+    or Python's own hides one of the user that has its name."""
     near = nearest(name, names)
+    files, spec = (Path(f, f"{module}.py") for f in sys.path), PathFinder.find_spec(module)
+    *_, own = None, *(file for file in files if file.is_file())  # the user's folder is the last
+    if own and spec and spec.origin and not own.samefile(spec.origin):
+        return f"; {spec.origin} hides {own}: give yours another name"
     if module in sys.stdlib_module_names and not near.startswith("; did"):
         return f"; {module!r} is Python's own module: give yours another name"
     return near
@@ -255,7 +261,7 @@ def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
         )
     if not faults.lines:
         _check_places(tables, faults, memory)
-        _check_names(tables, faults)
+    _check_names(tables, faults)
     return tables, _digest(data), faults.lines
 
 

@@ -9,7 +9,7 @@ import io
 import json
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from math import isfinite
 from pathlib import Path
@@ -565,26 +565,24 @@ def test_blocks_that_are_copies_are_warned_of(conduct: Conduct, tmp_path: Path) 
 
 
 def test_blocks_that_are_equal_by_chance_are_no_copies(conduct: Conduct) -> None:
-    """Trials that last 1 or 2 s make equal blocks, but each of them is found in other blocks."""
+    """Where trials that begin alike end differently, something draws from the seed. A selector that
+    takes another action is no sign of that."""
     task = conduct("names", runs=1).bench.task
     place = next(name for name, p in task.flat.places.items() if p.kind is Kind.ACTION)
     action = task.primitive_task_of(place).alternatives[0]
 
-    def copies(*blocks: tuple[float, ...]) -> list[list[int]]:
-        return Summary.of(
-            task,
-            [
-                TrialRow(
-                    1, "A", 40 + i, k, i, 9.0, Trial(k, 0.0, runs=[RunEntry(place, action, t)])
-                )
-                for i, block in enumerate(blocks)
-                for k, t in enumerate(block, 1)
-            ],
-        ).copies()
+    def copies(*blocks: tuple[float, ...], chosen: Sequence[str] = ()) -> list[list[int]]:
+        rows = []
+        for i, block in enumerate(blocks):
+            for k, t in enumerate(block, 1):
+                run = RunEntry(place, chosen[i] if chosen else action, 0.0, t)
+                rows.append(TrialRow(1, "A", 40 + i, k, i, 9.0, Trial(k, 0.0, runs=[run])))
+        return Summary.of(task, rows).copies()
 
-    assert copies((1.0, 2.0), (1.0, 2.0), (2.0, 1.0)) == []
-    assert copies((1.0, 2.0), (1.0, 2.0), (1.0, 3.0)) == [[40, 41]]
+    assert copies((1.0,), (1.0,), (2.0,)) == []
+    assert copies((1.0, 2.0), (1.0, 2.0), (1.0, 3.0)) == []
     assert copies((1.0, 2.0), (1.0, 2.0)) == [[40, 41]]
+    assert copies((1.0,), (1.0,), (2.0,), chosen=(action, action, "other")) == [[40, 41]]
 
 
 def test_the_summary_adds_up_what_the_score_counts_for_each_trial() -> None:

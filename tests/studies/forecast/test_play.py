@@ -64,9 +64,15 @@ def task_of(text: str, keys: str = GOAL) -> Task:
     return loads(with_transitions(HEAD.replace("{task}", keys) + text), "net.toml")
 
 
-def play(text: str, trials: list[Trial], n: int = 2000, task: str = GOAL) -> Played:
-    """Simulate trials of a task from measured runs."""
-    training = Training.of(task_of(text, task), trials)
+def play(
+    text: str, trials: list[Trial], n: int = 2000, keys: str = GOAL, listening: str = ""
+) -> Played:
+    """Simulate trials of a task from measured runs; a place that only listens may be named."""
+    task = task_of(text, keys)
+    if listening:
+        place = replace(task.places[listening], listen=True)
+        task = replace(task, places={**task.places, listening: place})
+    training = Training.of(task, trials)
     random = np.random.default_rng(1)
     drawer = Drawer(RunDistributions(training), training.waits, np.ones((1, len(trials))), random)
     return Play(
@@ -234,9 +240,27 @@ b_lost: b:error -> end
         Trial(1, 0.0, runs=[entry("a", 4.0, taken="done")], waits=[Waited("rung", wait)])
         for wait in (1.0, 3.0)
     ]
-    played = play(text, trials, task='final = "end == 1"')
+    played = play(text, trials, keys='final = "end == 1"')
     assert set(played.time.tolist()) == {5.0, 2.0}
     assert np.mean(played.time == 2.0) == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.parametrize(("listening", "time"), [("", 3.0), ("b", 1.0)])
+def test_a_trial_does_not_end_while_a_run_is_active_unless_it_only_listens(
+    listening: str, time: float
+) -> None:
+    """`final` holds as soon as the run token is taken, as in a task of `petrobot new robot`."""
+    text = """
+begin: jobs -> a, b
+a_done: a:normal ->
+a_lost: a:error ->
+b_done: b:normal ->
+b_lost: b:error ->
+"""
+    runs = [entry("a", 1.0, taken="a_done"), entry("b", 3.0, taken="b_done")]
+    keys = 'final = "jobs == 0"\nruns_place = "jobs"\ngoal_transitions = ["a_done"]'
+    played = play(text, [Trial(1, 0.0, runs=runs)], 1, keys, listening)
+    assert (played.goals.tolist(), played.time.tolist()) == ([1], [time])
 
 
 def test_giving_up_and_dead_ends_do_not_complete() -> None:
@@ -258,7 +282,7 @@ b_lost: b:error -> end
         'final = "end == 1"\nfinal_error = "broken == 1"\nruns_place = "jobs"',
         GOAL,
     ):
-        played = play(text, trials, task=ending)
+        played = play(text, trials, keys=ending)
         assert np.mean(played.completed) == pytest.approx(0.75, abs=0.04)
         assert np.isnan(played.time[~played.completed]).all()
 
@@ -362,7 +386,7 @@ a_lost: a:error -> end
 b_lost: b:error -> end
 """
     trials = [Trial(1, 0.0, runs=[entry("a", 1.0, taken="done"), entry("b", 2.0, taken="first")])]
-    played = play(text.replace("{threshold}", threshold), trials, n=20)
+    played = play(text.replace("{threshold}", threshold), trials, n=20, listening="b")
     assert played.time.tolist() == [seconds] * 20
 
 
@@ -570,20 +594,20 @@ c_lost: c:error -> end
 
 
 @pytest.mark.parametrize(
-    ("begin", "after_a"),
+    ("begin", "after_a", "listening"),
     [
-        ("c_waits, b_waits, a_waits", "a_over"),
+        ("c_waits, b_waits, a_waits", "a_over", "c"),
         # a wants the arm again at once, but b has waited since the beginning
-        ("b_waits, a_waits", "a_over, a_waits"),
+        ("b_waits, a_waits", "a_over, a_waits", "a"),
     ],
 )
 def test_a_contested_token_goes_to_who_came_first_and_then_to_the_first_in_the_file(
-    begin: str, after_a: str
+    begin: str, after_a: str, listening: str
 ) -> None:
     """a uses the arm for 1 s and then b for 2 s, as in the engine; c would take it for 4 s."""
     text = SHARED.replace("{begin}", begin).replace("{after_a}", after_a)
     runs = [entry("a", 1.0), entry("b", 2.0), entry("c", 4.0)]
-    played = play(text, [Trial(1, 0.0, runs=runs)], n=50)
+    played = play(text, [Trial(1, 0.0, runs=runs)], n=50, listening=listening)
     assert played.time.tolist() == [3.0] * 50
 
 

@@ -62,6 +62,7 @@ def test_times_that_are_equal_but_for_rounding_do_not_differ() -> None:
     rounded[::2] = 0.3
     assert residual._same_mean(equal, rounded) == 1.0
     assert residual._same_mean(equal, np.full(40, 0.31)) == 0.0
+    assert set(residual._classes(rounded, np.full(40, 0.1 + 0.2)).tolist()) == {4.0}
     assert 0.01 < residual._same_mean(rounded, np.linspace(0.29, 0.31, 40)) <= 1.0
     assert residual._same_mean(rounded, np.linspace(0.39, 0.41, 40)) < 1e-6
 
