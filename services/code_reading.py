@@ -635,13 +635,8 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
     else:
         seen.complete, seen.any_put = False, True
     own = _code(thing) if inspect.isfunction(thing) else None
-    if own is not None and _falls_off(last := own.tree.body[-1]):  # type: ignore[attr-defined]
-        text = f"{thing.__name__} returns no result here; end it with `return success()`"
-        seen.faults.append((own.file, last.end_lineno, text))
-    for value in _returned(own.tree) if own is not None else ():
-        if isinstance(value, ast.Constant) or any(own.value(value) is one for one in MADE):
-            text = f"`return {ast.unparse(value)}` is not a result; write `return success()`"
-            seen.faults.append((own.file, value.lineno, text))
+    if own is not None:
+        _ends(own, thing.__name__, seen)
     first = parameters[0] if parameters else None
     if first is None or first.kind is first.KEYWORD_ONLY or hints.get(first.name) in _KINDS:
         source = inspect.unwrap(thing).__code__
@@ -655,6 +650,17 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
         "wants": _wanted(hints.get(first.name) if first else None),
         **_plain(seen),
     }
+
+
+def _ends(own: _Code, name: str, seen: _Seen) -> None:
+    """Record where a function certainly ends without a result."""
+    if _falls_off(last := own.tree.body[-1]):  # type: ignore[attr-defined]
+        text = f"{name} returns no result here; end it with `return success()`"
+        seen.faults.append((own.file, last.end_lineno, text))
+    for value in _returned(own.tree):
+        if isinstance(value, ast.Constant) or any(own.value(value) is one for one in MADE):
+            text = f"`return {ast.unparse(value)}` is not a result; write `return success()`"
+            seen.faults.append((own.file, value.lineno, text))
 
 
 def _returned(function: ast.AST) -> Iterator[ast.expr]:

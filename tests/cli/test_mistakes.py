@@ -634,8 +634,8 @@ READY = '[services.ready]\nnode = "pc"\nrun = "arm_bot:ready"\n\n'
 ALONE = "def ready(ctx: Context, *, seed: int) -> Result:\n    return success()\n\n\n"
 COMMANDED = '    await ctx.command({"to": to})\n'
 
-MEMORY = (CELL, "[actions]", '[services]\nmemory = { node = "pc" }\n\n[actions]', "")
-LAMP = (CELL, "[actions]", '[streams]\nlamp = { to = "axis", period = 0.1 }\n\n[actions]', "")
+MEMORISES = (CELL, "[actions]", '[services]\nmemory = { node = "pc" }\n\n[actions]', "")
+STREAM = (CELL, "[actions]", '[streams]\nlamp = { to = "axis", period = 0.1 }\n\n[actions]', "")
 
 EYE = "class Eye(Driver):\n    def look(self) -> int:\n        return 3\n\n\n"
 SEEN = [
@@ -665,7 +665,7 @@ BOTH: list[tuple[list[Mistake], str]] = [
     ),
     *(
         (
-            [MEMORY, (CODE, "    return success()", f"    {one}", "")],
+            [MEMORISES, (CODE, "    return success()", f"    {one}", "")],
             r"arm_bot.py:\d+: `ctx.get` does nothing without `await`; write `await ctx.get",
         )
         for one in (
@@ -675,7 +675,7 @@ BOTH: list[tuple[list[Mistake], str]] = [
         )
     ),
     (
-        [LAMP, (CODE, "await ctx.sleep(0.3)", 'ctx.publish("lamp", {"on": 1.0})', "")],
+        [STREAM, (CODE, "await ctx.sleep(0.3)", 'ctx.publish("lamp", {"on": 1.0})', "")],
         r"`ctx.publish\('lamp', {'on': 1.0}\)`: .* write `ctx.publish\('lamp', \[...\]\)`",
     ),
     (
