@@ -37,6 +37,7 @@ from petrobot.services.device import (
     HasPicture,
     Key,
     QuickStopping,
+    Remote,
     faults_of_keys,
     faults_of_limits,
     keys_of,
@@ -49,6 +50,7 @@ AWAITED = frozenset(
 )
 """Methods of the context that do nothing unless they are awaited."""
 CONTEXT = ("ctx", "context")
+DEVICE = tuple(f"{name}.device" for name in CONTEXT)
 """Usual names of the context."""
 REMEMBERS = frozenset(("get", "get_versioned", "put", "compare_and_set"))
 """Calls of the context that need the global memory."""
@@ -108,6 +110,8 @@ class _Seen:
     reads: dict[str, tuple[str, int]] = field(default_factory=dict)
     """Keys of its device's state that it reads without asking whether they are there, with file and
     line."""
+    uses: dict[str, tuple[str, int]] = field(default_factory=dict)
+    """Attributes of its device that it uses on every way, with file and line."""
     memory: tuple[str, int] | None = None
     """Where it uses the global memory first."""
     device: tuple[str, int, str] | None = None
@@ -221,7 +225,7 @@ class _Code:
     def asks_for_device(self) -> bool:
         """Whether it compares the device of its context with None or asks whether it is there: it
         may then run without one."""
-        device = {f"{name}.device" for name in CONTEXT}
+        device = {*DEVICE}
         for node in self.nodes:
             if isinstance(node, ast.Assign) and ast.unparse(node.value) in device:
                 device |= {ast.unparse(target) for target in node.targets}
@@ -349,11 +353,15 @@ def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
                 seen.device or node in code.branched or code.asks_for_device
             ):
                 seen.device = (code.file, node.lineno, f"{owner}.{node.attr}")
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value) in DEVICE:
+            guarded = node.value in code.branched or node in code.tried or code.asks_for_device
+            if isinstance(node.ctx, ast.Load) and not guarded:
+                seen.uses.setdefault(node.attr, (code.file, node.lineno))
         if isinstance(node, ast.While) and in_action:
             _loops(code, node, seen)
         if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
             name = str(node.slice.value)
-            state = ast.unparse(node.value) in {f"{one}.device.state" for one in CONTEXT}
+            state = ast.unparse(node.value) in {f"{one}.state" for one in DEVICE}
             if state and name not in code.asked and node not in code.tried:
                 seen.reads.setdefault(name, (code.file, node.lineno))
         if not isinstance(node, ast.Call):
@@ -627,13 +635,8 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
     else:
         seen.complete, seen.any_put = False, True
     own = _code(thing) if inspect.isfunction(thing) else None
-    if own is not None and _falls_off(last := own.tree.body[-1]):  # type: ignore[attr-defined]
-        text = f"{thing.__name__} returns no result here; end it with `return success()`"
-        seen.faults.append((own.file, last.end_lineno, text))
-    for value in _returned(own.tree) if own is not None else ():
-        if isinstance(value, ast.Constant) or any(own.value(value) is one for one in MADE):
-            text = f"`return {ast.unparse(value)}` is not a result; write `return success()`"
-            seen.faults.append((own.file, value.lineno, text))
+    if own is not None:
+        _ends(own, thing.__name__, seen)
     first = parameters[0] if parameters else None
     if first is None or first.kind is first.KEYWORD_ONLY or hints.get(first.name) in _KINDS:
         source = inspect.unwrap(thing).__code__
@@ -647,6 +650,17 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
         "wants": _wanted(hints.get(first.name) if first else None),
         **_plain(seen),
     }
+
+
+def _ends(own: _Code, name: str, seen: _Seen) -> None:
+    """Record where a function certainly ends without a result."""
+    if _falls_off(last := own.tree.body[-1]):  # type: ignore[attr-defined]
+        text = f"{name} returns no result here; end it with `return success()`"
+        seen.faults.append((own.file, last.end_lineno, text))
+    for value in _returned(own.tree):
+        if isinstance(value, ast.Constant) or any(own.value(value) is one for one in MADE):
+            text = f"`return {ast.unparse(value)}` is not a result; write `return success()`"
+            seen.faults.append((own.file, value.lineno, text))
 
 
 def _returned(function: ast.AST) -> Iterator[ast.expr]:
@@ -704,6 +718,7 @@ def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, An
         "dry_run": not faults_of_limits(thing, dry, moves),
         "classes": [f"{base.__module__}:{base.__qualname__}" for base in thing.__mro__],
         "state": _state(thing),
+        "members": _members(thing),
         **_plain(seen),
     }
 
@@ -720,6 +735,22 @@ def _state(thing: type) -> list[str] | None:
         return None
     names = [key.value for key in keys if isinstance(key, ast.Constant)]
     return sorted(map(str, names)) if len(names) == len(keys) else None
+
+
+def _members(thing: type) -> list[str] | None:
+    """Return the attributes that an action finds at its device: those of the remote if the driver
+    is cyclic; None if the source does not show them."""
+    if getattr(thing, "period", None) is not None:
+        return [name for name in vars(Remote) if not name.startswith("_")]
+    codes = [_code(base) for base in thing.__mro__ if base not in (object, Driver)]
+    nodes = [node for code in codes if code is not None for node in code.nodes]
+    words = {node.id for node in nodes if isinstance(node, ast.Name)}
+    if None in codes or _sets_period(thing) or hasattr(thing, "__getattr__") or "setattr" in words:
+        return None
+    stored = {
+        n.attr for n in nodes if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)
+    }
+    return sorted(stored | {*dir(thing), *keys_of(thing), *LIMITS, "ports"})
 
 
 def _methods(thing: type[Driver], seen: _Seen) -> None:
@@ -849,6 +880,7 @@ def _plain(seen: _Seen) -> dict[str, Any]:
         "any_put": seen.any_put,
         "lasts": seen.lasts,
         "reads": seen.reads,
+        "uses": seen.uses,
         "memory": seen.memory,
         "device": seen.device,
     }

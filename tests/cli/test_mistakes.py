@@ -612,6 +612,12 @@ IN_THE_CODE: list[Mistake] = [
     ),
     (
         CODE,
+        'ctx.device.state["arrived"]',
+        "ctx.device.arrived",
+        r"arm_bot.py:\d+: `ctx.device` has no 'arrived'.*Axis runs in another process: .*`ctx.dev",
+    ),
+    (
+        CODE,
         "async def grip(ctx: Context[Remote]",
         "class Saw(Driver):\n    pass\n\n\nasync def grip(ctx: Context[Saw]",
         r"services.toml:\d+: actions.grip.device: its `ctx` is a Context\[Saw\], .* driver is Axis",
@@ -628,10 +634,21 @@ READY = '[services.ready]\nnode = "pc"\nrun = "arm_bot:ready"\n\n'
 ALONE = "def ready(ctx: Context, *, seed: int) -> Result:\n    return success()\n\n\n"
 COMMANDED = '    await ctx.command({"to": to})\n'
 
-MEMORY = (CELL, "[actions]", '[services]\nmemory = { node = "pc" }\n\n[actions]', "")
-LAMP = (CELL, "[actions]", '[streams]\nlamp = { to = "axis", period = 0.1 }\n\n[actions]', "")
+MEMORISES = (CELL, "[actions]", '[services]\nmemory = { node = "pc" }\n\n[actions]', "")
+STREAM = (CELL, "[actions]", '[streams]\nlamp = { to = "axis", period = 0.1 }\n\n[actions]', "")
+
+EYE = "class Eye(Driver):\n    def look(self) -> int:\n        return 3\n\n\n"
+SEEN = [
+    (CODE, "class Axis", f"{EYE}class Axis", ""),
+    (CELL, "[actions]", 'eye = { node = "pc", driver = "arm_bot:Eye" }\n\n[actions]', ""),
+    (CELL, 'grip", device = "axis"', 'grip", device = "eye"', ""),
+]
 
 BOTH: list[tuple[list[Mistake], str]] = [
+    (
+        [*SEEN, (CODE, "await ctx.sleep(0.3)", "ctx.device.lok()", "")],
+        r"arm_bot.py:\d+: `ctx.device` has no 'lok' \(did you mean 'look'\?\).*write it in Eye",
+    ),
     (
         [
             (TASK, '"parts == 0"', '"part == 0"', ""),
@@ -648,7 +665,7 @@ BOTH: list[tuple[list[Mistake], str]] = [
     ),
     *(
         (
-            [MEMORY, (CODE, "    return success()", f"    {one}", "")],
+            [MEMORISES, (CODE, "    return success()", f"    {one}", "")],
             r"arm_bot.py:\d+: `ctx.get` does nothing without `await`; write `await ctx.get",
         )
         for one in (
@@ -658,7 +675,7 @@ BOTH: list[tuple[list[Mistake], str]] = [
         )
     ),
     (
-        [LAMP, (CODE, "await ctx.sleep(0.3)", 'ctx.publish("lamp", {"on": 1.0})', "")],
+        [STREAM, (CODE, "await ctx.sleep(0.3)", 'ctx.publish("lamp", {"on": 1.0})', "")],
         r"`ctx.publish\('lamp', {'on': 1.0}\)`: .* write `ctx.publish\('lamp', \[...\]\)`",
     ),
     (
@@ -721,6 +738,7 @@ MEMORY = '[services.memory]\nnode = "pc"\n\n[actions]'
 READS = (CODE, "await ctx.sleep(0.3)", 'print(await ctx.get("part"))', "")
 
 DOUBTED: list[tuple[list[Mistake], str, list[Mistake]]] = [
+    ([*SEEN, (CODE, "await ctx.sleep(0.3)", "ctx.device.look()", "")], "", []),
     (
         WATCHES,
         r":\d+: places.watch: it listens, and its run keeps axis until .*: carry, fetch, grip wait",

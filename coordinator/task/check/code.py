@@ -92,9 +92,21 @@ def code_findings(
 
 
 def _unknown_states(facts: Mapping[str, Any]) -> Iterator[Finding]:
-    """What an action reads of its device's state, and the driver's `state` does not return."""
+    """What an action reads of its device's state, and the driver's `state` does not return; and
+    what it uses of the device itself that is not there."""
     device: Mapping[str, Any] = facts.get("device") or {}
-    known = device.get("state")
+    known, members = device.get("state"), device.get("members")
+    for name, (file, line) in facts.get("uses", {}).items():
+        if members is not None and name not in members:
+            driver = device["classes"][0].partition(":")[2]
+            text = f"`ctx.device` has no {name!r}{nearest(name, members)}"
+            remedy = f"write it in {driver}, or correct the name"
+            if known is not None:
+                remedy = (
+                    f"{driver} runs in another process: write `await ctx.command({{...}})`, or "
+                )
+                remedy += "read `ctx.device.state`"
+            yield Finding(Severity.ERROR, "code", f"{file}:{line}", text, remedy)
     for name, (file, line) in facts.get("reads", {}).items():
         if known is not None and name not in known:
             driver = device["classes"][0].partition(":")[2]
