@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import os
+import signal
 import threading
 import time
 from collections import Counter
@@ -724,8 +725,10 @@ class _Check:
             self.fault(f"close: leaves a thread behind: {_names(names)}")
         while not self.children.issuperset(running := _children()) and time.monotonic() < end:
             time.sleep(0.05)
-        if names := {name for number, name in running.items() if number not in self.children}:
-            self.fault(f"close: leaves a process behind: {_names(names)}")
+        if odd := {number: name for number, name in running.items() if number not in self.children}:
+            self.fault(f"close: leaves a process behind: {_names({*odd.values()})}")
+            for number in odd:
+                os.kill(number, signal.SIGKILL)  # this process might wait for it at its end
         threading.excepthook = self.excepthook
         if len(held := self.waits.pop("sleep", [])) >= HELD:
             self.fault(

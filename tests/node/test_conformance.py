@@ -414,8 +414,7 @@ class LeavesAProcess(Axis):
 def ends_processes() -> Iterator[None]:
     yield
     for process in LeavesAProcess.left:
-        process.kill()
-        process.wait()
+        process.wait(60.0)  # the check has killed it
 
 
 class DrawsByItself(Axis):
