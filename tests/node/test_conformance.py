@@ -15,6 +15,7 @@ import pytest
 
 from petrobot.services.conformance import DriverCheck, check_driver
 from petrobot.services.device import Driver, Ports, key
+from tests.waiting import Limit
 
 NO_PORTS = cast(Ports, None)
 
@@ -386,7 +387,8 @@ class ItsThreadComputes(WithAThread):
     """It only takes the interpreter's lock, as every thread."""
 
     def work(self) -> None:
-        while not self.end.wait(0.001):
+        limit = Limit("the end of the check")
+        while not self.end.wait(0.001) and limit.left():
             sum(range(20_000))
 
 
@@ -398,7 +400,8 @@ class ItsThreadRaises(WithAThread):
 
 class ItsThreadKeepsTheLock(WithAThread):
     def work(self) -> None:
-        while not self.end.is_set():
+        limit = Limit("the end of the check")
+        while not self.end.is_set() and limit.left():
             ctypes.PyDLL(None).usleep(60_000)
 
 
