@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import os
+import signal
 import threading
 import time
 from collections import Counter
@@ -20,6 +21,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial, wraps
 from inspect import signature
 from itertools import pairwise
+from pathlib import Path
 from resource import RUSAGE_THREAD, getrusage
 from typing import Any
 
@@ -46,7 +48,9 @@ BUSY = 0.3
 """Share of its running time that the check may wait for a processor: beyond that also locks of the
 system are slow, and a wait tells nothing of the driver."""
 LEAVING = 2.0
-"""Seconds in which the threads of a closed driver must end."""
+"""Seconds in which the threads and processes of a closed driver must end."""
+HELD = 3
+"""How often a thread may keep the interpreter: once or twice, the computer itself stood still."""
 GROWING = 250
 """Steps of which a state must not grow in each."""
 LONGEST_ROW = 32
@@ -201,8 +205,9 @@ class _Check:
         except FileNotFoundError:  # a kernel without these statistics
             self.schedule = -1
         self.begun = self.scheduled()
-        self.threads = set(threading.enumerate())
-        """Threads that are not the driver's."""
+        self.threads, self.children = set(threading.enumerate()), set(_children())
+        """Threads and processes that are not the driver's."""
+        self.excepthook, threading.excepthook = threading.excepthook, self.thread_raised
         self.leaves: dict[str, Any] = {}
         """The last state, by path."""
         self.sizes: list[Counter[str]] = []
@@ -246,18 +251,26 @@ class _Check:
         most = math.inf if self.positions else LONGEST_ROW
         return {name: float(value) for name, value in _leaves(state, "", most) if _tells(value)}
 
+    def thread_raised(self, raised: threading.ExceptHookArgs) -> None:
+        if raised.exc_type is not SystemExit:
+            name = raised.thread.name if raised.thread else "of the driver"
+            self.fault(f"thread {name}: {raised.exc_type.__name__}: {raised.exc_value}")
+
     def ask(self, method: Callable[..., Any], *given: Any) -> Any:
         """Call a method that the cycle calls, and note whether it waits: gives up the processor by
-        itself (`ru_nvcsw`), and does not only wait for one, as on a busy computer."""
+        itself (`ru_nvcsw`), and does not only wait for one, as on a busy computer, or for a thread
+        that runs and holds the interpreter's lock. `sleep` takes too long if a thread holds the
+        lock and does not run."""
         before = getrusage(RUSAGE_THREAD).ru_nvcsw
-        idle = time.perf_counter() - sum(self.scheduled())
+        idle = time.perf_counter() - time.process_time() - self.scheduled()[1]
         try:
             return method(*given)
         finally:
-            idle = time.perf_counter() - sum(self.scheduled()) - idle
+            idle = time.perf_counter() - time.process_time() - self.scheduled()[1] - idle
             slept = getrusage(RUSAGE_THREAD).ru_nvcsw > before
-            alone = self.threads.issuperset(threading.enumerate())  # else it may wait for the GIL
-            if idle > max(WAIT, self.period) and slept and alone:
+            if method == self.sleep:
+                slept, idle = threading.active_count() > 1, idle - given[0]
+            if idle > max(WAIT, self.period) and slept:
                 self.waits.setdefault(method.__name__, []).append(idle)
 
     def scheduled(self) -> tuple[float, float]:
@@ -277,7 +290,7 @@ class _Check:
         took = self.now() - begin
         self.steps, self.late = self.steps + 1, self.late + (took > self.period)
         self.longest = max(self.longest, took)
-        self.sleep(max(0.0, self.period - took))
+        self.ask(self.sleep, max(0.0, self.period - took))
         return numbers
 
     def run(
@@ -617,7 +630,7 @@ class _Check:
         if len(commands) > 1:
             positions, took = self.way(commands[0], commands[-1], seconds)
             self.move(commands[-1], PART * took)
-        cable(False)
+        self.plug(cable, False)
         try:
             self.driver.stop(self.now())
             self.run(seconds, lambda: not self.stopped())
@@ -627,7 +640,7 @@ class _Check:
             raised = False
         except Exception:  # the rule: the node then makes a new driver
             raised = True
-        cable(True)
+        self.plug(cable, True)
         if raised:
             self.again("cable put back")
         steps, before, end = dict[str, list[float]](), self.numbers(), self.now() + seconds
@@ -653,6 +666,12 @@ class _Check:
             found = self.follow(commands[0], seconds, before, judged=False)
         if not found:
             self.fault(f"cable put back: {dict(commands[0])} moves nothing")
+
+    def plug(self, cable: Callable[[bool], None], on: bool) -> None:
+        """Put the cable back or pull it; a process that this starts is not the driver's."""
+        before = set(_children())
+        cable(on)
+        self.children |= set(_children()) - before
 
     def close(self) -> None:
         """Close the driver. Its state must not have grown all the time."""
@@ -704,6 +723,19 @@ class _Check:
             thread.join(max(0.0, end - time.monotonic()))
         if names := {thread.name for thread in left if thread.is_alive()}:
             self.fault(f"close: leaves a thread behind: {_names(names)}")
+        while not self.children.issuperset(running := _children()) and time.monotonic() < end:
+            time.sleep(0.05)
+        if odd := {number: name for number, name in running.items() if number not in self.children}:
+            self.fault(f"close: leaves a process behind: {_names({*odd.values()})}")
+            for number in odd:
+                os.kill(number, signal.SIGKILL)  # this process might wait for it at its end
+        threading.excepthook = self.excepthook
+        if len(held := self.waits.pop("sleep", [])) >= HELD:
+            self.fault(
+                f"a thread of the driver kept the interpreter {len(held)} times while it waited, "
+                f"the longest {max(held):.3f} s: its library does not release the lock (GIL); put "
+                "it into a process of its own"
+            )
         for name, waits in self.waits.items():
             text = f"{name}: {len(waits)} calls waited, the longest {max(waits):.3f} s"
             if queued > BUSY * ran:
@@ -715,6 +747,21 @@ class _Check:
                 f"step: {self.late} of {self.steps} took longer than the period of "
                 f"{self.period:g} s, the longest {self.longest:.3f} s: it must not wait"
             )
+
+
+def _children() -> dict[int, str]:
+    """Return the running processes that this one has started, by number, except helpers of
+    `multiprocessing`, which end with it."""
+    found = {}
+    for path in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended
+            name, _, rest = (path / "stat").read_text().rpartition(")")  # proc(5)
+            state, parent = rest.split()[:2]
+            if int(parent) == os.getpid() and state != "Z":
+                line = (path / "cmdline").read_bytes()
+                if b"resource_tracker" not in line and b"multiprocessing.forkserver" not in line:
+                    found[int(path.name)] = name.partition("(")[2]
+    return found
 
 
 def _leaves(value: Any, path: str, most: float = math.inf) -> Iterator[tuple[str, Any]]:

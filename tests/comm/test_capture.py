@@ -96,6 +96,7 @@ class Device:
     opened: list[Any]
     accepted: dict[int, float]
     absent = False
+    channels = 3
 
     def __init__(self, *how: Any) -> None:
         self.opened.append(how)
@@ -112,7 +113,7 @@ class Device:
         return not self.absent
 
     def retrieve(self) -> tuple[bool, np.ndarray]:
-        return True, np.full((*SIZE, 3), (0, 100, 0), np.uint8)
+        return True, np.full((*SIZE, self.channels), (0, 100, 0)[: self.channels], np.uint8)
 
     def release(self) -> None:
         self.opened.append("released")
@@ -163,6 +164,17 @@ def test_a_lost_camera_is_opened_again(
     images.close()
     assert "camera 0 was lost; it is opened again in" in caplog.text
     assert device.opened.count("released") == len(device.opened) / 2
+
+
+def test_an_image_that_cannot_be_converted_is_no_end(device: type[Device]) -> None:
+    """As of a camera that gives YUYV: its two channels are no colours."""
+    device.channels = 2
+    images = CaptureImages(0, time.monotonic)
+    images.start(30.0)
+    until("the fault", lambda: "no usable image" in images.condition)
+    device.channels = 3
+    until("an image", images.newest)
+    images.close()
 
 
 def test_images_that_nobody_wants_are_taken_and_dropped(device: type[Device]) -> None:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import ctypes
 import random
+import subprocess
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, cast
 
 import pytest
 
 from petrobot.services.conformance import DriverCheck, check_driver
 from petrobot.services.device import Driver, Ports, key
+from tests.waiting import Limit
 
 NO_PORTS = cast(Ports, None)
 
@@ -87,9 +90,14 @@ COMMANDS = [{"to": 0.2}, {"to": 0.0}]
 def checked(kind: type[Axis], **more: Any) -> DriverCheck:
     """Check a driver, in simulated time unless the driver itself waits."""
     how: dict[str, Any] = {"simulated": True}
-    if kind is Waits:  # in real time every step waits too long, even on an idle computer
+    if kind in (Waits, ItsThreadKeepsTheLock):  # these need real time
         how = {"seconds": 0.5, "within": 0.05}
-    return check_driver(lambda: kind({}, cast(Ports, None)), COMMANDS, **how | more)
+    commands = [] if kind is ItsThreadKeepsTheLock else COMMANDS  # each of its steps takes long
+    return check_driver(lambda: kind({}, cast(Ports, None)), commands, **how | more)
+
+
+def test_a_thread_that_computes_is_no_wait() -> None:
+    assert checked(ItsThreadComputes).faults == []
 
 
 def test_a_good_driver_passes() -> None:
@@ -347,6 +355,71 @@ class LeavesAThread(Axis):
         threading.Thread(target=time.sleep, args=[60], name="reader", daemon=True).start()
 
 
+class WithAThread(Axis):
+    """Its thread, which must do something, ends when it is closed."""
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        super().__init__(config, ports)
+        self.end, self.moved = threading.Event(), threading.Event()
+        self.thread = threading.Thread(target=self.work, name="reader", daemon=True)
+        self.thread.start()
+
+    def work(self) -> None:
+        self.end.wait(60.0)
+
+    def step(self, now: float) -> None:
+        super().step(now)
+        self.moved.set()
+
+    def close(self) -> None:
+        self.end.set()
+        self.moved.set()
+
+
+class WaitsForItsThread(WithAThread):
+    def step(self, now: float) -> None:
+        super().step(now)
+        if self.cycles == 150:
+            self.end.wait(0.05)
+
+
+class ItsThreadComputes(WithAThread):
+    """It only takes the interpreter's lock, as every thread."""
+
+    def work(self) -> None:
+        limit = Limit("the end of the check")
+        while not self.end.wait(0.001) and limit.left():
+            sum(range(20_000))
+
+
+class ItsThreadRaises(WithAThread):
+    def work(self) -> None:
+        self.moved.wait(60.0)
+        raise RuntimeError("the reader has lost its line")
+
+
+class ItsThreadKeepsTheLock(WithAThread):
+    def work(self) -> None:
+        limit = Limit("the end of the check")
+        while not self.end.is_set() and limit.left():
+            ctypes.PyDLL(None).usleep(60_000)
+
+
+class LeavesAProcess(Axis):
+    left: ClassVar[list[subprocess.Popen[bytes]]] = []
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        super().__init__(config, ports)
+        self.left.append(subprocess.Popen(["sleep", "60"]))
+
+
+@pytest.fixture
+def ends_processes() -> Iterator[None]:
+    yield
+    for process in LeavesAProcess.left:
+        process.wait(60.0)  # the check has killed it
+
+
 class DrawsByItself(Axis):
     def step(self, now: float) -> None:
         super().step(now)
@@ -365,6 +438,14 @@ class DrawsByItself(Axis):
         (Grows, "state: moves grows all the time"),
         (TooLarge, "state: has more than 100,000 items and characters, most of them in image"),
         (LeavesAThread, "close: leaves a thread behind: reader"),
+        pytest.param(
+            LeavesAProcess,
+            "close: leaves a process behind: sleep",
+            marks=pytest.mark.processes,
+        ),
+        (WaitsForItsThread, "calls waited, the longest 0."),
+        (ItsThreadRaises, "thread reader: RuntimeError: the reader has lost its line"),
+        (ItsThreadKeepsTheLock, "a thread of the driver kept the interpreter"),
         (DrawsByItself, "two runs with the same seed differ in axis[0].at"),
         (IgnoresQuickStop, "quick_stop during a movement: stopped() is still False after 1 s"),
         (QuickStopsOnce, "quick_stop, a second time: RuntimeError: already stopped"),
@@ -384,10 +465,12 @@ class DrawsByItself(Axis):
         (Deaf, "{'to': 0.2}: no number of state changes"),
     ],
 )
+@pytest.mark.usefixtures("ends_processes")
 def test_each_broken_rule_is_named(kind: type[Axis], fault: str) -> None:
     check = checked(kind)
     # On a very busy computer a wait is only noted: it may not be the driver's.
-    found = [*check.faults, *(check.notes if kind in (WaitsOnce, WaitsInStop) else ())]
+    waiting = kind in (WaitsOnce, WaitsInStop, WaitsForItsThread)
+    found = [*check.faults, *(check.notes if waiting else ())]
     assert any(fault in one for one in found), found
     assert kind is not BreaksOnTheWay or BreaksOnTheWay.after[-2:] == ["stop", "close"]
 

@@ -6,6 +6,7 @@ package is its size (uint16, with these three bytes), its type (a letter) and it
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -70,12 +71,15 @@ class Recipe:
         self.size = sum(form.size for form in self._forms)
 
     def unpack(self, data: bytes) -> dict[str, Any]:
-        """Return the values by name. Raises RtdeError for another length."""
+        """Return the values by name. Raises RtdeError for another length, and for numbers that are
+        not finite: they would become set points."""
         if len(data) != self.size:
             raise RtdeError(f"expected {self.size} bytes of data, got {len(data)}")
         values, at = dict[str, Any](), 0
         for name, form in zip(self.names, self._forms, strict=True):
             found = form.unpack_from(data, at)
+            if not all(map(math.isfinite, found)):
+                raise RtdeError(f"{name} is {found}")
             values[name], at = (found if len(found) > 1 else found[0]), at + form.size
         return values
 

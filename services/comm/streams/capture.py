@@ -116,17 +116,22 @@ class CaptureImages:
     def _run(self) -> None:
         wait, ended = FIRST_WAIT, self._ended
         while not ended.is_set():
-            with _opened(self._target, self._settings, self._rate) as capture:
-                if capture is not None:
-                    self._fault = ""
-                    self._tried.set()
-                    if self._take(capture, ended):
-                        wait = FIRST_WAIT
+            try:
+                with _opened(self._target, self._settings, self._rate) as capture:
+                    fault = f"camera {self._target!r} was lost"
+                    if capture is None:
+                        fault = self._closed()
+                    else:
+                        self._fault = ""
+                        self._tried.set()
+                        if self._take(capture, ended):
+                            wait = FIRST_WAIT
+            except Exception as raised:  # of OpenCV: an image that it cannot convert, and others
+                text = " ".join(str(raised).split())
+                fault = f"camera {self._target!r}: no usable image, try another fourcc: {text:.300}"
             if ended.is_set():
                 return
-            self._fault = (
-                f"camera {self._target!r} was lost" if capture is not None else self._closed()
-            )
+            self._fault = fault
             _log.warning("%s; it is opened again in %g s", self._fault, wait)
             self._tried.set()
             ended.wait(wait)

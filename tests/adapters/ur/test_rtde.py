@@ -67,6 +67,10 @@ ACCEPTED = package("V", b"\x01") + package("O", b"\x01DOUBLE,VECTOR6D,INT32,")
         ),
         (ACCEPTED + package("I", b"\x01INT32,DOUBLE") + package("S", b"\x00"), "refuses to start"),
         (ACCEPTED + package("U", b"\x01abc"), "expected 60 bytes of data, got 3"),
+        (
+            ACCEPTED + package("U", b"\x01" + struct.pack(">7di", 1.0, *[float("nan")] * 6, 1)),
+            "actual_q is (nan, nan",
+        ),
         (package("V", b"\x01") + package("O", b""), "cannot be read"),
         (b"HTTP/1.1 400 Bad Request", "expected an RTDE package, got the bytes b'HTTP/1.1'"),
         (b"\x00\x02V", "expected an RTDE package"),
