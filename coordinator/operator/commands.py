@@ -110,6 +110,7 @@ class Operation:
                 selectors=selectors,
                 nodes=dict(self.feed.state["nodes"]),
             )
+            self.feed.emit("mission", mission={"state": "preparing"})
             self.executor.observers.append(shown.publisher)
             self.executor.observers.append(shown.trials)
         else:

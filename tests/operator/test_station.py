@@ -149,6 +149,21 @@ async def test_a_node_that_is_not_connected_is_named_and_leaves_no_run(
     assert (await cell.ended())["status"] == "success"
 
 
+async def test_a_start_is_shown_while_its_nodes_are_reached(cell: Cell) -> None:
+    """Every client sees that a run is being prepared; when it is refused, the state before is
+    shown."""
+    seen: list[str] = []
+    cell.station.subscribe(lambda c: seen.append(c.get("mission", {}).get("state", "")))
+    assert not (await cell.say("start", task="moving", parameters={"sped": 1.0}))["ok"]
+    assert [state for state in seen if state] == ["preparing", "idle"]
+    seen.clear()
+    await cell.say("start", task="moving")
+    await cell.ended()
+    assert [state for state in seen if state][:3] == ["preparing", "preparing", "running"]
+    assert not (await cell.say("start", task="nothing"))["ok"]
+    assert cell.state["mission"]["state"] == "success"
+
+
 async def test_breakpoints_and_choices_before_the_start(cell: Cell) -> None:
     """Settings of a loaded task hold for its next run; loading another task removes them."""
     assert (await cell.say("pause"))["code"] == "idle"
