@@ -56,6 +56,7 @@ async def test_the_run_can_be_controlled_while_it_is_active(cell: Cell) -> None:
         lambda: cell.state["mission"]["firings"] == fired + 1 and cell.state["paused"] is not None
     )
     assert (await cell.say("add_tokens", place="jobs"))["ok"]
+    assert "not an external event" in (await cell.say("raise_event", event="x"))["text"]
     assert (await cell.say("resume"))["ok"]
     result = await cell.ended()
     assert sum(f["transition"] == "begin" for f in cell.state["firings"]) == 3
