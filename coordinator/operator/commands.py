@@ -45,7 +45,7 @@ from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Stage
 from petrobot.coordinator.run.realtime import credentials_of
 from petrobot.coordinator.run.recording import JournalStore
-from petrobot.coordinator.task import Task
+from petrobot.coordinator.task import Scope, Task
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import Feedback
 
@@ -110,6 +110,7 @@ class Operation:
                 selectors=selectors,
                 nodes=dict(self.feed.state["nodes"]),
             )
+            self.feed.emit("mission", mission={"state": "preparing"})
             self.executor.observers.append(shown.publisher)
             self.executor.observers.append(shown.trials)
         else:
@@ -241,7 +242,11 @@ class Operation:
         return self._order(RemoveTokens(str(data["place"]), int(data.get("count", 1))))
 
     async def _do_raise_event(self, who: str, data: Mapping[str, Any]) -> Answer:
-        return self._order(RaiseEvent(str(data["event"])))
+        name = str(data["event"])
+        event = self.executor.task.flat.events.get(name)
+        if event is None or event.scope is not Scope.EXTERNAL:
+            return refusal("refused", f"{name} is not an external event of the task")
+        return self._order(RaiseEvent(name))
 
     async def _do_force_exit(self, who: str, data: Mapping[str, Any]) -> Answer:
         return self._order(ForceExit(str(data["transition"])))

@@ -127,7 +127,9 @@ def task_of(journal: Journal) -> Task:
     task = loads(journal.header["task"], f"{journal.path} (task)")
     if (expanded := journal.header.get("expanded")) is not None:
         flat = loads(expanded, f"{journal.path} (expanded task)", flat=True)
-        task = replace(task, expansion=flat)
+        # Older journals have no empty initial values there.
+        variables = {**flat.variables, **task.variables}
+        task = replace(task, expansion=replace(flat, variables=variables))
     runs = journal.header.get("runs")
     return with_runs(task, runs)[0] if runs is not None else task
 

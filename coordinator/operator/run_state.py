@@ -176,9 +176,9 @@ class ChangePublisher:
             self._overrides(time, before_overrides, state.overrides)
         if self._why:  # left over: draws of conflicts, and runs that never started
             self._why = {key: why for key, why in self._why.items() if state.run(key) is not None}
-        if (
-            state.mode in (Mode.RUNNING, Mode.PAUSED)
-            and self.feed.state["mission"]["state"] == "idle"
+        if state.mode in (Mode.RUNNING, Mode.PAUSED) and self.feed.state["mission"]["state"] in (
+            "idle",
+            "preparing",
         ):
             self.feed.emit("mission", time=time, mission={"state": "running"})
         if state.mode is Mode.ABORTING and self.feed.state["mission"]["state"] == "running":

@@ -237,10 +237,14 @@ class Station:
         if self._stopped:
             return refusal("stopped", "the emergency stop is active; clear it first")
         self._starting = True  # No other start may come in between.
+        before = {key: self.feed.state["mission"].get(key, "") for key in ("state", "reason")}
+        self.feed.emit("mission", mission={"state": "preparing", "reason": ""})
         try:
             return await self._started(data, ordered)
         finally:
             self._starting = False
+            if self._run is None and self.feed.state["mission"]["state"] == "preparing":
+                self.feed.emit("mission", mission=before)  # It was refused.
 
     def _busy(self) -> Answer | None:
         if not self._starting and self._run is None:
@@ -288,7 +292,7 @@ class Station:
         except MissionError as fault:
             await run.abandon()
             return refusal("in_use" if fault.bad_input else "stopped", str(fault))
-        return self._follow(run)
+        return await self._follow(run)
 
     async def _started_from(self, data: Mapping[str, Any]) -> Answer:
         """Start a simulated run from a point of a recorded one."""
@@ -298,7 +302,7 @@ class Station:
         name = task if task in self._tasks.names() else ""
         if name != self._loaded:
             self._forget(name)
-        return self._follow(run)
+        return await self._follow(run)
 
     def _prepared_from(self, data: Mapping[str, Any]) -> RunSession:
         name = str(data["from"].get("run", "")) if isinstance(data["from"], Mapping) else ""
@@ -323,8 +327,11 @@ class Station:
         more = f"; and {len(faults) - FAULTS_TOLD} more" if len(faults) > FAULTS_TOLD else ""
         return {**refusal("faults", f"{text.name} may not run: {told}{more}"), "findings": faults}
 
-    def _follow(self, run: RunSession) -> Answer:
+    async def _follow(self, run: RunSession) -> Answer:
         """Let operators see and control a run, and lead it to its end."""
+        if self._stopped:  # given while it was being prepared
+            await run.abandon()
+            return refusal("stopped", "an emergency stop was given meanwhile; clear it first")
         run.operate(self.feed, self.controls, starts=True, stops=self._stops, choices=self._choices)
         run.address = self.address(run.identity) if self.address is not None else None
         self._tell_file()

@@ -64,6 +64,16 @@ def test_good_file_reads() -> None:
     assert loads(dumps(task)) == task
 
 
+@pytest.mark.parametrize("initial", ["''", "'seen'", "0", "false", "0.0"])
+def test_an_initial_value_is_written_also_if_it_is_empty(initial: str) -> None:
+    """A journal has the task as it is written: a replay with another value of the variable would
+    differ from the run."""
+    kind = {"f": "bool", "0": "float" if "." in initial else "int"}.get(initial[0], "str")
+    changed = f'type = "{kind}"\ninitial = {initial}'
+    task = loads(GOOD.replace('type = "bool"', changed).replace('when = "seen"', ""))
+    assert loads(dumps(task)) == task and task.variables["seen"].initial is not None
+
+
 @pytest.mark.parametrize(
     ("written", "short"),
     [

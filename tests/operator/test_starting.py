@@ -325,6 +325,23 @@ async def test_an_emergency_stop_in_a_simulated_run_also_stops_the_real_devices(
     assert cell.state["mission"]["state"] == "idle"
 
 
+async def test_a_stop_while_a_run_is_prepared_is_shown_and_nothing_starts(
+    cell: Simulated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also in lock step, where no node would refuse the run."""
+
+    async def order_all(directory: Any, credentials: Any, verb: str) -> list[Any]:
+        return []
+
+    monkeypatch.setattr(station, "order_all", order_all)
+    answer, stop = await asyncio.gather(
+        cell.say("start", task="moving", mode="lockstep"), cell.say("estop")
+    )
+    assert stop["ok"] and answer["code"] == "stopped"
+    assert cell.state["mission"]["state"] == "stopped"
+    assert not list(cell.runs.glob("*"))
+
+
 async def test_a_stop_that_a_node_did_not_clear_is_still_shown(
     cell: Simulated, monkeypatch: pytest.MonkeyPatch
 ) -> None:

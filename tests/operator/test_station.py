@@ -56,6 +56,7 @@ async def test_the_run_can_be_controlled_while_it_is_active(cell: Cell) -> None:
         lambda: cell.state["mission"]["firings"] == fired + 1 and cell.state["paused"] is not None
     )
     assert (await cell.say("add_tokens", place="jobs"))["ok"]
+    assert "not an external event" in (await cell.say("raise_event", event="x"))["text"]
     assert (await cell.say("resume"))["ok"]
     result = await cell.ended()
     assert sum(f["transition"] == "begin" for f in cell.state["firings"]) == 3
@@ -147,6 +148,21 @@ async def test_a_node_that_is_not_connected_is_named_and_leaves_no_run(
     await cell.nodes["arm"].start()
     assert (await cell.say("start", task="moving"))["ok"]
     assert (await cell.ended())["status"] == "success"
+
+
+async def test_a_start_is_shown_while_its_nodes_are_reached(cell: Cell) -> None:
+    """Every client sees that a run is being prepared; when it is refused, the state before is
+    shown."""
+    seen: list[str] = []
+    cell.station.subscribe(lambda c: seen.append(c.get("mission", {}).get("state", "")))
+    assert not (await cell.say("start", task="moving", parameters={"sped": 1.0}))["ok"]
+    assert [state for state in seen if state] == ["preparing", "idle"]
+    seen.clear()
+    await cell.say("start", task="moving")
+    await cell.ended()
+    assert [state for state in seen if state][:3] == ["preparing", "preparing", "running"]
+    assert not (await cell.say("start", task="nothing"))["ok"]
+    assert cell.state["mission"]["state"] == "success"
 
 
 async def test_breakpoints_and_choices_before_the_start(cell: Cell) -> None:

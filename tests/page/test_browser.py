@@ -565,8 +565,8 @@ async def test_the_clock_of_a_run_stands_still_while_it_is_held(
     """As its deadline does; that of a run which cannot be held goes on, as its deadline does, and
     so does the mission's clock. A page that connects later shows the same."""
     tab = await opened(browser, page)
-    run = {"place": "look", "primitive_task": "look", "action": "a", "node": "vision", "why": ""}
-    run |= {"started": 0.0, "deadline": 20.0, "progress": 0.1}
+    run: dict[str, Any] = {"place": "look", "primitive_task": "look", "action": "a", "why": ""}
+    run |= {"node": "vision", "started": 0.0, "deadline": 20.0, "progress": 0.1}
     held = {"id": "x#1", "state": "held", "held_since": 9.0, "held_for": 2.0}
     free = {"id": "x#2", "state": "running", "held_since": None, "held_for": 2.5}
     paused = {"reason": "by ana", "at": 9.0, "nodes": {"vision": "held"}}

@@ -312,6 +312,23 @@ async def test_the_emergency_stop_goes_past_a_connection_that_has_just_died(
     await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Emergency stop")
 
 
+async def test_silence_is_a_lost_connection_before_it_is_closed(
+    browser: Browser, page: Page
+) -> None:
+    """Without a network, closing a connection takes long. The page says at once that it is old."""
+    tab = await opened(browser, page)
+    await expect(element(tab, "^Control place parts", "Task net")).to_be_visible()
+    silent = """() => {
+      const { link } = petrobot;
+      link.socket.close = () => {};
+      link.heardAt = performance.now() - 4000;
+      link.watch();
+      return link.connected;
+    }"""
+    assert await tab.evaluate(silent) is False
+    await expect(tab.get_by_role("alert")).to_be_hidden()  # connected again
+
+
 async def test_a_page_that_never_connected_says_so(browser: Browser, page: Page) -> None:
     """Its files arrived, but the live connection fails: it shows a bar, not an idle mission, until
     there is a connection."""

@@ -32,7 +32,9 @@ def dumps(task: Task) -> str:
     lines += _errors("", task.errors_to)
     for group in ("primitive_tasks", "variables", "events"):
         for name, record in getattr(task, group).items():
-            lines += _section(f"{group}.{_name(name)}", _changed(record))
+            values = _changed(record)
+            # An empty text is the value of a variable: left out, it would be none.
+            lines += _section(f"{group}.{_name(name)}", values, keep="initial" in values)
     lines += _net("", task.places, task.transitions)
     for subnet in task.subnets.values():
         lines += _subnet(subnet)

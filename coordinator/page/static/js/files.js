@@ -186,10 +186,10 @@ export async function exportAs(form, model, view, text) {
   if (form === "png") return download(`${name}.png`, await pngOf(view), "image/png");
   if (form === "toml") return download(`${name}.toml`, text, "application/toml");
   if (!model.name || model.dirty) return toast("warning", "Save the task first: it is exported from its file.");
-  const answer = await ask("GET", `/api/tasks/${encodeURIComponent(model.name)}/export/${form}`);
-  if (!answer.ok) return toast("error", String(answer.value));
-  if (form === "gspn.svg") return showPicture("Stochastic view", name, answer.value);
-  return download(`${name}.${form}`, answer.value, "text/xml");
+  const exported = await need("GET", `/api/tasks/${encodeURIComponent(model.name)}/export/${form}`);
+  if (exported === null) return null;
+  if (form === "gspn.svg") return showPicture("Stochastic view", name, exported);
+  return download(`${name}.${form}`, exported, "text/xml");
 }
 
 /** Show an SVG in a dialog: the whole of it, or at full size around the point that was clicked. As an image, no script in it can run. */

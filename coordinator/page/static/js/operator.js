@@ -125,7 +125,7 @@ export class Operator {
     const may = !this.link.barred;
     const now = stateOf(state);
     const live = ["running", "paused", "stopping"].includes(now);
-    const set = { start: may && !live && now !== "preparing" && now !== "stopped", pause: may && now === "running", step: may && now === "paused", resume: may && now === "paused", abort: may && (live || now === "preparing") };
+    const set = { start: may && !live && now !== "preparing" && now !== "stopped", pause: may && now === "running", step: may && now === "paused", resume: may && now === "paused", abort: may && live };
     for (const [verb, on] of Object.entries(set)) this.buttons[verb].disabled = !on;
     this.showTasks(state, may && !live && now !== "preparing");
     this.buttons.start.hidden = state.mission.starts === false;
