@@ -28,7 +28,6 @@ from tests.studies.forecast.test_preempting import ONE_WAY, one_way, trials_of
 
 pytestmark = pytest.mark.once
 
-SIDE = ("goals", "completed", "all_success", "time")
 NOTHING = Played(np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros(0, np.bool_), np.zeros(0))
 
 
@@ -94,6 +93,7 @@ def test_a_place_that_only_one_side_entered_is_no_doubt_if_that_may_be_chance() 
     the training did."""
     training = Training.of(loads(ONE_WAY, "scan.toml"), trials_of(one_way, 200, 3))
     real = measured(training)
+    of_trials = real.goals, real.completed, real.all_success, real.time
     for entering, doubtful in ((1, False), (100, True)):
         trials = [
             replace(t, runs=t.runs[: 1 + (i < entering)]) for i, t in enumerate(training.trials)
@@ -101,7 +101,8 @@ def test_a_place_that_only_one_side_entered_is_no_doubt_if_that_may_be_chance() 
         few = Training.of(training.task, trials)
         last = trials[0].runs[1].place
         ways = {place: counts for place, counts in routing(few).items() if place != last}
-        played = replace(real, **{f: np.repeat(getattr(real, f), 4) for f in SIDE}, ways=ways)
+        goals, completed, good, time = (np.repeat(each, 4) for each in of_trials)
+        played = Played(goals, completed, good, time, ways=ways)
         (row,) = (r for r in residuals(few, played) if r["of"] == f"ways out of {last}")
         assert (row["p_holm"] < 0.01) is doubtful
         assert row["off"] == entering / 200
