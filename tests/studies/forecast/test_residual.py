@@ -93,7 +93,6 @@ def test_a_place_that_only_one_side_entered_is_no_doubt_if_that_may_be_chance() 
     the training did."""
     training = Training.of(loads(ONE_WAY, "scan.toml"), trials_of(one_way, 200, 3))
     real = measured(training)
-    of_trials = real.goals, real.completed, real.all_success, real.time
     for entering, doubtful in ((1, False), (100, True)):
         trials = [
             replace(t, runs=t.runs[: 1 + (i < entering)]) for i, t in enumerate(training.trials)
@@ -101,8 +100,13 @@ def test_a_place_that_only_one_side_entered_is_no_doubt_if_that_may_be_chance() 
         few = Training.of(training.task, trials)
         last = trials[0].runs[1].place
         ways = {place: counts for place, counts in routing(few).items() if place != last}
-        goals, completed, good, time = (np.repeat(each, 4) for each in of_trials)
-        played = Played(goals, completed, good, time, ways=ways)
+        played = Played(
+            np.repeat(real.goals, 4),
+            np.repeat(real.completed, 4),
+            np.repeat(real.all_success, 4),
+            np.repeat(real.time, 4),
+            ways=ways,
+        )
         (row,) = (r for r in residuals(few, played) if r["of"] == f"ways out of {last}")
         assert (row["p_holm"] < 0.01) is doubtful
         assert row["off"] == entering / 200
