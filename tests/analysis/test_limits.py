@@ -19,13 +19,16 @@ import pytest
 
 from petrobot.coordinator.analysis import commands, report
 from petrobot.coordinator.analysis.commands import analyse_command, convert_command
+from petrobot.coordinator.analysis.execution.graph import execute
 from petrobot.coordinator.analysis.formats import tree
 from petrobot.coordinator.analysis.formats.netfile import NetFile
 from petrobot.coordinator.analysis.formats.pnml import write_pnml
+from petrobot.coordinator.analysis.limits import until
 from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
 from petrobot.coordinator.analysis.net.space import SearchLimits, Space
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.cli import loading
+from petrobot.coordinator.task.file import load
 from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import KANBAN_RATES, kanban, philosophers
 from tests.waiting import Limit
@@ -203,6 +206,15 @@ def test_structure_stops_with_the_time_of_the_analysis(tmp_path: Path) -> None:
         "siphons" in note and "unknown within the limit" in note for note in found.data["notes"]
     )
     assert clock.now < 400.0
+
+
+def test_the_execution_graph_ends_with_the_time_of_the_analysis() -> None:
+    """It stops at the next look at the clock, and says so; without a deadline it has no clock."""
+    task = load(CATCH)
+    with until(1.0, lambda: 2.0):
+        late = execute(task)
+    assert not late.complete and late.reason.startswith("time limit, after 10")
+    assert len(late) < len(execute(task))
 
 
 def test_all_parts_of_an_analysis_share_its_time(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from petrobot.coordinator.analysis.execution.names import (
     Orders,
     TooManyValues,
 )
+from petrobot.coordinator.analysis.limits import overtime
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.engine import (
     Begin,
@@ -47,6 +48,8 @@ SHOWN = 20
 """The most firings of one stimulus that are written."""
 STEPS = 300_000
 """The most stimuli and firings for one graph; they take about twenty seconds."""
+BETWEEN = 1_000
+"""Stimuli and firings between two looks at the clock."""
 QUEUE = 16
 """So many runs of a state count like one more firing. Else a queue that grows for ever, by a timer
 or by the operator's tokens, reaches thousands of runs, and each stimulus takes as long."""
@@ -313,6 +316,8 @@ class _Search:
     """Sources, targets and labels."""
     handled: int = 0
     """Stimuli and firings so far."""
+    late: bool = False
+    """Whether the time of the whole analysis was used up before a limit was reached."""
 
     def run(self, limit: int) -> ExecutionGraph:
         """Explore until nothing new is found or the limit is reached."""
@@ -326,7 +331,7 @@ class _Search:
         """Explore what the operator's commands add."""
         by_hand, begin, end = [False] * len(x.source), 0, len(x)
         found = x
-        while begin < end and self.handled < limit:
+        while begin < end and self.handled < limit and not self.late:
             for i in range(begin, end):
                 if self.handled >= limit:
                     break
@@ -337,14 +342,17 @@ class _Search:
             found = self._result(x.first, end, np.array(by_hand, np.bool_), limit)
             if found.dead[len(x) :].any() or len(found.contests) > len(x.contests):
                 break
-        return replace(found, complete=found.complete and self.handled < limit)
+        return replace(found, complete=found.complete and self.handled < limit and not self.late)
 
     def _explore(self, i: int, limit: int) -> int:
         """Follow the stimuli of the states from number i on; return the first state that was not
         explored."""
-        while i < len(self.states) and self.handled < limit:
+        looked = self.handled
+        while i < len(self.states) and self.handled < limit and not self.late:
             self._follow(i, self._causes(i))
             i += 1
+            if self.handled - looked >= BETWEEN:
+                looked, self.late = self.handled, overtime()
         return i
 
     def _follow(self, i: int, causes: Iterable[Cause]) -> None:
@@ -380,7 +388,11 @@ class _Search:
             first,
             expanded,
             complete,
-            "" if complete else f"more than {limit} stimuli and firings",
+            ""
+            if complete
+            else f"time limit, after {self.handled} stimuli and firings"
+            if self.late
+            else f"more than {limit} stimuli and firings",
             tuple(self.livelocks),
             self.crowded,
             self.contests,

@@ -28,7 +28,6 @@ from tests.studies.forecast.test_preempting import ONE_WAY, one_way, trials_of
 
 pytestmark = pytest.mark.once
 
-SIDE = ("goals", "completed", "all_success", "time")
 NOTHING = Played(np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros(0, np.bool_), np.zeros(0))
 
 
@@ -102,7 +101,13 @@ def test_a_place_that_only_one_side_entered_is_no_doubt_if_that_may_be_chance() 
         few = Training.of(training.task, trials)
         last = trials[0].runs[1].place
         ways = {place: counts for place, counts in routing(few).items() if place != last}
-        played = replace(real, **{f: np.repeat(getattr(real, f), 4) for f in SIDE}, ways=ways)
+        played = Played(
+            np.repeat(real.goals, 4),
+            np.repeat(real.completed, 4),
+            np.repeat(real.all_success, 4),
+            np.repeat(real.time, 4),
+            ways=ways,
+        )
         (row,) = (r for r in residuals(few, played) if r["of"] == f"ways out of {last}")
         assert (row["p_holm"] < 0.01) is doubtful
         assert row["off"] == entering / 200
