@@ -330,8 +330,10 @@ def test_a_net_that_cannot_be_solved_can_be_simulated(tmp_path: Path) -> None:
 @pytest.mark.parametrize("share", [0.2, pytest.param(1.0, marks=pytest.mark.proof)])
 def test_ctrl_c_keeps_what_was_found(net: Net, share: float, tmp_path: Path) -> None:
     """Interrupted twice after the search has begun, at given processor times."""
-    process = started(net, tmp_path, "analyse", "--rates", "unit", "--json", "-")
-    _interrupt_after(process, 0.8 + share)
+    analyse = ("analyse", "--rates", "unit", "--json", "-")
+    before = _start_up(tmp_path, *analyse)
+    process = started(net, tmp_path, *analyse)
+    _interrupt_after(process, before + share)
     data = answered(process)
     assert (
         data["complete"] is False
@@ -353,10 +355,19 @@ def test_ctrl_c_ends_a_simulation_with_its_intervals(tmp_path: Path) -> None:
         "--json",
         "-",
     )
+    before = _start_up(tmp_path, "simulate", "--rates", "unit", "--horizon", "1")
     process = started(kanban(5), tmp_path, *arguments)
-    _interrupt_after(process, 1.2)
+    _interrupt_after(process, before + 0.4)
     data = answered(process)
     assert data["complete"] is False and data["firings"] > 0 and data["throughput"]["tin1"][0] > 0
+
+
+def _start_up(folder: Path, *arguments: str) -> float:
+    """Return the processor time of a command on a small net (s); a slow machine imports long."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    started(ring(3, 1), folder, *arguments).communicate(timeout=300)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def _interrupt_after(process: subprocess.Popen[str], seconds: float) -> None:
