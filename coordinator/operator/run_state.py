@@ -221,7 +221,7 @@ class ChangePublisher:
             "why": self._why.pop(start.run, "the only alternative"),
             "started": round(time, 4),
             "deadline": start.deadline,
-            "progress": 0.0,
+            "progress": None,
             "state": "running",
             "held_since": None,
             "held_for": 0.0,
