@@ -332,6 +332,7 @@ class SlicedCell:
         JournalError, CellError."""
         told = begun = time.perf_counter()
         paused = 0.0  # wall time that the pace ignores
+        length = TELL if feed is None else SLICE  # without a page nobody waits for the loop
         while not self._party.over:
             if self._fault is not None:
                 raise self._fault
@@ -341,7 +342,7 @@ class SlicedCell:
                 self._tell(feed)
                 await self._wake.wait()
                 paused += time.perf_counter()
-            until = time.perf_counter() + SLICE
+            until = time.perf_counter() + length
             while not self._party.over and not self.still and time.perf_counter() < until:
                 if (
                     self._pace

@@ -130,11 +130,11 @@ class CoordinatorParty:
 
     def drain(self) -> Sequence[Envelope]:
         """Return what was sent since the last call, in order."""
-        return [
-            Envelope(node, NAME, _target(node, message), "call", message)
-            for node, caller in self.mission.callers.items()
-            for message in caller.messages(self._now)
-        ]
+        out: list[Envelope] = []
+        for node, caller in self.mission.callers.items():
+            for message in caller.messages(self._now):
+                out.append(Envelope(node, NAME, _target(node, message), "call", message))
+        return out
 
 
 def _target(node: str, message: Message) -> str:

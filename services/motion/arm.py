@@ -157,6 +157,8 @@ class Arm(Driver):
         self._off_path = 0.0
         self._measured = [0.0] * JOINTS
         self._measured_speed = [0.0] * JOINTS
+        self._stands = True
+        """Whether all joints count as standing."""
         self._cycles = 0
         self._now = ports.now
         self._drive_speeds = self._master.speeds
@@ -212,7 +214,7 @@ class Arm(Driver):
             "target": self._steering.goal,
             "commanded": tuple(trajectory.q),
             "in_place": self._in_place(),
-            "still": self._standing(),
+            "still": self._stands,
             "following_error": self._off_path if self._mode != "off" else 0.0,
             "guard": self._steering.refused,
             "limited": master.limited,
@@ -246,11 +248,8 @@ class Arm(Driver):
         if self._master.blind:
             return False
         if self._mode == "off":
-            return (
-                self._master.phase is not MasterPhase.RUNNING
-                or max(map(abs, self._measured_speed)) < _STANDING
-            )
-        return self._trajectory.still and self._standing()
+            return self._master.phase is not MasterPhase.RUNNING or self._stands
+        return self._stands and self._trajectory.still
 
     def hold(self, now: float) -> str:
         """Pause for the operator: brake, and resume the same motion after `release`."""
@@ -328,6 +327,7 @@ class Arm(Driver):
         self._measured_speed = [
             (new - old) / PERIOD for new, old in zip(self._measured, before, strict=True)
         ]
+        self._stands = max(map(abs, self._measured_speed)) < _STANDING
 
     def _sense(self, now: float) -> None:
         """Read the light barrier."""
@@ -348,10 +348,10 @@ class Arm(Driver):
         if not enabled:
             self._off("fault" if self._master.troubles else "disabled")
             return
-        if self._master.speeds != self._drive_speeds:
-            self._drive_speeds = self._master.speeds
+        if (speeds := self._master.speeds) != self._drive_speeds:
+            self._drive_speeds = speeds
             self._steering.limit(self._speeds())
-        moves = not (self._trajectory.still and self._standing())
+        moves = not (self._stands and self._trajectory.still)
         if moves and not self._master.limited and self._lost():
             self._master.give_up(f"the joints are more than {LOST} rad off the commanded path")
             return
@@ -449,9 +449,6 @@ class Arm(Driver):
     def _off_by(self, q: Sequence[float]) -> float:
         farthest: float = max(map(abs, map(sub, q, self._measured)))
         return farthest
-
-    def _standing(self) -> bool:
-        return max(map(abs, self._measured_speed)) < _STANDING
 
 
 _STANDING: Final = 0.01

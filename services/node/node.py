@@ -348,7 +348,10 @@ class Node:
         """Return whether no call, no command and no emergency stop is due yet."""
         if self._commands or now >= self.callee.soonest or now >= self._stops.due:
             return False
-        return all(now < caller.soonest for caller in self.callers.values())
+        for caller in self.callers.values():  # noqa: SIM110 - in each tick; `all` takes twice as long
+            if now >= caller.soonest:
+                return False
+        return True
 
     def _advance_ends(self, now: float) -> None:
         """Advance callee and callers that are due; calling `due` keeps their `soonest` up to

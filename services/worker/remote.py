@@ -46,7 +46,7 @@ class DeviceCommand:
     body: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # one is made in each cycle, and a frozen one takes three times as long
 class DeviceState:
     """What the driver's end publishes at each cycle; only the newest one counts."""
 

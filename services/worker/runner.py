@@ -408,8 +408,9 @@ class Runner:
     def commands_taken(self, now: float) -> None:
         """End the runs that only waited for the driver, which was just stepped, to handle their
         last commands."""
-        for run in [run for run in self._runs.values() if run.phase is TAKING]:
-            self._await_taking(now, run)
+        for run in list(self._runs.values()):
+            if run.phase is TAKING:
+                self._await_taking(now, run)
 
     def give_up_all(self, now: float, text: str) -> list[Report]:
         """Return how all runs end when their device has failed; its stop routine is not called."""
