@@ -105,6 +105,7 @@ def test_nothing_of_this_checkout_is_imported(installed: Installed) -> None:
     assert Path(said.stdout.strip()).is_relative_to(installed.python.parents[1])
 
 
+@pytest.mark.timeout(900)  # some thirty commands, each with a limit of its own
 def test_every_command_of_the_readme(installed: Installed) -> None:
     """In its order; the first run takes the location file that the wheel brings along."""
     assert len(COMMANDS) >= 16 and COMMANDS[0].startswith("petrobot run catch_ball --mode lockstep")
