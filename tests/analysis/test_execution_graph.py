@@ -419,6 +419,7 @@ def reached(first: int, after: list[set[int]]) -> set[int]:
     return known
 
 
+@pytest.mark.once
 @settings(COMMON, max_examples=60)
 @given(whole_tasks(), st.data())
 def test_sound_is_what_a_search_from_every_state_says(task: Task, data: st.DataObject) -> None:

@@ -1119,6 +1119,7 @@ def test_recovery_from_an_arm_fault_agrees_with_the_estimates() -> None:
     assert found.odds.by_exit["give_up"][0] == 0.0
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("name", ["catch_ball", "follow_track"])
 def test_the_chain_completes_as_probably_as_the_stochastic_view(name: str) -> None:
     """Two models are made from the same numbers in different ways. follow_track has conditions on

@@ -41,6 +41,7 @@ def alive(state: State) -> Counter[str]:
     return Counter(r.place for r in state.runs() if r.phase is not Phase.DONE)
 
 
+@pytest.mark.once
 @settings(
     max_examples=80,
     deadline=None,

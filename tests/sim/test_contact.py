@@ -235,6 +235,7 @@ def same(one: list[bool], other: list[bool]) -> float:
     return sum(a == b for a, b in zip(one, other, strict=True)) / len(one)
 
 
+@pytest.mark.once
 @needs_bullet
 def test_at_the_rim_the_portable_contact_has_converged_and_bullet_is_near(
     site: Site, model: BallModel
