@@ -4,6 +4,7 @@ starts processes says so."""
 from __future__ import annotations
 
 import gc
+import signal
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -17,6 +18,9 @@ settings.register_profile(
     "petrobot", deadline=None, suppress_health_check=[HealthCheck.too_slow], print_blob=True
 )
 settings.load_profile("petrobot")
+
+# A background job of a shell ignores Ctrl-C, and so would each process that a test starts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 PROOF_LIMIT_S = 6 * 3600.0
 """The limit of one test marked `proof` (s); the others have `timeout` of pyproject.toml."""

@@ -151,7 +151,6 @@ def _staying(installed: Installed, command: str) -> Iterator[Path]:
             env=installed.environment,
             stdout=output,
             stderr=output,
-            preexec_fn=_hears_ctrl_c,
         )
         try:
             yield said
@@ -160,8 +159,3 @@ def _staying(installed: Installed, command: str) -> Iterator[Path]:
         finally:
             process.kill()
             process.wait()
-
-
-def _hears_ctrl_c() -> None:
-    # A shell's background job is started with SIGINT ignored, and its children inherit that.
-    signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -99,9 +99,9 @@ def _task_of(options: argparse.Namespace) -> Task:
         return load_task(options.task)
     except CommandError as fault:
         written = task_path(options.task)
-        services = options.services or written.parent / "services.toml"
+        services = find_cell(options.services, options.task, None)
         try:
-            if written.is_file() and services.is_file():
+            if written.is_file() and services is not None and services != written:
                 _cell_with_code(services)
         except CommandError as more:
             raise CommandError(fault.code, f"{fault}\n{more}") from fault

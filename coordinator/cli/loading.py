@@ -172,18 +172,18 @@ def cell_path(given: Path | None, name: str, task: Task) -> Path:
 MISSING_CELL = "there is no services.toml beside the task, one folder above it, or here"
 
 
-def find_cell(given: Path | None, name: str, task: Task) -> Path | None:
+def find_cell(given: Path | None, name: str, task: Task | None) -> Path | None:
     """Return the location file for a task: the given one, else the one that the task names, else
     services.toml beside the task, one folder above it, or here; None if there is none.
 
     A task that comes with petrobot falls back to the location file that comes with it. `name` is
-    the task as the command line names it. Raises CommandError if the task names a file that does
-    not exist.
+    the task as the command line names it, `task` None if it cannot be read. Raises CommandError if
+    the task names a file that does not exist.
     """
     if given is not None:
         return given
     written = task_path(name)
-    if not task.services:
+    if task is None or not task.services:
         if written.parent == SHIPPED:
             return services_path(None)
         folder = written.parent

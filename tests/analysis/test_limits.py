@@ -131,9 +131,8 @@ def started(net: Net, folder: Path, *arguments: str) -> subprocess.Popen[str]:
 
 
 def _limited() -> None:
-    """Limit the memory and enable Ctrl-C, which a shell disables for background jobs."""
+    """Limit the memory."""
     resource.setrlimit(resource.RLIMIT_AS, (ROOM, ROOM))
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def answered(process: subprocess.Popen[str], *, proven: bool = False) -> dict[str, Any]:
