@@ -50,8 +50,9 @@ AWAITED = frozenset(
 )
 """Methods of the context that do nothing unless they are awaited."""
 CONTEXT = ("ctx", "context")
-DEVICE = tuple(f"{name}.device" for name in CONTEXT)
 """Usual names of the context."""
+DEVICE = tuple(f"{name}.device" for name in CONTEXT)
+"""The device of an action, as it is usually written."""
 REMEMBERS = frozenset(("get", "get_versioned", "put", "compare_and_set"))
 """Calls of the context that need the global memory."""
 MADE = {

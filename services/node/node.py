@@ -348,7 +348,7 @@ class Node:
         """Return whether no call, no command and no emergency stop is due yet."""
         if self._commands or now >= self.callee.soonest or now >= self._stops.due:
             return False
-        for caller in self.callers.values():  # noqa: SIM110 - in each tick; `all` takes twice as long
+        for caller in self.callers.values():  # noqa: SIM110 - `all` takes twice as long
             if now >= caller.soonest:
                 return False
         return True
