@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import socket
 from collections import deque
 
@@ -10,6 +11,12 @@ KEPT = 256
 files."""
 
 _kept: deque[socket.socket] = deque()
+
+
+@atexit.register
+def _close() -> None:
+    for probe in _kept:
+        probe.close()
 
 
 def free_ports(count: int) -> list[int]:

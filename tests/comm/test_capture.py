@@ -170,8 +170,10 @@ def test_an_image_that_cannot_be_converted_is_no_end(device: type[Device]) -> No
     """As of a camera that gives YUYV: its two channels are no colours."""
     device.channels = 2
     images = CaptureImages(0, time.monotonic)
-    images.start(30.0)
-    until("the fault", lambda: "no usable image" in images.condition)
+    with pytest.raises(ConnectionError, match="camera 0: no usable image, try another fourcc"):
+        images.start(30.0)
+    until("the second attempt", lambda: device.opened.count("released") == 2)
+    assert "no usable image" in images.condition, "said until an image came"
     device.channels = 3
     until("an image", images.newest)
     images.close()

@@ -27,7 +27,7 @@ SILENCE_MS = 3000
 FIRST_WAIT, LONGEST_WAIT = 0.5, 8.0
 """Seconds until a source that was lost is opened again: twice as long after each failure."""
 OPEN_LIMIT = 10.0
-"""Seconds for which `start` waits until a source is open."""
+"""Seconds for which `start` waits for the first image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,12 +76,12 @@ class CaptureImages:
 
     @property
     def condition(self) -> str:
-        """Why no images come; empty while the camera is open or was not asked for any."""
+        """Why no images come; empty while they come or none was asked for."""
         return self._fault
 
     def start(self, rate: float) -> None:
-        """Deliver the images from now on, those that come. Raises ConnectionError with the source
-        while it cannot be opened."""
+        """Deliver the images from now on; return when the camera has given one. Raises
+        ConnectionError with the source and the reason while it gives none."""
         with self._lock:
             self._newest, self._sequence, self._rate = None, 0, rate
         if self._thread is None:
@@ -90,7 +90,7 @@ class CaptureImages:
             self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
             self._thread.start()
         if not self._tried.wait(OPEN_LIMIT):
-            raise ConnectionError(f"camera {self._target!r} was not opened within {OPEN_LIMIT:g} s")
+            raise ConnectionError(f"camera {self._target!r}: no image within {OPEN_LIMIT:g} s")
         if self._fault:
             raise ConnectionError(self._fault)
 
@@ -121,11 +121,8 @@ class CaptureImages:
                     fault = f"camera {self._target!r} was lost"
                     if capture is None:
                         fault = self._closed()
-                    else:
-                        self._fault = ""
-                        self._tried.set()
-                        if self._take(capture, ended):
-                            wait = FIRST_WAIT
+                    elif self._take(capture, ended):
+                        wait = FIRST_WAIT
             except Exception as raised:  # of OpenCV: an image that it cannot convert, and others
                 text = " ".join(str(raised).split())
                 fault = f"camera {self._target!r}: no usable image, try another fourcc: {text:.300}"
@@ -147,19 +144,20 @@ class CaptureImages:
         """Take images until the camera is lost or closed; return how many came."""
         count = 0
         while not ended.is_set() and capture.grab():
-            count += 1
             time = self._clock() - self._settings.latency
-            if not self._rate:
-                continue
-            taken, pixels = capture.retrieve()
-            if not taken:
-                break
-            if not self._settings.colour:
-                pixels = grey(pixels)
-            with self._lock:
-                if self._rate:
-                    self._newest = Image(pixels, time, self._sequence)
-                    self._sequence += 1
+            if self._rate:
+                taken, pixels = capture.retrieve()
+                if not taken:
+                    break
+                if not self._settings.colour:
+                    pixels = grey(pixels)
+                with self._lock:
+                    if self._rate:
+                        self._newest = Image(pixels, time, self._sequence)
+                        self._sequence += 1
+            count += 1
+            self._fault = ""
+            self._tried.set()
         return count
 
 
