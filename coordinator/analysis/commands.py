@@ -32,7 +32,7 @@ from petrobot.coordinator.analysis.report import CUT, FULL, LATE, Analysis, anal
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
 from petrobot.coordinator.analysis.time.measures import Measure as UserMeasure
-from petrobot.coordinator.analysis.time.measures import read_measure, value_of
+from petrobot.coordinator.analysis.time.measures import read_measures, value_of
 from petrobot.coordinator.analysis.time.simulate import (
     IntervalEstimate,
     Simulation,
@@ -118,6 +118,7 @@ def analyse_command(
     due = deadlines[-1][0]
     full = _full(FAULT, f"{path}: the memory was used up; give more --memory, or fewer --states")
     try:
+        expressions = read_measures(measures)
         with until(due, clock):
             model = open_model(path)
         view = view or _view(model, rates)
@@ -152,8 +153,8 @@ def analyse_command(
                 what = [change.text for change in wanted]
                 data |= {"what_if": what, "as_it_is": now.to_json(structure=False)}
                 said += ["", f"what if {', '.join(what)}:", *_compared(now, then)]
-            if measures:
-                data["measures"], lines = _tell_measures(measures, analyses)
+            if expressions:
+                data["measures"], lines = _tell_measures(expressions, analyses)
                 said += lines
     except (NetFileError, ValueError, OverflowError) as error:
         return _refused(path, error)
@@ -184,16 +185,11 @@ def _deadlines(limits: SearchLimits, analyses: int) -> list[tuple[float | None, 
 
 
 def _tell_measures(
-    measures: Sequence[str], analyses: Sequence[Analysis]
+    measures: Sequence[UserMeasure], analyses: Sequence[Analysis]
 ) -> tuple[dict[str, float], list[str]]:
     """Return each measure of the user in the last analysis, and the lines that tell it in all.
     Raises NetFileError."""
-    asked = [read_measure(text) for text in measures]
-    for one in asked:
-        if not one.name or not one.text or sum(other.name == one.name for other in asked) > 1:
-            problem = "two measures have this name" if one.name and one.text else "a part is empty"
-            raise NetFileError("--measure", one.name or one.text, problem, "write NAME=EXPRESSION")
-    rows = {one.name: _measure_values(one, analyses) for one in asked}
+    rows = {one.name: _measure_values(one, analyses) for one in measures}
     lines = [
         f"  {name:28}" + " -> ".join(f"{value:.6g}" for value in values)
         for name, values in rows.items()

@@ -24,7 +24,7 @@ from petrobot.coordinator.analysis.time.completion import Completion, completion
 from petrobot.coordinator.analysis.time.gspn import Chain
 from petrobot.coordinator.analysis.time.markov import visits_before
 from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
-from petrobot.coordinator.analysis.time.measures import read_measure, value_of
+from petrobot.coordinator.analysis.time.measures import read_measures, value_of
 from petrobot.coordinator.analysis.time.simulate import simulate
 from petrobot.coordinator.analysis.time.stochastic import StochasticView, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
@@ -174,8 +174,8 @@ def test_measures_of_the_user() -> None:
         "marked(act)": 1.0,
         "(tokens(act)+tokens(done))*2": 2.0,
     }.items():
-        assert value_of(read_measure(text), found) == pytest.approx(value, abs=1e-9), text
-    assert read_measure("late=late(4)").name == "late"
+        assert value_of(*read_measures([text]), found) == pytest.approx(value, abs=1e-9), text
+    assert read_measures(["late=late(4)"])[0].name == "late"
     for text, said in {
         "rate(nope)": "no transition 'nope'; transitions: go",
         "time(1.5)": "out of range",
@@ -186,7 +186,7 @@ def test_measures_of_the_user() -> None:
         "R_goal": "not defined here",
     }.items():
         with pytest.raises(NetFileError, match=said):
-            value_of(read_measure(text), found)
+            value_of(*read_measures([text]), found)
 
 
 def test_measured_runs_choices_and_no_declared_estimates() -> None:

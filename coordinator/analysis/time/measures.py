@@ -13,7 +13,7 @@ Written as an expression, if wanted with a name in front: `late=late(20)`, `time
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import isfinite
@@ -34,10 +34,21 @@ class Measure:
     text: str
 
 
-def read_measure(text: str) -> Measure:
-    """Split a measure into name and expression."""
-    name, sign, rest = text.partition("=")
-    return Measure(name.strip(), rest.strip()) if sign else Measure(text.strip(), text.strip())
+def read_measures(texts: Sequence[str]) -> list[Measure]:
+    """Split each measure into name and expression. Raises NetFileError."""
+    read: dict[str, Measure] = {}
+    for text in texts:
+        name, _, rest = (part.strip() for part in text.partition("="))
+        measure = Measure(name, rest if "=" in text else name)
+        if not measure.name or not measure.text:
+            raise NetFileError(
+                "--measure", name or rest, "a part is empty", "write NAME=EXPRESSION"
+            )
+        if name in read:
+            problem = "two measures have this name"
+            raise NetFileError("--measure", name, problem, "write NAME=EXPRESSION")
+        read[name] = measure
+    return list(read.values())
 
 
 def value_of(measure: Measure, found: Forecast | LongRun) -> float:
