@@ -119,14 +119,6 @@ OBEYED = frozenset((*LIMITS, "pause"))
 COMMON_KEYS = (*PORT_KEYS, *LIMITS)
 
 
-def refuse_unknown_keys(config: Mapping[str, Any], own: Collection[str]) -> None:
-    """Raise ValueError if a device's table has a key that is neither one of its driver's `own` nor
-    of its ports: a mistyped key would have no effect. For a driver's constructor."""
-    for name in config:
-        if name not in own and name not in COMMON_KEYS:
-            raise ValueError(f"unknown key {name!r}{nearest(name, [*own, *COMMON_KEYS])}")
-
-
 class _Required:
     """Default of a required key."""
 

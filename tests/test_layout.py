@@ -39,7 +39,16 @@ ALLOWED: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("services.host", ()),
     ("services.comm", ("services.host",)),
     *(
-        (room, ("services.action", "services.device", "services.comm", "services.host"))
+        (
+            room,
+            (
+                "services.action",
+                "services.device",
+                "services.camera",
+                "services.comm",
+                "services.host",
+            ),
+        )
         for room in ("services.vision", "services.motion", "services.mobile")
     ),
     # What a user writes: an adapter reaches petrobot by its public API alone.

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Final
 
 from petrobot.services.action import Cancelled, Context, Result, error, failure, success
-from petrobot.services.comm.streams.image import explained
-from petrobot.services.mobile.camera import FloorCamera, FloorCameraError
+from petrobot.services.camera import CameraError
+from petrobot.services.mobile.camera import FloorCamera
 from petrobot.services.mobile.detection import (
     TemplateBank,
     TrackDetector,
@@ -167,11 +167,11 @@ async def _next(
     one."""
     try:
         image = await camera.read(ctx, image_timeout)
-    except FloorCameraError as fault:
+    except CameraError as fault:
         return error("bad_image", str(fault))
     if image is None:
         camera.end()  # The next run opens the source again.
-        text = explained(f"no image for {image_timeout} s", camera.state())
+        text = camera.missing(f"no image for {image_timeout} s")
         return error("no_image", text, images=watcher.images)
     sight = watcher.look(image.pixels)
     ahead = TrackAhead(max(0.0, ctx.now - image.time), sight.confidence, sight.end, thinned(sight))

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.services.action import Context, Result, error, provisional, success
-from petrobot.services.comm.streams.image import explained
 from petrobot.services.picking.camera import TableCamera
 from petrobot.services.picking.finding import FINDERS, Finder, Found
 from petrobot.services.picking.model import PickingCell
@@ -52,8 +51,8 @@ async def _locate(ctx: Context[TableCamera], find: Finder, images: int, timeout:
     taken = await ctx.device.take(ctx, images, timeout)
     if len(taken) < images:
         text = f"{len(taken)} of {images} images came"
-        return error("no_image", explained(text, ctx.device.state()))
-    parts = confirmed([find(image, cell) for image in taken])
+        return error("no_image", ctx.device.missing(text))
+    parts = confirmed([find(image.pixels, cell) for image in taken])
     if not parts:
         return error(
             "no_part", f"no part of {', '.join(cell.kinds)} is seen in the area of the parts"
@@ -106,8 +105,8 @@ async def await_tray(
         taken = await ctx.device.take(ctx, 1, 1.0)
         if not taken:
             text = "the camera sends no images"
-            return error("no_image", explained(text, ctx.device.state()))
-        empty = empty + 1 if is_empty(taken[0], cell, tray) else 0
+            return error("no_image", ctx.device.missing(text))
+        empty = empty + 1 if is_empty(taken[0].pixels, cell, tray) else 0
         if empty == 3:
             return success(slots={**(slots or {}), tray: 0})
         await ctx.sleep(0.2)

@@ -24,8 +24,9 @@ from petrobot.services.action import (
     provisional,
     success,
 )
-from petrobot.services.comm.streams.image import Image, explained
-from petrobot.services.vision.camera import Camera, CameraError, Mark
+from petrobot.services.camera import CameraError
+from petrobot.services.comm.streams.image import Image
+from petrobot.services.vision.camera import Camera, Mark
 from petrobot.services.vision.location import BallDetector, MixtureOfGaussians
 from petrobot.services.vision.specification import Specification
 
@@ -231,7 +232,7 @@ class _Search:
                 self._ctx, min(over, silent + asked.image_timeout) - self._ctx.now
             )
             if image is None and self._ctx.now >= silent + asked.image_timeout:
-                text = explained(f"no image for {asked.image_timeout} s", self._camera.state())
+                text = self._camera.missing(f"no image for {asked.image_timeout} s")
                 return error("no_image", text, images=self._images)
             if image is None:
                 continue

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from petrobot.services.action import Cancelled, Context, Result, Status, error, failure, success
-from petrobot.services.comm.streams.image import Image, explained
-from petrobot.services.vision.camera import Camera, CameraError, Mark
+from petrobot.services.camera import CameraError
+from petrobot.services.comm.streams.image import Image
+from petrobot.services.vision.camera import Camera, Mark
 from petrobot.services.vision.location import BallWindow
 from petrobot.services.vision.prediction import ExitWay, PredictedExit, Predictor, Surface
 from petrobot.services.vision.specification import Specification
@@ -158,7 +159,7 @@ class _Chase:
         """Read images until the ball has left, is lost, or leaves another way."""
         asked = self._specification
         self._camera.start(asked.rate)
-        pause = 1.5 / self._camera.rate
+        pause = 1.5 / self._camera.requested
         silent = self._ctx.now
         while True:
             image = await self._camera.read(self._ctx, pause)
@@ -168,7 +169,7 @@ class _Chase:
                 if ended is not None:
                     return ended
             elif self._ctx.now >= silent + asked.image_timeout:
-                text = explained(f"no image for {asked.image_timeout} s", self._camera.state())
+                text = self._camera.missing(f"no image for {asked.image_timeout} s")
                 return error("no_image", text, **self._values())
             if self._left():
                 return await self._judged()

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
         provisional,
         success,
     )
+    from petrobot.services.camera import CameraDriver
+    from petrobot.services.comm.streams.image import Image
     from petrobot.services.comm.streams.line import ByteLine, Link
     from petrobot.services.conformance import DriverCheck, check_driver
     from petrobot.services.device import Driver, Ports, Remote, Setpoint, key, numbers
@@ -40,11 +42,13 @@ if TYPE_CHECKING:
 __all__ = [
     "ByteLine",
     "CallFailed",
+    "CameraDriver",
     "Cancelled",
     "CommandRefused",
     "Context",
     "Driver",
     "DriverCheck",
+    "Image",
     "JointChain",
     "JointMotion",
     "Link",
@@ -72,6 +76,8 @@ _HOMES = {
     **dict.fromkeys(
         ("Driver", "Ports", "Remote", "Setpoint", "key", "numbers"), "petrobot.services.device"
     ),
+    "CameraDriver": "petrobot.services.camera",
+    "Image": "petrobot.services.comm.streams.image",
     "JointChain": "petrobot.services.joint_chain",
     "JointMotion": "petrobot.services.joint_motion",
     **dict.fromkeys(("DriverCheck", "check_driver"), "petrobot.services.conformance"),

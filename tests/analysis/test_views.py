@@ -174,7 +174,7 @@ def test_measures_of_the_user() -> None:
         "marked(act)": 1.0,
         "(tokens(act)+tokens(done))*2": 2.0,
     }.items():
-        assert value_of(*read_measures([text]), found) == pytest.approx(value, abs=1e-9), text
+        assert value_of(read_measures([text])[0], found) == pytest.approx(value, abs=1e-9), text
     assert read_measures(["late=late(4)"])[0].name == "late"
     for text, said in {
         "rate(nope)": "no transition 'nope'; transitions: go",
@@ -186,7 +186,7 @@ def test_measures_of_the_user() -> None:
         "R_goal": "not defined here",
     }.items():
         with pytest.raises(NetFileError, match=said):
-            value_of(*read_measures([text]), found)
+            value_of(read_measures([text])[0], found)
 
 
 def test_measured_runs_choices_and_no_declared_estimates() -> None:

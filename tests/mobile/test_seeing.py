@@ -11,7 +11,7 @@ import pytest
 from petrobot.services.comm.streams.camera import MemoryImages
 from petrobot.services.comm.streams.image import Image
 from petrobot.services.mobile import seeing
-from petrobot.services.mobile.camera import FloorCamera, FloorCameraError
+from petrobot.services.mobile.camera import FloorCamera
 from petrobot.services.mobile.sight import TrackAhead, TrackEnd
 from petrobot.services.rehearsal import Rehearsal, rehearse
 from tests.mobile.conftest import DrawnFloor, Photographer
@@ -117,7 +117,7 @@ def test_a_camera_that_stops_is_an_error_and_is_started_again() -> None:
     drive = CarriedCamera(DrawnFloor("SSS"), 0.3, 0.1, dark=0.5)
     played = drive.play(seeing.watch_edges)
     assert (played.result.status, played.result.cause) == ("error", "no_image")
-    assert drive.camera.rate == 0.0
+    assert drive.camera.requested == 0.0
 
 
 def test_images_of_another_size_are_refused() -> None:
@@ -130,11 +130,6 @@ def test_a_cancelled_watch_withdraws_its_set_points() -> None:
     played = CarriedCamera(DrawnFloor("SSSS"), 0.3, 0.1).play(seeing.watch_edges, cancel_after=0.5)
     assert played.result.cause == "cancelled"
     assert max(time for time, _, _ in played.published) <= 0.51
-
-
-def test_the_driver_refuses_an_impossible_rate() -> None:
-    with pytest.raises(FloorCameraError, match="rate"):
-        FloorCamera({"rate": 0.0}, CameraPorts())  # type: ignore[arg-type]
 
 
 def test_the_driver_is_a_device_without_commands() -> None:

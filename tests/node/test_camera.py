@@ -1,0 +1,134 @@
+"""The base class of cameras: images come only while they are wanted, those of another shape are
+refused with the remedy, and the operator sees the last one."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import cv2
+import numpy as np
+import pytest
+
+from petrobot import CameraDriver, Context, Image, Ports, Result, error, rehearse, success
+from petrobot.services.camera import CameraError
+
+SHAPE = (48, 64)
+
+
+class Source:
+    """An image of this shape at each call, with its number as brightness; none while it is cut
+    off."""
+
+    def __init__(self) -> None:
+        self.shape: tuple[int, ...] = SHAPE
+        self.condition, self.rates, self.count = "", list[float](), 0
+
+    def start(self, rate: float) -> None:
+        if self.condition:
+            raise ConnectionError(self.condition)
+        self.rates.append(rate)
+
+    def stop(self) -> None:
+        self.rates.append(0.0)
+
+    def close(self) -> None:
+        self.rates.append(-1.0)
+
+    def newest(self) -> Image | None:
+        if self.condition or not self.rates or self.rates[-1] <= 0.0:
+            return None
+        self.count += 1
+        return Image(np.full(self.shape, self.count, np.uint8), 0.5, self.count)
+
+
+class Eye(CameraDriver):
+    """A camera whose images have a known shape."""
+
+    usual_rate = 40.0
+    shape = SHAPE
+    shaped_by = "[camera] of eye.toml"
+
+
+def eye(source: Source, **table: Any) -> Eye:
+    ports = type("Own", (), {"images": lambda self: source, "now": 2.0})()
+    return Eye(table, cast(Ports, ports))
+
+
+async def look(ctx: Context[CameraDriver], count: int = 2) -> Result:
+    try:
+        taken = await ctx.device.take(ctx, count, 0.5)
+    except (CameraError, ConnectionError) as fault:
+        return error("no_image", str(fault))
+    if len(taken) < count:
+        return error("no_image", ctx.device.missing(f"{len(taken)} images came"))
+    return success(shown=[int(image.pixels.flat[0]) for image in taken])
+
+
+def test_images_come_only_while_they_are_taken() -> None:
+    source = Source()
+    camera = eye(source)
+    assert rehearse(look, device=camera).result.values == {"shown": [1, 2]}
+    assert rehearse(look, device=camera, count=1).result.values == {"shown": [3]}
+    assert source.rates == [40.0, 0.0, 40.0, 0.0] and camera.stopped()
+    assert camera.state() == {"rate": 0.0, "source": "ok", "images": 3}
+    camera.close()
+    assert source.rates[-1] == -1.0
+
+
+@pytest.mark.parametrize(
+    ("trouble", "text"),
+    [
+        ({"shape": (24, 32)}, "expected images of 64x48, found 32x24; change [camera] of eye.toml"),
+        ({"shape": (48, 64, 3)}, "expected images of 64x48, found 64x48x3"),
+        ({"condition": "camera 'x' was lost"}, "was lost"),
+    ],
+)
+def test_what_is_wrong_with_the_images_is_said(trouble: dict[str, Any], text: str) -> None:
+    source = Source()
+    camera = eye(source)
+    for name, value in trouble.items():
+        setattr(source, name, value)
+    found = rehearse(look, device=camera).result
+    assert found.cause == "no_image" and text in found.text, found
+    assert camera.stopped() and (not source.rates or source.rates[-1] == 0.0)
+    source.shape, source.condition = SHAPE, ""
+    assert rehearse(look, device=camera).result.status == "success"
+
+
+def test_why_images_are_missing_is_said() -> None:
+    """By an action that began before the camera was lost."""
+    source = Source()
+
+    async def cut_off(ctx: Context[CameraDriver]) -> Result:
+        ctx.device.start()
+        source.condition = "camera 'x' was lost"
+        assert await ctx.device.read(ctx, 0.3) is None
+        return error("no_image", ctx.device.missing("no image for 0.3 s"))
+
+    camera = eye(source)
+    found = rehearse(cut_off, device=camera).result
+    assert found.text == "no image for 0.3 s: camera 'x' was lost"
+    assert camera.state()["source"] == "camera 'x' was lost" and camera.hold(0.0) == "held"
+    camera.stop(0.0)
+    assert camera.stopped()
+
+
+@pytest.mark.parametrize("rate", [-1.0, 1001.0])
+def test_an_impossible_rate_is_refused(rate: float) -> None:
+    with pytest.raises(CameraError, match=r"rate: expected images/s .* such as 40, found"):
+        eye(Source(), rate=rate)
+    assert eye(Source(), rate=12.5).rate == 12.5
+
+
+def test_the_operator_sees_the_last_image() -> None:
+    source = Source()
+    camera = eye(source)
+    camera.shape = ()
+    source.shape = (48, 64, 3)
+    assert camera.picture() == {}
+    rehearse(look, device=camera)
+    seen = camera.picture()
+    shown = cv2.imdecode(np.frombuffer(seen["data"], np.uint8), cv2.IMREAD_COLOR)
+    assert shown is not None and shown.shape == (seen["height"], seen["width"], 3) == (48, 64, 3)
+    assert abs(float(shown.mean()) - 2.0) < 2.0
+    assert (seen["mime"], seen["age"]) == ("image/jpeg", 1.5)
