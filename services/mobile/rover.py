@@ -64,7 +64,7 @@ class Rover(Driver):
     the middle of its axle in the odometry frame: where that stood when the driver was made.
     """
 
-    obeys = LIMITS
+    obeys = (*LIMITS, "pause")
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         self.limit(config)
@@ -89,7 +89,6 @@ class Rover(Driver):
         self._reflectors = ReflectorMap(self.numbers.sensor, self.numbers.track.reflector_height)
         self._profile = SpeedProfile()
         self._mode, self._reason = "off", ""
-        self._paused = False
         self._leased_until = 0.0
         self._law, self._asked, self._heading, self._rate = "feed_forward", 0.0, 0.0, 1.0
         self._speed = self._turning = self._measured = 0.0
@@ -178,13 +177,9 @@ class Rover(Driver):
         still = self._standing() and not self._master.blind
         return still and self._mode in ("off", "rest")
 
-    def hold(self, now: float) -> str:
-        """Pause for the operator: brake, and resume the same motion after `release`."""
-        self._paused = True
-        return "held"
-
     def release(self, now: float) -> None:
-        self._paused = False
+        """End the operator's pause: the same motion continues."""
+        super().release(now)
         self._leased_until = max(self._leased_until, now + LEASE)
 
     def close(self) -> None:
@@ -322,11 +317,11 @@ class Rover(Driver):
             return self._set_wheels(0.0, 0.0)
         if self._mode == "off":
             self._mode, self._reason = "rest", "enabled"
-        if self._mode in ("follow", "turn") and now > self._leased_until and not self._paused:
+        if self._mode in ("follow", "turn") and now > self._leased_until and not self.paused:
             self._rest("silent_action")
         if self._mode == "follow" and (outside := self._leaves()):
             self._rest(outside)
-        if self._paused or self._mode == "rest":
+        if self.paused or self._mode == "rest":
             return self._brake()
         return self._turn_on() if self._mode == "turn" else self._follow_on()
 

@@ -115,7 +115,7 @@ class Arm(Driver):
     cup's mouth in the arm's base frame."""
 
     period: float | None = PERIOD
-    obeys = LIMITS
+    obeys = (*LIMITS, "pause")
     stream: str = key("catch_point", "stream of catch points")
     stream_period: float = key(0.02, "s")
     enable: bool = key(True, "enable the drives at the start")
@@ -150,7 +150,6 @@ class Arm(Driver):
         self._ball = CupBarrier()
         self._mode = "off"
         self._reason = ""
-        self._paused = False
         self._leased_until = 0.0
         self._after_stop = ""
         self._commanded: deque[tuple[float, ...]] = deque(maxlen=LAG_CYCLES + 1)
@@ -208,7 +207,7 @@ class Arm(Driver):
             "phase": master.phase.value,
             "mode": self._mode,
             "reason": self._reason,
-            "paused": self._paused,
+            "paused": self.paused,
             "q": tuple(self._measured),
             "qd": tuple(self._measured_speed),
             "target": self._steering.goal,
@@ -251,13 +250,9 @@ class Arm(Driver):
             return self._master.phase is not MasterPhase.RUNNING or self._stands
         return self._stands and self._trajectory.still
 
-    def hold(self, now: float) -> str:
-        """Pause for the operator: brake, and resume the same motion after `release`."""
-        self._paused = True
-        return "held"
-
     def release(self, now: float) -> None:
-        self._paused = False
+        """End the operator's pause: the same motion continues."""
+        super().release(now)
         self._leased_until = max(self._leased_until, now + LEASE)
 
     def close(self) -> None:
@@ -370,13 +365,13 @@ class Arm(Driver):
         late = self.ports.now
         if self._follows() and not self._follower.fresh(late):
             self._let_go()
-        self._steering.cycle(self._paused)
+        self._steering.cycle(self.paused)
         if self._follows():
             self._follower.executed(late)
 
     def _follows(self) -> bool:
         """Return whether this cycle moves towards a set point."""
-        return self._mode == "follow" and self._steering.goal is not None and not self._paused
+        return self._mode == "follow" and self._steering.goal is not None and not self.paused
 
     def _let_go(self) -> None:
         """Come to rest because the last set point is stale; count its values as new if they arrive
@@ -389,7 +384,7 @@ class Arm(Driver):
         """Aim at the newest prediction; hold if it is stale or the action has stopped repeating its
         command."""
         follower, trajectory = self._follower, self._trajectory
-        if now > self._leased_until and not self._paused:
+        if now > self._leased_until and not self.paused:
             self._rest("silent_action")
             return
         if not follower.take(self._setpoint, now):

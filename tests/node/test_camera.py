@@ -45,7 +45,7 @@ class Eye(CameraDriver):
     """A camera whose images have a known shape."""
 
     usual_rate = 40.0
-    shape = SHAPE
+    shape: tuple[int, ...] = SHAPE
     shaped_by = "[camera] of eye.toml"
 
 
