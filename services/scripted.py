@@ -18,7 +18,6 @@ events = [{ after = 0.1, name = "contact", data = { force = 2.0 } }]
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +25,7 @@ from typing import Any
 
 from petrobot.services.action import Context, Result, Status
 from petrobot.services.comm.location_file.reading import nearest
+from petrobot.services.host.toml_text import TomlError, read_toml
 
 _KEYS = ("status", "seconds", "values", "cause", "text", "events", "deferred")
 _EVENT_KEYS = ("after", "name", "data")
@@ -95,9 +95,9 @@ def load(path: str | Path) -> dict[str, Callable[..., Any]]:
     cannot be read."""
     source = Path(path)
     try:
-        data = tomllib.loads(source.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as fault:
-        raise ScriptError(f"{source}: not valid TOML: {fault}") from fault
+        data = read_toml(source.read_bytes(), str(source))
+    except TomlError as fault:
+        raise ScriptError(str(fault)) from fault
     faults = [f"{source}: {f}" for f in _top_faults(data)]
     scripted: dict[str, Callable[..., Any]] = {}
     for name, rule in data.get("actions", {}).items() if not faults else ():

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from importlib.resources import files
 from typing import Any, Self
+
+from petrobot.services.host.toml_text import TomlError, read_toml
 
 NOMINAL = "rover.toml"
 
@@ -107,9 +108,9 @@ class RoverModel:
 def read_rover(text: str, source: str = NOMINAL) -> RoverModel:
     """Read a rover from the text of a TOML file. Raises RoverFileError."""
     try:
-        tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as fault:
-        raise RoverFileError(f"{source}: not valid TOML ({fault}); correct it") from fault
+        tables = read_toml(text, source)
+    except TomlError as fault:
+        raise RoverFileError(str(fault)) from fault
     return RoverModel(
         FloorSizes.of(tables, "track", source),
         Wheels.of(tables, "rover", source),

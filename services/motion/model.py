@@ -5,7 +5,6 @@ drives and the laboratory."""
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,6 +13,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from petrobot.services.host.toml_text import read_toml
 
 Vector = NDArray[np.float64]
 
@@ -105,8 +106,8 @@ def _column(joints: Sequence[Mapping[str, Any]], key: str, scale: float = 1.0) -
 
 def read_arm(text: str) -> ArmModel:
     """Read an arm from a text in the format that the head of `puma560.toml` describes. Raises
-    ArmFileError."""
-    table = tomllib.loads(text)
+    ArmFileError and TomlError."""
+    table = read_toml(text, "puma560.toml")
     joints = table.get("joint", [])
     if len(joints) != JOINTS:
         raise ArmFileError(f"puma560.toml: expected {JOINTS} tables [[joint]], got {len(joints)}")
@@ -148,8 +149,8 @@ def _poses(table: Mapping[str, Any], limits: Vector) -> dict[str, tuple[float, .
 
 def read_cell(text: str) -> CatchingCell:
     """Read what motion needs from a text in the format of `services/cell.toml`. Raises
-    ArmFileError."""
-    table = tomllib.loads(text)
+    ArmFileError and TomlError."""
+    table = read_toml(text, "cell.toml")
     for section in ("cup", "table", "ball"):
         if section not in table:
             raise ArmFileError(

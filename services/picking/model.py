@@ -7,7 +7,6 @@ joints can be used. `ArmNumbers.over` gives the joint angles for fingers that po
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from petrobot.services.host.toml_text import TomlError, read_toml
 from petrobot.services.joint_chain import JointChain, rotation_matrix, rotation_vector
 
 
@@ -245,9 +245,9 @@ def _text(path: Path) -> str:
 
 def _table(text: str, source: str) -> Mapping[str, Any]:
     try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as fault:
-        raise NumbersError(f"{source}: {fault}") from fault
+        return read_toml(text, source)
+    except TomlError as fault:
+        raise NumbersError(str(fault)) from fault
 
 
 def _pair(values: Sequence[float]) -> tuple[float, float]:

@@ -3,7 +3,6 @@ their poses."""
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from petrobot.services.host.toml_text import TomlError, read_toml
 from petrobot.services.vision.calibration import Board, BoardView, Calibration
 from petrobot.services.vision.optics import Array, Optics
 
@@ -59,7 +59,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
     """Read a calibration from TOML; `name` is the file named in error messages. Raises
     CalibrationFileError."""
     try:
-        data = tomllib.loads(text)
+        data = read_toml(text, name)
         if data.get("schema") != SCHEMA:
             raise CalibrationFileError(
                 f"{name}: schema: expected {SCHEMA}, got {data.get('schema')!r}; remake the file "
@@ -75,10 +75,8 @@ def parse_calibration(text: str, name: str) -> Calibration:
         )
         quality = (float(data[key]) for key in ("residual_px", "table_residual", "table_sigma"))
         calibration = Calibration(optics, int(data["views"]), *quality)
-    except tomllib.TOMLDecodeError as fault:
-        raise CalibrationFileError(
-            f"{name}: not valid TOML ({fault}); remake it with petrobot calibrate"
-        ) from fault
+    except TomlError as fault:
+        raise CalibrationFileError(f"{fault}; or remake it with petrobot calibrate") from fault
     except KeyError as fault:
         raise CalibrationFileError(
             f"{name}: key {fault} is missing; remake it with petrobot calibrate"
@@ -123,7 +121,7 @@ def missing_views(folder: Path) -> tuple[list[tuple[Path, bool]], Board]:
 def _listed(folder: Path) -> tuple[Board, list[tuple[Path, Array | None]]]:
     path = folder / "views.toml"
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = read_toml(path.read_bytes(), str(path))
         board = Board(
             int(data["board"]["columns"]),
             int(data["board"]["rows"]),
@@ -134,8 +132,8 @@ def _listed(folder: Path) -> tuple[Board, list[tuple[Path, Array | None]]]:
         raise CalibrationFileError(
             f"{path}: cannot be read ({fault.strerror}); it lists the board images"
         ) from fault
-    except tomllib.TOMLDecodeError as fault:
-        raise CalibrationFileError(f"{path}: not valid TOML ({fault}); correct it") from fault
+    except TomlError as fault:
+        raise CalibrationFileError(str(fault)) from fault
     except KeyError as fault:
         raise CalibrationFileError(
             f"{path}: key {fault} is missing; docs/vision.md shows such a file"

@@ -3,7 +3,6 @@ operator what was seen."""
 
 from __future__ import annotations
 
-import tomllib
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from petrobot.services.action import Context
-from petrobot.services.camera import CameraDriver, CameraError
+from petrobot.services.camera import CameraDriver
 from petrobot.services.comm.streams.image import Image
 from petrobot.services.device import key
+from petrobot.services.host.toml_text import read_toml
 from petrobot.services.vision.calibration_file import DEFAULT, parse_calibration
 from petrobot.services.vision.location import Background, BallDetector
 from petrobot.services.vision.prediction import Surface
@@ -130,8 +130,4 @@ class Camera(CameraDriver):
     def _cell(self) -> dict[str, Any]:
         name = self.cell
         text = self.ports.file(name).decode() if name else CELL.read_text(encoding="utf-8")
-        try:
-            return tomllib.loads(text)
-        except tomllib.TOMLDecodeError as fault:
-            message = f"{name or CELL.name}: not valid TOML ({fault}); correct it"
-            raise CameraError(message) from fault
+        return read_toml(text, name or CELL.name)

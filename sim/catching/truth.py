@@ -8,7 +8,6 @@ Only the laboratory reads this. A regime name is a regime and any number of dist
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -16,6 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from petrobot.services.host import toml_text
 
 Vector = NDArray[np.float64]
 
@@ -125,14 +126,13 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Return a TOML file as a dict. Raises LaboratoryError naming the file when it is missing or
     not TOML."""
     try:
-        with path.open("rb") as file:
-            return tomllib.load(file)
+        return toml_text.read_toml(path.read_bytes(), str(path))
     except OSError as fault:
         raise LaboratoryError(
             f"{path}: cannot be read ({fault.strerror}); give the path of an existing file"
         ) from fault
-    except tomllib.TOMLDecodeError as fault:
-        raise LaboratoryError(f"{path}: not valid TOML ({fault}); correct it") from fault
+    except toml_text.TomlError as fault:
+        raise LaboratoryError(str(fault)) from fault
 
 
 def disturbed(settings: Mapping[str, Any], regime: str) -> tuple[Mapping[str, Any], dict[str, Any]]:

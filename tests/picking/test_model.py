@@ -96,7 +96,7 @@ def test_a_point_out_of_reach_is_refused() -> None:
         ("so101", "rest = [0.0, ", "rest = [", "poses.rest: expected 5 joint angles"),
         ("cell", 'shape = "round"', 'shape = "ball"', "expected box or round, found 'ball'"),
         ("cell", 'tray = "boxes"', 'tray = "bin"', "expected boxes or rounds, found 'bin'"),
-        ("cell", "[camera]", "[camera", "cell.toml: "),
+        ("cell", "[camera]", "[camera", "cell.toml:10: not valid TOML: "),
     ],
 )
 def test_a_bad_file_is_refused_with_its_name_and_key(

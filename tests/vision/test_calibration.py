@@ -210,7 +210,7 @@ def test_file_round_trip(cell: dict[str, Any]) -> None:
 )
 def test_bad_file_is_refused_with_file_and_remedy(old: str, new: str, fault: str) -> None:
     text = DEFAULT.read_text(encoding="utf-8").replace(old, new, 1)
-    with pytest.raises(CalibrationFileError, match=r"lab\.toml: .*remake it") as refused:
+    with pytest.raises(CalibrationFileError, match=r"lab\.toml:.*remake it") as refused:
         parse_calibration(text, "lab.toml")
     assert fault in str(refused.value)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -19,6 +18,7 @@ from xml.etree.ElementTree import Element
 from petrobot.coordinator.analysis.limits import keep_time
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.task.net import Arcs, Net
+from petrobot.services.host.toml_text import TomlError, read_toml
 
 FILE = "the net in the file"
 """What stays unknown if the time is used up before a file has been read."""
@@ -436,14 +436,14 @@ def read_rates(text: str, file: str, model: NetFile) -> Gspn:
 
 def _tables(text: str, file: str) -> dict[str, Any]:
     try:
-        said = json.loads(text) if text.lstrip().startswith("{") else tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
-        raise NetFileError(
-            file, "TOML", str(error), "write [rates] and TRANSITION = NUMBER below it"
-        ) from error
+        return json.loads(text) if text.lstrip().startswith("{") else read_toml(text, file)
+    except TomlError as error:
+        raise NetFileError(file, error.key, error.found, error.remedy, line=error.line) from error
+    except json.JSONDecodeError as error:
+        remedy = 'write {"rates": {"TRANSITION": NUMBER}}'
+        raise NetFileError(file, "JSON", error.msg, remedy, line=error.lineno) from error
     except RecursionError as error:
-        raise NetFileError(file, "TOML", "nested too deeply", "flatten it") from error
-    return dict(said)
+        raise NetFileError(file, "JSON", "nested too deeply", "flatten it") from error
 
 
 def _sorted_in(said: dict[str, Any], file: str, model: NetFile) -> dict[str, Any]:
