@@ -26,6 +26,7 @@ class CameraDriver(Driver):
     Images come only while actions want them, and only the newest one is kept.
     """
 
+    source: str = key(text='where images come from, such as "capture:0"')
     rate: float = key(0.0, "images/s; 0: the usual rate of this camera")
     threads: int = key(1, "of OpenCV: other nodes share the cores")
 

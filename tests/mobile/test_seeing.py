@@ -49,7 +49,7 @@ class CarriedCamera:
         small: bool = False,
     ) -> None:
         self.ports = CameraPorts()
-        self.camera = FloorCamera({}, self.ports)  # type: ignore[arg-type]
+        self.camera = FloorCamera({"source": "sim"}, self.ports)  # type: ignore[arg-type]
         self._floor, self._s, self._speed, self._dark, self._small = floor, s, speed, dark, small
         self._due, self._sequence = 0.0, 0
         self._random = np.random.default_rng(2)
@@ -133,7 +133,7 @@ def test_a_cancelled_watch_withdraws_its_set_points() -> None:
 
 
 def test_the_driver_is_a_device_without_commands() -> None:
-    camera = FloorCamera({}, CameraPorts())  # type: ignore[arg-type]
+    camera = FloorCamera({"source": "sim"}, CameraPorts())  # type: ignore[arg-type]
     camera.start()
     assert camera.state()["rate"] == 25.0 and not camera.stopped() and camera.hold(0.0) == "held"
     camera.stop(0.0)

@@ -51,7 +51,7 @@ class Eye(CameraDriver):
 
 def eye(source: Source, **table: Any) -> Eye:
     ports = type("Own", (), {"images": lambda self: source, "now": 2.0})()
-    return Eye(table, cast(Ports, ports))
+    return Eye({"source": "sim", **table}, cast(Ports, ports))
 
 
 async def look(ctx: Context[CameraDriver], count: int = 2) -> Result:

@@ -35,4 +35,4 @@ def bench(pinhole: PinholeCamera) -> CameraBench:
 @pytest.fixture
 def context(bench: CameraBench) -> BenchContext:
     """A context with a camera that knows only its shipped calibration."""
-    return BenchContext(bench, Camera({}, BenchPorts(bench)))
+    return BenchContext(bench, Camera({"source": "sim"}, BenchPorts(bench)))

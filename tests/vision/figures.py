@@ -108,7 +108,7 @@ def throws(
     rng, located, tracked, errors = np.random.default_rng(3), LocatorTally(), LocatorTally(), []
     camera.reseed(np.random.default_rng(4))
     bench = TimedBench(camera, light=LIGHTS[light])
-    driver = Camera({}, BenchPorts(bench))
+    driver = Camera({"source": "sim"}, BenchPorts(bench))
     for _ in range(count):
         bench.ball, bench.release = draw_ball(rng, regime), bench.now + float(rng.uniform(0.3, 0.8))
         context = BenchContext(bench, driver)
@@ -201,7 +201,7 @@ def draw_picture(camera: PinholeCamera) -> None:
         ),
         [0.07, 0.05],
     )
-    context = BenchContext(bench, Camera({}, BenchPorts(bench)))
+    context = BenchContext(bench, Camera({"source": "sim"}, BenchPorts(bench)))
     located = run_action(bench, actions.locate_background(context))
     tracking = actions.predict_least_squares(context, ball=located.values["ball"])
     wait, until = tracking.send(None), bench.now + 0.45

@@ -404,7 +404,7 @@ def test_tracker_starts_from_ages_when_the_image_is_not_remembered(context: Benc
     """To another process of the camera, sequence numbers mean nothing, but ages do."""
     context.bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.2)
     located = run_action(context.bench, actions.locate_background(context))
-    fresh = Camera({}, BenchPorts(context.bench))
+    fresh = Camera({"source": "sim"}, BenchPorts(context.bench))
     fresh.background = context.device.background
     after = BenchContext(context.bench, fresh)
     tracked = run_action(
@@ -451,7 +451,7 @@ def test_images_of_another_size_are_refused(pinhole: PinholeCamera) -> None:
             return super().picture()[::2, ::2]
 
     bench = Small(pinhole)
-    context = BenchContext(bench, Camera({}, BenchPorts(bench)))
+    context = BenchContext(bench, Camera({"source": "sim"}, BenchPorts(bench)))
     located = run_action(bench, actions.locate_background(context))
     assert (located.status, located.cause) == (Status.ERROR, "bad_image")
     assert "320x240" in located.text and "640x480" in located.text
@@ -462,7 +462,7 @@ def test_the_same_seed_gives_the_same_stream(pinhole: PinholeCamera) -> None:
     for _ in range(2):
         pinhole.reseed(np.random.default_rng(3))
         bench = CameraBench(pinhole, draw_ball(np.random.default_rng(5), "B"))
-        context = BenchContext(bench, Camera({}, BenchPorts(bench)))
+        context = BenchContext(bench, Camera({"source": "sim"}, BenchPorts(bench)))
         catch(context)
         streams.append(context.published)
     assert streams[0] == streams[1]

@@ -20,11 +20,11 @@ from tests.vision.bench import BenchContext, BenchPorts, CameraBench, draw_ball,
 
 
 def test_shipped_files_are_the_default_and_others_can_be_named(bench: CameraBench) -> None:
-    usual = Camera({}, BenchPorts(bench))
+    usual = Camera({"source": "sim"}, BenchPorts(bench))
     calibration = DEFAULT.read_bytes().replace(b"focal_px = [6", b"focal_px = [7")
     cell = CELL.read_bytes().replace(b"near_edge = 0.62", b"near_edge = 0.70")
     other = Camera(
-        {"calibration": "lab.toml", "cell": "cell.toml"},
+        {"source": "sim", "calibration": "lab.toml", "cell": "cell.toml"},
         BenchPorts(bench, {"lab.toml": calibration, "cell.toml": cell}),
     )
     assert other.calibrated.optics.focal[0] == usual.calibrated.optics.focal[0] + 100
@@ -62,7 +62,7 @@ def test_bad_config_is_refused_with_name_and_remedy(
     text: str,
 ) -> None:
     with pytest.raises(error, match=re.escape(text)):
-        Camera(config, BenchPorts(bench, files))
+        Camera({"source": "sim", **config}, BenchPorts(bench, files))
 
 
 def test_the_drivers_interface_to_the_node(context: BenchContext) -> None:
@@ -135,7 +135,7 @@ def test_a_source_that_cannot_be_opened_is_the_error_no_image(context: BenchCont
         def images(self) -> Any:
             return Unplugged()
 
-    camera = Camera({}, Ports(context.bench))
+    camera = Camera({"source": "sim"}, Ports(context.bench))
     located = run_action(
         context.bench, actions.locate_background(BenchContext(context.bench, camera))
     )
@@ -163,7 +163,7 @@ def test_no_image_says_why_if_the_source_knows(context: BenchContext) -> None:
         def images(self) -> Any:
             return Lost()
 
-    lost = BenchContext(context.bench, Camera({}, Ports(context.bench)))
+    lost = BenchContext(context.bench, Camera({"source": "sim"}, Ports(context.bench)))
     ball = {"sequence": 0, "age": 0.1, "sigma": 0.001, "places": [[0.3, 2.0, 0.0], [0.1, 1.9, 0.0]]}
     found = [run_action(context.bench, actions.locate_background(lost))]
     found.append(run_action(context.bench, actions.predict_kalman(lost, ball=ball)))
