@@ -521,8 +521,8 @@ def _input(key: str, arc: Input, place: Place) -> Iterator[Fault]:
     name = arc.place
     if place.kind is Kind.ACTION and arc.end is None:
         remedy = (
-            f"write {name}:normal or {name}:error (its run has ended), {name}:preempt=none (it is "
-            f"stopped) or {name}:going (it continues)"
+            f"write {name}:normal, {name}:error, {name}:preempt=none (its run is stopped then) or "
+            f"{name}:going (its run continues)"
         )
         yield Fault(
             key, f"{name!r} is an action place, so its arc must say when it takes the token", remedy
