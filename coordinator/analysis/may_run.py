@@ -185,7 +185,7 @@ def _uncovered(x: ExecutionGraph) -> Iterator[Finding]:
             place = finding.key.removeprefix("places.")
             ends = (End.NORMAL, End.ERROR)
             takers = [t.name for end in ends for t in task.exits.get((place, end), ())]
-            free = x.graph.backward(x.source[x.firing(takers)])
+            free = x.graph.backward(x.source[x.firing(takers)].tolist())
             if any(
                 run.place == place and run.phase is Phase.DONE and not free[i]
                 for i, state in enumerate(x.states)
