@@ -643,6 +643,8 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
         source = inspect.unwrap(thing).__code__
         text = f"{thing.__name__} takes no context; its first parameter is `ctx`"
         text += f", found {first.name!r}" if first else ""
+        # That its body finds no `ctx` follows from it.
+        seen.faults = [one for one in seen.faults if not one[2].startswith("`ctx` is not")]
         seen.faults.append((_near(source.co_filename), source.co_firstlineno, text))
     return {
         "parameters": {p.name: _KINDS.get(hints.get(p.name, object), "") for p in named},

@@ -11,9 +11,15 @@ from dataclasses import dataclass, replace
 from math import inf
 from typing import TYPE_CHECKING
 
-from petrobot.coordinator.task import Input, Status, Task, Transition
+from petrobot.coordinator.engine import Phase
+from petrobot.coordinator.task import End, Input, Status, Task, Transition
 from petrobot.coordinator.task.check import CheckReport, Finding, Severity, check, in_file
-from petrobot.coordinator.task.check.completeness import EXTERNAL_WAIT, external_waits
+from petrobot.coordinator.task.check.completeness import (
+    EXTERNAL_WAIT,
+    UNCOVERED,
+    external_waits,
+    uncovered_exits,
+)
 from petrobot.coordinator.task.validation import is_pulse
 from petrobot.coordinator.task.wording import listed, wrapped
 
@@ -156,16 +162,36 @@ def _with_graph(report: CheckReport, analysis: Analysis) -> CheckReport:
     if analysis.progress is None or not analysis.progress.x.complete:
         return report
     judged = ("unsettled-conflict", "arrival-order", EXTERNAL_WAIT)
-    rest = [f for f in report.findings if f.code not in judged]
+    open_ones = [f for f in report.findings if f.code == UNCOVERED and f.severity is Severity.NOTE]
+    rest = [f for f in report.findings if f.code not in judged and f not in open_ones]
     may_stay = analysis.progress.may_stay
     rest += external_waits(analysis.progress.x.engine.compiled.task, may_stay=may_stay)
     found = [_contest(contest) for contest in analysis.progress.contests]
     found += map(_retries, analysis.progress.x.retries)
     found += [_left_behind(p, verdict) for p, verdict in analysis.progress.left_behind.items()]
     found += _lost_pulses(analysis.progress.x)
+    found += _uncovered(analysis.progress.x) if open_ones else ()
     errors = [f for f in found if f.severity is Severity.ERROR]
     others = [f for f in found if f.severity is not Severity.ERROR]
     return CheckReport((*errors, *rest, *others))
+
+
+def _uncovered(x: ExecutionGraph) -> Iterator[Finding]:
+    """Places whose exits depend on how other runs ended, and from which an ended run can indeed
+    never be taken."""
+    task = x.engine.compiled.task.flat
+    for finding in uncovered_exits(task):
+        if finding.code == UNCOVERED and finding.severity is Severity.NOTE:
+            place = finding.key.removeprefix("places.")
+            ends = (End.NORMAL, End.ERROR)
+            takers = [t.name for end in ends for t in task.exits.get((place, end), ())]
+            free = x.graph.backward(x.source[x.firing(takers)].tolist())
+            if any(
+                run.place == place and run.phase is Phase.DONE and not free[i]
+                for i, state in enumerate(x.states)
+                for run in state.runs()
+            ):
+                yield replace(finding, severity=Severity.ERROR)
 
 
 def _lost_pulses(x: ExecutionGraph) -> Iterator[Finding]:

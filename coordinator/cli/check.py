@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.faulty_files import FaultyFile
 from petrobot.coordinator.cli.loading import (
     MISSING_CELL,
     add_services_argument,
@@ -17,15 +19,12 @@ from petrobot.coordinator.cli.loading import (
     cell_path,
     find_cell,
     load_directory,
-    load_task,
-    refuse_misplaced,
     task_path,
     write_json,
 )
 from petrobot.coordinator.task.wording import Severity, listed, wrapped
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
     from petrobot.coordinator.analysis.may_run import MayRun
@@ -35,11 +34,15 @@ if TYPE_CHECKING:
     from petrobot.coordinator.task.check import CheckReport
     from petrobot.services.comm.location_file import Directory
 
+Facts = Mapping[str, Any]
+"""What is known of one import path's code."""
 EXAMPLE = "petrobot check catch_ball"
 NO_CELL = "no-cell"
 """Code of the finding that no location file was given."""
 NO_DRY_RUN = "no-dry-run"
 """Code of the finding that drivers of the location file refuse a dry run."""
+NO_EXIT = ("no-normal-exit", "no-error-exit")
+"""Codes of the findings that a place lacks an outgoing transition."""
 PATIENCE = 2.0
 """Seconds that a node has to answer."""
 HANG = 8
@@ -65,22 +68,42 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Check the task. Return 0 if it may run, 2 if it may not, 3 if only a node that it needs is
     missing."""
-    task = _task_of(options)
-    services = find_cell(options.services, options.task, task)
-    if options.live:
-        services = cell_path(services, options.task, task)
-    judged, report = _checked(task, services)
-    missing = _missing(task, services) if options.live else []
-    analysis, ok = judged.analysis, judged.ok and report.ok
+    from petrobot.coordinator.task.check import CheckReport
+
+    read, services = _read_task(options.task), None
+    cell: FaultyFile[Directory] = FaultyFile("")
+    code: Mapping[str, Facts] = {}
+    try:
+        services = find_cell(options.services, options.task, read.value)
+        if options.live and read.value is not None:
+            services = cell_path(services, options.task, read.value)
+        if services is not None and services != task_path(options.task):
+            cell, code = _read_cell(services)
+    except CommandError as fault:
+        cell.faults.append(str(fault))
+    faults = [*read.faults, *cell.faults]
+    if read.value is None:
+        raise CommandError(2, "\n".join(faults))
+    task, analysed = read.value, not read.unknown
+    judged, report = _checked(task, cell, code, analysed)
+    if not services and not faults:
+        report = _noted(report)
+    if not analysed:
+        raise CommandError(2, "\n".join([*faults, *_independent(options.task, report, read, cell)]))
+    report = CheckReport(tuple(f for f in report.findings if cell.is_new(f.key, f.text)))
+    missing = _missing(task, services) if options.live and not faults else []
+    analysis, ok = judged.analysis, judged.ok and report.ok and not faults
     live = {"live": missing} if options.live else {}
-    if options.json:
+    if options.json and not faults:
         data = {} if analysis is None else _plain_analysis(analysis)
         findings = _plain(report, options.task)
         write_json(
             options.json, {"task": task.name, "ok": ok, "findings": findings, **data, **live}
         )
     if options.json != "-":
-        print("\n".join(_text(options.task, judged, report, missing)))
+        print("\n".join(_text(options.task, judged, report, missing, faults)))
+    if faults:
+        raise CommandError(2, "\n".join(faults))
     return (
         2
         if not ok
@@ -92,52 +115,84 @@ def run(options: argparse.Namespace) -> int:
     )
 
 
-def _task_of(options: argparse.Namespace) -> Task:
-    """Read the task. Of a faulty one, tell the faults of its location file, too: both files can
-    then be corrected together."""
+def _read_task(name: str) -> FaultyFile[Task]:
+    """Read the task, and tell all faults of its file."""
+    from petrobot.coordinator.task.file import TaskFileError, loads
+    from petrobot.coordinator.task.file.reading import read_text
+
+    path = task_path(name)
+    read: FaultyFile[Task] = FaultyFile(str(path))
     try:
-        return load_task(options.task)
-    except CommandError as fault:
-        written = task_path(options.task)
-        services = find_cell(options.services, options.task, None)
-        try:
-            if written.is_file() and services is not None and services != written:
-                _cell_with_code(services)
-        except CommandError as more:
-            raise CommandError(fault.code, f"{fault}\n{more}") from fault
+        text = read_text(path)
+    except TaskFileError as fault:
+        raise CommandError(2, str(fault)) from fault
+    read.read(text, lambda t, data: loads(t, str(path), data=data), TaskFileError)
+    return read
+
+
+def _read_cell(
+    services: Path,
+) -> tuple[FaultyFile[Directory], dict[str, Facts]]:
+    """Read a location file and what is known of the code that it names, and tell all faults of
+    both."""
+    from petrobot.services.comm.location_file import DirectoryError, parse, read_text
+    from petrobot.services.comm.location_file.code import code_faults, read_code
+    from petrobot.services.comm.location_file.host_checks import misplaced
+
+    cell: FaultyFile[Directory] = FaultyFile(str(services))
+    try:
+        text = read_text(services)
+    except (OSError, DirectoryError):
+        load_directory(services)  # it words the fault
         raise
 
+    def reader(text: str, data: dict[str, Any] | None) -> Directory:
+        directory = parse(text, services, data)
+        found = misplaced(directory)
+        if mendable := [line for line in found if re.search("did you mean|: write '", line)]:
+            raise DirectoryError(tuple(mendable))
+        return directory
 
-def _cell_with_code(services: Path) -> tuple[Directory, Mapping[str, Mapping[str, Any]]]:
-    """Return a location file, and what is known of the code that it names. Raises CommandError for
-    their faults."""
-    from petrobot.services.comm.location_file import read_text
-    from petrobot.services.comm.location_file.code import code_faults, read_code
-
-    directory = load_directory(services)
-    refuse_misplaced(directory)
-    code = read_code(directory)
-    if faults := code_faults(directory, code, read_text(directory.source)):
-        raise CommandError(2, "\n".join(faults))
-    return directory, code
+    cell.read(text, reader, DirectoryError)
+    if cell.value is None:
+        return cell, {}
+    cell.add(misplaced(cell.value))
+    code = read_code(cell.value)
+    cell.add(code_faults(cell.value, code, text))
+    return cell, {path: facts for path, facts in code.items() if "import" not in facts}
 
 
-def _checked(task: Task, services: Path | None) -> tuple[MayRun, CheckReport]:
-    """Return the judgement of the task in the cell of a location file, and its findings with a
-    note about that file."""
+def _checked(
+    task: Task, cell: FaultyFile[Directory], code: Mapping[str, Facts], search: bool
+) -> tuple[MayRun, CheckReport]:
+    """Return the judgement of the task in a cell, and its findings with those about the code."""
     from petrobot.coordinator.analysis.may_run import BUDGET, may_run
 
-    if services is None:
-        judged = may_run(task, None, BUDGET)
-        said = f"{MISSING_CELL}: whether nodes offer the actions was not checked"
-        return judged, _noted(judged.report, said)
-    directory, code = _cell_with_code(services)
-    judged = may_run(task, cell_of(directory), BUDGET)
-    return judged, _with_code(task, directory, code, judged)
+    budget = BUDGET if search else None
+    if cell.value is None:
+        judged = may_run(task, None, budget)
+        return judged, judged.report
+    judged = may_run(task, cell_of(cell.value), budget)
+    return judged, _with_code(task, cell.value, code, judged)
+
+
+def _independent(
+    name: str, report: CheckReport, task: FaultyFile[Task], cell: FaultyFile[Directory]
+) -> Iterator[str]:
+    """Yield what was found in a faulty task and does not follow from its faults: errors, and what
+    concerns the code; each as a line."""
+    for f, line in zip(report.findings, _lines(report, name), strict=True):
+        wrong = f.severity is Severity.ERROR or (
+            f.code == "code" and f.severity is not Severity.NOTE
+        )
+        new = (line is None or task.is_new(f.key, f.text)) and cell.is_new(f.key, f.text)
+        if wrong and new:
+            place = f"{task.source}:{line}: " if line else ""
+            yield f"{place}{f.key}: {f.text}" + (f"; {f.remedy}" if f.remedy else "")
 
 
 def _with_code(
-    task: Task, directory: Directory, code: Mapping[str, Mapping[str, Any]], judged: MayRun
+    task: Task, directory: Directory, code: Mapping[str, Facts], judged: MayRun
 ) -> CheckReport:
     """Add findings about the code that the location file names."""
     from petrobot.coordinator.task.check import CheckReport, Finding, Severity, in_file
@@ -185,9 +240,7 @@ def _with_code(
     return CheckReport(in_file(task, (*errors, *known, *warnings)))
 
 
-def _services(
-    directory: Directory, code: Mapping[str, Mapping[str, Any]]
-) -> dict[str, Mapping[str, Any]]:
+def _services(directory: Directory, code: Mapping[str, Facts]) -> dict[str, Facts]:
     """Return what is known of the services that are not actions. Those without code of their own
     write nothing into the global memory by themselves."""
     from petrobot.services.comm.location_file import MEMORY, MEMORY_CALLS
@@ -197,9 +250,7 @@ def _services(
     return found | (dict.fromkeys(MEMORY_CALLS, none) if MEMORY in found else {})
 
 
-def _raised(
-    task: Task, directory: Directory, code: Mapping[str, Mapping[str, Any]]
-) -> tuple[set[str], bool]:
+def _raised(task: Task, directory: Directory, code: Mapping[str, Facts]) -> tuple[set[str], bool]:
     """Return the events that the cell raises, and whether it is known to raise no others: not if
     some of its code was not read or raises events by names that it computes, and not of a
     laboratory."""
@@ -227,10 +278,11 @@ def _driver(directory: Directory, device: str) -> str:
     return directory.devices[device].driver if device else ""
 
 
-def _noted(report: CheckReport, said: str) -> CheckReport:
+def _noted(report: CheckReport) -> CheckReport:
     """Add the finding that no location file was given."""
     from petrobot.coordinator.task.check import CheckReport, Finding, Severity
 
+    said = f"{MISSING_CELL}: whether nodes offer the actions was not checked"
     remedy = "write one of your own, or give --services FILE"
     return CheckReport(
         (*report.findings, Finding(Severity.NOTE, NO_CELL, "services.toml", said, remedy))
@@ -288,6 +340,8 @@ def _told(report: CheckReport, name: str) -> Iterator[Told]:
     shown = path.name if str(path) != name else name  # that of a shipped task is long
     notes = Counter(f.code for f in report.findings if f.severity is Severity.NOTE)
     for finding, line in zip(report.findings, _lines(report, name), strict=True):
+        if finding.code == "left-behind" and _follows(finding.key, report):
+            continue
         place = f"{shown}:{line}: " if line else ""
         details = [finding.remedy, *finding.details] if finding.remedy else [*finding.details]
         if finding.severity is Severity.NOTE:
@@ -331,14 +385,18 @@ class Told(NamedTuple):
         return "\n".join(lines)
 
 
-def _text(name: str, judged: MayRun, report: CheckReport, missing: list[str]) -> Iterator[str]:
-    """Yield the answer first, then the verdicts by name, then what was found, errors first."""
+def _text(
+    name: str, judged: MayRun, report: CheckReport, missing: list[str], faults: list[str]
+) -> Iterator[str]:
+    """Yield the answer first, then the verdicts by name, then what was found, errors first.
+    `faults`: what is wrong in its files besides."""
     from petrobot.coordinator.analysis.may_run import LATE
 
     analysis, told = judged.analysis, list(_told(report, name))
-    if missing or not (judged.ok and report.ok):
+    if missing or faults or not (judged.ok and report.ok):
         held = analysis is not None and not analysis.objections
         why = next((f.key for f in report.errors), "a missing node")
+        why = faults[0].partition(":")[0] if faults else why
         yield wrapped(f"{name}: may not run{f' because of {why}' if held else ''}", 2)
     elif analysis is not None and analysis.interrupted:
         yield f"{name}: was not checked to its end (Ctrl-C)"
@@ -353,7 +411,10 @@ def _text(name: str, judged: MayRun, report: CheckReport, missing: list[str]) ->
         yield wrapped(f"{name}: may run{f', but {listed(but)}' if but else ''}", 2)
     if analysis is not None:
         yield from _summary(analysis)
-        told += [*_reasons(analysis), *_notes(name, analysis)]
+        for one in _reasons(analysis):
+            if not _follows(" ".join([one.text, *one.details[:1]]), report):
+                told.append(one)
+        told += _notes(name, analysis)
     if missing or told:
         yield ""
     yield from (wrapped(f"missing {line}", HANG) for line in missing)
@@ -361,6 +422,12 @@ def _text(name: str, judged: MayRun, report: CheckReport, missing: list[str]) ->
     yield from map(str, sorted(told, key=lambda one: order.index(one.severity)))
     if analysis is not None and analysis.objections:
         yield f"petrobot analyse {name} --pictures FOLDER draws how it comes to that"
+
+
+def _follows(reason: str, report: CheckReport) -> bool:
+    """Return whether a verdict fails at a place without an exit, which is reported on its own."""
+    missing = {f.key.rpartition(".")[2] for f in report.errors if f.code in NO_EXIT}
+    return not missing.isdisjoint(re.findall(r"\w+", reason))
 
 
 def _summary(analysis: Analysis) -> list[str]:

@@ -340,8 +340,15 @@ def _arguments_of_macro(
     names: _Names, key: str, p: Place, inside: Iterable[str]
 ) -> Iterator[Fault]:
     """Faults in what a macro place gives to the parameters of its subnet."""
-    parameters = names.subnets[p.subnet].parameters
+    subnet = names.subnets[p.subnet]
+    parameters, values = (
+        subnet.parameters,
+        [v for q in subnet.places.values() for v in q.args.values()],
+    )
+    read = {v.variable for v in values if isinstance(v, Reference)} - names.read
     for name in sorted({*p.args, *parameters}):
+        if name in read - {*parameters}:
+            continue  # the subnet reads what it does not declare: that is reported there
         if name not in parameters:
             remedy = f"drop it, or declare it in [subnets.{p.subnet}.parameters]"
             yield Fault(f"{key}.args.{name}", f"{p.subnet!r} has no such parameter", remedy)
@@ -429,6 +436,9 @@ def _action_place(names: _Names, key: str, p: Place) -> Iterator[Fault]:
                 yield Fault(f"{key}.args.{name}", text, "name a variable or another parameter")
             elif value.variable not in names.read:
                 remedy = f"declare it in [variables]{nearest(value.variable, names.read)}"
+                if key.startswith("subnets."):
+                    own = f"[{key.partition('.places.')[0]}.parameters]"
+                    remedy = f'give its type in {own}: {value.variable} = "str"; or {remedy}'
                 yield Fault(
                     f"{key}.args.{name}",
                     f"unknown variable or parameter {value.variable!r}",
@@ -510,7 +520,10 @@ def _arcs(
 def _input(key: str, arc: Input, place: Place) -> Iterator[Fault]:
     name = arc.place
     if place.kind is Kind.ACTION and arc.end is None:
-        remedy = f"write {name}:normal, {name}:error, {name}:preempt=COUNTS or {name}:going"
+        remedy = (
+            f"write {name}:normal, {name}:error, {name}:preempt=none (its run is stopped then) or "
+            f"{name}:going (its run continues)"
+        )
         yield Fault(
             key, f"{name!r} is an action place, so its arc must say when it takes the token", remedy
         )

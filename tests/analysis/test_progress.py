@@ -762,6 +762,33 @@ def test_a_task_that_gives_up_after_three_errors_is_sound() -> None:
     assert may_run(task, None, Budget()).ok
 
 
+@pytest.mark.parametrize(
+    ("other", "steps", "severity"),
+    [("failure", 60_000, None), ("error", 60_000, "error"), ("failure", 1, "note")],
+)
+def test_exits_that_read_another_run_are_judged_with_the_graph(
+    other: str, steps: int, severity: str | None
+) -> None:
+    """`act` starts only after a normal end of `first`. Without a complete graph it is a note."""
+    task = make_task(
+        "go=1 first! act! done failed",
+        {
+            "begin": {"in": "go", "out": "first"},
+            "next": {"in": "first:normal", "out": "act"},
+            "good": {"in": "act:normal", "out": "done", "when": "first.status == 'success'"},
+            "half": {"in": "act:normal", "out": "done", "when": f"first.status == '{other}'"},
+            "first_bad": {"in": "first:error", "out": "failed"},
+            "bad": {"in": "act:error", "out": "failed"},
+        },
+        final="done == 1",
+        final_error=parse("failed == 1"),
+    )
+    answer = may_run(task, None, Budget(steps=steps))
+    found = {f.severity.value for f in answer.report.findings if f.code == "uncovered-exit"}
+    assert found == ({severity} if severity else set())
+    assert answer.report.ok is (severity != "error")
+
+
 def test_a_branch_that_can_never_fire_is_reported_with_its_reason() -> None:
     task = make_task(
         "go=1 act! done bin",

@@ -1547,6 +1547,82 @@ def test_a_class_that_cannot_be_hashed_is_read_like_any_other(
     expect(r"arm_bot.py:\d+: `ctx.sleep` does nothing without", CHECK)
 
 
+TOGETHER: list[list[Mistake]] = [
+    [  # each stage of reading: syntax, keys, names, code
+        (TASK, 'kind = "resource", tokens', "kind = resource, tokens", r"TOML: resource is a text"),
+        (TASK, "deadline = 8.0", "dedline = 8.0", r"move.dedline: unknown key"),
+        (TASK, '["grip:normal"]', '["gripp:normal"]', r"gripped.in: unknown place 'gripp'"),
+        (
+            TASK,
+            "args = { to = 0.2 }",
+            "args = { two = 0.2 }",
+            r"args.two: .* has no argument 'two'",
+        ),
+        (
+            TASK,
+            '{ in = ["carry:normal"] }',
+            '{ in = ["carry:error"] }',
+            r"carry: no outgoing arc `normal`",
+        ),
+        (CELL, "port = 7501", "port = 75010", r"nodes.pc.port: is 75010"),
+        (CELL, "arm_bot:Axis", "arm_bot:Axes", r"devices.axis.driver: .*'Axes'"),
+        (CODE, "await ctx.sleep(0.3)", "ctx.sleep(0.3)", r"`ctx.sleep` does nothing without"),
+    ],
+    [  # a place that is not known keeps the net from being judged, and nothing else
+        (TASK, '["grip:normal"]', '["zzz:normal"]', r"gripped.in: unknown place 'zzz'"),
+        (TASK, "tries = 3", "tries = 0", r"grip.tries: 0 tries"),
+        (TASK, 'runs_place = "parts"', 'runs_place = "axis"', r"task.runs_place: expected a con"),
+        (CELL, "top_speed = 0.5", "topspeed = 0.5", r"devices.axis.topspeed: unknown key"),
+        (CODE, "    return success()", "    return success", r"`return success` is not a result"),
+    ],
+    [  # a location file with a fault does not keep the net from being judged
+        (TASK, "tokens = 1", "tokens = 0", r"deadlock free: stuck with parts:3"),
+        (CELL, 'device = "axis" }\ng', 'devise = "axis" }\ng', r"actions.move.devise: unknown key"),
+        (CELL, "arm_bot:grip", "arm_bot:gripp", r"actions.grip.run: .*'gripp'"),
+    ],
+    [  # a line of the location file that cannot be read
+        (TASK, 'to = "broken"', 'to = "brokn"', r"errors.to: 'brokn' is not a place"),
+        (CELL, 'arm_bot:Axis"', "arm_bot:Axis", r"services.toml:7: not valid TOML: the quote"),
+        (CELL, 'grip", device = "axis"', 'grip", device = "hand"', r"grip.device: no device is na"),
+        (CODE, "def stop(", "def stpo(", r"`stpo` of Axis is never called|but no stop"),
+    ],
+    [  # code that cannot be imported
+        (TASK, "final_error", "final_eror", r"task.final_eror: unknown key"),
+        (
+            TASK,
+            '{ in = ["grip:error"] }',
+            '{ in = ["grip:eror"] }',
+            r"lost.in: .*'eror' is none of",
+        ),
+        (CODE, "from petrobot", "import nothere\nfrom petrobot", r"it imports 'nothere'"),
+    ],
+    [  # nothing can be read of the task: its brace ends nowhere
+        (TASK, "[transitions]", "[transitions", r"arm_bot.toml:28: TOML"),
+        (CELL, "[actions]", "[action]", r"action: unknown table"),
+        (CODE, "period = 0.01", "period = 0", r"Axis.period: expected seconds above 0"),
+    ],
+]
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("mistakes", TOGETHER, ids=range(len(TOGETHER)))
+def test_one_check_names_all_mistakes(
+    sound: dict[str, str],
+    mistakes: list[Mistake],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each of them once, and none that follows from another."""
+    damaged(sound, mistakes, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    code, words = said(*CHECK)
+    lines = re.sub(r"\n {8,}", " ", words).splitlines()
+    found = [one for one in lines if re.match(r"(petrobot check: |error )|\S+:\d+: ", one)]
+    assert code == 2 and len(found) == len(mistakes), words
+    for *_, pattern in mistakes:
+        assert sum(bool(re.search(pattern, one)) for one in found) == 1, (pattern, found)
+
+
 @pytest.mark.processes
 @pytest.mark.parametrize(
     ("old", "new", "told"),

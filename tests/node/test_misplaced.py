@@ -12,6 +12,7 @@ import pytest
 
 from petrobot.coordinator.cli import main
 from petrobot.services.comm.location_file import DirectoryError, load, parse
+from petrobot.services.comm.location_file import code as location_code
 from petrobot.services.comm.location_file.host_checks import misplaced, signatures
 from petrobot.services.comm.protocol.security import is_loopback
 
@@ -165,17 +166,24 @@ def told(*command: str) -> tuple[int, str]:
     return code, said.getvalue()
 
 
+EMPTY = 'schema = 1\n[task]\nname = "empty"\nfinal = "true"\n'
+
+
 @pytest.mark.parametrize(
     ("right", "wrong", "says"), MISTAKES, ids=[f"{wrong[:40]}" for _, wrong, _ in MISTAKES]
 )
-def test_each_mistake_gives_one_line(right: str, wrong: str, says: str, tmp_path: Path) -> None:
+def test_each_mistake_gives_one_line(
+    right: str, wrong: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """`petrobot check` refuses the file, names file, line, key and remedy, and shows no
-    traceback."""
+    traceback. What the code says is another matter, and takes seconds to import."""
+    monkeypatch.setattr(location_code, "read_code", lambda directory: {})
     text = SHIPPED.read_text(encoding="utf-8")
     assert right in text
     path = tmp_path / "services.toml"
     path.write_text(text.replace(right, wrong, 1), encoding="utf-8")
-    code, said = told("check", "catch_ball", "--services", str(path))
+    (tmp_path / "empty.toml").write_text(EMPTY, encoding="utf-8")
+    code, said = told("check", str(tmp_path / "empty.toml"), "--services", str(path))
     assert code == 2
     assert says.format(folder=tmp_path) in said
     assert f"{path}:" in said and "Traceback" not in said

@@ -248,7 +248,8 @@ def _arguments(
                 yield _unlike(f"{key}.{name}", action, name, known[name], found)
         elif not _fits(value, known[name]):
             yield _unlike(f"{key}.{name}", action, name, known[name], f"{value!r}")
-    for name in facts["required"]:
+    misnamed = not facts["open"] and not {*place.args} <= {*known}
+    for name in facts["required"] if not misnamed else ():
         if name not in place.args and name not in given:
             text = f"the action {action!r} needs the argument {name!r}"
             remedy = f"give args = {{ {name} = ... }} here or in [actions.{action}]"

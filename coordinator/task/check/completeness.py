@@ -24,6 +24,8 @@ from petrobot.coordinator.task.conditions.regions import Certainty, Domain, cove
 from petrobot.coordinator.task.validation import condition_domains
 from petrobot.coordinator.task.wording import Severity, listed, nearest
 
+UNCOVERED = "uncovered-exit"
+"""Code of the findings that the conditions of a place's exits may all be false."""
 EXTERNAL_WAIT = "external-wait"
 """Code of the findings of `external_waits`."""
 _EXIT_OF = {Status.SUCCESS: End.NORMAL, Status.FAILURE: End.NORMAL, Status.ERROR: End.ERROR}
@@ -75,13 +77,23 @@ def _uncovered(
             f"after {status} the conditions of its exits {names} may all be false: "
             "finished, nowhere to go"
         )
-        yield Finding(Severity.ERROR, "uncovered-exit", key, text, remedy, verdict.witness)
+        # How other runs can have ended when this one ends, only the execution graph shows.
+        others = any(_reads_other(w, place, domains) for w in ways)
+        severity = Severity.NOTE if others else Severity.ERROR
+        yield Finding(severity, UNCOVERED, key, text, remedy, verdict.witness)
     elif verdict.answer is Certainty.UNKNOWN:
         text = (
             f"after {status} it is not known whether the conditions of its exits {names} "
             "cover all cases"
         )
         yield Finding(Severity.WARNING, "coverage-unknown", key, text, remedy)
+
+
+def _reads_other(way: Transition, place: Place, domains: Mapping[str, Domain]) -> bool:
+    """Return whether a condition reads how a run of another place ended."""
+    names = () if way.when is None else way.when.names
+    owners = {name.rpartition(".")[0] for name in names if name in domains}
+    return not owners <= {"", place.name}
 
 
 # Events that no transition can receive, and waits that only the outside world can end.

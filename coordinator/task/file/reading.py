@@ -188,7 +188,11 @@ LARGEST = 4 << 20
 
 def load(path: str | Path) -> Task:
     """The task in a file. Raises TaskFileError with every fault."""
-    path = Path(path)
+    return loads(read_text(Path(path)), str(path))
+
+
+def read_text(path: Path) -> str:
+    """The text of a task file. Raises TaskFileError if it cannot be one."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -201,25 +205,31 @@ def load(path: str | Path) -> Task:
             str(path), [Fault("file", f"{len(data)} bytes", f"a task has at most {LARGEST}")], [0]
         )
     try:
-        text = data.decode("utf-8")
+        return data.decode("utf-8")
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
         raise TaskFileError(
             str(path), [Fault("file", "is not UTF-8", "save it as UTF-8")], [line]
         ) from error
-    return loads(text, str(path))
 
 
-def loads(text: str, source: str = "task", *, flat: bool = False) -> Task:
+def loads(
+    text: str,
+    source: str = "task",
+    *,
+    flat: bool = False,
+    data: Mapping[str, Any] | None = None,
+) -> Task:
     """The task in a TOML text; `source` names it in errors. Raises TaskFileError with every
     fault.
 
     `flat`: the text is a flat task that petrobot wrote (`dumps(task.flat)`): its names may have
-    dots, its elements say what they were made from, and it was judged before.
+    dots, its elements say what they were made from, and it was judged before. `data` is read in
+    place of the text's own, which then only gives the lines of faults.
     """
     text = text.removeprefix("\ufeff")  # some editors begin a file with a byte-order mark
     try:
-        data = tomllib.loads(text)
+        data = tomllib.loads(text) if data is None else data
     except tomllib.TOMLDecodeError as error:
         fault, line = syntax_fault(text, error)
         raise TaskFileError(source, [fault], [line]) from error

@@ -256,11 +256,11 @@ def read_text(source: Path) -> str:
         ) from fault
 
 
-def parse(text: str, source: Path) -> Directory:
-    """Read the text of a services.toml; `source` is its path, for messages and for relative
-    paths."""
+def parse(text: str, source: Path, data: dict[str, Any] | None = None) -> Directory:
+    """Read the text of a services.toml; `source` is its path, for messages and for relative paths.
+    `data` is read in place of the text's own, which then only gives the lines of faults."""
     text = text.removeprefix("\ufeff")  # some editors begin a file with a byte-order mark
-    tables, digest, faults = directory_file.read(text, str(source), MEMORY)
+    tables, digest, faults = directory_file.read(text, str(source), MEMORY, data)
     if faults:
         raise DirectoryError(tuple(faults))
     _find_modules_in(source.parent)

@@ -57,7 +57,7 @@ def misplaced(
                 faults.add(f"{table}.{name}", f"{directory.file(path)} is not there; {made}")
     here = {n.name for n in directory.nodes.values() if everywhere or is_loopback(n.host)}
     for key, path in _imports(directory, here, actions):
-        fault = _unknown(path)
+        fault = _unknown(path, directory.source.parent)
         if fault:
             faults.add(key, fault)
     if actions:
@@ -159,9 +159,9 @@ def _parsed(file: Path, changed: int) -> ast.Module:
     return ast.parse(file.read_bytes())
 
 
-def _unknown(path: str) -> str:
+def _unknown(path: str, beside: Path) -> str:
     """Return what is wrong with an import path, with the remedy; empty if nothing is, as far as its
-    source shows."""
+    source shows. `beside`: the folder of the location file."""
     module, _, attribute = path.partition(":")
     if module.endswith(".py"):
         return f"a module is named without .py: write {module[:-3] + ':' + attribute!r}"
@@ -173,9 +173,10 @@ def _unknown(path: str) -> str:
             "package here or put it beside the location file"
         )
     if spec is None:
+        near = nearest(module, sorted(file.stem for file in beside.glob("*.py")))
         return (
             f"no module {module!r} on this host; install its package here or put it beside "
-            "the location file"
+            f"the location file{near if 'did you mean' in near else ''}"
         )
     names = _names(spec)
     if names is None or attribute in names:

@@ -217,12 +217,14 @@ def _bare(key: str) -> str:
     return ".".join(part.strip().strip("\"'") for part in key.split("."))
 
 
-def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
+def read(
+    text: str, source: str, memory: str, data: dict[str, Any] | None = None
+) -> tuple[Tables, str, list[str]]:
     """Return the tables of the file, the hash of its data, and all faults. With faults the tables
-    must not be used."""
+    must not be used. `data` is read in place of the text's own."""
     faults = Faults(text, source)
     try:
-        data = tomllib.loads(text)
+        data = tomllib.loads(text) if data is None else data
     except tomllib.TOMLDecodeError as fault:
         return {}, "", [_syntax_fault(text, source, str(fault))]
     _check_top(data, faults)
@@ -277,19 +279,19 @@ def _digest(data: Mapping[str, Any]) -> str:
 
 
 def _syntax_fault(text: str, source: str, why: str) -> str:
-    place = re.search(r"\(at line (\d+)", why)
-    line = f":{place[1]}" if place else ""
-    keys = [(number, name) for number, name, _ in _keys(text.splitlines())]
-    name = next((name for number, name in keys if place and number == int(place[1])), "")
-    first = next((number for number, own in keys if own == name), 0)
-    if place and 0 < first < int(place[1]):
+    found, lines = re.search(r"\(at line (\d+)", why), text.splitlines() or [""]
+    number = min(int(found[1]) if found else len(lines), len(lines))  # "at end of document"
+    keys = [(line, name) for line, name, _ in _keys(lines)]
+    name = next((name for line, name in keys if line == number), "")
+    first = next((line for line, own in keys if own == name), 0)
+    if 0 < first < number:
         return (
-            f"{source}{line}: {name}: already written in line {first}; a name belongs to one "
+            f"{source}:{number}: {name}: already written in line {first}; a name belongs to one "
             "table: remove one of the two or rename it"
         )
-    found, remedy = _syntax((*text.splitlines(), "")[int(place[1]) - 1]) if place else ("", "")
-    why, remedy = (found, remedy) if found else (why, "correct this line")
-    return f"{source}{line}: not valid TOML: {why}; {remedy}"
+    wrong, remedy = _syntax(lines[number - 1])
+    why, remedy = (wrong, remedy) if wrong else (why, "correct this line")
+    return f"{source}:{number}: not valid TOML: {why}; {remedy}"
 
 
 def _syntax(line: str) -> tuple[str, str]:
