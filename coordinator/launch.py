@@ -36,7 +36,6 @@ from petrobot.coordinator.run.recording import (
 )
 from petrobot.coordinator.run.supervisor import Program, Supervisor, is_local
 from petrobot.coordinator.task import Task
-from petrobot.coordinator.task.file.errors import key_lines, line_of
 from petrobot.coordinator.task.wording import nearest
 from petrobot.services.comm.calls.caller import Caller
 from petrobot.services.comm.location_file import Directory, NodeEntry, module_name
@@ -46,6 +45,7 @@ from petrobot.services.comm.lockstep.party import Party
 from petrobot.services.comm.lockstep.process import cell_key
 from petrobot.services.comm.protocol.messages import Hello
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
+from petrobot.services.host.toml_text import key_lines, line_of
 
 NODE_PARTY = "petrobot.services.node.lockstep:LockstepNode"
 SCRIPTED = "petrobot.services.scripted:load"

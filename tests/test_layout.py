@@ -58,7 +58,7 @@ ALLOWED: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("coordinator.task.compiled", ()),
     ("coordinator.task.net", ("coordinator.task.compiled",)),
     ("coordinator.task.conditions", ("coordinator.task.net", "coordinator.task.wording")),
-    ("coordinator.task", ()),
+    ("coordinator.task", ("services.host.toml_text",)),
     ("coordinator.drawing", ("coordinator.task",)),
     ("coordinator.engine", ("coordinator.task",)),
     (

@@ -198,9 +198,9 @@ def _with_code(
     from petrobot.coordinator.task.check import CheckReport, Finding, Severity, in_file
     from petrobot.coordinator.task.check.code import code_findings, given_findings, occupied
     from petrobot.coordinator.task.check.completeness import EXTERNAL_WAIT, external_waits
-    from petrobot.coordinator.task.file.errors import key_lines, line_of
     from petrobot.services.comm.location_file import read_text
     from petrobot.services.comm.location_file.code import SLOW
+    from petrobot.services.host.toml_text import key_lines, line_of
 
     actions = directory.actions.values()
     by_action = {
@@ -357,7 +357,7 @@ def _told(report: CheckReport, name: str) -> Iterator[Told]:
 def _lines(report: CheckReport, name: str) -> list[int | None]:
     """Return the line of each finding's key, or of the macro place that contains it; None if the
     finding is not about the task file."""
-    from petrobot.coordinator.task.file.errors import key_lines, line_of
+    from petrobot.services.host.toml_text import key_lines, line_of
 
     lines = key_lines(task_path(name).read_text(encoding="utf-8"))
     elsewhere = [

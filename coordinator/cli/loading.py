@@ -229,7 +229,7 @@ def cell_of(directory: Directory) -> Cell:
 
 def file_line(path: Path, key: str) -> str:
     """Return FILE:LINE of a key of a TOML file."""
-    from petrobot.coordinator.task.file.errors import key_lines, line_of
+    from petrobot.services.host.toml_text import key_lines, line_of
 
     return f"{path}:{line_of(key, key_lines(path.read_text(encoding='utf-8')))}"
 
@@ -302,8 +302,8 @@ def refuse_arguments(
     more."""
     from petrobot.coordinator.task.check import in_file
     from petrobot.coordinator.task.check.code import argument_findings
-    from petrobot.coordinator.task.file.errors import key_lines, line_of
     from petrobot.services.comm.location_file.host_checks import signatures
+    from petrobot.services.host.toml_text import key_lines, line_of
 
     if scripted:
         return

@@ -62,10 +62,11 @@ def key_lines(text: str) -> dict[str, int]:
 
 
 def line_of(key: str, lines: Mapping[str, int]) -> int:
-    """Return the line of a key, or of the nearest table around it; 0 if there is none."""
+    """Return the line of a key, or of the nearest table around it; 1 for what the file has no table
+    for, where it may be added."""
     while key and key not in lines:
         key = key.rpartition(".")[0]
-    return lines.get(key, 0)
+    return lines.get(key, 1)
 
 
 def _keys(text: str) -> Iterator[tuple[int, str]]:

@@ -58,7 +58,7 @@ IN_THE_TASK: list[Mistake] = [
         TASK,
         'name = "arm_bot"',
         'name = "arm_bot',
-        r":LINE: TOML: the quote in column 8 is not closed; cl",
+        r":LINE: not valid TOML: the quote in column 8 is not closed; cl",
     ),
     (
         TASK,
@@ -176,13 +176,18 @@ IN_THE_TASK: list[Mistake] = [
         'out = ["carry"], set = { n = 1 }',
         r":LINE: .*'n' is not a variable",
     ),
-    (TASK, "lost = { in", "lost = in", r"arm_bot.toml:LINE: TOML: "),
-    (TASK, "broken = {}", "broken = { # don't\n}", r":LINE: TOML: the brace in column 10 is not"),
+    (TASK, "lost = { in", "lost = in", r"arm_bot.toml:LINE: not valid TOML: "),
+    (
+        TASK,
+        "broken = {}",
+        "broken = { # don't\n}",
+        r":LINE: not valid TOML: the brace in column 10 is not",
+    ),
     (
         TASK,
         'tries = 3, holds = "axis"',
         "listen = True",
-        r":LINE: TOML: True is Python; write true or false",
+        r":LINE: not valid TOML: True is Python; write true or false",
     ),
     (
         TASK,
@@ -206,13 +211,13 @@ IN_THE_TASK: list[Mistake] = [
         TASK,
         'kind = "action", tries',
         "kind = action, tries",
-        r":LINE: TOML: action is a text without quotes; write \"action\"",
+        r":LINE: not valid TOML: action is a text without quotes; write \"action\"",
     ),
     (
         TASK,
         '["carry:normal"] }',
         '["carry:normal", nothing] }',
-        r":LINE: TOML: nothing is a text without quotes",
+        r":LINE: not valid TOML: nothing is a text without quotes",
     ),
     (
         TASK,
@@ -304,7 +309,7 @@ IN_THE_CELL: list[Mistake] = [
         CELL,
         "grip = {",
         "move = {",
-        r":LINE: actions.move: already written in line 10; a name belongs to one table",
+        r":LINE: actions.move: already written in line 10; drop one of the two, or rename it",
     ),
     (CELL, "[actions]", "[action]", r":LINE: action: .*did you mean 'actions'"),
     (
@@ -1597,7 +1602,7 @@ TOGETHER: list[list[Mistake]] = [
         (CODE, "from petrobot", "import nothere\nfrom petrobot", r"it imports 'nothere'"),
     ],
     [  # nothing can be read of the task: its brace ends nowhere
-        (TASK, "[transitions]", "[transitions", r"arm_bot.toml:28: TOML"),
+        (TASK, "[transitions]", "[transitions", r"arm_bot.toml:28: not valid TOML"),
         (CELL, "[actions]", "[action]", r"action: unknown table"),
         (CODE, "period = 0.01", "period = 0", r"Axis.period: expected seconds above 0"),
     ],

@@ -46,7 +46,7 @@ def test_a_byte_order_mark_is_no_fault() -> None:
         ("links.vision/arm", 5),
         ("places", 6),
         ("places.free.kind", 7),
-        ("none", 0),
+        ("none", 1),
     ],
 )
 def test_the_line_of_a_key_or_of_what_is_around_it(key: str, line: int) -> None:

@@ -158,7 +158,7 @@ FAULTS = [
     (
         "[actions.look_twice]",
         "[actions.look]",
-        "actions.look: already written in line 21; a name belongs to one table",
+        "actions.look: already written in line 21; drop one of the two, or rename it",
     ),
     (
         "[actions.add]",

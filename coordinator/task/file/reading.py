@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from enum import StrEnum
@@ -36,9 +35,10 @@ from petrobot.coordinator.task import (
 from petrobot.coordinator.task.conditions import ConditionError, Expression, parse
 from petrobot.coordinator.task.expansion import written
 from petrobot.coordinator.task.file.arcs import ArcError, read_input, read_output
-from petrobot.coordinator.task.file.errors import TaskFileError, key_lines, line_of, syntax_fault
+from petrobot.coordinator.task.file.errors import TaskFileError
 from petrobot.coordinator.task.validation import faults as task_faults
 from petrobot.coordinator.task.wording import Fault, nearest
+from petrobot.services.host.toml_text import TomlError, key_lines, line_of, read_toml
 
 # Reading one TOML table: every key is asked for by name and type, every fault is collected,
 # leftovers are refused.
@@ -227,16 +227,11 @@ def loads(
     dots, its elements say what they were made from, and it was judged before. `data` is read in
     place of the text's own, which then only gives the lines of faults.
     """
-    text = text.removeprefix("\ufeff")  # some editors begin a file with a byte-order mark
     try:
-        data = tomllib.loads(text) if data is None else data
-    except tomllib.TOMLDecodeError as error:
-        fault, line = syntax_fault(text, error)
-        raise TaskFileError(source, [fault], [line]) from error
-    except RecursionError as error:
-        raise TaskFileError(
-            source, [Fault("TOML", "nested too deeply", "flatten it")], [0]
-        ) from error
+        data = read_toml(text, source) if data is None else data
+    except TomlError as error:
+        fault = Fault(error.key, error.found, error.remedy)
+        raise TaskFileError(source, [fault], [error.line or 0]) from error
     if "nodes" in data and "task" not in data:
         remedy = "name the task: petrobot check TASK.toml finds the services.toml beside it"
         raise TaskFileError(

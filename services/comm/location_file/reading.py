@@ -7,13 +7,13 @@ import ipaddress
 import json
 import re
 import sys
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from petrobot.services.comm.protocol.messages import COORDINATOR
+from petrobot.services.host.toml_text import TomlError, key_lines, line_of, read_toml
 
 SCHEMA = 1
 Tables = dict[str, dict[str, Any]]
@@ -176,45 +176,14 @@ class Faults:
     """Collects faults as lines "FILE:LINE: KEY: what is wrong; remedy"."""
 
     def __init__(self, text: str, source: str) -> None:
-        self._lines = text.splitlines()
+        self._text = text
         self._source = source
         self.lines: list[str] = []
 
     def add(self, key: str, fault: str) -> None:
         """Add a fault of a key, given as "table.name.key"."""
-        line = self._line(key.split("."))
-        place = f"{self._source}:{line}" if line else self._source
-        self.lines.append(f"{place}: {key}: {fault}")
-
-    def _line(self, path: list[str]) -> int:
-        """Return the line of the key, or of the table around it, which may be an inline one; else
-        0.
-
-        tomllib reports no positions, so the line is searched in the text.
-        """
-        wanted, first, longest = f"{'.'.join(path)}.", 0, 0
-        for number, here, is_header in _keys(self._lines):
-            if wanted == f"{here}." or (is_header and f"{here}.".startswith(wanted)):
-                return number
-            if wanted.startswith(f"{here}.") and len(here) > longest:
-                first, longest = number, len(here)
-        return first
-
-
-def _keys(lines: Iterable[str]) -> Iterator[tuple[int, str, bool]]:
-    """Yield each header and each key that begins a line: its number, its dotted name, and whether
-    it is a header."""
-    header = ""
-    for number, raw in enumerate(lines, 1):
-        if opened := re.fullmatch(r"\[+\s*([^\]]+?)\s*\]+\s*(#.*)?", raw.strip()):
-            header = _bare(opened[1])
-            yield number, header, True
-        elif key := re.match(r"\s*([\w./\-\"']+)\s*=", raw):
-            yield number, f"{header}.{_bare(key[1])}".lstrip("."), False
-
-
-def _bare(key: str) -> str:
-    return ".".join(part.strip().strip("\"'") for part in key.split("."))
+        line = line_of(key, key_lines(self._text))
+        self.lines.append(f"{self._source}:{line}: {key}: {fault}")
 
 
 def read(
@@ -224,9 +193,9 @@ def read(
     must not be used. `data` is read in place of the text's own."""
     faults = Faults(text, source)
     try:
-        data = tomllib.loads(text) if data is None else data
-    except tomllib.TOMLDecodeError as fault:
-        return {}, "", [_syntax_fault(text, source, str(fault))]
+        data = read_toml(text, source) if data is None else data
+    except TomlError as fault:
+        return {}, "", [str(fault)]
     _check_top(data, faults)
     tables: Tables = {name: data.get(name, {}) for name in (*SHAPES, *FLAT)}
     tables[COORDINATOR] = _coordinator(data, faults)
@@ -276,40 +245,6 @@ def _digest(data: Mapping[str, Any]) -> str:
     told = {name: table for name, table in data.items() if name not in ("keys", "dry_run")}
     digest = hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
     return (DRY if data.get("dry_run") else "") + digest
-
-
-def _syntax_fault(text: str, source: str, why: str) -> str:
-    found, lines = re.search(r"\(at line (\d+)", why), text.splitlines() or [""]
-    number = min(int(found[1]) if found else len(lines), len(lines))  # "at end of document"
-    keys = [(line, name) for line, name, _ in _keys(lines)]
-    name = next((name for line, name in keys if line == number), "")
-    first = next((line for line, own in keys if own == name), 0)
-    if 0 < first < number:
-        return (
-            f"{source}:{number}: {name}: already written in line {first}; a name belongs to one "
-            "table: remove one of the two or rename it"
-        )
-    wrong, remedy = _syntax(lines[number - 1])
-    why, remedy = (wrong, remedy) if wrong else (why, "correct this line")
-    return f"{source}:{number}: not valid TOML: {why}; {remedy}"
-
-
-def _syntax(line: str) -> tuple[str, str]:
-    """Return what is wrong with a line that is not TOML, and the remedy: a quote or brace that is
-    not closed, or a word of Python; empty if it is something else
-    (`coordinator.task.file.errors` has the same)."""
-    closed = re.compile(r"""\"(?:\\.|[^\"\\])*\"|'[^']*'|#.*""")
-    rest = closed.sub(lambda whole: " " * len(whole[0]), line)
-    if opened := re.search("[\"']", rest):
-        return f"the quote in column {opened.start() + 1} is not closed", "close it"
-    if rest.count("{") > rest.count("}"):
-        text = f"the brace in column {rest.index('{') + 1} is not closed in its line"
-        return text, "write all of it in one line, or as a table of its own"
-    if word := re.search(r"=\s*(True|False|None)\b", rest):
-        return f"{word[1]} is Python", "write true or false, or leave the key out"
-    if word := re.search(r"=\s*(?:\[(?:[^\]=]*,)?\s*)?([A-Za-z_]\w*)\s*(?=[,\]}]|$)", rest):
-        return f"{word[1]} is a text without quotes", f'write "{word[1]}"'
-    return "", ""
 
 
 def _check_top(data: Mapping[str, Any], faults: Faults) -> None:
