@@ -12,8 +12,8 @@ import pytest
 
 from petrobot import Context, Remote, Result, rehearse
 from petrobot.services.adapters.ros2 import actions
-from petrobot.services.adapters.ros2.bridge import Bridge
-from petrobot.services.adapters.ros2.protocol import LARGEST, Fragments, Message, parse
+from petrobot.services.adapters.ros2.bridge import LARGEST, Bridge, Fragments, parse
+from petrobot.services.adapters.ros2.messages import Message
 from tests.adapters.ros2.test_actions import Ports
 
 Sent = list[Message]
@@ -124,7 +124,7 @@ def test_answers_in_another_order_belong_to_their_goals() -> None:
 def test_a_cancelled_run_cancels_its_goal_at_the_server() -> None:
     device = bridge()
     rehearse(goal("/slow", timeout=None), device=device, cancel_after=0.5)
-    assert len(device.link._robot.cancelled) == 1 and device.stopped()  # type: ignore[attr-defined]
+    assert len(device.link._device.cancelled) == 1 and device.stopped()  # type: ignore[union-attr]
 
 
 def test_fragments_do_not_fill_the_memory() -> None:

@@ -12,8 +12,7 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.adapters.ros2.bridge import Bridge
-from petrobot.services.adapters.ros2.protocol import ExchangePhase
+from petrobot.services.adapters.ros2.bridge import Bridge, ExchangePhase
 from petrobot.services.comm.protocol.plain import plain
 from tests.adapters.ros2.conftest import FakeProcess
 from tests.adapters.ros2.test_actions import Ports
@@ -111,10 +110,11 @@ def test_a_killed_server_and_its_successor() -> None:
     fake.end()
     bridge.until_phase(ExchangePhase.LOST)
     successor = FakeProcess(fake.port)
-    bridge.until_phase(ExchangePhase.RECALLED)
-    bridge.until_phase(ExchangePhase.GONE)
-    assert not bridge.stopped()
-    assert {m["op"] for m in successor.log()} == {"cancel_action_goal"}
+    bridge.until(lambda: bridge.link.count == 2, "the successor")
+    recalled = bridge.now
+    bridge.until(lambda: bridge.now > recalled + 2.5, "the end of its patience")
+    assert not bridge.stopped() and bridge.phase() is ExchangePhase.LOST
+    assert [m["op"] for m in successor.log()] == 2 * ["cancel_action_goal"]
     bridge.goal("/slow")
     bridge.until_phase(ExchangePhase.ACTIVE)
     bridge.stop(bridge.now)
