@@ -50,10 +50,10 @@ def test_set_points_keep_speed_and_acceleration_and_arrive_together(
     for step in range(4000):
         if step == steps and happens == "stop":
             motion.stop()
-        motion.paused = happens == "pause" and steps <= step < steps + 40
+        motion._driver.paused = happens == "pause" and steps <= step < steps + 40
         motion.step()
         seen.append(list(motion.q))
-        if not motion.moving and not motion.paused:
+        if not motion.moving and not motion._driver.paused:
             break
     most = 2.0 * 0.5 * share
     fast = [max(abs(b - a) for a, b in zip(*each, strict=True)) / DT for each in pairwise(seen)]

@@ -46,6 +46,7 @@ GRASP_TIME: Final = 0.1
 """Time for which the gripper must squeeze at a standstill (s)."""
 
 
+COMMANDS: Final = ("move", "open", "close", "free", "calibrate", "enable", "rest")
 UNREAD: Final = bus.Reading(0, False, 2048, 2048, 0, 0.0, 0.0, 0)
 
 
@@ -124,7 +125,7 @@ class Arm(Driver):
     `kinematics`."""
 
     period = 0.02
-    obeys = ("speed", "workspace", "dry_run")
+    obeys = ("speed", "workspace", "dry_run", "pause")
     port: str = key(text="serial port, as /dev/ttyACM0")
     calibration: str = key("", "file of the zero positions, written by the command calibrate")
     limits: dict[str, Any] = key({}, "joints with other limits, as { gripper = [0.0, 1.5] } (rad)")
@@ -200,12 +201,8 @@ class Arm(Driver):
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
         do = body.get("do")
-        known = {
-            "move": self._move, "open": self._open, "close": self._close, "free": self._free,
-            "calibrate": self._calibrate, "enable": self._enable, "rest": self._rest,
-        }  # fmt: skip
-        if do not in known:
-            raise ValueError(f"unknown command {dict(body)!r:.80}; do: {', '.join(known)}")
+        if do not in COMMANDS:
+            raise ValueError(f"unknown command {dict(body)!r:.80}; do: {', '.join(COMMANDS)}")
         if do != "rest" and (missing := self._missing(now)):
             raise ValueError(missing)
         if do in ("move", "open", "close"):
@@ -216,24 +213,24 @@ class Arm(Driver):
                 raise ValueError(f"{self.calibration} is not there yet: calibrate the arm first")
             if not all(joint.ready for joint in self.joints):
                 raise ValueError("the servos are being switched on: try again")
-        known[do](body)
+        getattr(self, f"_do_{do}")(body)
 
-    def _move(self, body: Mapping[str, Any]) -> None:
+    def _do_move(self, body: Mapping[str, Any]) -> None:
         self.motion.begin([numbers(body.get("joints"), 5, "joints")], body.get("speed", 1.0))
 
-    def _open(self, body: Mapping[str, Any]) -> None:
+    def _do_open(self, body: Mapping[str, Any]) -> None:
         self.jaw.halt(self.jaw.q)
         self.jaw.begin([[body.get("angle", self.gripper.high)]])
         self._hand = "open"
 
-    def _close(self, body: Mapping[str, Any]) -> None:
+    def _do_close(self, body: Mapping[str, Any]) -> None:
         (squeeze,) = numbers([body.get("squeeze", self.squeeze / 2)], 1, "squeeze")
         if not 0.0 < squeeze <= self.squeeze:
             raise ValueError(f"squeeze: expected at most {self.squeeze}, found {squeeze:g}")
         self.jaw.stop()
         self._hand, self._grip, self._gripped = "close", squeeze, 0.0
 
-    def _calibrate(self, body: Mapping[str, Any]) -> None:
+    def _do_calibrate(self, body: Mapping[str, Any]) -> None:
         pose = numbers(body.get("pose", [0.0] * 6), 6, "pose")
         if self.dry_run:
             raise ValueError("a dry run does not know where the arm is: calibrate without it")
@@ -254,14 +251,14 @@ class Arm(Driver):
         self._calibrated, self._hand = True, ""
         self._freeze()
 
-    def _free(self, body: Mapping[str, Any]) -> None:
+    def _do_free(self, body: Mapping[str, Any]) -> None:
         self._on, self._hand = False, ""
         self._freeze()
 
-    def _rest(self, body: Mapping[str, Any]) -> None:
+    def _do_rest(self, body: Mapping[str, Any]) -> None:
         self.stop(self.ports.now)
 
-    def _enable(self, body: Mapping[str, Any]) -> None:
+    def _do_enable(self, body: Mapping[str, Any]) -> None:
         self.faults.clear()
         self._freeze()
         self._on = True
@@ -348,7 +345,7 @@ class Arm(Driver):
                 self._fault("overload", f"{joint.name} pushes against something")
                 joint.settle()
                 self._freeze()
-            if self._untrimmed(joint) and not self.motion.paused:
+            if self._untrimmed(joint) and not self.paused:
                 change = TRIM_RATE * self.period * (joint.aim - joint.q)
                 joint.trim = min(0.1, max(-0.1, joint.trim + change))
 
@@ -362,7 +359,7 @@ class Arm(Driver):
         """Close the gripper as long as its load is below the wish; see whether it holds."""
         joint, jaw = self.gripper, self.jaw
         low, high = joint.within()
-        if self._hand == "close" and not jaw.paused:
+        if self._hand == "close" and not self.paused:
             excess = -joint.load - self._grip
             if excess > 0.0 or joint.stands:  # it touches something
                 way = GIVE * excess * self.period
@@ -392,11 +389,11 @@ class Arm(Driver):
                 joint.started = True
             elif joint.read.torque:
                 free[joint.servo] = b"\0"
-        out = bus.sync_write(bus.GOAL, goals) if goals else b""
-        out += bus.sync_write(bus.TORQUE, start) if start else b""
-        out += bus.sync_write(bus.TORQUE, free) if free else b""
         question = bus.read_state(joint.servo for joint in self._order)
-        return question if self.dry_run else out + question
+        if self.dry_run:
+            return question
+        torque = bus.sync_write(bus.TORQUE, start) + bus.sync_write(bus.TORQUE, free)
+        return bus.sync_write(bus.GOAL, goals) + torque + question
 
     # --- called by the node ---------------------------------------------------------------------
 
@@ -420,19 +417,13 @@ class Arm(Driver):
         """Return whether every servo answers and stands still, and no motion is left."""
         if self._missing(self.ports.now):
             return False
-        trims = not self.motion.paused and any(map(self._untrimmed, self.joints))
+        trims = not self.paused and any(map(self._untrimmed, self.joints))
         going = self.motion.moving or self.jaw.moving or trims
         return not going and all(joint.stands for joint in self.joints)
 
     def hold(self, now: float) -> str:
         """Brake, and keep the goal until `release`."""
-        if self._missing(now):
-            return "cannot hold"
-        self.motion.paused = self.jaw.paused = True
-        return "held"
-
-    def release(self, now: float) -> None:
-        self.motion.paused = self.jaw.paused = False
+        return "cannot hold" if self._missing(now) else super().hold(now)
 
     def state(self) -> Mapping[str, Any]:
         """Return angles (rad), speeds (rad/s), loads (share of the stall torque), temperatures
