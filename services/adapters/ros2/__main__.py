@@ -89,7 +89,7 @@ class OfferedTask:
         goal = message.get("id")
         if message["op"] == "cancel_action_goal" and goal == self._goal:
             self._why = "cancelled"
-        elif message["op"] == "send_action_goal" and isinstance(goal, str):
+        elif message["op"] == "send_action_goal" and isinstance(goal, str) and goal:
             if self._goal:
                 self._result(goal, ABORTED, "refused", "a run of this task is active")
                 return

@@ -16,15 +16,17 @@ from typing import Any
 import aiohttp
 
 from petrobot import Ports, SessionThread, SimulatedSession, key
-from petrobot.services.adapters.ros2.messages import Message, unfit, words
+from petrobot.services.adapters.ros2.messages import LARGEST_VALUE, Message, unfit, words
 from petrobot.services.adapters.ros2.topics import TopicDriver
 
 LARGEST = 4 << 20
 """Bytes of the largest message that is received."""
+RATE = 5e6
+"""Bytes a second that are read of a server which sends large messages without a pause."""
 CONNECTING = 5.0
 """Limit of an attempt to connect (s)."""
-WAITING = 8
-"""Messages of which fragments may be missing at the same time."""
+WAITING, MOST_FRAGMENTS = 8, 1000
+"""Messages of which fragments may be missing at the same time, and most fragments of one."""
 ENDED_KEPT = 5
 """Ended goals and calls that are kept for actions which have not read them."""
 REPEAT = 1.0
@@ -66,7 +68,7 @@ class Fragments:
         ValueError."""
         match part:
             case {"num": int(number), "total": int(total), "data": str(data)} if (
-                0 <= number < total
+                0 <= number < total <= MOST_FRAGMENTS
             ):
                 name = str(part.get("id"))
             case _:
@@ -105,6 +107,8 @@ async def _receive(session: SessionThread, socket: aiohttp.ClientWebSocketRespon
             session.tell("message", parse(frame.data))
         except ValueError as fault:
             session.tell("refused", str(fault))
+        if len(frame.data) > LARGEST_VALUE:  # reading it has kept the driver from its work
+            await asyncio.sleep(len(frame.data) / RATE)
         await session.room()  # the driver is busy: let the server wait
 
 
@@ -275,16 +279,16 @@ class Exchanges:
         """Process feedback, a result, a response, or rosbridge's report that an operation failed;
         return why it cannot be used, "" if it can."""
         op, said, status = message["op"], message.get("values"), message.get("status")
-        identity, orphan = message.get("id"), self.orphans.get(str(message.get("id")))
+        identity = given if isinstance(given := message.get("id"), str) else ""
         failed = op == "status" and message.get("level") == "error"
         if op not in ANSWERS:
             return f"operation {words(op):.40}: was not asked for"
-        if failed and identity is None:
+        if failed and not identity:
             return f"rosbridge reports: {message.get('msg')}"
-        if orphan is not None:
-            orphan.heard = now
+        if identity in self.orphans:
+            self.orphans[identity].heard = now
             if op == "action_result" or failed:
-                del self.orphans[str(identity)]
+                del self.orphans[identity]
         one = next((e for e in self.open.values() if e.request["id"] == identity), None)
         if one is None or one.phase not in RUNNING or (op == "status" and not failed):
             return ""

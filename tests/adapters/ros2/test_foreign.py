@@ -136,6 +136,8 @@ def test_fragments_do_not_fill_the_memory() -> None:
     with pytest.raises(ValueError, match="too many or too long"):
         for name in range(20):
             waiting.add({"op": "fragment", "id": str(name), "data": "x", "num": 0, "total": 2})
+    with pytest.raises(ValueError, match="not a fragment"):  # empty ones fill it, too
+        waiting.add({"op": "fragment", "id": "b", "data": "", "num": 5000, "total": 9999})
     whole = fragments({"op": "publish", "id": "z", "msg": {"data": "\u00e4"}}, 5)
     fresh = Fragments()
     told = [fresh.add(parse(json.dumps(part))) for part in whole]

@@ -227,6 +227,17 @@ def test_one_goal_at_a_time() -> None:
     assert played(steps)[1].results()[0] == ("g2", 6, "refused")
 
 
+def test_a_goal_without_a_name_starts_nothing() -> None:
+    """Beside it a second goal would be accepted."""
+
+    async def steps(page: Page, link: Link) -> None:
+        link.say("send_action_goal", "", args={})
+        link.say("send_action_goal", "g2", args={})
+        await until(lambda: page.phase == "running", "the run of the other goal")
+
+    assert [verb for verb, _ in played(steps)[0].commands].count("start") == 1
+
+
 @pytest.mark.parametrize("lost", ["link", "page", "stop"])
 def test_a_run_is_aborted_when_its_client_or_link_is_lost(lost: str) -> None:
     """A link that breaks aborts the run: its client can no longer cancel it."""

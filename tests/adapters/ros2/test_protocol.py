@@ -262,9 +262,31 @@ def test_words_of_unusual_servers(said: dict[str, Any], phase: ExchangePhase, te
     assert one.phase is phase
 
 
+def test_an_answer_of_another_kind_ends_nothing() -> None:
+    """Else a response with the id of a goal would be its success."""
+    exchanges = Exchanges(1.0)
+    goal = exchanges.begin(0.0, "goal", GOAL)["id"]
+    call = exchanges.begin(0.0, "call", {"op": "call_service", "service": "/s"})["id"]
+    for identity, op in ((goal, "service_response"), (call, "action_result")):
+        said = {"op": op, "id": identity, "values": {}, "result": True, "status": 4}
+        assert "another operation" in exchanges.receive(0.0, said)
+    assert {one.phase for one in exchanges.open.values()} == {ExchangePhase.PENDING}
+
+
+def test_a_response_may_have_the_fields_status_and_result() -> None:
+    """Only old servers wrap a goal's result into these two."""
+    exchanges = Exchanges(1.0)
+    call = exchanges.begin(0.0, "run", {"op": "call_service", "service": "/s"})["id"]
+    values = {"status": 6, "result": {"x": 1}}
+    exchanges.receive(0.0, {"op": "service_response", "id": call, "values": values, "result": True})
+    one = exchanges.open["run"]
+    assert (one.phase, one.values) == (ExchangePhase.SUCCEEDED, values)
+
+
 @pytest.mark.parametrize(
     ("said", "fault"),
     [
+        ({"op": "status", "level": "error", "id": [1], "msg": "odd"}, "reports: odd"),
         ({"op": "png", "data": "iVBORw0KGgo="}, "operation png: was not asked for"),
         ({"op": "status", "level": "error", "msg": "no such type"}, "reports: no such type"),
         ({"op": "status", "level": "warning", "msg": "slow"}, ""),
