@@ -34,7 +34,10 @@ TRIM_RATE, DEAD = 6.0, 0.004
 """The set point of a loaded joint is corrected until the joint is at its goal: share of the error
 per second, and the error that is tolerated because of friction (rad)."""
 NEAR: Final = 0.3
-"""Largest distance between a servo and its set point that its load can explain (rad)."""
+"""Largest distance between a servo and its set point that its load can explain, and between two
+answers of one servo that come together (rad)."""
+SLACK: Final = 20
+"""How far beyond the positions to which it can be sent a servo may be (steps)."""
 REACHED: Final = 0.015
 """Distance to its goal within which a joint has reached it (rad)."""
 STRAIN_TIME: Final = 0.5
@@ -81,6 +84,12 @@ class Joint:
     def stands(self) -> bool:
         """Return whether the servo has stood still for some readings."""
         return self.still >= STILL and abs(self.read.speed) <= CREEP
+
+    @property
+    def usable(self) -> bool:
+        """Return whether it can be sent to where it is: else it would jump when torque comes on."""
+        beyond = abs(self.steps(self.q) - self.read.position)
+        return not self.read.mode and beyond <= SLACK
 
     @property
     def q(self) -> float:
@@ -287,6 +296,8 @@ class Arm(Driver):
             joint, read = by_servo.get(answer.servo), bus.reading(answer.data)
             if joint is None or read is None:
                 continue
+            if joint in heard and abs(read.position - joint.read.position) * bus.RAD > NEAR:
+                self._fault("twice", f"two servos answer as {joint.name}: change the id of one")
             heard.append(joint)
             if self.dry_run and self._on and joint.started:  # as if it had followed
                 at = joint.steps(joint.aim)
@@ -298,6 +309,11 @@ class Arm(Driver):
             if read.mode:
                 text = f"the servo of {joint.name} is in mode {read.mode}: it must be 0 (position)"
                 self._fault("mode", text)
+            elif not joint.usable:
+                text = (
+                    f"the servo of {joint.name} is at {read.position}, and only goes to 0 to 4095"
+                )
+                self._fault("range", f"{text}: turn it back, or change its offset")
             if read.temperature > self.hottest:
                 text = f"{joint.name} has {read.temperature} deg C, more than {self.hottest:g}"
                 self._fault("heat", f"{text}: let it cool down")
@@ -306,7 +322,7 @@ class Arm(Driver):
                 joint.started = False
             if not (joint.ready and read.torque):
                 joint.settle()
-            joint.ready = read.torque and self._on and joint.started and not read.mode
+            joint.ready = read.torque and self._on and joint.started and joint.usable
         if not self.motion.moving and not all(joint.ready for joint in self.arm):
             self.motion.halt([joint.aim for joint in self.arm])
         if not self.gripper.ready:
@@ -382,7 +398,7 @@ class Arm(Driver):
                 continue
             if joint.ready:
                 goals[joint.servo] = bus.word(joint.steps(joint.aim + joint.trim))
-            elif self._on and not joint.read.mode:
+            elif self._on and joint.usable and "twice" not in self.faults:
                 limit = self.squeeze if joint is self.gripper else 1.0
                 speed = min(round(1.5 * self.top_speed / bus.RAD), 32767)
                 start[joint.servo] = bus.setup(joint.steps(joint.aim), speed, round(1000 * limit))
