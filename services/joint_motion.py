@@ -39,6 +39,8 @@ class JointMotion:
         """The set point."""
         self.goal: list[float] | None = None
         """Where the way ends; None after `stop`."""
+        self.paused = False
+        """Brake on the way, and move on when it is False again, as while the driver is `paused`."""
         self._driver, self._point = driver, point
         self._speed, self._acceleration = speed, acceleration
         self._way: list[list[float]] = []
@@ -50,7 +52,11 @@ class JointMotion:
     @property
     def moving(self) -> bool:
         """Whether the set point moves."""
-        return bool(self._way) and not (self._driver.paused and self._rate == 0.0)
+        return bool(self._way) and not (self._rests and self._rate == 0.0)
+
+    @property
+    def _rests(self) -> bool:
+        return self.paused or self._driver.paused
 
     @property
     def arrived(self) -> bool:
@@ -114,8 +120,7 @@ class JointMotion:
         # The speed from which `periods` of braking, one change of speed each, end on the goal.
         periods = max(1, math.ceil(math.sqrt(0.25 + 2 * left / (change * dt)) - 0.5))
         braking = left / (periods * dt) + change * (periods - 1) / 2
-        rests = self._driver.paused or self.goal is None
-        wish = 0.0 if rests else min(self._most, braking)
+        wish = 0.0 if self._rests or self.goal is None else min(self._most, braking)
         self._rate += min(change, max(-change, wish - self._rate))
         self._at += self._rate * dt
         if self.goal is None and self._rate <= 0.0:
