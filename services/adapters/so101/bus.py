@@ -109,8 +109,9 @@ def reading(data: bytes) -> Reading | None:
     if len(data) != _STATE.size:
         return None
     mode, torque, goal, _, position, speed, load, voltage, temperature, _, _ = _STATE.unpack(data)
-    turned = [number(each) for each in (goal, position, speed)]
-    return Reading(mode, torque == 1, *turned, number(load, 10) / 1000, voltage / 10, temperature)
+    wanted, at, rate = number(goal), number(position), number(speed)
+    share, volts = number(load, 10) / 1000, voltage / 10
+    return Reading(mode, torque == 1, wanted, at, rate, share, volts, temperature)
 
 
 class PacketSplitter:
