@@ -190,8 +190,7 @@ def test_a_simulated_device_answers_on_its_drivers_clock() -> None:
     """What it gets and tells is copied, as by a real session."""
     now, sent = 0.0, {"x": [1]}
     session = SimulatedSession(f"{__name__}:Echo", lambda: now)
-    assert not session.up and list(session.news()) == [("up", None)]
-    assert session.up and session.count == 1
+    assert (session.count, list(session.news()), session.count) == (0, [("up", None)], 1)
     now = 2.0
     session.send(sent)
     sent["x"].append(2)
