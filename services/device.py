@@ -411,6 +411,21 @@ def numbers(value: Any, count: int, name: str) -> list[float]:
     return [float(v) for v in value]
 
 
+def table(
+    value: Any, name: str, needed: Collection[str], other: Collection[str] = ()
+) -> dict[str, Any]:
+    """Return a table that has the keys `needed`, and of all others only `other`. Raises ValueError
+    with the name for anything else."""
+    if not isinstance(value, dict):
+        raise ValueError(f"{name}: expected a table with {', '.join(needed)}, found {value!r:.60}")
+    missing, unknown = {*needed} - {*value}, {*value} - {*needed, *other}
+    if missing or unknown:
+        wrong = f"is missing {sorted(missing)}" if missing else f"unknown keys {sorted(unknown)}"
+        more = f", optional {sorted(other)}" if other else ""
+        raise ValueError(f"{name}: {wrong}; expected {sorted(needed)}{more}")
+    return value
+
+
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 

@@ -15,7 +15,7 @@ PART: Final = 0.02
 
 class JointMotion:
     """Set points of joints along a way: all start and arrive together, within limits of speed and
-    acceleration. Part of a cyclic driver, whose `speed` and `workspace` it obeys.
+    acceleration. Part of a cyclic driver, whose `speed`, `workspace` and `paused` it obeys.
 
     A command calls `begin`; each period calls `step` and sends `q`. Positions are in rad or m.
     """
@@ -40,7 +40,7 @@ class JointMotion:
         self.goal: list[float] | None = None
         """Where the way ends; None after `stop`."""
         self.paused = False
-        """Brake on the way, and move on when it is False again."""
+        """Brake on the way, and move on when it is False again, as while the driver is `paused`."""
         self._driver, self._point = driver, point
         self._speed, self._acceleration = speed, acceleration
         self._way: list[list[float]] = []
@@ -52,7 +52,11 @@ class JointMotion:
     @property
     def moving(self) -> bool:
         """Whether the set point moves."""
-        return bool(self._way) and not (self.paused and self._rate == 0.0)
+        return bool(self._way) and not (self._rests and self._rate == 0.0)
+
+    @property
+    def _rests(self) -> bool:
+        return self.paused or self._driver.paused
 
     @property
     def arrived(self) -> bool:
@@ -116,7 +120,7 @@ class JointMotion:
         # The speed from which `periods` of braking, one change of speed each, end on the goal.
         periods = max(1, math.ceil(math.sqrt(0.25 + 2 * left / (change * dt)) - 0.5))
         braking = left / (periods * dt) + change * (periods - 1) / 2
-        wish = 0.0 if self.paused or self.goal is None else min(self._most, braking)
+        wish = 0.0 if self._rests or self.goal is None else min(self._most, braking)
         self._rate += min(change, max(-change, wish - self._rate))
         self._at += self._rate * dt
         if self.goal is None and self._rate <= 0.0:

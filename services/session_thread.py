@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import importlib
 import logging
 import threading
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from typing import Any, Final
 
+from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.comm.streams.line import PAUSES
 
 _log = logging.getLogger(__name__)
@@ -149,3 +151,32 @@ class SessionThread:
     def _cancel(self) -> None:
         self._closing = True
         self._stop("closed")
+
+
+class SimulatedSession:
+    """A simulated device in the place of a `SessionThread`, also for lock step: an object of the
+    class `path` ("module:Class") with `receive(now, item)` and `step(now)`, which return what the
+    device sends. `news` has each as ("message", item)."""
+
+    def __init__(self, path: str, clock: Callable[[], float]) -> None:
+        module, _, name = path.partition(":")
+        self.up, self.count, self.why = False, 0, "not connected yet"
+        self._device, self._clock = getattr(importlib.import_module(module), name)(), clock
+        self._news: list[tuple[str, Any]] = [("up", None)]
+
+    def news(self) -> Iterator[tuple[str, Any]]:
+        """Remove and return what the device has sent."""
+        self._tell(self._device.step(self._clock()))
+        found, self._news = self._news, []
+        self.up, self.count = True, 1
+        yield from found
+
+    def send(self, item: Any) -> None:
+        """Send to the device."""
+        self._tell(self._device.receive(self._clock(), plain(item)))
+
+    def close(self, wait: float = 1.0) -> None:
+        """Do nothing."""
+
+    def _tell(self, items: Iterable[Any]) -> None:
+        self._news += [("message", plain(item)) for item in items]

@@ -38,6 +38,8 @@ class OperatorClient:
         """The snapshot, up to date."""
         self.who = ""
         """The name under which all others see this operator."""
+        self.over = ""
+        """Why the connection has ended; empty while it is there."""
         self._url = url
         self._headers = {"Authorization": f"Bearer {token}"}
         self._hello = {"type": "hello", "protocol": PROTOCOL, "name": name, "tab": secret}
@@ -51,7 +53,6 @@ class OperatorClient:
         self._watched = False
         self._behind = False
         """Whether changes are missing, and a snapshot has been asked for."""
-        self._over = ""
 
     async def __aenter__(self) -> Self:
         """Connect, send hello, and wait for the snapshot."""
@@ -91,8 +92,8 @@ class OperatorClient:
 
     async def command(self, verb: str, data: dict[str, Any] | None = None) -> dict[str, Any]:
         """Give a command; return its answer {ok, ...} after it was carried out and journaled."""
-        if self._socket is None or self._over:
-            raise OperatorError(self._over or "not connected")
+        if self._socket is None or self.over:
+            raise OperatorError(self.over or "not connected")
         self._numbers += 1
         number = self._numbers
         answer = self._answers[number] = asyncio.get_running_loop().create_future()
@@ -114,7 +115,7 @@ class OperatorClient:
         try:
             async with asyncio.timeout(timeout):
                 while not holds(self.state):
-                    if self._over:
+                    if self.over:
                         return False
                     self._changed.clear()
                     await self._changed.wait()
@@ -125,13 +126,13 @@ class OperatorClient:
     async def changes(self) -> AsyncIterator[dict[str, Any]]:
         """Yield every change until the connection ends; `reset` when there is a new snapshot."""
         self._watched = True
-        while not self._over and (change := await self._changes.get()) is not None:
+        while not self.over and (change := await self._changes.get()) is not None:
             yield change
 
     async def _until_open(self) -> None:
         while not self.who:
-            if self._over:
-                raise OperatorError(self._over)
+            if self.over:
+                raise OperatorError(self.over)
             self._changed.clear()
             await self._changed.wait()
 
@@ -141,21 +142,21 @@ class OperatorClient:
             while True:
                 message = await asyncio.wait_for(self._socket.receive(), LOST_AFTER)
                 if message.type is not aiohttp.WSMsgType.TEXT:
-                    self._over = str(message.extra or "") or "the coordinator closed the connection"
+                    self.over = str(message.extra or "") or "the coordinator closed the connection"
                     break
                 await self._take(json.loads(message.data))
         except TimeoutError:
-            self._over = f"the coordinator has been silent for {LOST_AFTER:g} s"
+            self.over = f"the coordinator has been silent for {LOST_AFTER:g} s"
         except (aiohttp.ClientError, ConnectionError, ValueError) as fault:
-            self._over = f"the connection broke: {fault}"
+            self.over = f"the connection broke: {fault}"
         finally:
             self._end()
 
     def _end(self) -> None:
-        self._over = self._over or "left"
+        self.over = self.over or "left"
         for answer in self._answers.values():
             if not answer.done():
-                answer.set_exception(OperatorError(self._over))
+                answer.set_exception(OperatorError(self.over))
         self._changes.put_nowait(None)
         self._changed.set()
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 if TYPE_CHECKING:
+    from petrobot.coordinator.operator.client import OperatorClient, OperatorError
     from petrobot.services.action import (
         CallFailed,
         Cancelled,
@@ -32,12 +33,12 @@ if TYPE_CHECKING:
     from petrobot.services.comm.streams.image import Image
     from petrobot.services.comm.streams.line import ByteLine, Link
     from petrobot.services.conformance import DriverCheck, check_driver
-    from petrobot.services.device import Driver, Ports, Remote, Setpoint, key, numbers
+    from petrobot.services.device import Driver, Ports, Remote, Setpoint, key, numbers, table
     from petrobot.services.joint_chain import JointChain
     from petrobot.services.joint_motion import JointMotion
     from petrobot.services.perform import perform
     from petrobot.services.rehearsal import Rehearsal, rehearse, rehearse_task
-    from petrobot.services.session_thread import SessionThread
+    from petrobot.services.session_thread import SessionThread, SimulatedSession
 
 __all__ = [
     "ByteLine",
@@ -52,12 +53,15 @@ __all__ = [
     "JointChain",
     "JointMotion",
     "Link",
+    "OperatorClient",
+    "OperatorError",
     "Ports",
     "Rehearsal",
     "Remote",
     "Result",
     "SessionThread",
     "Setpoint",
+    "SimulatedSession",
     "Status",
     "check_driver",
     "error",
@@ -69,20 +73,23 @@ __all__ = [
     "rehearse",
     "rehearse_task",
     "success",
+    "table",
 ]
 
 _HOMES = {
     **dict.fromkeys(("ByteLine", "Link"), "petrobot.services.comm.streams.line"),
     **dict.fromkeys(
-        ("Driver", "Ports", "Remote", "Setpoint", "key", "numbers"), "petrobot.services.device"
+        ("Driver", "Ports", "Remote", "Setpoint", "key", "numbers", "table"),
+        "petrobot.services.device",
     ),
     "CameraDriver": "petrobot.services.camera",
     "Image": "petrobot.services.comm.streams.image",
     "JointChain": "petrobot.services.joint_chain",
     "JointMotion": "petrobot.services.joint_motion",
     **dict.fromkeys(("DriverCheck", "check_driver"), "petrobot.services.conformance"),
+    **dict.fromkeys(("OperatorClient", "OperatorError"), "petrobot.coordinator.operator.client"),
     "perform": "petrobot.services.perform",
-    "SessionThread": "petrobot.services.session_thread",
+    **dict.fromkeys(("SessionThread", "SimulatedSession"), "petrobot.services.session_thread"),
     **dict.fromkeys(("Rehearsal", "rehearse", "rehearse_task"), "petrobot.services.rehearsal"),
 }
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from petrobot.services.comm.location_file import DeviceEntry, DirectoryError, parse
-from petrobot.services.device import Driver, key, read_keys
+from petrobot.services.device import Driver, key, read_keys, table
 from petrobot.services.node.drivers import make_driver
 
 CELL = """schema = 1
@@ -117,3 +117,21 @@ def test_keys_of_ports_are_accepted() -> None:
 def test_a_missing_device_is_not_reported_as_a_wrong_key() -> None:
     with pytest.raises(DirectoryError, match=r"cannot open its device.*check that it is connected"):
         made("Broken")
+
+
+@pytest.mark.parametrize(
+    ("value", "wrong"),
+    [
+        ({"a": 1}, ""),
+        ({"a": 1, "b": 2}, ""),
+        ({"b": 2}, r"key\.x: is missing \['a'\]; expected \['a'\], optional \['b'\]"),
+        ({"a": 1, "c": 3}, r"key\.x: unknown keys \['c'\]"),
+        (7, r"key\.x: expected a table with a, found 7"),
+    ],
+)
+def test_a_table_has_the_keys_that_it_needs_and_no_unknown_ones(value: Any, wrong: str) -> None:
+    if wrong:
+        with pytest.raises(ValueError, match=wrong):
+            table(value, "key.x", ("a",), ("b",))
+    else:
+        assert table(value, "key.x", ("a",), ("b",)) is value

@@ -40,7 +40,12 @@ ways = st.lists(st.tuples(st.floats(-1.5, 1.5), st.floats(-3.0, 3.0)), min_size=
 
 
 @settings(max_examples=40)
-@given(ways, st.floats(0.3, 1.0), st.integers(0, 80), st.sampled_from(["stop", "pause", "none"]))
+@given(
+    ways,
+    st.floats(0.3, 1.0),
+    st.integers(0, 80),
+    st.sampled_from(["stop", "pause", "driver", "none"]),
+)
 def test_set_points_keep_speed_and_acceleration_and_arrive_together(
     way: list[tuple[float, float]], share: float, steps: int, happens: str
 ) -> None:
@@ -50,10 +55,12 @@ def test_set_points_keep_speed_and_acceleration_and_arrive_together(
     for step in range(4000):
         if step == steps and happens == "stop":
             motion.stop()
-        motion.paused = happens == "pause" and steps <= step < steps + 40
+        if happens in ("pause", "driver"):
+            paused: Any = motion if happens == "pause" else motion._driver
+            paused.paused = steps <= step < steps + 40
         motion.step()
         seen.append(list(motion.q))
-        if not motion.moving and not motion.paused:
+        if not motion.moving and not motion._rests:
             break
     most = 2.0 * 0.5 * share
     fast = [max(abs(b - a) for a, b in zip(*each, strict=True)) / DT for each in pairwise(seen)]

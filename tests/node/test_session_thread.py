@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from petrobot import SessionThread
+from petrobot import SessionThread, SimulatedSession
 from petrobot.services.session_thread import WAITING
 from tests.waiting import Limit
 
@@ -174,3 +174,26 @@ def test_a_session_waits_until_its_driver_reads(begin: Begin) -> None:
         seen += [item for _, item in session.news()]
         time.sleep(0.005)
     assert seen == [None, *range(WAITING + 10)] and told.is_set()
+
+
+class Echo:
+    """A simulated device that repeats what it gets, and tells the time."""
+
+    def receive(self, now: float, item: Any) -> list[Any]:
+        return [{"heard": item, "at": now}]
+
+    def step(self, now: float) -> list[Any]:
+        return [{"at": now}] if now else []
+
+
+def test_a_simulated_device_answers_on_its_drivers_clock() -> None:
+    """What it gets and tells is copied, as by a real session."""
+    now, sent = 0.0, {"x": [1]}
+    session = SimulatedSession(f"{__name__}:Echo", lambda: now)
+    assert (session.count, list(session.news()), session.count) == (0, [("up", None)], 1)
+    now = 2.0
+    session.send(sent)
+    sent["x"].append(2)
+    told = [("message", {"heard": {"x": [1]}, "at": 2.0}), ("message", {"at": 2.0})]
+    assert list(session.news()) == told
+    session.close()

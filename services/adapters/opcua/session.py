@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from petrobot import Driver, Ports, SessionThread, key
+from petrobot import Driver, Ports, SessionThread, key, table
 
 LOOK: Final = 0.3
 """Time between two checks of the connection (s)."""
@@ -82,8 +82,7 @@ class OpcUaSession(Driver):
         if self.certificate and not (self.private_key and self.server_certificate):
             raise ValueError("certificate: write private_key and server_certificate, too")
         for name, event in self.events.items():
-            if not isinstance(event, Mapping) or set(event) != {"node", "becomes"}:
-                raise ValueError(f"events.{name}: expected node and becomes, found {event!r:.60}")
+            table(event, f"events.{name}", ("node", "becomes"))
         for name in (*self.on_stop, *(event["node"] for event in self.events.values())):
             if name not in self.nodes:
                 raise ValueError(f"no node {name!r}; there are {', '.join(self.nodes)}")

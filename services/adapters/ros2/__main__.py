@@ -16,70 +16,47 @@ import contextlib
 import json
 import logging
 import os
+import secrets
 import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import aiohttp
-
-from petrobot.services.adapters.ros2 import definitions
-from petrobot.services.adapters.ros2.link import RosbridgeLink, connect
+from petrobot import OperatorClient, OperatorError, SessionThread
+from petrobot.services.adapters.ros2 import messages
+from petrobot.services.adapters.ros2.bridge import serve
+from petrobot.services.adapters.ros2.messages import Message
 
 _log = logging.getLogger(__name__)
 LOOK = 0.2
-"""Time between two checks of the run (s)."""
-LATE = 10
-"""Checks after the end of the run, before the wait for its result is given up."""
+"""Least time between two messages of feedback (s)."""
+RESULT = 2.0
+"""Longest wait for the begin of a run, and after its end for its result (s)."""
 SUCCEEDED, CANCELLED, ABORTED = 4, 5, 6
 """action_msgs/msg/GoalStatus."""
 ENDS = ("success", "failure", "error", "aborted", "stopped")
 NAME = "ros2"
+PAGE = "address that `petrobot serve` prints, http://.../?token=... (or PETROBOT_PAGE)"
 TYPE = "petrobot_interfaces/action/RunTask"
-
-
-class OperatorPage:
-    """The coordinator's page, over HTTP. Its calls raise OSError when it cannot be reached."""
-
-    def __init__(self, address: str, http: aiohttp.ClientSession) -> None:
-        base, _, token = address.partition("/?token=")
-        self._base, self._http = base.rstrip("/"), http
-        self._headers = {"Authorization": f"Bearer {token}"}
-
-    async def snapshot(self) -> Mapping[str, Any]:
-        """Return the state of the mission."""
-        return await self._ask("get", "/api/snapshot")
-
-    async def command(self, verb: str, **data: Any) -> Mapping[str, Any]:
-        """Give a command; return its answer, {ok, code, text, ...}."""
-        body = {"verb": verb, "data": data, "name": NAME}
-        return await self._ask("post", "/api/command", json=body)
-
-    async def _ask(self, method: str, path: str, **more: Any) -> Mapping[str, Any]:
-        try:
-            async with self._http.request(
-                method, self._base + path, headers=self._headers, **more
-            ) as answer:
-                said = await answer.json(content_type=None)
-        except (aiohttp.ClientError, TimeoutError, ValueError) as fault:
-            raise OSError(f"the page does not answer: {fault or type(fault).__name__}") from fault
-        if not isinstance(said, dict):
-            raise OSError(f"the page refuses: {said!r:.100}; is its token right?")
-        return said
 
 
 class OfferedTask:
     """One task as one action server; one goal at a time."""
 
     def __init__(
-        self, link: RosbridgeLink, page: OperatorPage, options: argparse.Namespace
+        self,
+        link: SessionThread,
+        connect: Callable[[], OperatorClient],
+        options: argparse.Namespace,
     ) -> None:
-        self._link, self._page, self._options = link, page, options
-        self._fields: Mapping[str, Mapping[str, Any]] = {}
+        """`connect` makes a client of the page, for each goal another one."""
+        self._link, self._connect, self._options = link, connect, options
+        self._fields: messages.Definitions = {}
         if options.definition is not None:
             text = options.definition.read_text(encoding="utf-8")
-            self._fields = definitions.read(options.type, text, str(options.definition))
+            self._fields = messages.read(options.type, text, str(options.definition))
         self._goal = ""
         """Id of the active goal."""
         self._why = ""
@@ -93,7 +70,9 @@ class OfferedTask:
         while not stop.is_set():
             for kind, item in self._link.news():
                 if kind == "up":
-                    self._send({"op": "advertise_action", **action, "type": self._options.type})
+                    self._link.send(
+                        {"op": "advertise_action", **action, "type": self._options.type}
+                    )
                     print(f"{self._options.action} is offered", flush=True)
                 elif kind == "down":
                     self._why = "lost"
@@ -104,13 +83,13 @@ class OfferedTask:
                 await asyncio.wait_for(stop.wait(), 0.02)
         self._why = "lost"
         await asyncio.gather(*self._runs)
-        self._send({"op": "unadvertise_action", **action})
+        self._link.send({"op": "unadvertise_action", **action})
 
-    def _take(self, message: Mapping[str, Any]) -> None:
+    def _take(self, message: Message) -> None:
         goal = message.get("id")
         if message["op"] == "cancel_action_goal" and goal == self._goal:
             self._why = "cancelled"
-        elif message["op"] == "send_action_goal" and isinstance(goal, str):
+        elif message["op"] == "send_action_goal" and isinstance(goal, str) and goal:
             if self._goal:
                 self._result(goal, ABORTED, "refused", "a run of this task is active")
                 return
@@ -122,83 +101,83 @@ class OfferedTask:
     async def _run(self, goal: str, args: Any) -> None:
         """Start a run, follow it to its end, and report to ROS 2."""
         try:
-            await self._follow(goal, await self._start(args))
-        except (OSError, ValueError) as fault:
-            self._result(goal, ABORTED, "refused", str(fault))
+            async with self._connect() as page:
+                try:
+                    ended = await self._follow(goal, page, await self._start(page, args))
+                finally:
+                    with contextlib.suppress(OperatorError):
+                        await page.command("release_controls")
+        except (OperatorError, ValueError) as fault:
+            ended = ABORTED, "refused", str(fault), ""
         except Exception as fault:  # answer at once, so that the client does not wait for ever
             _log.exception("goal %s", goal)
-            self._result(goal, ABORTED, "refused", f"{type(fault).__name__}: {fault}")
-        finally:
-            self._goal = ""
-            with contextlib.suppress(OSError):
-                await self._page.command("release_controls")
+            ended = ABORTED, "refused", f"{type(fault).__name__}: {fault}", ""
+        self._goal = ""
+        self._result(goal, *ended)
 
-    async def _start(self, args: Any) -> str:
+    async def _start(self, page: OperatorClient, args: Any) -> str:
+        """Start the run of a goal; return its id."""
         if not isinstance(args, dict):
             raise ValueError(f"expected a goal with fields, found {args!r:.60}")
         parameters = {k: v for k, v in args.items() if k not in ("parameters", "runs", "seed")}
         given = json.loads(args.get("parameters") or "{}")
         if not isinstance(given, dict):
             raise ValueError(f"parameters: expected a JSON object, found {given!r:.60}")
-        counts = {k: args[k] for k in ("runs", "seed") if args.get(k)}
-        for verb, data in (
-            ("take_controls", {}),
-            (
-                "start",
-                {
-                    "task": self._options.task,
-                    "mode": self._options.mode,
-                    "parameters": {**parameters, **given},
-                    **counts,
-                },
-            ),
-        ):
-            answer = await self._page.command(verb, **data)
+        start = {"task": self._options.task, "mode": self._options.mode}
+        start |= {"parameters": {**parameters, **given}}
+        start |= {name: args[name] for name in ("runs", "seed") if args.get(name)}
+        for verb, data in (("take_controls", {}), ("start", start)):
+            answer = await page.command(verb, data)
             if not answer.get("ok"):
                 raise ValueError(f"{verb}: {answer.get('text')}")
         return str(answer["run"])
 
-    async def _follow(self, goal: str, run: str) -> None:
-        told: dict[str, Any] = {}
-        looks = 0
-        while True:
-            seen = await self._page.snapshot()
-            if seen["mission"]["id"] == run and seen["mission"]["state"] in ENDS:
-                looks += 1  # the result comes shortly after the end
-                if seen["result"] is not None or looks > LATE:
-                    break
+    async def _follow(self, goal: str, page: OperatorClient, run: str) -> tuple[int, str, str, str]:
+        """Send the feedback of a run until it ends, and abort it if it must not continue. Return
+        status, state, reason and result."""
+
+        def is_active(state: Mapping[str, Any]) -> bool:
+            return state["mission"]["id"] == run and state["mission"]["state"] not in ENDS
+
+        told: Message = {}
+        await page.until(is_active, RESULT)
+        while is_active(page.state):
+            marking, runs = page.state["marking"], page.state["runs"]
             feedback = {
-                "places": [place for place, tokens in seen["marking"].items() if tokens],
-                "tokens": [tokens for tokens in seen["marking"].values() if tokens],
-                "active": [active["action"] for active in seen["runs"].values()],
+                "places": [place for place, tokens in marking.items() if tokens],
+                "tokens": [tokens for tokens in marking.values() if tokens],
+                "active": [active["action"] for active in runs.values()],
             }
             if feedback != told:
                 told = feedback
                 self._tell("action_feedback", goal, "Feedback", feedback)
-            if self._why and seen["mission"]["state"] != "stopping":
-                await self._page.command("take_controls")
-                await self._page.command("abort")
-            await asyncio.sleep(LOOK)
-        state = seen["mission"]["state"]
+            if self._why and page.state["mission"]["state"] != "stopping":
+                await page.command("take_controls")
+                await page.command("abort")
+            await page.until(lambda state: not is_active(state), LOOK)
+            if page.over:
+                raise OperatorError(page.over)
+        await page.until(lambda state: state["result"] is not None, RESULT)
+        mission = page.state["mission"]
+        if mission["id"] != run:
+            raise OperatorError(f"{run} has ended; it is unknown how, since another run began")
         # ROS 2 knows `cancelled` only after its client's cancel, not after an operator's abort.
         failed = CANCELLED if self._why == "cancelled" else ABORTED
-        status = SUCCEEDED if state == "success" else failed
-        text = json.dumps(seen["result"], allow_nan=False)
-        self._result(goal, status, state, str(seen["mission"].get("reason") or ""), text)
+        status = SUCCEEDED if mission["state"] == "success" else failed
+        text = json.dumps(page.state["result"], allow_nan=False)
+        return status, mission["state"], str(mission.get("reason") or ""), text
 
     def _result(self, goal: str, status: int, state: str, reason: str, result: str = "") -> None:
         values = {"state": state, "reason": reason, "result": result}
         # `result: true` also for an abort: else rosbridge drops the values
         self._tell("action_result", goal, "Result", values, status=status, result=True)
 
-    def _tell(self, op: str, goal: str, part: str, values: dict[str, Any], **more: Any) -> None:
+    def _tell(self, op: str, goal: str, part: str, values: Message, **more: Any) -> None:
         known = self._fields.get(f"{self._options.type}.{part}", values)
         values = {name: value for name, value in values.items() if name in known}
-        self._send({"op": op, "action": self._options.action, "id": goal, "values": values, **more})
-
-    def _send(self, message: dict[str, Any]) -> None:
-        if self._link.up:
-            self._link.send(message)
+        self._link.send(
+            {"op": op, "action": self._options.action, "id": goal, "values": values, **more}
+        )
 
 
 async def main(arguments: list[str]) -> int:
@@ -206,11 +185,7 @@ async def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m petrobot.services.adapters.ros2")
     parser.description = "Offer a task to ROS 2 as an action."
     parser.add_argument("task", help="name of a task that the page offers")
-    parser.add_argument(
-        "--page",
-        default=os.environ.get("PETROBOT_PAGE"),
-        help="address that `petrobot serve` prints, with its token (PETROBOT_PAGE)",
-    )
+    parser.add_argument("--page", default=os.environ.get("PETROBOT_PAGE"), help=PAGE)
     parser.add_argument("--url", default="ws://127.0.0.1:9090", help="rosbridge (%(default)s)")
     parser.add_argument("--action", help="name of the action (/TASK)")
     parser.add_argument("--type", default=TYPE, help="type of the action (%(default)s)")
@@ -219,22 +194,20 @@ async def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     options.action = options.action or f"/{options.task}"
     if not options.page or "/?token=" not in options.page:
-        parser.error(
-            "--page: expected the address that `petrobot serve` prints, http://.../?token="
-        )
+        parser.error(f"--page: expected the {PAGE}")
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    timeout = aiohttp.ClientTimeout(10.0)
-    async with aiohttp.ClientSession(trust_env=False, timeout=timeout) as http:
-        link = connect(options.url, 10.0)
-        try:
-            await OfferedTask(link, OperatorPage(options.page, http), options).serve(stop)
-        except (OSError, ValueError) as fault:
-            print(fault, file=sys.stderr)
-            return 2
-        finally:
-            link.close()
+    address, _, token = options.page.partition("/?token=")
+    connect = partial(OperatorClient, address, token, NAME, secrets.token_hex())
+    link = SessionThread(partial(serve, options.url, 10.0))
+    try:
+        await OfferedTask(link, connect, options).serve(stop)
+    except (OSError, ValueError) as fault:
+        print(fault, file=sys.stderr)
+        return 2
+    finally:
+        link.close()
     return 0
 
 

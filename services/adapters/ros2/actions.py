@@ -15,8 +15,8 @@ from dataclasses import replace
 from typing import Any
 
 from petrobot import CommandRefused, Context, Remote, Result, Status, error, success
-from petrobot.services.adapters.ros2.protocol import RUNNING, ExchangePhase, filled, pick
-from petrobot.services.adapters.ros2.topics import fits
+from petrobot.services.adapters.ros2.bridge import RUNNING, ExchangePhase
+from petrobot.services.adapters.ros2.messages import Message, fits, pick
 
 Paths = Mapping[str, str]
 CONNECT, CANCEL = 5.0, 2.0
@@ -48,13 +48,10 @@ async def goal(
     `cancelled` (by another client), `timeout`, `bad_result`; `link_lost`, `unanswered` (it is
     unknown what was executed).
     """
-    try:
-        args = _request(goal, fields, arguments)
-    except ValueError as fault:
-        return _not_executed("bad_goal", str(fault))
-    asked = {"op": "send_action_goal", "action": action, "action_type": action_type, "args": args}
+    asked = {"op": "send_action_goal", "action": action, "action_type": action_type}
+    request = {**asked, "feedback": True, "args": goal or {}}
     feedback = _Feedback(ctx, remaining, to_memory or {}, to_streams or {})
-    body = {"goal": {**asked, "feedback": True}}
+    body = {"goal": request, "fields": fields, "given": arguments}
     return await _exchange(ctx, body, timeout, values, expect or {}, feedback)
 
 
@@ -72,11 +69,8 @@ async def call(
 ) -> Result:
     """Call a service and return its response. Causes of ERROR: those of `goal`, and `failed`.
     `service_type` is only used to check the request against its definition."""
-    try:
-        args = _request(request, fields, arguments)
-    except ValueError as fault:
-        return _not_executed("bad_goal", str(fault))
-    body = {"call": {"op": "call_service", "service": service, "args": args}, "type": service_type}
+    asked = {"op": "call_service", "service": service, "args": request or {}}
+    body = {"call": asked, "type": service_type, "fields": fields, "given": arguments}
     return await _exchange(ctx, body, timeout, values, expect or {}, None)
 
 
@@ -102,7 +96,7 @@ async def wait_for(
         return _not_executed("bad_goal", f"no topic {topic!r}; `subscribe` names {sorted(known)}")
     if not await ctx.wait(found, timeout):
         return error("timeout", f"no such message on {topic} within {timeout:g} s")
-    return _ended(ctx.device.state["topics"][topic]["msg"], values, {})
+    return _picked(ctx.device.state["topics"][topic]["msg"], values, {})
 
 
 async def publish(
@@ -115,12 +109,8 @@ async def publish(
     **arguments: Any,
 ) -> Result:
     """Publish one message."""
-    try:
-        msg = _request(message, fields, arguments)
-    except ValueError as fault:
-        return _not_executed("bad_goal", str(fault))
-    refused = await _command(ctx, {"publish": {"topic": topic, "type": message_type, "msg": msg}})
-    return refused or success()
+    body = {"topic": topic, "type": message_type, "msg": message or {}}
+    return await _command(ctx, {"publish": body, "fields": fields, "given": arguments}) or success()
 
 
 async def drive(
@@ -149,17 +139,18 @@ async def navigate_to_pose(
     y: float,
     yaw: float = 0.0,
     frame: str = "map",
-    action: str = "/navigate_to_pose",
     **options: Any,
 ) -> Result:
     """Nav2: drive to a pose (m, rad). Options are those of `goal`."""
     turn = {"z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
     pose = {"position": {"x": float(x), "y": float(y)}, "orientation": turn}
-    args = {"pose": {"header": {"frame_id": frame}, "pose": pose}}
-    options = {"remaining": "distance_remaining", **options}
-    return await goal(
-        ctx, action=action, action_type="nav2_msgs/action/NavigateToPose", goal=args, **options
-    )
+    defaults = {
+        "action": "/navigate_to_pose",
+        "action_type": "nav2_msgs/action/NavigateToPose",
+        "goal": {"pose": {"header": {"frame_id": frame}, "pose": pose}},
+        "remaining": "distance_remaining",
+    }
+    return await goal(ctx, **{**defaults, **options})
 
 
 async def move_group(
@@ -170,7 +161,6 @@ async def move_group(
     tolerance: float = 0.01,
     speed: float = 0.1,
     seconds: float = 5.0,
-    action: str = "/move_action",
     **options: Any,
 ) -> Result:
     """MoveIt: plan and move the joints (rad or m) of a group to these positions, at this share of
@@ -185,12 +175,14 @@ async def move_group(
         "max_velocity_scaling_factor": speed,
         "max_acceleration_scaling_factor": speed,
     }
-    code = {"code": "error_code.val"}
-    options = {"values": code, "expect": {"error_code.val": 1}, **options}
-    args = {"request": request}
-    return await goal(
-        ctx, action=action, action_type="moveit_msgs/action/MoveGroup", goal=args, **options
-    )
+    defaults = {
+        "action": "/move_action",
+        "action_type": "moveit_msgs/action/MoveGroup",
+        "goal": {"request": request},
+        "values": {"code": "error_code.val"},
+        "expect": {"error_code.val": 1},
+    }
+    return await goal(ctx, **{**defaults, **options})
 
 
 async def follow_joint_trajectory(
@@ -205,9 +197,8 @@ async def follow_joint_trajectory(
     """A trajectory controller of ros2_control: go through `positions` (rad or m, one list for each
     point) at `times` (s after the start). Options are those of `goal`."""
     if len(positions) != len(times) or any(len(point) != len(joints) for point in positions):
-        return _not_executed(
-            "bad_goal", "expected a time and a position of each joint for each point"
-        )
+        wrong = "expected a time and a position of each joint for each point"
+        return _not_executed("bad_goal", wrong)
     points = [
         {
             "positions": [float(p) for p in point],
@@ -215,10 +206,12 @@ async def follow_joint_trajectory(
         }
         for point, t in zip(positions, times, strict=True)
     ]
-    args = {"trajectory": {"joint_names": list(joints), "points": points}}
-    options = {"expect": {"error_code": 0}, **options}
-    name = "control_msgs/action/FollowJointTrajectory"
-    return await goal(ctx, action=action, action_type=name, goal=args, **options)
+    defaults = {
+        "action_type": "control_msgs/action/FollowJointTrajectory",
+        "goal": {"trajectory": {"joint_names": list(joints), "points": points}},
+        "expect": {"error_code": 0},
+    }
+    return await goal(ctx, action=action, **{**defaults, **options})
 
 
 # --- shared by the actions ----------------------------------------------------------------------
@@ -249,12 +242,6 @@ class _Feedback:
                 await self.ctx.put(name, pick(feedback, path))
 
 
-def _request(base: Any, fields: Paths | None, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    if unknown := set(arguments) - set(fields or {}):
-        raise ValueError(f"no arguments {sorted(unknown)}; `fields` names {sorted(fields or {})}")
-    return filled(base or {}, {(fields or {})[name]: value for name, value in arguments.items()})
-
-
 def _not_executed(cause: str, text: str) -> Result:
     return replace(error(cause, text), executed="no")
 
@@ -281,85 +268,75 @@ async def _exchange(
     expect: Mapping[str, Any],
     feedback: _Feedback | None,
 ) -> Result:
-    paths = [*values.values(), *expect] if values is not None else None
+    """Send a goal or a call, pass on its feedback, cancel it after `timeout` and when the run is
+    cancelled, and return its result."""
+    paths = None if values is None else [*values.values(), *expect]
     keep = None if paths is None else sorted({path.split(".")[0] for path in paths})
     if refused := await _command(ctx, {**body, "run": ctx.run, "keep": keep}):
         return refused
+    if ctx.device.state["dry_run"]:  # nothing was sent; it succeeds as expected
+        return Result(Status.SUCCESS, {n: expect.get(p) for n, p in (values or {}).items()})
+    begun, seen = ctx.now, 0
 
-    def told() -> Mapping[str, Any]:
-        found: Mapping[str, Any] = ctx.device.state["exchanges"].get(ctx.run, {"phase": "gone"})
-        return found
+    def told() -> Message:
+        none = {"phase": ExchangePhase.LOST, "count": 0}
+        return dict(ctx.device.state["exchanges"].get(ctx.run, none))
 
     def ended() -> bool:
-        return ExchangePhase(told()["phase"]) not in RUNNING
-
-    begun, seen = ctx.now, 0
+        return told()["phase"] not in RUNNING
 
     def news() -> bool:
         return ended() or told()["count"] != seen
 
     try:
-        while not ended():
-            left = None if timeout is None else begun + timeout - ctx.now
-            if left is not None and left <= 0:
-                break
-            await ctx.wait(news, left)
-            if feedback is not None and told().get("count", seen) != seen:
+        while not ended() and (timeout is None or ctx.now < begun + timeout):
+            await ctx.wait(news, None if timeout is None else begun + timeout - ctx.now)
+            if feedback is not None and told()["count"] != seen:
                 seen = told()["count"]
                 await feedback.take(told()["feedback"])
         late = not ended()
         if late:
             await ctx.command({"cancel": ctx.run})
             await ctx.wait(ended, CANCEL)
+        end = told()
     except BaseException:  # Cancelled, or feedback that cannot be passed on: nothing moves on alone
         ctx.device.send({"cancel": ctx.run})
         raise
     finally:
-        end = {**told(), "dry_run": ctx.device.state["dry_run"]}
         ctx.device.send({"forget": ctx.run})
-    return _result(ExchangePhase(end["phase"]), end, late, values, expect, "call" in body, timeout)
+    if end["phase"] == ExchangePhase.SUCCEEDED:
+        fault = end["fault"]
+        return error("bad_result", fault) if fault else _picked(end["values"], values, expect)
+    return _failed(end, f"{timeout or 0.0:g} s" if late else "", "call" in body)
 
 
-def _result(
-    phase: ExchangePhase,
-    end: Mapping[str, Any],
-    late: bool,
-    values: Paths | None,
-    expect: Mapping[str, Any],
-    service: bool,
-    timeout: float | None,
-) -> Result:
-    """Return the result of a run whose goal or call ended in a phase, or is `late`."""
-    text, given = end.get("text", ""), end.get("values", {})
-    if end.get("dry_run"):  # it succeeds as expected
-        return Result(Status.SUCCESS, {n: expect.get(p) for n, p in (values or {}).items()})
-    if phase is ExchangePhase.SUCCEEDED:
-        if end["fault"]:
-            return error("bad_result", end["fault"])
-        return _ended(given, values, expect)
-    if phase is ExchangePhase.REJECTED and not service:
-        return _not_executed("rejected", text)
-    if phase in (ExchangePhase.LOST, ExchangePhase.RECALLED, ExchangePhase.GONE):
-        said = "the connection to rosbridge broke; nobody knows whether it was executed"
-        return replace(error("link_lost", said), executed="unknown")
-    if phase is ExchangePhase.UNANSWERED or phase in RUNNING:
-        said = f"no result within {timeout or 0.0:g} s" if late else "it was given up"
-        cause = "timeout" if late else "unanswered"
-        said += "; its cancel was not answered: look at the robot"
-        return replace(error(cause, said), executed="unknown")
-    if late and phase is ExchangePhase.CANCELLED:
-        return Result(Status.ERROR, given, "timeout", f"cancelled after {timeout:g} s")
-    cause = "failed" if service else str(phase)
-    text = text or ("another client cancelled the goal" if phase is ExchangePhase.CANCELLED else "")
-    return Result(Status.ERROR, given, cause, text)
-
-
-def _ended(given: Mapping[str, Any], values: Paths | None, expect: Mapping[str, Any]) -> Result:
+def _picked(given: Message, values: Paths | None, expect: Mapping[str, Any]) -> Result:
+    """Return the result of a run whose goal or call has succeeded with these values."""
     try:
-        named = {n: pick(given, p) for n, p in values.items()} if values is not None else given
+        named = given if values is None else {n: pick(given, p) for n, p in values.items()}
     except ValueError as fault:
         return error("bad_result", str(fault))
-    if not fits(dict(given), expect):
-        wrong = f"expected {dict(expect)}, found {str(dict(given))[:200]}"
+    if not fits(given, expect):
+        wrong = f"expected {dict(expect)}, found {given!s:.200}"
         return Result(Status.FAILURE, named, "unexpected", wrong)
     return Result(Status.SUCCESS, named)
+
+
+def _failed(end: Message, late: str, service: bool) -> Result:
+    """Return the result of a run whose goal or call did not succeed; `late`: within which time."""
+    phase, text = end["phase"], end.get("text", "")
+    if phase == ExchangePhase.REJECTED and not service:
+        return _not_executed("rejected", text)
+    if phase == ExchangePhase.LOST:
+        said = "the connection to rosbridge broke; nobody knows whether it was executed"
+        return replace(error("link_lost", said), executed="unknown")
+    if phase == ExchangePhase.UNANSWERED or phase in RUNNING:
+        said = f"no result within {late}" if late else "it was given up"
+        said += "; its cancel was not answered: look at the robot"
+        return replace(error("timeout" if late else "unanswered", said), executed="unknown")
+    cause = "failed" if service else str(phase)
+    if phase == ExchangePhase.CANCELLED:
+        text = text or "another client cancelled the goal"
+        if late:
+            cause, text = "timeout", f"cancelled after {late}"
+    return Result(Status.ERROR, end["values"], cause, text)

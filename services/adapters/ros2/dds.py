@@ -20,20 +20,14 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from petrobot import Ports, key
-from petrobot.services.adapters.ros2.definitions import Definitions, Field
-from petrobot.services.adapters.ros2.protocol import Message
+from petrobot.services.adapters.ros2.messages import BASIC, Definitions, Field, Message
 from petrobot.services.adapters.ros2.topics import TopicDriver
 
 _BASIC: Mapping[str, Any] = {
-    **{f"{u}int{n}": getattr(idl, f"{u}int{n}") for u in ("", "u") for n in (8, 16, 32, 64)},
-    "byte": idl.uint8,
-    "char": idl.uint8,
-    "float32": idl.float32,
-    "float64": idl.float64,
-    "bool": bool,
-    "string": str,
+    name: getattr(idl, {"byte": "uint8", "char": "uint8"}.get(name, name), kinds[0])
+    for name, kinds in BASIC.items()
+    if name != "wstring"
 }
-_ZERO: Mapping[str, Any] = {"float32": 0.0, "float64": 0.0, "bool": False, "string": ""}
 EMPTY = "structure_needs_at_least_one_member"
 """The field that ROS 2 gives to a message without one."""
 DEPTH = 10
@@ -81,7 +75,7 @@ class Types:
     def _value(self, field: Field, value: Any) -> Any:
         if not field.array:
             if field.type in _BASIC:
-                return _ZERO.get(field.type, 0) if value is None else value
+                return BASIC[field.type][-1]() if value is None else value
             return self.make(field.type, value or {})
         one = Field(field.type)
         absent = [None] * (0 if field.size is None or field.bounded else field.size)

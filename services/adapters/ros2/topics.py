@@ -8,21 +8,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from petrobot import Driver, Ports, key
-from petrobot.services.adapters.ros2 import definitions
-from petrobot.services.adapters.ros2.protocol import (
-    LARGEST_VALUE,
-    Message,
-    filled,
-    pick,
-    unfit,
-    words,
-)
+from petrobot import Driver, Ports, key, table
+from petrobot.services.adapters.ros2 import messages
+from petrobot.services.adapters.ros2.messages import Message, filled, fits, pick, unfit
 
+_TWIST = [f"{part}.{axis}" for part in ("linear", "angular") for axis in "xyz"]
 SPEEDS = {
-    "geometry_msgs/msg/Twist": [
-        f"{part}.{axis}" for part in ("linear", "angular") for axis in "xyz"
-    ],
+    "geometry_msgs/msg/Twist": _TWIST,
     "moveit_msgs/action/MoveGroup": ["request.max_velocity_scaling_factor"],
 }
 """By type: paths of the values that `speed` scales."""
@@ -50,22 +42,14 @@ class TopicDriver(Driver):
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         super().__init__(config, ports)
-        self.known: dict[str, Mapping[str, definitions.Field]] = {}
+        self.known: dict[str, Mapping[str, messages.Field]] = {}
         for name, file in self.definitions.items():
             text = ports.file(file).decode("utf-8", "replace")
-            self.known.update(definitions.read(name, text, file))
-        for name, sub in self.subscribe.items():
-            _table(sub, f"subscribe.{name}", {"topic", "type"}, {"event", "when", "throttle"})
-        for name, out in self.setpoints.items():
-            _table(out, f"setpoints.{name}", {"topic", "type", "fields"}, {"rest"})
-            if len(out.get("rest", out["fields"])) != len(out["fields"]):
-                raise ValueError(f"setpoints.{name}.rest: expected one value for each of `fields`")
-            out["rest"] = [float(value) for value in out.get("rest", [0.0] * len(out["fields"]))]
-            self.check(_row(out["fields"], out["rest"]), out["type"])
+            self.known.update(messages.read(name, text, file))
         self.speeds, self.points = {**SPEEDS, **self.speeds}, {**POINTS, **self.points}
-        self._check_limits()
-        self.inside, self.left = True, ""
-        """Whether the robot is in its workspace as far as its topics tell; how it left it."""
+        self._check_tables()
+        self.left = ""
+        """How the robot has left its workspace, as far as its topics tell; "" if it is inside."""
         self.refused, self.fault = 0, ""
         """Number of messages that could not be used, and what was wrong with the last one."""
         self.topics: dict[str, Message] = {}
@@ -77,6 +61,24 @@ class TopicDriver(Driver):
         self.streams = {name: ports.stream(name) for name in self.setpoints}
         self.sent: dict[str, tuple[int, bool]] = {}
         """By stream: number of the last set point sent, and whether it was that of rest."""
+
+    def _check_tables(self) -> None:
+        for name, sub in self.subscribe.items():
+            table(sub, f"subscribe.{name}", ("topic", "type"), ("event", "when", "throttle"))
+        for name, out in self.setpoints.items():
+            table(out, f"setpoints.{name}", ("topic", "type", "fields"), ("rest",))
+            if len(out.get("rest", out["fields"])) != len(out["fields"]):
+                raise ValueError(f"setpoints.{name}.rest: expected one value for each of `fields`")
+            out["rest"] = [float(value) for value in out.get("rest", [0.0] * len(out["fields"]))]
+            self.check(_row(out["fields"], out["rest"]), out["type"])
+            if self.speed < 1.0 and out["type"] not in self.speeds:
+                raise ValueError(f"speed: setpoints.{name}: {_unknown_speed(out['type'])}")
+        types = {sub["type"] for sub in self.subscribe.values()}
+        if self.workspace.bounds and types.isdisjoint(self.points):
+            raise ValueError(
+                "workspace: nothing tells where the robot is; subscribe to a topic whose type has "
+                f"a point: {', '.join(self.points)}, or another one with points = {{ TYPE = PATH }}"
+            )
 
     @property
     def connected(self) -> bool:
@@ -94,31 +96,30 @@ class TopicDriver(Driver):
                 raise ValueError(f"no setpoints {sorted(unknown)}; expected {list(self.setpoints)}")
             self.open = set(body["drive"])
         elif "publish" in body:
-            message = body["publish"]
-            self.check(message["msg"], message["type"])
-            limited = self.limited(message["msg"], message["type"])
+            topic, interface = body["publish"]["topic"], body["publish"]["type"]
+            message = self.limited(self.request(body["publish"]["msg"], body, interface), interface)
             if not self.dry_run:
-                self.transmit(message["topic"], message["type"], limited)
+                self.transmit(topic, interface, message)
         else:
             raise ValueError(f"unknown command {sorted(body)}: publish or drive")
 
+    # --- checks and limits ----------------------------------------------------------------------
+
+    def request(self, base: Message, body: Mapping[str, Any], interface: str) -> Message:
+        """Return a message with the arguments `given` in a command at their `fields`. Raises
+        ValueError if it does not fit its definition."""
+        given, fields = body.get("given") or {}, body.get("fields") or {}
+        if unknown := set(given) - set(fields):
+            raise ValueError(f"no arguments {sorted(unknown)}; `fields` names {sorted(fields)}")
+        message = filled(base, {fields[name]: value for name, value in given.items()})
+        self.check(message, interface)
+        return message
+
     def check(self, message: Message, interface: str) -> None:
         """Raise ValueError for a message that does not fit its definition, or cannot be sent."""
-        faults = [*definitions.faults(message, interface, self.known), unfit(message)]
+        faults = [*messages.faults(message, interface, self.known), unfit(message)]
         if wrong := "; ".join(filter(None, faults)):
             raise ValueError(f"{interface}: {wrong}")
-
-    def _check_limits(self) -> None:
-        for name, out in self.setpoints.items():
-            if self.speed < 1.0 and out["type"] not in self.speeds:
-                raise ValueError(f"speed: setpoints.{name}: {_unknown_speed(out['type'])}")
-        if self.workspace.bounds and not any(
-            sub["type"] in self.points for sub in self.subscribe.values()
-        ):
-            raise ValueError(
-                "workspace: nothing tells where the robot is; subscribe to a topic whose type has "
-                f"a point: {', '.join(self.points)}, or another one with points = {{ TYPE = PATH }}"
-            )
 
     def limited(self, message: Message, interface: str) -> Message:
         """Return a message as slow as the device's `speed` says. Raises ValueError if nothing says
@@ -131,99 +132,83 @@ class TopicDriver(Driver):
                 with contextlib.suppress(ValueError):  # what is not given is 0
                     slow[path] = self.speed * float(pick(message, path))
             if self.speeds[interface] and not slow:
-                raise ValueError(
-                    f"speed = {self.speed:g}: expected {' or '.join(self.speeds[interface])}"
-                )
+                wanted = " or ".join(self.speeds[interface])
+                raise ValueError(f"speed = {self.speed:g}: expected {wanted}")
             message = filled(message, slow)
-        if outside := self.outside(message, interface):
+        if outside := self._outside(message, interface):
             raise ValueError(outside)
         return message
 
-    def outside(self, message: Message, interface: str) -> str:
-        """Return in words that the point of a message lies outside the workspace."""
+    def _outside(self, message: Message, interface: str) -> str:
+        """Return in words that the point of a message lies outside the workspace, or is none."""
         if interface not in self.points or not self.workspace.bounds:
             return ""
-        at = pick(message, self.points[interface])
-        return self.workspace.outside([float(at.get(axis, 0.0)) for axis in "xyz"])
+        try:
+            at = pick(message, self.points[interface])
+            return self.workspace.outside([float(at.get(axis, 0.0)) for axis in "xyz"])
+        except (ValueError, TypeError, AttributeError) as fault:
+            return f"{interface}: {fault}"
+
+    # --- topics to petrobot ---------------------------------------------------------------------
 
     def refuse(self, fault: str) -> None:
         """Count a message that cannot be used."""
-        self.refused, self.fault = self.refused + 1, words(fault)[:300]
+        self.refused, self.fault = self.refused + 1, messages.words(fault)[:300]
 
     def arrive(self, now: float, topic: Any, message: Any) -> None:
         """Process a message of a topic."""
-        most = min(LARGEST_VALUE, TOPICS // max(1, len(self.subscribe)))
+        most = min(messages.LARGEST_VALUE, TOPICS // max(1, len(self.subscribe)))
         if fault := unfit(message, most):
             self.refuse(f"{topic}: {fault}")
             return
         for name, sub in self.subscribe.items():
             if sub["topic"] != topic:
                 continue
-            self._watch(now, message, sub["type"])
+            if sub["type"] in self.points:
+                before, self.left = self.left, self._outside(message, sub["type"])
+                if self.left and not before:
+                    self.stop(now)
             count = self.topics.get(name, {}).get("count", 0) + 1
             self.topics[name], self.arrived[name] = {"msg": message, "count": count}, now
             if "event" in sub:
-                holds, before = fits(message, sub.get("when", {})), self.held.get(name, False)
+                holds, held = fits(message, sub.get("when", {})), self.held.get(name, False)
                 self.held[name] = holds and "when" in sub
-                if holds and not before:
+                if holds and not held:
                     self.ports.raise_event(sub["event"], msg=message)
 
-    def _watch(self, now: float, message: Message, interface: str) -> None:
-        """Stop when a message tells that the robot has left the workspace."""
-        if interface in self.points and self.workspace.bounds:
-            try:
-                self.left = self.outside(message, interface)
-            except (ValueError, TypeError, AttributeError) as fault:
-                self.left = f"{interface}: {fault}"
-            if self.left and self.inside:
-                self.stop(now)
-            self.inside = not self.left
+    # --- set points to the robot ----------------------------------------------------------------
 
     def step(self, now: float) -> None:
-        """Send the set points that are due."""
-        for name, out in self.setpoints.items():
-            self._steer(now, name, out)
+        """Send the newest set point of each stream; if there is none, once that of rest."""
+        for name, out in self.setpoints.items() if self.connected else ():
+            count, resting = self.sent.get(name, (0, True))
+            row, new = self._row_of(name, out), self.streams[name].count != count
+            if (row is None and resting) or (row is not None and not resting and not new):
+                continue
+            self.sent[name] = (self.streams[name].count, row is None)
+            if not self.dry_run:
+                self.transmit(out["topic"], out["type"], row or _row(out["fields"], out["rest"]))
 
-    def _steer(self, now: float, name: str, out: Message) -> None:
-        """Send the newest set point of a stream; if there is none, once that of rest."""
-        port = self.streams[name]
-        count, resting = self.sent.get(name, (0, True))
-        values = port.values if name in self.open and not self.paused else None
-        moving = values is not None and len(values) == len(out["fields"])
-        moving = moving and all(map(math.isfinite, values or ()))
-        if not self.connected or (resting and not moving):
-            return
-        if moving and port.count == count and not resting:
-            return
-        message = _row(out["fields"], out["rest"])
-        if moving and values is not None:
-            try:
-                message = self.limited(_row(out["fields"], values), out["type"])
-            except ValueError as fault:  # outside the workspace
-                self.refuse(str(fault))
-                moving = False
-        self.sent[name] = (port.count, not moving)
-        if not self.dry_run:
-            self.transmit(out["topic"], out["type"], message)
+    def _row_of(self, name: str, out: Message) -> Message | None:
+        """Return the message of a stream's newest set point; None if the robot must rest."""
+        values = self.streams[name].values if name in self.open and not self.paused else None
+        if not values or len(values) != len(out["fields"]) or not all(map(math.isfinite, values)):
+            return None
+        try:
+            return self.limited(_row(out["fields"], values), out["type"])
+        except ValueError as fault:  # outside the workspace
+            self.refuse(str(fault))
+            return None
 
     def state(self) -> Mapping[str, Any]:
         """`connected`, whether it is a `dry_run`, how the robot has `left` its workspace, messages
         `refused` and the last `fault`, and the newest message of each topic with its `count` and
         `age` (s), None before the first and after a lost link."""
-        now = self.ports.now
-        return {
-            "connected": self.connected,
-            "dry_run": self.dry_run,
-            "left": self.left,
-            "refused": self.refused,
-            "fault": self.fault,
-            "topics": {
-                name: {**self.topics[name], "age": now - self.arrived[name]}
-                if name in self.topics
-                else None
-                for name in self.subscribe
-            },
-        }
+        now, topics = self.ports.now, dict[str, Any].fromkeys(self.subscribe)
+        for name, told in self.topics.items():
+            topics[name] = {**told, "age": now - self.arrived[name]}
+        shown = ("connected", "dry_run", "left", "refused", "fault")
+        return {"topics": topics, **{name: getattr(self, name) for name in shown}}
 
     def stop(self, now: float) -> None:
         """Send the set points of rest."""
@@ -249,28 +234,5 @@ def _row(fields: Sequence[str], values: Sequence[float]) -> Message:
 
 
 def _unknown_speed(interface: str) -> str:
-    table = f'speeds = {{ "{interface}" = [PATHS] }}'
-    return f"nothing says what is slower in {interface}; write {table}, [] if the robot limits it"
-
-
-def _table(config: Mapping[str, Any], where: str, needed: set[str], other: set[str]) -> None:
-    missing, unknown = needed - set(config), set(config) - needed - other
-    if missing or unknown:
-        wrong = f"is missing {sorted(missing)}" if missing else f"unknown keys {sorted(unknown)}"
-        raise ValueError(f"{where}: {wrong}; expected {sorted(needed)}, optional {sorted(other)}")
-
-
-def fits(message: Message, when: Mapping[str, Any]) -> bool:
-    """Return whether a message has all these values at their paths. A list of two numbers is a
-    range."""
-    for path, wanted in when.items():
-        try:
-            found = pick(message, path)
-        except ValueError:
-            return False
-        if isinstance(wanted, list) and isinstance(found, int | float):
-            if not wanted[0] <= found <= wanted[1]:
-                return False
-        elif found != wanted:
-            return False
-    return True
+    named = f'speeds = {{ "{interface}" = [PATHS] }}'
+    return f"nothing says what is slower in {interface}; write {named}, [] if the robot limits it"

@@ -1,7 +1,8 @@
 """Primitive actions of the SO-101: move_joints, move_to, grasp, release, enable, calibrate.
 
 Error causes: `unreachable`, `late`, `command_refused`, and the faults of the driver: `missing`,
-`mode`, `heat`, `overload`, `voltage`, `current`, `sensor`, `power`, `workspace`, `uncalibrated`.
+`mode`, `range`, `twice`, `heat`, `overload`, `voltage`, `current`, `sensor`, `power`, `workspace`,
+`uncalibrated`.
 `grasp` fails with `empty`.
 """
 

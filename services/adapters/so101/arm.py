@@ -34,7 +34,10 @@ TRIM_RATE, DEAD = 6.0, 0.004
 """The set point of a loaded joint is corrected until the joint is at its goal: share of the error
 per second, and the error that is tolerated because of friction (rad)."""
 NEAR: Final = 0.3
-"""Largest distance between a servo and its set point that its load can explain (rad)."""
+"""Largest distance between a servo and its set point that its load can explain, and between two
+answers of one servo that come together (rad)."""
+SLACK: Final = 20
+"""How far beyond the positions to which it can be sent a servo may be (steps)."""
 REACHED: Final = 0.015
 """Distance to its goal within which a joint has reached it (rad)."""
 STRAIN_TIME: Final = 0.5
@@ -46,6 +49,7 @@ GRASP_TIME: Final = 0.1
 """Time for which the gripper must squeeze at a standstill (s)."""
 
 
+COMMANDS: Final = ("move", "open", "close", "free", "calibrate", "enable", "rest")
 UNREAD: Final = bus.Reading(0, False, 2048, 2048, 0, 0.0, 0.0, 0)
 
 
@@ -80,6 +84,12 @@ class Joint:
     def stands(self) -> bool:
         """Return whether the servo has stood still for some readings."""
         return self.still >= STILL and abs(self.read.speed) <= CREEP
+
+    @property
+    def usable(self) -> bool:
+        """Return whether it can be sent to where it is: else it would jump when torque comes on."""
+        beyond = abs(self.steps(self.q) - self.read.position)
+        return not self.read.mode and beyond <= SLACK
 
     @property
     def q(self) -> float:
@@ -124,7 +134,7 @@ class Arm(Driver):
     `kinematics`."""
 
     period = 0.02
-    obeys = ("speed", "workspace", "dry_run")
+    obeys = ("speed", "workspace", "dry_run", "pause")
     port: str = key(text="serial port, as /dev/ttyACM0")
     calibration: str = key("", "file of the zero positions, written by the command calibrate")
     limits: dict[str, Any] = key({}, "joints with other limits, as { gripper = [0.0, 1.5] } (rad)")
@@ -200,12 +210,8 @@ class Arm(Driver):
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
         do = body.get("do")
-        known = {
-            "move": self._move, "open": self._open, "close": self._close, "free": self._free,
-            "calibrate": self._calibrate, "enable": self._enable, "rest": self._rest,
-        }  # fmt: skip
-        if do not in known:
-            raise ValueError(f"unknown command {dict(body)!r:.80}; do: {', '.join(known)}")
+        if do not in COMMANDS:
+            raise ValueError(f"unknown command {dict(body)!r:.80}; do: {', '.join(COMMANDS)}")
         if do != "rest" and (missing := self._missing(now)):
             raise ValueError(missing)
         if do in ("move", "open", "close"):
@@ -216,24 +222,24 @@ class Arm(Driver):
                 raise ValueError(f"{self.calibration} is not there yet: calibrate the arm first")
             if not all(joint.ready for joint in self.joints):
                 raise ValueError("the servos are being switched on: try again")
-        known[do](body)
+        getattr(self, f"_do_{do}")(body)
 
-    def _move(self, body: Mapping[str, Any]) -> None:
+    def _do_move(self, body: Mapping[str, Any]) -> None:
         self.motion.begin([numbers(body.get("joints"), 5, "joints")], body.get("speed", 1.0))
 
-    def _open(self, body: Mapping[str, Any]) -> None:
+    def _do_open(self, body: Mapping[str, Any]) -> None:
         self.jaw.halt(self.jaw.q)
         self.jaw.begin([[body.get("angle", self.gripper.high)]])
         self._hand = "open"
 
-    def _close(self, body: Mapping[str, Any]) -> None:
+    def _do_close(self, body: Mapping[str, Any]) -> None:
         (squeeze,) = numbers([body.get("squeeze", self.squeeze / 2)], 1, "squeeze")
         if not 0.0 < squeeze <= self.squeeze:
             raise ValueError(f"squeeze: expected at most {self.squeeze}, found {squeeze:g}")
         self.jaw.stop()
         self._hand, self._grip, self._gripped = "close", squeeze, 0.0
 
-    def _calibrate(self, body: Mapping[str, Any]) -> None:
+    def _do_calibrate(self, body: Mapping[str, Any]) -> None:
         pose = numbers(body.get("pose", [0.0] * 6), 6, "pose")
         if self.dry_run:
             raise ValueError("a dry run does not know where the arm is: calibrate without it")
@@ -254,14 +260,14 @@ class Arm(Driver):
         self._calibrated, self._hand = True, ""
         self._freeze()
 
-    def _free(self, body: Mapping[str, Any]) -> None:
+    def _do_free(self, body: Mapping[str, Any]) -> None:
         self._on, self._hand = False, ""
         self._freeze()
 
-    def _rest(self, body: Mapping[str, Any]) -> None:
+    def _do_rest(self, body: Mapping[str, Any]) -> None:
         self.stop(self.ports.now)
 
-    def _enable(self, body: Mapping[str, Any]) -> None:
+    def _do_enable(self, body: Mapping[str, Any]) -> None:
         self.faults.clear()
         self._freeze()
         self._on = True
@@ -290,6 +296,8 @@ class Arm(Driver):
             joint, read = by_servo.get(answer.servo), bus.reading(answer.data)
             if joint is None or read is None:
                 continue
+            if joint in heard and abs(read.position - joint.read.position) * bus.RAD > NEAR:
+                self._fault("twice", f"two servos answer as {joint.name}: change the id of one")
             heard.append(joint)
             if self.dry_run and self._on and joint.started:  # as if it had followed
                 at = joint.steps(joint.aim)
@@ -301,6 +309,11 @@ class Arm(Driver):
             if read.mode:
                 text = f"the servo of {joint.name} is in mode {read.mode}: it must be 0 (position)"
                 self._fault("mode", text)
+            elif not joint.usable:
+                text = (
+                    f"the servo of {joint.name} is at {read.position}, and only goes to 0 to 4095"
+                )
+                self._fault("range", f"{text}: turn it back, or change its offset")
             if read.temperature > self.hottest:
                 text = f"{joint.name} has {read.temperature} deg C, more than {self.hottest:g}"
                 self._fault("heat", f"{text}: let it cool down")
@@ -309,7 +322,7 @@ class Arm(Driver):
                 joint.started = False
             if not (joint.ready and read.torque):
                 joint.settle()
-            joint.ready = read.torque and self._on and joint.started and not read.mode
+            joint.ready = read.torque and self._on and joint.started and joint.usable
         if not self.motion.moving and not all(joint.ready for joint in self.arm):
             self.motion.halt([joint.aim for joint in self.arm])
         if not self.gripper.ready:
@@ -348,7 +361,7 @@ class Arm(Driver):
                 self._fault("overload", f"{joint.name} pushes against something")
                 joint.settle()
                 self._freeze()
-            if self._untrimmed(joint) and not self.motion.paused:
+            if self._untrimmed(joint) and not self.paused:
                 change = TRIM_RATE * self.period * (joint.aim - joint.q)
                 joint.trim = min(0.1, max(-0.1, joint.trim + change))
 
@@ -362,7 +375,7 @@ class Arm(Driver):
         """Close the gripper as long as its load is below the wish; see whether it holds."""
         joint, jaw = self.gripper, self.jaw
         low, high = joint.within()
-        if self._hand == "close" and not jaw.paused:
+        if self._hand == "close" and not self.paused:
             excess = -joint.load - self._grip
             if excess > 0.0 or joint.stands:  # it touches something
                 way = GIVE * excess * self.period
@@ -385,18 +398,18 @@ class Arm(Driver):
                 continue
             if joint.ready:
                 goals[joint.servo] = bus.word(joint.steps(joint.aim + joint.trim))
-            elif self._on and not joint.read.mode:
+            elif self._on and joint.usable and "twice" not in self.faults:
                 limit = self.squeeze if joint is self.gripper else 1.0
                 speed = min(round(1.5 * self.top_speed / bus.RAD), 32767)
                 start[joint.servo] = bus.setup(joint.steps(joint.aim), speed, round(1000 * limit))
                 joint.started = True
             elif joint.read.torque:
                 free[joint.servo] = b"\0"
-        out = bus.sync_write(bus.GOAL, goals) if goals else b""
-        out += bus.sync_write(bus.TORQUE, start) if start else b""
-        out += bus.sync_write(bus.TORQUE, free) if free else b""
         question = bus.read_state(joint.servo for joint in self._order)
-        return question if self.dry_run else out + question
+        if self.dry_run:
+            return question
+        torque = bus.sync_write(bus.TORQUE, start) + bus.sync_write(bus.TORQUE, free)
+        return bus.sync_write(bus.GOAL, goals) + torque + question
 
     # --- called by the node ---------------------------------------------------------------------
 
@@ -420,19 +433,13 @@ class Arm(Driver):
         """Return whether every servo answers and stands still, and no motion is left."""
         if self._missing(self.ports.now):
             return False
-        trims = not self.motion.paused and any(map(self._untrimmed, self.joints))
+        trims = not self.paused and any(map(self._untrimmed, self.joints))
         going = self.motion.moving or self.jaw.moving or trims
         return not going and all(joint.stands for joint in self.joints)
 
     def hold(self, now: float) -> str:
         """Brake, and keep the goal until `release`."""
-        if self._missing(now):
-            return "cannot hold"
-        self.motion.paused = self.jaw.paused = True
-        return "held"
-
-    def release(self, now: float) -> None:
-        self.motion.paused = self.jaw.paused = False
+        return "cannot hold" if self._missing(now) else super().hold(now)
 
     def state(self) -> Mapping[str, Any]:
         """Return angles (rad), speeds (rad/s), loads (share of the stall torque), temperatures

@@ -55,7 +55,10 @@ def sync_read(address: int, size: int, servos: Iterable[int]) -> bytes:
 
 
 def sync_write(address: int, data: Mapping[int, bytes]) -> bytes:
-    """Write the same registers of several servos; none answers. All data have the same size."""
+    """Write the same registers of several servos; none answers. All data have the same size. No
+    servos: no bytes."""
+    if not data:
+        return b""
     size = len(next(iter(data.values())))
     content = b"".join(bytes((servo,)) + part for servo, part in data.items())
     return packet(BROADCAST, SYNC_WRITE, bytes((address, size)) + content)
@@ -106,16 +109,9 @@ def reading(data: bytes) -> Reading | None:
     if len(data) != _STATE.size:
         return None
     mode, torque, goal, _, position, speed, load, voltage, temperature, _, _ = _STATE.unpack(data)
-    return Reading(
-        mode,
-        torque == 1,
-        number(goal),
-        number(position),
-        number(speed),
-        number(load, 10) / 1000,
-        voltage / 10,
-        temperature,
-    )
+    wanted, at, rate = number(goal), number(position), number(speed)
+    share, volts = number(load, 10) / 1000, voltage / 10
+    return Reading(mode, torque == 1, wanted, at, rate, share, volts, temperature)
 
 
 class PacketSplitter:

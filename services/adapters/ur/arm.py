@@ -80,7 +80,7 @@ class Arm(Driver):
     """Driver of the arm (see `petrobot.Driver`)."""
 
     period = 0.008
-    obeys = ("speed", "workspace", "dry_run")
+    obeys = ("speed", "workspace", "dry_run", "pause")
     host: str = key(text="IP address of the controller, or unix:PATH of a simulated one")
     model: str = key("ur5e", "ur3e, ur5e or ur10e")
     tool: list[float] = key([0.0, 0.0, 0.0], "tool point in the flange's frame, m")
@@ -277,14 +277,6 @@ class Arm(Driver):
             return self._now >= self._unseen_until and not self._enabled
         still = all(abs(v) < STANDING for v in self._rtde.data["actual_qd"])
         return still and not self._motion.moving and self._now >= self._unseen_until
-
-    def hold(self, now: float) -> str:
-        """Pause: brake on the way, and go on along it after `release`."""
-        self._motion.paused = True
-        return "held"
-
-    def release(self, now: float) -> None:
-        self._motion.paused = False
 
     def close(self) -> None:
         """Close the connections; the program on the controller then stops the arm."""

@@ -293,7 +293,7 @@ def test_a_wrong_node_is_named_and_the_others_work(cell: Cell) -> None:
         ({"url": "opc.tcp://plc.example:4840"}, "another host"),
         ({"url": "http://127.0.0.1"}, "expected opc.tcp"),
         ({"certificate": "me.der"}, "private_key and server_certificate"),
-        ({"events": {"part": {"node": "sensor"}}}, "events.part: expected node and becomes"),
+        ({"events": {"part": {"node": "sensor"}}}, r"events\.part: is missing \['becomes'\]"),
         ({"on_stop": {"nothing": 0}}, "no node 'nothing'"),
     ],
 )

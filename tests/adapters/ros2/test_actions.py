@@ -298,7 +298,7 @@ def shown(bridge: Bridge, *messages: Any, topic: str = "/button") -> None:
 
 def wired(ports: Ports, **config: Any) -> tuple[Bridge, ScriptedLink]:
     bridge = Bridge({"url": HERE, **config}, ports)  # type: ignore[arg-type]
-    bridge.link = link = ScriptedLink(bridge)
+    bridge.link = link = ScriptedLink(bridge)  # type: ignore[assignment]
     return bridge, link
 
 
@@ -420,7 +420,7 @@ def test_goals_are_checked_against_the_users_file() -> None:
     ports = Ports({"a.action": ACTION})
     config = {"url": HERE, "definitions": {"a/action/B": "a.action"}}
     bridge = Bridge(config, ports)  # type: ignore[arg-type]
-    bridge.link = link = ScriptedLink(bridge)
+    bridge.link = link = ScriptedLink(bridge)  # type: ignore[assignment]
     bridge.ports = None  # type: ignore[assignment]
     for more, wrong in (
         ({"goal": {"joint": [1]}}, "did you mean 'joints'?"),
@@ -580,7 +580,7 @@ def test_the_driver_keeps_the_rules() -> None:
 def test_shipped_goals(
     action: Callable[..., Any], options: dict[str, Any], action_type: str, part: tuple[str, Any]
 ) -> None:
-    from petrobot.services.adapters.ros2.protocol import pick
+    from petrobot.services.adapters.ros2.messages import pick
 
     bridge, link = robot()
     options = {"remaining": "distance", **options}

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.adapters.ros2 import definitions
-from petrobot.services.adapters.ros2.definitions import Field
+from petrobot.services.adapters.ros2 import messages as definitions
+from petrobot.services.adapters.ros2.messages import Field
 from tests.adapters.ros2.test_actions import Ports
 from tests.waiting import Limit
 

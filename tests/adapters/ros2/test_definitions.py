@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.adapters.ros2.definitions import Field, faults, read
+from petrobot.services.adapters.ros2.messages import Field, faults, read
 
 NAVIGATE = """\
 #goal definition

@@ -12,8 +12,8 @@ import pytest
 
 from petrobot import Context, Remote, Result, rehearse
 from petrobot.services.adapters.ros2 import actions
-from petrobot.services.adapters.ros2.bridge import Bridge
-from petrobot.services.adapters.ros2.protocol import LARGEST, Fragments, Message, parse
+from petrobot.services.adapters.ros2.bridge import LARGEST, Bridge, Fragments, parse
+from petrobot.services.adapters.ros2.messages import Message
 from tests.adapters.ros2.test_actions import Ports
 
 Sent = list[Message]
@@ -124,7 +124,7 @@ def test_answers_in_another_order_belong_to_their_goals() -> None:
 def test_a_cancelled_run_cancels_its_goal_at_the_server() -> None:
     device = bridge()
     rehearse(goal("/slow", timeout=None), device=device, cancel_after=0.5)
-    assert len(device.link._robot.cancelled) == 1 and device.stopped()  # type: ignore[attr-defined]
+    assert len(device.link._device.cancelled) == 1 and device.stopped()  # type: ignore[union-attr]
 
 
 def test_fragments_do_not_fill_the_memory() -> None:
@@ -136,6 +136,8 @@ def test_fragments_do_not_fill_the_memory() -> None:
     with pytest.raises(ValueError, match="too many or too long"):
         for name in range(20):
             waiting.add({"op": "fragment", "id": str(name), "data": "x", "num": 0, "total": 2})
+    with pytest.raises(ValueError, match="not a fragment"):  # empty ones fill it, too
+        waiting.add({"op": "fragment", "id": "b", "data": "", "num": 5000, "total": 9999})
     whole = fragments({"op": "publish", "id": "z", "msg": {"data": "\u00e4"}}, 5)
     fresh = Fragments()
     told = [fresh.add(parse(json.dumps(part))) for part in whole]

@@ -9,11 +9,13 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
+from unittest.mock import AsyncMock, Mock
 
+import aiohttp
 import pytest
 
-from petrobot.services.adapters.ros2.bridge import Bridge
-from petrobot.services.adapters.ros2.protocol import ExchangePhase
+from petrobot.services.adapters.ros2 import bridge as bridge_module
+from petrobot.services.adapters.ros2.bridge import Bridge, ExchangePhase
 from petrobot.services.comm.protocol.plain import plain
 from tests.adapters.ros2.conftest import FakeProcess
 from tests.adapters.ros2.test_actions import Ports
@@ -111,10 +113,11 @@ def test_a_killed_server_and_its_successor() -> None:
     fake.end()
     bridge.until_phase(ExchangePhase.LOST)
     successor = FakeProcess(fake.port)
-    bridge.until_phase(ExchangePhase.RECALLED)
-    bridge.until_phase(ExchangePhase.GONE)
-    assert not bridge.stopped()
-    assert {m["op"] for m in successor.log()} == {"cancel_action_goal"}
+    bridge.until(lambda: bridge.link.count == 2, "the successor")
+    recalled = bridge.now
+    bridge.until(lambda: bridge.now > recalled + 2.5, "the end of its patience")
+    assert not bridge.stopped() and bridge.phase() is ExchangePhase.LOST
+    assert [m["op"] for m in successor.log()] == 2 * ["cancel_action_goal"]
     bridge.goal("/slow")
     bridge.until_phase(ExchangePhase.ACTIVE)
     bridge.stop(bridge.now)
@@ -190,6 +193,25 @@ def test_a_message_that_is_too_long_ends_only_the_link(bridge: Stepped, fake: Fa
     bridge.until(lambda: bridge.link.count == 2, "the next connection")
     bridge.goal("/ok")
     bridge.until_phase(ExchangePhase.SUCCEEDED)
+
+
+async def test_large_messages_are_read_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reading a large one takes the interpreter from the driver's steps: without pauses a server
+    that sends nothing else kept a step for 11 s."""
+    pauses, told = list[float](), list[Any]()
+
+    async def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+
+    async def frames() -> Any:
+        for size in (10, 70_000, 4_000_000):
+            text = json.dumps({"op": "publish", "topic": "/b", "msg": {"x": "y" * size}})
+            yield aiohttp.WSMessage(aiohttp.WSMsgType.TEXT, text, None)
+
+    session = Mock(tell=lambda kind, item: told.append(kind), room=AsyncMock())
+    monkeypatch.setattr("asyncio.sleep", sleep)
+    await bridge_module._receive(session, frames())
+    assert told == 3 * ["message"] and len(pauses) == 2 and pauses[1] > 50 * pauses[0]
 
 
 def test_a_full_send_buffer_ends_the_connection(bridge: Stepped, fake: FakeProcess) -> None:

@@ -12,12 +12,13 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pytest
 
+from petrobot import OperatorError
 from petrobot.services.adapters.ros2 import __main__ as offering
-from petrobot.services.adapters.ros2.protocol import ExchangePhase
+from petrobot.services.adapters.ros2.bridge import ExchangePhase
 from tests.adapters.ros2.conftest import FakeProcess
 from tests.adapters.ros2.test_link import bridge_to
 from tests.ports import free_ports
@@ -31,27 +32,44 @@ class Page:
     """A scripted page of the coordinator: a run lasts until the test ends it."""
 
     def __init__(self) -> None:
-        self.state, self.run, self.marking = "idle", "", {"a": 1}
+        self.phase, self.run, self.marking = "idle", "", {"a": 1}
         self.commands: list[tuple[str, dict[str, Any]]] = []
         self.gone, self.held, self.obeys = False, False, True
 
-    async def snapshot(self) -> dict[str, Any]:
+    async def __aenter__(self) -> Self:
         if self.gone:
-            raise OSError("the page does not answer")
-        mission = {"id": self.run, "state": self.state, "reason": "because"}
-        runs = {"1": {"action": "rest"}} if self.state == "running" else {}
+            raise OperatorError(self.over)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Do nothing."""
+
+    @property
+    def over(self) -> str:
+        return "the page does not answer" if self.gone else ""
+
+    @property
+    def state(self) -> dict[str, Any]:
+        mission = {"id": self.run, "state": self.phase, "reason": "because"}
+        runs = {"1": {"action": "rest"}} if self.phase == "running" else {}
         return {"mission": mission, "marking": self.marking, "runs": runs, "result": {"n": 1}}
 
-    async def command(self, verb: str, **data: Any) -> dict[str, Any]:
+    async def until(self, holds: Callable[[dict[str, Any]], bool], timeout: float) -> bool:
+        limit = time.monotonic() + timeout
+        while not holds(self.state) and not self.over and time.monotonic() < limit:
+            await asyncio.sleep(0.01)
+        return holds(self.state)
+
+    async def command(self, verb: str, data: dict[str, Any] | None = None) -> dict[str, Any]:
         if self.gone:
-            raise OSError("the page does not answer")
-        self.commands.append((verb, data))
+            raise OperatorError(self.over)
+        self.commands.append((verb, data or {}))
         if verb == "start" and self.held:
             return {"ok": False, "code": "not_holder", "text": "ana holds the controls"}
         if verb == "start":
-            self.run, self.state = f"run-{len(self.commands)}", "running"
+            self.run, self.phase = f"run-{len(self.commands)}", "running"
         if verb == "abort" and self.obeys:
-            self.state = "aborted"
+            self.phase = "aborted"
         return {"ok": True, "run": self.run}
 
 
@@ -95,7 +113,7 @@ def played(steps: Steps, **more: Any) -> tuple[Page, Link]:
 
     async def play() -> None:
         stop = asyncio.Event()
-        offer = offering.OfferedTask(link, page, options)  # type: ignore[arg-type]
+        offer = offering.OfferedTask(link, lambda: page, options)  # type: ignore
         serving = asyncio.create_task(offer.serve(stop))
         await steps(page, link)
         stop.set()
@@ -112,10 +130,10 @@ def test_a_goal_is_a_run(state: str, status: int) -> None:
     async def steps(page: Page, link: Link) -> None:
         args = {"seconds": 2.0, "parameters": '{"more": [1]}', "seed": 7, "runs": 0}
         link.say("send_action_goal", "g1", args=args)
-        await until(lambda: page.state == "running" and len(link.sent) > 1, "the feedback")
+        await until(lambda: page.phase == "running" and len(link.sent) > 1, "the feedback")
         page.marking = {"a": 0, "b": 2}
         await until(lambda: len(link.sent) > 2, "the next feedback")
-        page.state = state
+        page.phase = state
         await until(link.results, "the result")
 
     page, link = played(steps)
@@ -140,7 +158,7 @@ def test_a_goal_is_a_run(state: str, status: int) -> None:
 def test_a_cancel_aborts_the_run() -> None:
     async def steps(page: Page, link: Link) -> None:
         link.say("send_action_goal", "g1", args={})
-        await until(lambda: page.state == "running", "the run")
+        await until(lambda: page.phase == "running", "the run")
         link.say("cancel_action_goal", "another")
         link.say("cancel_action_goal", "g1")
         await until(link.results, "the result")
@@ -153,10 +171,10 @@ def test_a_cancel_that_comes_too_late_leaves_the_success() -> None:
     async def steps(page: Page, link: Link) -> None:
         page.obeys = False
         link.say("send_action_goal", "g1", args={})
-        await until(lambda: page.state == "running", "the run")
+        await until(lambda: page.phase == "running", "the run")
         link.say("cancel_action_goal", "g1")
         await until(lambda: ("abort", {}) in page.commands, "the abort")
-        page.state = "success"
+        page.phase = "success"
         await until(link.results, "the result")
 
     assert played(steps)[1].results() == [("g1", 4, "success")]
@@ -167,8 +185,8 @@ def test_an_abort_by_the_operator_is_not_a_cancel() -> None:
 
     async def steps(page: Page, link: Link) -> None:
         link.say("send_action_goal", "g1", args={})
-        await until(lambda: page.state == "running", "the run")
-        page.state = "aborted"
+        await until(lambda: page.phase == "running", "the run")
+        page.phase = "aborted"
         await until(link.results, "the result")
 
     assert played(steps)[1].results() == [("g1", 6, "aborted")]
@@ -192,7 +210,7 @@ def test_a_goal_that_cannot_be_started_is_aborted_with_the_reason(
         await until(link.results, "the result")
         page.held = False
         link.say("send_action_goal", "g2", args={})
-        await until(lambda: page.state == "running", "the next goal's run")
+        await until(lambda: page.phase == "running", "the next goal's run")
 
     _, link = played(steps)
     assert link.results()[0] == ("g1", 6, "refused")
@@ -209,26 +227,37 @@ def test_one_goal_at_a_time() -> None:
     assert played(steps)[1].results()[0] == ("g2", 6, "refused")
 
 
+def test_a_goal_without_a_name_starts_nothing() -> None:
+    """Beside it a second goal would be accepted."""
+
+    async def steps(page: Page, link: Link) -> None:
+        link.say("send_action_goal", "", args={})
+        link.say("send_action_goal", "g2", args={})
+        await until(lambda: page.phase == "running", "the run of the other goal")
+
+    assert [verb for verb, _ in played(steps)[0].commands].count("start") == 1
+
+
 @pytest.mark.parametrize("lost", ["link", "page", "stop"])
 def test_a_run_is_aborted_when_its_client_or_link_is_lost(lost: str) -> None:
     """A link that breaks aborts the run: its client can no longer cancel it."""
 
     async def steps(page: Page, link: Link) -> None:
         link.say("send_action_goal", "g1", args={})
-        await until(lambda: page.state == "running", "the run")
+        await until(lambda: page.phase == "running", "the run")
         if lost == "page":
             page.gone = True
             await until(link.results, "the result")
         elif lost == "link":
             link.inbox += [("down", "pulled"), ("up", None)]
-            await until(lambda: page.state == "aborted", "the abort")
+            await until(lambda: page.phase == "aborted", "the abort")
             await until(link.results, "a result")
 
     page, link = played(steps)
     if lost == "page":
         assert link.results() == [("g1", 6, "refused")]
     else:
-        assert page.state == "aborted" and link.results() == [("g1", 6, "aborted")]
+        assert page.phase == "aborted" and link.results() == [("g1", 6, "aborted")]
     offered = [m for m in link.sent if m["op"] == "advertise_action"]
     assert len(offered) == (2 if lost == "link" else 1)
 
@@ -239,8 +268,8 @@ def test_messages_fit_the_definition(tmp_path: Path) -> None:
 
     async def steps(page: Page, link: Link) -> None:
         link.say("send_action_goal", "g1", args={})
-        await until(lambda: page.state == "running" and len(link.sent) > 1, "the feedback")
-        page.state = "success"
+        await until(lambda: page.phase == "running" and len(link.sent) > 1, "the feedback")
+        page.phase = "success"
         await until(link.results, "the result")
 
     definition = tmp_path / "Mine.action"
@@ -250,13 +279,13 @@ def test_messages_fit_the_definition(tmp_path: Path) -> None:
 
 
 def test_the_shipped_definition_is_what_is_sent() -> None:
-    from petrobot.services.adapters.ros2.definitions import faults, read
+    from petrobot.services.adapters.ros2.messages import faults, read
 
     known = read(offering.TYPE, RUN_TASK, "RunTask.action")
 
     async def steps(page: Page, link: Link) -> None:
         link.say("send_action_goal", "g1", args={})
-        await until(lambda: page.state == "running" and len(link.sent) > 1, "the feedback")
+        await until(lambda: page.phase == "running" and len(link.sent) > 1, "the feedback")
 
     _, link = played(steps)
     for part, op in (("Feedback", "action_feedback"), ("Result", "action_result")):

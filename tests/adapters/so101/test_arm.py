@@ -241,6 +241,34 @@ def test_one_servo_that_is_missing_from_the_start() -> None:
     assert arm.stopped() and arm.state()["faults"] == {}
 
 
+@pytest.mark.parametrize("at", [5000.0, -400.0])
+def test_a_servo_beyond_its_positions_gets_no_torque(at: float) -> None:
+    """It would jump to the nearest position that a goal can have, here by up to 80 degrees."""
+    rig = Rig()
+    rig.bus.servos[2].position = at
+    arm = rig.arm()
+    arm.run(1.0)
+    assert (
+        rig.bus.servos[2].position == at and "shoulder_lift is at" in arm.state()["faults"]["range"]
+    )
+    rig.bus.servos[2].position = 2048.0
+    arm.run(0.1)
+    arm.command(arm.ports.now, {"do": "enable"})
+    arm.run(0.3)
+    assert arm.state()["ready"] and arm.state()["faults"] == {}
+
+
+def test_two_arms_on_one_bus_get_no_torque() -> None:
+    """Both answer under the same ids, so one would jump to the pose of the other."""
+    first, second = so101(), so101([0.5] * 6)
+    answer = first.receive
+    first.receive = lambda data: answer(data) + second.receive(data)  # type: ignore[method-assign]
+    arm = Rig(first).arm()
+    arm.run(1.0)
+    assert "change the id" in arm.state()["faults"]["twice"] and not arm.state()["ready"]
+    assert {servo.angle for servo in first.servos.values()} == {0.0}
+
+
 @pytest.mark.parametrize(("seed", "echo"), [(1, False), (2, True), (3, True)])
 def test_noise_and_echoes_do_not_disturb_it(seed: int, echo: bool) -> None:
     chance = random.Random(seed)
