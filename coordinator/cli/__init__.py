@@ -21,15 +21,16 @@ exit codes:
     1  the task ended in ERROR or was aborted, or the answer is no: analyse refutes or cannot decide
        a property, simulate was cut short, forecast or replay disagrees, the active task refuses an
        operator's command
-    2  bad input (check: the task may not run)
-    3  a node cannot be reached
+    2  bad input (check: the task may not run), or nothing was begun because an emergency stop or
+       another run holds a device
+    3  a node cannot be reached or is not ready, or a device is not known to stand still (estop)
   130  interrupted
   141  the program that reads its output has closed it"""
 SHORT_EXIT_CODES = """\
 exit codes:
     0  done
     2  bad input
-    3  a node cannot be reached
+    3  a node cannot be reached or is not ready
   130  interrupted
   141  the program that reads its output has closed it"""
 
