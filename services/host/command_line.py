@@ -8,7 +8,9 @@ raised here is printed as it is: `argument --runs: abc is not a whole number of 
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Callable
+from contextlib import suppress
 from math import isfinite
 from typing import TYPE_CHECKING
 
@@ -100,3 +102,20 @@ def number(
 def probability(text: str) -> float:
     """Read a probability that is to be reached: more than 0, at most 1."""
     return number(above=0.0, most=1.0)(text)
+
+
+def reopen_outputs() -> None:
+    """Open the standard output and error again if code of users has closed them: others may print.
+    Python keeps their files open."""
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        stream = getattr(sys, name, None)
+        encoding = None
+        try:
+            if stream is None or not stream.closed:
+                continue
+            encoding = stream.encoding
+        except (AttributeError, ValueError):  # no stream, or one without its buffer
+            pass
+        with suppress(OSError):
+            again = open(number, "w", buffering=1, encoding=encoding, closefd=False)  # noqa: SIM115
+            setattr(sys, name, again)

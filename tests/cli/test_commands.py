@@ -716,17 +716,23 @@ def test_a_task_may_draw_its_own_pictures() -> None:
 @pytest.mark.processes
 @pytest.mark.parametrize(
     "deed",
-    ["sys.stdout.close()", "sys.stdout = io.StringIO()", "sys.stdout.close(); sys.stderr.close()"],
+    [
+        "sys.stdout.close()",
+        "sys.stdout = io.StringIO()",
+        "sys.stdout.close(); sys.stderr.close()",
+        "sys.stdout.detach()",
+        "sys.stdout = io.StringIO(); sys.stdout.close()",
+    ],
 )
 def test_the_result_is_printed_although_an_action_takes_the_output_away(
     tmp_path: Path, deed: str
 ) -> None:
-    """In lock step the action runs in the process of the command."""
+    """In lock step the action runs in the process of the command. Later actions print, too."""
     assert petrobot("new", "robot", "bot", cwd=tmp_path).returncode == 0
     code = tmp_path / "bot" / "bot.py"
     head, move, body = code.read_text(encoding="utf-8").partition("async def move(")
     signature, end, rest = body.partition("-> Result:\n")
-    deed = f"    import io, sys; {deed}\n"
+    deed = f"    import io, sys; print('moves'); print('moves', file=sys.stderr); {deed}\n"
     code.write_text(head + move + signature + end + deed + rest, encoding="utf-8")
     words = ["run", "bot/bot.toml", "--mode", "lockstep", "--journal", "runs"]
     done = petrobot(*words, cwd=tmp_path)
