@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
+from petrobot.services.host.command_line import leave_threads
 from petrobot.services.host.emergency_latch import uptime
 
 EXIT_CODES = """\
@@ -148,8 +149,16 @@ MEANT = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
+    if argv is not None:
+        return _safe_main(list(argv), uptime())
+    code = _safe_main(sys.argv[1:], _begun())
+    leave_threads(code)
+    return code
+
+
+def _safe_main(arguments: list[str], ordered: float) -> int:
     try:
-        code = _main(list(argv), uptime()) if argv is not None else _main(sys.argv[1:], _begun())
+        code = _main(arguments, ordered)
         sys.stdout.flush()
         return code
     except KeyboardInterrupt:  # also while modules are imported: that takes longest

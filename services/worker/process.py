@@ -39,7 +39,7 @@ from petrobot.services.comm.protocol.messages import (
     Pong,
 )
 from petrobot.services.device import Driver
-from petrobot.services.host.command_line import log_to_stderr
+from petrobot.services.host.command_line import LAST_THREADS, log_to_stderr
 from petrobot.services.host.emergency_latch import latch_of
 from petrobot.services.host.parent_death import STOP_ROUTINE, outlive
 from petrobot.services.node.drivers import make_driver
@@ -69,8 +69,6 @@ OUT_OF_MEMORY = "out_of_memory"
 LINK_LOST, NO_MEMORY, CHANGED = 90, 91, 92
 """Exit codes: the driver's process has ended; not even the report of a run fits into the remaining
 memory; a run has changed its process for good."""
-LAST_THREADS = 0.5
-"""How long a process that has served waits for threads that user code has left running (s)."""
 
 
 _log = logging.getLogger(__name__)

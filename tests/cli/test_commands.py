@@ -722,12 +722,14 @@ def test_a_task_may_draw_its_own_pictures() -> None:
         "sys.stdout.close(); sys.stderr.close()",
         "sys.stdout.detach()",
         "sys.stdout = io.StringIO(); sys.stdout.close()",
+        "import threading; threading.Thread(target=threading.Event().wait).start()",
     ],
 )
 def test_the_result_is_printed_although_an_action_takes_the_output_away(
     tmp_path: Path, deed: str
 ) -> None:
-    """In lock step the action runs in the process of the command. Later actions print, too."""
+    """In lock step the action runs in the process of the command. Later actions print, too. A
+    thread that it has left running does not keep the command from ending."""
     assert petrobot("new", "robot", "bot", cwd=tmp_path).returncode == 0
     code = tmp_path / "bot" / "bot.py"
     head, move, body = code.read_text(encoding="utf-8").partition("async def move(")
