@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import importlib
 import os
 import sys
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
@@ -359,6 +360,10 @@ async def _lead_realtime(session: RunSession, options: argparse.Namespace) -> No
     from petrobot.coordinator.cli.output import progress
     from petrobot.coordinator.launch import local_nodes
 
+    # All that is imported must be there before the nodes are connected: a coordinator that imports
+    # does not answer them, and on a busy host they take it for lost.
+    for module in ("petrobot.coordinator.operator.station", "petrobot.coordinator.page.server"):
+        importlib.import_module(module)
     directory = session.mission.executor.directory
     try:
         up = getattr(options, "up", False)
