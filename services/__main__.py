@@ -18,7 +18,13 @@ from petrobot.services.comm.location_file import (
 )
 from petrobot.services.comm.location_file.reading import nearest
 from petrobot.services.comm.protocol.security import KeyFileError, KeyNeededError
-from petrobot.services.host.command_line import LOG_LEVELS, add_log_level, log_to_stderr, number
+from petrobot.services.host.command_line import (
+    LOG_LEVELS,
+    add_log_level,
+    leave_threads,
+    log_to_stderr,
+    number,
+)
 from petrobot.services.host.parent_death import die_with, wanted_with_parent
 from petrobot.services.node.realtime import serve
 from petrobot.services.scripted import ScriptError
@@ -120,4 +126,6 @@ def _run_in_lockstep(directory: Directory, options: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    code = main()
+    leave_threads(code)
+    sys.exit(code)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
+from petrobot.services.host.command_line import leave_threads
 from petrobot.services.host.emergency_latch import uptime
 
 EXIT_CODES = """\
@@ -21,15 +22,16 @@ exit codes:
     1  the task ended in ERROR or was aborted, or the answer is no: analyse refutes or cannot decide
        a property, simulate was cut short, forecast or replay disagrees, the active task refuses an
        operator's command
-    2  bad input (check: the task may not run)
-    3  a node cannot be reached
+    2  bad input (check: the task may not run), or nothing was begun because an emergency stop or
+       another run holds a device
+    3  a node cannot be reached or is not ready, or a device is not known to stand still (estop)
   130  interrupted
   141  the program that reads its output has closed it"""
 SHORT_EXIT_CODES = """\
 exit codes:
     0  done
     2  bad input
-    3  a node cannot be reached
+    3  a node cannot be reached or is not ready
   130  interrupted
   141  the program that reads its output has closed it"""
 
@@ -147,8 +149,16 @@ MEANT = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
+    if argv is not None:
+        return _safe_main(list(argv), uptime())
+    code = _safe_main(sys.argv[1:], _begun())
+    leave_threads(code)
+    return code
+
+
+def _safe_main(arguments: list[str], ordered: float) -> int:
     try:
-        code = _main(list(argv), uptime()) if argv is not None else _main(sys.argv[1:], _begun())
+        code = _main(arguments, ordered)
         sys.stdout.flush()
         return code
     except KeyboardInterrupt:  # also while modules are imported: that takes longest

@@ -76,10 +76,8 @@ def run(options: argparse.Namespace) -> int:
             options.out,
             _text(found) if options.format == "text" else _exported(options.format, found),
         )
-    except JournalError as fault:
+    except (JournalError, ReplayError) as fault:
         raise CommandError(2, str(fault)) from fault
-    except ReplayError as fault:
-        raise CommandError(1, str(fault)) from fault
     except OSError as fault:
         text = (
             f"{options.mcap or options.out}: {fault.strerror or fault}; name a file that "

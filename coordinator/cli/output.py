@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from petrobot.coordinator.cli.loading import pictures_of, write_json
+from petrobot.services.host.command_line import reopen_outputs
 from petrobot.services.host.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -58,12 +59,8 @@ def kept_streams() -> Iterator[None]:
         for number, copy in copies.items():
             os.dup2(copy, number)
             os.close(copy)
-        sys.stdout, sys.stderr = (
-            open(number, "w", buffering=1, encoding=stream.encoding, closefd=False)  # noqa: SIM115
-            if stream is not None and stream.closed and number in copies
-            else stream
-            for number, stream in enumerate(streams, 1)
-        )
+        sys.stdout, sys.stderr = streams
+        reopen_outputs()
 
 
 @contextmanager

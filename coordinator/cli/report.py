@@ -252,10 +252,8 @@ def _steps(found: Recorded) -> Iterator[RecordedStep]:
 
     try:
         yield from found.steps()
-    except JournalError as fault:
+    except (JournalError, ReplayError) as fault:
         raise CommandError(2, str(fault)) from fault
-    except ReplayError as fault:
-        raise CommandError(1, str(fault)) from fault
 
 
 def _result_of(path: Path, task: Task) -> dict[str, Any]:

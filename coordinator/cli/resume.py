@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_page_arguments(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
     add_log_level_argument(parser)
-    parser.set_defaults(mock=None)
+    parser.set_defaults(mock=None, keep=None)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> int:
 
         return resume(found, observers, options.ordered)
 
-    return conduct(make, options, mode, resumed=True)
+    return conduct(make, options, mode)
 
 
 def later_run(journal: Journal) -> str:

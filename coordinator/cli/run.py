@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import importlib
 import os
 import sys
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
@@ -299,14 +300,8 @@ def conduct(
     make: Callable[[Sequence[Observer]], RunSession],
     options: argparse.Namespace,
     mode: str,
-    *,
-    resumed: bool = False,
 ) -> int:
-    """Make a session, lead it to its end, print and write its result. Return the exit code.
-
-    `resumed`: return 2 for a damaged journal only. A supervisor that restarts `petrobot resume`
-    until it succeeds gives up at 2.
-    """
+    """Make a session, lead it to its end, print and write its result. Return the exit code."""
     from petrobot.coordinator.cli.output import give
     from petrobot.coordinator.launch import RequestError
     from petrobot.coordinator.learning.estimates_file import EstimatesError
@@ -340,17 +335,16 @@ def conduct(
             print(f"`petrobot resume {folder}` continues this run", file=sys.stderr)
         raise
     except MissionError as fault:
-        raise CommandError(2 if fault.bad_input and not resumed else 1, str(fault)) from fault
+        raise CommandError(2 if fault.bad_input else 1, str(fault)) from fault
     except (CellError, UnreachableError, LaunchError) as fault:
         raise CommandError(3, str(fault)) from fault
     except JournalError as fault:
-        raise CommandError(1 if made and not resumed else 2, str(fault)) from fault
+        raise CommandError(1 if made else 2, str(fault)) from fault
     except (RequestError, DepartureError, EstimatesError, ReplayError, DirectoryError) as fault:
         raise CommandError(2, str(fault)) from fault
     [session] = made
     give(session, options, timeline)
-    if not resumed:
-        tidy(options, session.folder)
+    tidy(options, session.folder)
     return 0 if session.result()["status"] == "success" else 1
 
 
@@ -366,6 +360,10 @@ async def _lead_realtime(session: RunSession, options: argparse.Namespace) -> No
     from petrobot.coordinator.cli.output import progress
     from petrobot.coordinator.launch import local_nodes
 
+    # All that is imported must be there before the nodes are connected: a coordinator that imports
+    # does not answer them, and on a busy host they take it for lost.
+    for module in ("petrobot.coordinator.operator.station", "petrobot.coordinator.page.server"):
+        importlib.import_module(module)
     directory = session.mission.executor.directory
     try:
         up = getattr(options, "up", False)

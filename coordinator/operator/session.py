@@ -12,6 +12,7 @@ docs/decisions/one-session.md says what this replaced.
 from __future__ import annotations
 
 import asyncio
+import importlib
 import logging
 import math
 import shutil
@@ -252,6 +253,10 @@ class RealtimeSession(RunSession):
         """`begin` makes a resumed mission continue, `shown` is what operators see of its recorded
         steps; `ordered` as for `RunRequest`."""
         super().__init__(mission, selector, learning, folder, observers, resumed=begin is not None)
+        for module in ("numpy", "scipy.special"):
+            # What draws and counts imports it at the first use, and then the coordinator would
+            # not answer its nodes in the middle of the run.
+            importlib.import_module(module)
         self.shell = RealtimeMission(mission, directory, credentials_of(directory), ordered)
         self._begin, self._shown = begin or mission.start, shown
 

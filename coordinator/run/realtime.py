@@ -6,8 +6,9 @@ import asyncio
 import itertools
 import math
 import os
+import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from shlex import quote
 from typing import Final
 
@@ -36,6 +37,13 @@ SHARE: Final = 0.01
 """Share of late checks from which the host counts as too busy for a run in real time."""
 WORST: Final = 3 * LATE
 """Single delay (s) from which it counts as too busy: a set point of such a stream is stale then."""
+STOOD_STILL: Final = 2.0
+"""Single delay (s) that no busy host explains."""
+
+
+def _suspended() -> float:
+    """How long this computer has been suspended since it was started (s)."""
+    return uptime() - time.monotonic()
 
 
 @dataclass
@@ -47,6 +55,8 @@ class Punctuality:
     late: int = 0
     worst: float = 0.0
     """The longest delay (s)."""
+    suspended: float = field(default_factory=_suspended)
+    """How long the computer had been suspended before (s): the loop's clock stands still then."""
 
     def look(self, due: float, now: float) -> float:
         """Note that the due check happens now, and return when the next one is due (s)."""
@@ -56,13 +66,20 @@ class Punctuality:
         return now + PERIOD
 
     def remark(self) -> str:
-        """Return a remark for the result; empty if the host was not too busy."""
+        """Return a remark for the result; empty if the host was awake and not too busy."""
+        if (asleep := _suspended() - self.suspended) >= STOOD_STILL:
+            return (
+                f"suspended for {asleep:.0f} s in this run: its clocks and timers stood still, its "
+                "devices did not; what failed may be due to that"
+            )
         if self.worst < WORST and self.late <= SHARE * self.looks:
             return ""
         return (
             f"too busy for real time: the coordinator woke up more than {1e3 * LATE:g} ms "
             f"late {self.late} of {self.looks} times, "
             f"by {1e3 * self.worst:.0f} ms at most; what failed may be due to that"
+            + " (its process was stopped, or the computer stood still)"
+            * (self.worst >= STOOD_STILL)
         )
 
 

@@ -8,7 +8,12 @@ raised here is printed as it is: `argument --runs: abc is not a whole number of 
 from __future__ import annotations
 
 import logging
+import os
+import sys
+import threading
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from math import isfinite
 from typing import TYPE_CHECKING
 
@@ -100,3 +105,38 @@ def number(
 def probability(text: str) -> float:
     """Read a probability that is to be reached: more than 0, at most 1."""
     return number(above=0.0, most=1.0)(text)
+
+
+def reopen_outputs() -> None:
+    """Open the standard output and error again if code of users has closed them: others may print.
+    Python keeps their files open."""
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        stream = getattr(sys, name, None)
+        encoding = None
+        try:
+            if stream is None or not stream.closed:
+                continue
+            encoding = stream.encoding
+        except (AttributeError, ValueError):  # no stream, or one without its buffer
+            pass
+        with suppress(OSError):
+            again = open(number, "w", buffering=1, encoding=encoding, closefd=False)  # noqa: SIM115
+            setattr(sys, name, again)
+
+
+LAST_THREADS = 0.5
+"""How long a process that has finished waits for threads that code of users has left running
+(s)."""
+
+
+def leave_threads(code: int) -> None:
+    """End this process with the exit code if threads are left that Python would wait for at its
+    end: some never end."""
+    until = time.monotonic() + LAST_THREADS
+    left = [thread for thread in threading.enumerate() if not thread.daemon]
+    for thread in left:
+        if thread is not threading.current_thread():
+            thread.join(max(0.0, until - time.monotonic()))
+            if thread.is_alive():
+                sys.stdout.flush()
+                os._exit(code)

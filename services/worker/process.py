@@ -16,6 +16,8 @@ import select
 import signal
 import socket
 import sys
+import time
+import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -37,7 +39,7 @@ from petrobot.services.comm.protocol.messages import (
     Pong,
 )
 from petrobot.services.device import Driver
-from petrobot.services.host.command_line import log_to_stderr
+from petrobot.services.host.command_line import LAST_THREADS, log_to_stderr
 from petrobot.services.host.emergency_latch import latch_of
 from petrobot.services.host.parent_death import STOP_ROUTINE, outlive
 from petrobot.services.node.drivers import make_driver
@@ -97,14 +99,16 @@ class Setup:
 
 
 class Surroundings:
-    """What the code of one run may change for the runs after it: working directory, file mode mask,
-    standard streams, limits and timers of the process."""
+    """What the code of one run may change for the runs after it, so that they would fail. What was
+    there is put back; what it has added to the environment or the import path stays: it may have
+    prepared something once for its own later runs."""
 
     LIMITS = tuple(
         getattr(resource, f"RLIMIT_{name}")
         for name in ("AS", "CPU", "DATA", "FSIZE", "NOFILE", "NPROC", "STACK")
     )
     TIMERS = (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF)
+    SIGNALS = (signal.SIGCHLD, signal.SIGPIPE, signal.SIGALRM)
 
     def __init__(self) -> None:
         """Note how they are now."""
@@ -114,6 +118,13 @@ class Surroundings:
         self._depth = sys.getrecursionlimit()
         self._streams = (sys.stdin, sys.stdout, sys.stderr)
         self._limits = [resource.getrlimit(limit) for limit in self.LIMITS]
+        self._files = self._standard_files()
+        self._environment, self._path = dict(vars(os.environ)["_data"]), sys.path[:]
+        self._handlers = [signal.getsignal(number) for number in self.SIGNALS]
+        self._filters, self._timeout = warnings.filters[:], socket.getdefaulttimeout()
+        # Not imported here: a node in real time starts in half the time without it.
+        self._numpy = sys.modules.get("numpy")
+        self._numbers = self._numpy.geterr() if self._numpy else {}
 
     def restored(self) -> str:
         """Make them so again. Return why that is not possible, empty if it is."""
@@ -132,9 +143,41 @@ class Surroundings:
                     resource.setrlimit(limit, wanted)
             if self._here() != self._folder:
                 os.chdir(self._folder)
-        except (OSError, ValueError) as fault:
+            if self._standard_files() != self._files:
+                return "it has closed the file of a standard stream"
+            self._restore_modules()
+        except (OSError, TypeError, ValueError) as fault:
             return str(fault)
         return ""
+
+    def _restore_modules(self) -> None:
+        # Its dictionary: to decode each variable takes as long as a short run.
+        if not self._environment.items() <= vars(os.environ)["_data"].items():
+            os.environb.update(self._environment)
+            time.tzset()
+        if not isinstance(sys.path, list) or not set(self._path) <= set(sys.path):
+            sys.path = self._path[:]
+        for number, handler in zip(self.SIGNALS, self._handlers, strict=True):
+            if signal.getsignal(number) is not handler:
+                signal.signal(number, handler)
+        if warnings.filters != self._filters:
+            warnings.resetwarnings()
+            warnings.filters[:] = self._filters
+        if socket.getdefaulttimeout() != self._timeout:
+            socket.setdefaulttimeout(self._timeout)
+        if self._numpy and self._numpy.geterr() != self._numbers:
+            self._numpy.seterr(**self._numbers)
+
+    @staticmethod
+    def _standard_files() -> list[tuple[int, int] | None]:
+        found: list[tuple[int, int] | None] = []
+        for number in range(3):
+            try:
+                file = os.fstat(number)
+                found.append((file.st_dev, file.st_ino))
+            except OSError:  # closed
+                found.append(None)
+        return found
 
     @staticmethod
     def _here() -> str:
@@ -428,6 +471,10 @@ def main(passed: Sequence[int]) -> None:
         serve(node, descriptors, link, permits)
     except MemoryError:
         os._exit(NO_MEMORY)
+    finally:
+        # At its end Python waits for every thread that is not a daemon, and some never end.
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_REAL, LAST_THREADS)
 
 
 def _take_signals() -> None:

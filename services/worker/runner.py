@@ -22,6 +22,7 @@ from petrobot.services.action import Cancelled, CommandRefused, Status, Wait
 from petrobot.services.comm.location_file import ActionEntry, resolve
 from petrobot.services.comm.protocol.messages import Call, Cancel, Command, Executed, Outcome
 from petrobot.services.comm.protocol.plain import plain
+from petrobot.services.host.command_line import reopen_outputs
 from petrobot.services.worker.callables import (
     check_arguments,
     describe,
@@ -234,6 +235,7 @@ class Execution:
             if _forked:
                 os._exit(0)
             _active = earlier
+            reopen_outputs()
             self.cpu += process_time() - before
 
 

@@ -3,8 +3,10 @@ fault."""
 
 from __future__ import annotations
 
+import ast
 import json
 import os
+import re
 import resource
 import socket
 import subprocess
@@ -16,7 +18,7 @@ import pytest
 from petrobot.coordinator.analysis import commands
 from petrobot.coordinator.analysis.formats import read_net
 from petrobot.coordinator.analysis.net.space import explore
-from petrobot.coordinator.cli import COMMANDS, main
+from petrobot.coordinator.cli import COMMANDS, Subcommand, main
 from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
@@ -77,6 +79,25 @@ def test_commands_on_nets_bound_their_memory(
     assert said in capsys.readouterr().err
     assert limits[0] != resource.RLIM_INFINITY
     assert resource.getrlimit(resource.RLIMIT_DATA) == before
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
+def test_a_command_ends_with_no_other_code_than_its_help_lists(
+    command: Subcommand, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The codes of its errors stand in its module, as numbers."""
+    main([command.name, "--help"])
+    listed = {int(code) for code in re.findall(r"^ +(\d+)  ", capsys.readouterr().out, re.M)}
+    module = (command.home or command.name).partition(":")[0]
+    tree = ast.parse((ROOT / "coordinator" / "cli" / f"{module}.py").read_text())
+    raised = {
+        part.value
+        for call in ast.walk(tree)
+        if isinstance(call, ast.Call) and ast.unparse(call.func) == "CommandError"
+        for part in ast.walk(call.args[0])
+        if isinstance(part, ast.Constant) and isinstance(part.value, int)
+    }
+    assert raised <= listed
 
 
 LOCKSTEP = ["run", "catch_ball", "--mode", "lockstep"]
@@ -695,17 +716,25 @@ def test_a_task_may_draw_its_own_pictures() -> None:
 @pytest.mark.processes
 @pytest.mark.parametrize(
     "deed",
-    ["sys.stdout.close()", "sys.stdout = io.StringIO()", "sys.stdout.close(); sys.stderr.close()"],
+    [
+        "sys.stdout.close()",
+        "sys.stdout = io.StringIO()",
+        "sys.stdout.close(); sys.stderr.close()",
+        "sys.stdout.detach()",
+        "sys.stdout = io.StringIO(); sys.stdout.close()",
+        "import threading; threading.Thread(target=threading.Event().wait).start()",
+    ],
 )
 def test_the_result_is_printed_although_an_action_takes_the_output_away(
     tmp_path: Path, deed: str
 ) -> None:
-    """In lock step the action runs in the process of the command."""
+    """In lock step the action runs in the process of the command. Later actions print, too. A
+    thread that it has left running does not keep the command from ending."""
     assert petrobot("new", "robot", "bot", cwd=tmp_path).returncode == 0
     code = tmp_path / "bot" / "bot.py"
     head, move, body = code.read_text(encoding="utf-8").partition("async def move(")
     signature, end, rest = body.partition("-> Result:\n")
-    deed = f"    import io, sys; {deed}\n"
+    deed = f"    import io, sys; print('moves'); print('moves', file=sys.stderr); {deed}\n"
     code.write_text(head + move + signature + end + deed + rest, encoding="utf-8")
     words = ["run", "bot/bot.toml", "--mode", "lockstep", "--journal", "runs"]
     done = petrobot(*words, cwd=tmp_path)

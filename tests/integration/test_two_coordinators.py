@@ -6,6 +6,8 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -20,7 +22,8 @@ from petrobot.coordinator.run.realtime import RealtimeMission
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.coordinator.task import Executed, Status
 from petrobot.services.comm.location_file import Directory, load
-from tests.chaos.shuttle_cell import TASK, moves, shuttle_services
+from tests.chaos.shuttle_cell import ROOT, TASK, moves, shuttle_services
+from tests.ports import free_ports
 from tests.waiting import beat, until
 
 pytestmark = pytest.mark.processes
@@ -184,3 +187,19 @@ async def test_a_goodbye_is_sent_over_a_new_link_if_the_first_breaks(tmp_path: P
         await led(directory, second)
     done, _ = judged(second)
     assert done and all(r.status is Status.SUCCESS for r in done), done
+
+
+def test_a_coordinator_imports_nothing_more_while_a_run_is_active(tmp_path: Path) -> None:
+    """An import blocks its loop for 0.3 s, on a busy host for so long that its nodes lose it."""
+    services = str(shuttle_services(tmp_path))
+    given = ["run", str(TASK), "--up", "--services", services, "--journal", str(tmp_path / "runs")]
+    given += ["--quiet", "--page-port", str(free_ports(1)[0]), "--log-level", "info"]
+    command = [sys.executable, "-X", "importtime", "-m", "petrobot.coordinator", *given]
+    ran = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=LIMIT, check=True
+    )
+    _, started, during = ran.stderr.partition(": started (realtime")
+    active, finished, _ = during.partition(": finished, success")
+    assert started and finished, ran.stderr[-2_000:]
+    imported = [line for line in active.splitlines() if "import time:" in line]
+    assert not imported

@@ -24,11 +24,13 @@ TEXT = """\
 schema = 1
 nodes.left = { host = "127.0.0.1", port = 7001 }
 actions.ask = { run = "asked:ask", task = "ask", node = "left" }
+actions.linger = { run = "asked:linger", task = "linger", node = "left" }
 actions.draw = { run = "asked:draw", task = "draw", node = "left" }
 """
 CODE = """\
 import os
 import random
+import threading
 import uuid
 from pathlib import Path
 import numpy as np
@@ -36,6 +38,10 @@ from petrobot import success
 
 def ask(ctx):
     return success(setting=os.environ.get("SETTING", ""), folder=str(Path.cwd()))
+
+def linger(ctx):
+    threading.Thread(target=threading.Event().wait).start()
+    return success()
 
 def draw(ctx):
     return success(python=random.random(), numpy=float(np.random.rand()), uuid=str(uuid.uuid4()))
@@ -56,8 +62,9 @@ class Started:
         if any(isinstance(item, list) and item[0] == READY for item in items):
             self.ready.set()
 
-    async def ask(self, action: str = "ask") -> dict[str, object]:
-        """Wait until it is ready, call its action, and end it; return the values."""
+    async def ask(self, action: str = "ask", code: int = 0) -> dict[str, object]:
+        """Wait until it is ready, call its action, and end it, with this exit code; return the
+        values."""
         async with asyncio.timeout(PATIENCE):
             await self.ready.wait()
             self.child.give(Call("1", action, {}))
@@ -65,7 +72,7 @@ class Started:
             assert self.results[0].status == "success", self.results
             self.child.leave()
             await self.over.wait()
-        assert self.child.code == 0
+        assert self.child.code == code
         return dict(self.results[0].values)
 
 
@@ -96,6 +103,11 @@ async def test_a_worker_and_its_keeper(folder: Path) -> None:
     assert parent(keeper) == os.getpid() and keeper != fork_server()._process.pid
     assert (await started.ask())["setting"] == ""
     assert not alive(worker) and not Path(f"/proc/{keeper}").exists()
+
+
+async def test_a_thread_of_user_code_does_not_keep_its_process(folder: Path) -> None:
+    """Python waits for it, but not until the node kills the process 4 s later."""
+    await Started(folder).ask("linger", -signal.SIGALRM)
 
 
 async def test_what_has_ended_leaves_no_zombie(folder: Path) -> None:

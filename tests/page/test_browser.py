@@ -521,6 +521,11 @@ async def test_history(
     )
     await scrub.get_by_role("button", name="Previous error").click()
     await tab.screenshot(path=shots / "history.png")
+    said = "(text) => import('/page/js/toast.js').then((m) => m.toast('error', text))"
+    await tab.evaluate(said, "Refused: another run is active")
+    toast, bar = await tab.locator(".toast").last.bounding_box(), await scrub.bounding_box()
+    assert toast is not None and bar is not None
+    assert toast["y"] + toast["height"] <= bar["y"], "a message covers no button of the records"
     await scrub.get_by_role("button", name="Simulate from here").click()
     dialog = tab.get_by_role("dialog", name="Simulate from here")
     await dialog.get_by_label("Run in clear").select_option("error")

@@ -642,6 +642,31 @@ async def test_variables_and_events_of_a_condition_can_be_declared(
     assert complaints == []
 
 
+@pytest.mark.parametrize(
+    ("typed", "initial"), [('""', ""), ("", None), ("12", "12"), ('"', '"'), ("a b", "a b")]
+)
+async def test_the_initial_text_of_a_variable(
+    browser: Browser, page: Page, tasks: Path, typed: str, initial: str | None
+) -> None:
+    """An empty text is written with quotes; an empty field means that there is none."""
+    tab, complaints = await designing(browser, page)
+    form = properties(tab)
+    await form.get_by_label("New variable", exact=True).fill("code")
+    await form.get_by_role("button", name="Add variable").click()
+    await form.get_by_label("Type of code").select_option("str")
+    field = form.get_by_label("Initial value of code")
+    await field.fill(typed)
+    await field.press("Enter")
+    await save(tab)
+    assert load(tasks / "pick_and_place.toml").variables["code"].initial == initial
+    shown = await field.input_value()
+    await field.fill(shown + " ")
+    await field.fill(shown)
+    await field.press("Enter")
+    await expect(tab.locator(".saved")).to_have_text("saved")
+    assert complaints == []
+
+
 EDITS = (Path(__file__).parent / "random_edits.js").read_text(encoding="utf-8")
 
 

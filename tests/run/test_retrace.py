@@ -196,6 +196,26 @@ def test_a_run_that_differs_by_more_than_last_digits_is_not_overwritten(
     assert (recorded_run / JOURNAL).read_bytes() == there
 
 
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["replay", "RUN"], 1),
+        (["log", "RUN"], 2),
+        (["log", "RUN", "--format", "xes"], 2),
+        (["report", "RUN", "--out", "FOLDER"], 2),
+        (["resume", "RUN", "--quiet"], 2),
+        (["run", "--from", "RUN:20", "--quiet"], 2),
+    ],
+)
+def test_a_journal_that_does_not_replay_is_bad_input(
+    arguments: list[str], code: int, recorded_run: Path, tmp_path: Path
+) -> None:
+    """Only `replay` was asked whether it does: its answer is no."""
+    recorded_elsewhere(recorded_run, 1e-3)
+    names = {"RUN": str(recorded_run), "RUN:20": f"{recorded_run}:20", "FOLDER": str(tmp_path)}
+    assert main([names.get(word, word) for word in arguments]) == code
+
+
 def test_a_journal_of_a_newer_petrobot_is_refused(
     recorded_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

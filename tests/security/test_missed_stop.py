@@ -118,9 +118,9 @@ class Turns:
         options = ["--runs", "100000", "--no-page", "--quiet", *more]
         return petrobot("run", str(self.task(pause)), *options, *self._services, *self._journal)
 
-    def resume(self, run: Path) -> subprocess.Popen[str]:
-        """Resume a run."""
-        return petrobot("resume", str(run), "--no-page", "--quiet")
+    def resume(self, run: Path, **variables: str) -> subprocess.Popen[str]:
+        """Resume a run, with these environment variables."""
+        return petrobot("resume", str(run), "--no-page", "--quiet", **variables)
 
     def serve(self) -> subprocess.Popen[str]:
         """Serve the page."""
@@ -297,6 +297,30 @@ async def test_an_order_from_before_a_stop_moves_nothing_after_it_is_cleared(
     finally:
         coordinator.kill()
         coordinator.communicate()
+
+
+async def test_a_stop_and_another_run_refuse_a_resume_as_they_refuse_a_run(turns: Turns) -> None:
+    """Exit code 2, and nothing moves, whether the host of the coordinator knows of the stop or only
+    the node."""
+    coordinator = turns.start(0.02)
+    run = await turns.connected(coordinator)
+    await turns.moving()
+    coordinator.kill()
+    coordinator.communicate()
+    await turns.estop()
+    then = turns.begun()
+    for variables in ({}, {"PETROBOT_STATE": str(turns.folder / "another host")}):
+        code, out, err = await finished(turns.resume(run, **variables))
+        assert (code, turns.begun()) == (2, then) and "petrobot estop --clear" in err, out + err
+    await turns.estop("--clear")
+    other = turns.start(0.5)
+    try:
+        await turns.connected(other)
+        code, out, err = await finished(turns.resume(run))
+        assert code == 2 and "in use: left_hand accepts orders from" in err, out + err
+    finally:
+        other.kill()
+        other.communicate()
 
 
 async def test_a_start_that_a_frozen_page_reads_after_a_stop_moves_nothing(turns: Turns) -> None:

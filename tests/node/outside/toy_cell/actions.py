@@ -8,13 +8,17 @@ import multiprocessing
 import os
 import resource
 import signal
+import socket
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from petrobot.services.action import Cancelled, Context, Result, Status, error, failure, success
 
@@ -34,6 +38,13 @@ CHANGES: dict[str, Callable[[], Any]] = {
     "clock": lambda: vars(time).update(monotonic=str, time=str, process_time=str),
     "no output": lambda: setattr(sys, "stdout", None),
     "closed output": lambda: sys.stdout.close(),
+    "closed files": lambda: os.closerange(0, 3),
+    "environment": lambda: os.environ.update(PATH="/nowhere"),
+    "path": lambda: sys.path.clear(),
+    "children": lambda: signal.signal(signal.SIGCHLD, signal.SIG_IGN),
+    "warnings": lambda: warnings.simplefilter("error"),
+    "sockets": lambda: socket.setdefaulttimeout(1e-6),
+    "numbers": lambda: np.seterr(all="raise"),
     "files": lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (5, 1024)),
 }
 """What an action may leave behind in its process."""
@@ -46,6 +57,9 @@ def change(ctx: Context, *, what: str = "") -> Result:
     depth = sys.getrecursionlimit()
     found = [str(Path.cwd()), mask, depth, list(resource.getrlimit(resource.RLIMIT_NOFILE))]
     found.append(sys.stdout is not None and not sys.stdout.closed)
+    found += [os.environ["PATH"], bool(sys.path), str(signal.getsignal(signal.SIGCHLD))]
+    found += [[each[0] for each in warnings.filters], socket.getdefaulttimeout(), np.geterr()]
+    found.append([Path(f"/proc/self/fd/{number}").exists() for number in range(3)])
     CHANGES[what]()
     return success(found=found, pid=os.getpid())
 

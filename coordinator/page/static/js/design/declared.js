@@ -28,7 +28,7 @@ function table(form, title, key, row, fresh) {
 }
 
 const setter = (form, key, entry, label) => (field, value) => form.model.edit(label, (data) => {
-  if (value === "" || value === null) delete data[key][entry][field];
+  if (value === null || (value === "" && field !== "initial")) delete data[key][entry][field];
   else data[key][entry][field] = value;
 });
 
@@ -53,9 +53,11 @@ export function variables(form) {
   return table(form, "Variables", "variables", (entry, variable) => {
     const set = setter(form, "variables", entry, "change variable");
     const initial = "initial" in variable ? writeValue(variable.initial) : "";
+    // Without quotes everything is text; with them it may be empty, or begin with one.
+    const read = (text) => (variable.type === "str" && !text.startsWith('"') ? text : readValue(text));
     return [
       form.choice(variable.type ?? "any", TYPES, (type) => set("type", type), { "aria-label": `Type of ${words(entry)}` }),
-      form.input(initial, (text) => set("initial", text.trim() === "" ? null : variable.type === "str" ? text : readValue(text)), { placeholder: "initial", "aria-label": `Initial value of ${words(entry)}` }),
+      form.input(initial, (text) => set("initial", text.trim() === "" ? null : read(text)), { placeholder: "initial", title: '"" is an empty text', "aria-label": `Initial value of ${words(entry)}` }),
     ];
   }, { type: "bool", initial: false });
 }

@@ -11,4 +11,4 @@ export function readValue(text) {
   }
 }
 
-export const writeValue = (value) => (value && typeof value === "object" && typeof value.var === "string" ? `$${value.var}` : typeof value === "string" && !/^[\d$"[{]|^(true|false|null)$/.test(value) ? value : JSON.stringify(value));
+export const writeValue = (value) => (value && typeof value === "object" && typeof value.var === "string" ? `$${value.var}` : typeof value === "string" && !/^$|^[-\d$"[{]|^(true|false|null)$/.test(value) ? value : JSON.stringify(value));
