@@ -38,6 +38,7 @@ from petrobot.coordinator.studies.forecast.residual import (
     event_doubts,
     measured,
     order_doubts,
+    parallel_doubts,
     rare_doubts,
     residuals,
     routing,
@@ -61,8 +62,8 @@ GRID = tuple(float(q) for q in np.linspace(0.005, 0.995, 100))
 TRIALS, NET = "trials", "net"
 """Where the figures come from: the training trials themselves, or the simulated net."""
 NO_TRIALS = (
-    "an estimates file contains no trials: runs of one trial are taken as independent, and nothing "
-    "tests that; give a campaign's folder"
+    "an estimates file contains no trials: successive runs of one trial are taken as independent, "
+    "and nothing tests that; give a campaign's folder"
 )
 NO_FIGURE: dict[str, Any] = {"value": None, "interval": None, "confidence": None}
 
@@ -339,6 +340,7 @@ def _from_net(training: Training, request: Request, random: np.random.Generator)
             *doubts(residual, whole, request.point),
             *event_doubts(training),
             *condition_doubts(training, net.structure.moves),
+            *parallel_doubts(training),
             *order_doubts(training),
             *rare_doubts(training, np.ones(n), told),
         ],

@@ -212,8 +212,10 @@ def test_estimates_of_another_task_are_refused(
     assert main(["forecast", str(own), "--estimates", str(path), *QUICK]) == 2
     assert "it holds estimates of locate, watch; pair has first, second" in capsys.readouterr().err
     own.write_text(ONE_WAY, encoding="utf-8")
-    assert main(["forecast", str(own), "--estimates", str(path), *QUICK]) == 0
-    assert "no trials to compare with" in capsys.readouterr().out
+    assert main(["forecast", str(own), "--estimates", str(path), *QUICK]) == 1
+    shown = capsys.readouterr().out
+    assert "no trials to compare with" in shown
+    assert "DOUBTFUL: locate, watch: these may run at the same time" in shown
 
 
 # --- places that training never entered -------------------------------------------------------
