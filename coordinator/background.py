@@ -210,7 +210,7 @@ def _shown(analysis: Analysis, cell: Cell | None) -> dict[str, Any]:
         "markings": len(space),
         "verdicts": verdicts,
         "notes": [*analysis.notes, assumed(cell)],
-        "heat": heat(analysis),
+        "heat": {} if analysis.forecast is None else heat(analysis.forecast),
         "figures": analysis.figures(),
     }
 

@@ -57,6 +57,10 @@ from petrobot.services.host.whole_file import write_whole
 OK, FAULT, BAD_INPUT = 0, 1, 2
 SEARCHED = 0.5
 """Share of the seconds of an analysis that its searches may use; the rest is for the verdicts."""
+UNFINISHED = (
+    "stopped early: replicas that were still active are left out, so those that take long are "
+    "missing in shares and times; use fewer --replicas, or a --horizon"
+)
 
 Measure = Callable[[Task, Cell | None], Measured]
 """Returns what was measured of a task that runs in a cell."""
@@ -410,6 +414,8 @@ def simulate_command(
             if horizon is None and seen.complete:
                 doubts += _unlike_the_engine(task, measured, devices_of(cell), seen, stages)
             notes = (*(f"doubtful: {text}" for text in doubts), *notes)
+        if not seen.complete:
+            notes = (UNFINISHED, *notes)
         return _simulated(name or path.stem, seen, notes)
     except (NetFileError, NoEstimate, ValueError, KeyError, OverflowError) as error:
         return _refused(path, error)
@@ -432,8 +438,9 @@ def _unlike_the_engine(
         if not x.complete:
             raise ValueError("the execution graph is too large")
         plays = played(x, measured)
-    except (ValueError, OutOfTime, KeyboardInterrupt) as why:
-        return [f"not compared with missions of the engine: {str(why) or INTERRUPTED}"]
+    except (ValueError, OutOfTime, KeyboardInterrupt, *OUT_OF_MEMORY) as why:
+        memory = "out of memory" if isinstance(why, OUT_OF_MEMORY) else INTERRUPTED
+        return [f"not compared with missions of the engine: {str(why) or memory}"]
     share, off = seen.completed.mean, list[str]()
     here = {"P_complete": (share, sqrt(share * (1 - share) / seen.replicas))}
     if seen.time is not None:

@@ -1030,11 +1030,9 @@ def _probability(p: float) -> str:
     return f"1 - {1 - p:.1e}" if 0 < 1 - p < 5e-8 else f"{p:.8f}" if p % 1 else f"{p:.0f}"
 
 
-def heat(analysis: Analysis) -> dict[str, float]:
+def heat(found: Forecast) -> dict[str, float]:
     """Return the share of the time that each place takes, 0 to 1, to colour a drawing."""
-    if analysis.forecast is not None:
-        shares: dict[str, float] = {}
-        for w in analysis.forecast.worth:
-            shares[w.place] = shares.get(w.place, 0.0) + w.time_share
-        return {place: float(np.clip(share, 0.0, 1.0)) for place, share in shares.items()}
-    return dict(analysis.run.occupancy) if analysis.run is not None else {}
+    shares: dict[str, float] = {}
+    for w in found.worth:
+        shares[w.place] = shares.get(w.place, 0.0) + w.time_share
+    return {place: float(np.clip(share, 0.0, 1.0)) for place, share in shares.items()}

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from petrobot.coordinator.analysis.limits import OUT_OF_MEMORY, OutOfTime, until
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     add_estimates_argument,
@@ -35,8 +36,8 @@ if TYPE_CHECKING:
 EXAMPLE = "petrobot analyse catch_ball --view gspn --what-if locate_ball.error.share=0.01"
 TOLD_EVERY, TOLD_AFTER = 0.5, 2.0
 """Seconds between two lines of progress; the first appears after as long."""
-MEMORY = 2 << 30
-"""The most bytes of a command that has no option for it."""
+SECONDS, MEMORY = 60.0, 2 << 30
+"""The most seconds and bytes of a command that has no options for them."""
 REASON_LETTERS = 150
 """Longest reason that is written below a picture (characters); the rest is cut."""
 
@@ -67,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seconds",
         type=number(least=0.0),
-        default=60.0,
+        default=SECONDS,
         metavar="S",
         help="longest time of the analysis, 0 for no limit; what was found by then is "
         "reported, the rest is unknown (default: %(default)g)",
@@ -201,6 +202,21 @@ def bounded_memory(most: int = MEMORY) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+
+@contextmanager
+def bounded(file: str) -> Iterator[None]:
+    """Limit a command that has no options for it to SECONDS and MEMORY. Raises CommandError if it
+    has no answer by then; one with a partial answer stops by itself (`overtime`)."""
+    full = CommandError(2, f"{file}: the memory was used up; use a smaller net")
+    try:
+        with bounded_memory(), until(time.monotonic() + SECONDS, time.monotonic):
+            yield
+    except OUT_OF_MEMORY as fault:
+        raise full from fault
+    except OutOfTime as late:
+        text = f"{file}: stopped after {SECONDS:g} s: {late}; use a smaller net"
+        raise CommandError(1, text) from late
 
 
 def give(outcome: CommandResult, json_file: str | None) -> int:

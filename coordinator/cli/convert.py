@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Convert the file, and list what could not be kept."""
     from petrobot.coordinator.analysis.commands import convert_command, written_view
-    from petrobot.coordinator.cli.analyse import bounded_memory, give
+    from petrobot.coordinator.cli.analyse import bounded, give
 
     measured = options.estimates is not None
     view = written_view(options.target, options.view, options.exact, measured)
@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
     if source.suffix == ".toml" and view != "gspn":
         why = f"its devices are of the stochastic view, and the {view} net is written; add --view"
         refuse_idle(options, add_arguments, f"{why} gspn, or leave it out", idle={"services"})
-    with bounded_memory():  # a chain (`.drn`) may be far larger than its net
+    with bounded(options.source):  # a chain (`.drn`) may be far larger than its net
         found = convert_command(
             source,
             options.target,

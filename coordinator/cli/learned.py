@@ -48,6 +48,7 @@ def figures(kept: FileContents, name: str, options: argparse.Namespace) -> dict[
     """Return the figures as plain data: of the primitive tasks, and of the task for one token in
     its runs place."""
     from petrobot.coordinator.analysis.time.measured import NoEstimate
+    from petrobot.coordinator.cli.analyse import bounded
     from petrobot.coordinator.launch import with_runs
     from petrobot.coordinator.learning.propagation import propagate
 
@@ -57,7 +58,8 @@ def figures(kept: FileContents, name: str, options: argparse.Namespace) -> dict[
     refuse_unknown_cost({name: of for name, of in known.items() if of}, options)
     asked = {name: asked_question(kept, name, options) for name in known}
     try:
-        found = propagate(task, kept.estimates, context, questions=asked, rho=options.rho)
+        with bounded(name):
+            found = propagate(task, kept.estimates, context, questions=asked, rho=options.rho)
     except (NoEstimate, ValueError) as fault:
         raise CommandError(2, f"{task.name}: {fault}") from fault
     parts = [

@@ -169,7 +169,7 @@ def _remarks(session: RunSession, result: Mapping[str, Any]) -> Iterator[str]:
     elif LAST_ERRORS in result:
         yield f"what led to the errors: petrobot log {session.folder}"
     met, _, wanted = result.get("goals", "").partition(" of ")
-    if success and int(met or 0) < int(wanted or 0):
+    if success and wanted and int(met) < int(wanted):
         yield (
             f"only {result['goals']} goals were met; the exit code is 0 because the task reached "
             "its final marking"

@@ -66,20 +66,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Draw the picture and write it."""
-    from petrobot.coordinator.analysis.limits import OUT_OF_MEMORY
-    from petrobot.coordinator.cli.analyse import bounded_memory
+    from petrobot.coordinator.cli.analyse import bounded
 
     _refuse_idle(options)
     if (suffix := Path(options.out).suffix) not in ("", ".svg"):
         text = f"--out {options.out}: expected a file .svg, found {suffix}; drawings are SVG alone"
         raise CommandError(2, text)
     drawn = _graph if options.graph else _gspn if options.view == "gspn" else _net
-    try:
-        with bounded_memory():
-            svg = drawn(options)
-    except OUT_OF_MEMORY as fault:
-        text = f"{options.task}: the memory was used up; the net is too large for this drawing"
-        raise CommandError(2, text) from fault
+    with bounded(options.task):
+        svg = drawn(options)
     if options.out == "-":
         print(svg)
         return 0
@@ -143,19 +138,27 @@ def _gspn(options: argparse.Namespace) -> str:
 def _heat(task: Task, options: argparse.Namespace) -> Overlay:
     """Return an overlay of each action place's share of the mean time, as forecast. Raises
     CommandError."""
+    from petrobot.coordinator.analysis.limits import OutOfTime
     from petrobot.coordinator.analysis.may_run import assumed, devices_of
-    from petrobot.coordinator.analysis.report import analyse, heat
+    from petrobot.coordinator.analysis.net.space import SearchLimits
+    from petrobot.coordinator.analysis.report import heat
+    from petrobot.coordinator.analysis.time.stochastic import stochastic_view
+    from petrobot.coordinator.analysis.time.task_forecast import forecast
+    from petrobot.coordinator.cli.analyse import MEMORY
     from petrobot.coordinator.drawing import Overlay
 
     cell = cell_finder(options.services, options.task)(task)
     measure = measurements(options.estimates)
     known = measure(task, cell) if measure else None
-    analysis = analyse(task, view="gspn", measured=known, devices=devices_of(cell))
-    shares = heat(analysis)
+    try:
+        view = stochastic_view(task, known, devices=devices_of(cell))
+        shares = heat(forecast(view, limits=SearchLimits(memory=MEMORY)))
+    except OutOfTime:
+        raise
+    except (ValueError, ArithmeticError) as why:
+        raise CommandError(2, f"{task.name}: no heat without a forecast: {why}") from why
     if not shares:
-        raise CommandError(
-            2, f"{task.name}: no heat without a forecast: {'; '.join(analysis.notes)}"
-        )
+        raise CommandError(2, f"{task.name}: no heat: no action takes time")
     most = max(shares, key=lambda place: shares[place])
     told = (
         f"Warm: share of the mean time by the forecast; the bottleneck is {most} with "

@@ -68,7 +68,7 @@ def run(options: argparse.Namespace) -> int:
     import numpy as np
 
     from petrobot.coordinator.analysis.commands import simulate_command
-    from petrobot.coordinator.cli.analyse import bounded_memory, give
+    from petrobot.coordinator.cli.analyse import bounded, give
 
     random = np.random.default_rng(options.seed)
     given: dict[str, Any] = {
@@ -79,6 +79,6 @@ def run(options: argparse.Namespace) -> int:
     given["changes"] = options.what_if
     given["measure"] = measurements(options.estimates)
     given["cell_of"] = cell_finder(options.services, options.file)
-    with bounded_memory():
+    with bounded(options.file):
         found = simulate_command(task_path(options.file), random, **given)
     return give(found, options.json)

@@ -380,6 +380,8 @@ class Mission:
         has_goal, met = bool(self.tally.goal_transitions), self.tally.goals
         wanted = self.runs + self.tally.added
         recovered = not failed and (not has_goal or met >= wanted)
+        # A run may meet several goals: "4 of 2" would be no share.
+        within = f"of {wanted}" if met <= wanted else f"in {wanted} run{'s' * (wanted != 1)}"
         general = {
             "task": self.executor.task.name,
             "mode": mode,
@@ -388,7 +390,7 @@ class Mission:
             "runs": self.runs,
             "status": finished.status.value if finished else Status.ERROR.value,
             "reason": finished.reason if finished else "not finished",
-            **({"goals": f"{met} of {wanted}"} if has_goal else {}),
+            **({"goals": f"{met} {within}"} if has_goal else {}),
             "happened": self.tally.happened(recovered),
             **({"last_errors": errors} if errors else {}),
             **({"last_failure": _row(failure, self.executor.directory)} if failure else {}),

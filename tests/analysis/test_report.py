@@ -183,8 +183,8 @@ def test_the_catching_task_in_one_analysis() -> None:
         and "recovered arm_back" in text
         and "P_complete" in text
     )
-    assert 0 < max(heat(found).values()) <= 1
     assert found.forecast is not None
+    assert 0 < max(heat(found.forecast).values()) <= 1
     rest = missing(found.forecast)
     assert sum(share for share, _, _ in rest) == pytest.approx(
         1 - found.forecast.completion_probability, rel=0.02

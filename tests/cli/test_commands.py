@@ -19,6 +19,7 @@ from petrobot.coordinator.analysis import commands
 from petrobot.coordinator.analysis.formats import read_net
 from petrobot.coordinator.analysis.net.space import explore
 from petrobot.coordinator.cli import COMMANDS, Subcommand, main
+from petrobot.coordinator.cli import analyse as cli_analyse
 from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
@@ -54,8 +55,8 @@ def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> Non
 @pytest.mark.parametrize(
     ("function", "arguments", "said"),
     [
-        ("graph_command", ["show", "catch_ball", "--graph"], "too large for this drawing"),
-        ("gspn_of", ["show", "catch_ball", "--view", "gspn"], "too large for this drawing"),
+        ("graph_command", ["show", "catch_ball", "--graph"], "up; use a smaller net"),
+        ("gspn_of", ["show", "catch_ball", "--view", "gspn"], "up; use a smaller net"),
         ("open_model", ["simulate", "catch_ball"], "fewer --replicas, or a smaller net"),
         ("open_model", ["convert", "catch_ball", "out.drn"], "too large for .drn"),
     ],
@@ -98,6 +99,30 @@ def test_a_command_ends_with_no_other_code_than_its_help_lists(
         if isinstance(part, ast.Constant) and isinstance(part.value, int)
     }
     assert raised <= listed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["show", "catch_ball", "--heat"], 2, "the search stopped: time limit"),
+        (["show", "catch_ball", "--graph"], 0, ""),
+        (["simulate", "catch_ball"], 1, "0 firings (stopped early)"),
+        (["convert", "catch_ball", "out.drn"], 2, "the search stopped: time limit"),
+    ],
+)
+def test_commands_on_nets_bound_their_time(
+    arguments: list[str],
+    code: int,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """What needs longer ends in one line, or shows the part that was found."""
+    monkeypatch.setattr(cli_analyse, "SECONDS", -1.0)
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == code
+    assert said in "".join(capsys.readouterr())
 
 
 LOCKSTEP = ["run", "catch_ball", "--mode", "lockstep"]

@@ -176,6 +176,19 @@ def test_an_error_that_cost_a_goal_is_not_called_recovered(
     assert told["goals"] == f"{met} of 5" and "all recovered" not in told["happened"]
 
 
+@pytest.mark.parametrize(
+    ("per_run", "runs", "said"), [(1, 3, "3 of 3"), (2, 3, "6 in 3 runs"), (2, 1, "2 in 1 run")]
+)
+def test_goals_are_a_share_of_the_runs_only_where_they_can_be(
+    catch_ball: Task, per_run: int, runs: int, said: str
+) -> None:
+    goals = ("missed", "homed")[:per_run]
+    flat = replace(catch_ball.flat, goal_transitions=goals)
+    task = replace(catch_ball, goal_transitions=goals, expansion=flat)
+    mission, _ = run(task, {}, runs=runs)
+    assert mission.result("lockstep", 0.0)["goals"] == said
+
+
 def test_an_arm_that_cannot_be_recovered_ends_the_task_in_error(catch_ball: Task) -> None:
     """After four failed recoveries in a row the task ends with `final_error`, with runs left."""
     mission, _ = run(

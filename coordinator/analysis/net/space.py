@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.coordinator.analysis.limits import OUT_OF_MEMORY
+from petrobot.coordinator.analysis.limits import OUT_OF_MEMORY, overtime
 from petrobot.coordinator.analysis.net.explore import (
     ExplorationEngine,
     Explored,
@@ -280,7 +280,7 @@ def _run(
 def _late(limits: SearchLimits, started: float) -> str:
     """Return the reason for stopping if the time is used up, else an empty string."""
     if limits.seconds is None or limits.clock is None:
-        return ""
+        return "time limit" if overtime() else ""
     due = started + limits.seconds if limits.due is None else limits.due
     return f"time limit of {limits.seconds:g} s" if limits.clock() > due else ""
 

@@ -14,6 +14,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
+from petrobot.coordinator.analysis.limits import overtime
 from petrobot.coordinator.analysis.net.columns import concession
 from petrobot.coordinator.analysis.net.graph import Mask
 from petrobot.coordinator.analysis.net.pack import Tokens
@@ -23,6 +24,8 @@ from petrobot.coordinator.task.net import Marking
 Stop = Callable[[Tokens], Mask]
 """From tokens of shape (places, replicas) to which replicas have reached their goal, shape
 (replicas,)."""
+REMEMBERED = 1 << 22
+"""The most tokens in the markings that a goal remembers: a large net seldom visits one twice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +75,7 @@ class Simulation:
 
     Throughput (1/s) and mean tokens are per replica, over its observed time. `completed` is None
     without a goal. `firings` counts those of all replicas; `complete` is False if the limit of
-    firings or Ctrl-C ended the simulation early.
+    firings, the time limit or Ctrl-C ended the simulation early.
     """
 
     replicas: int
@@ -156,15 +159,15 @@ def simulate(
 
     All replicas together fire at most `firings` times. Throughput and mean tokens count from
     `warmup` (s) on. Without a horizon a goal is required; replicas that are dead before it count as
-    not completed. `progress` is called with (firings, share of replicas still played). Ctrl-C ends
-    the simulation; its result is then marked as not complete. Raises ValueError
-    for a missing horizon or goal.
+    not completed. `progress` is called with (firings, share of replicas still played). The time
+    limit of the analysis (`overtime`) or Ctrl-C ends the simulation; its result is then marked as
+    not complete. Raises ValueError for a missing horizon or goal.
     """
     if goal is None and not horizon < np.inf:
         raise ValueError("a simulation needs a horizon (s) or a goal")
     play = _Play(gspn, random, replicas, horizon, warmup, goal, lost)
     try:
-        while len(play.alive) and play.fired < firings:
+        while len(play.alive) and play.fired < firings and not overtime():
             play.step()
             if progress and play.steps % 1000 == 0:
                 progress(play.fired, len(play.alive) / replicas)
@@ -283,12 +286,14 @@ class _Play:
 
 
 def goal_by_marking(predicate: Callable[[Marking], bool]) -> Stop:
-    """Return a goal for `simulate` from a predicate, which is called once per distinct marking."""
+    """Return a goal for `simulate` from a predicate. Its answers are remembered by marking."""
     known: dict[bytes, bool] = {}
 
     def stop(tokens: NDArray[np.int64]) -> Mask:
         columns = np.ascontiguousarray(tokens.T)
         out = np.empty(len(columns), dtype=np.bool_)
+        if len(known) * tokens.shape[0] > REMEMBERED:
+            known.clear()
         for i, column in enumerate(columns):
             key = column.tobytes()
             if key not in known:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -410,6 +411,22 @@ def condition_doubts(training: Training, moves: Iterable[Move]) -> list[str]:
         for m in moves
         if m.allowed is None and reads_variables(transitions[m.name])
     ]
+
+
+def parallel_doubts(training: Training) -> list[str]:
+    """Return in words which places may run at the same time, if the training is an estimates file:
+    it does not tell whether their runs depend on each other, on which the time of a join rests."""
+    if training.whole:
+        return []
+    net, names = training.task.flat.net, training.vocabulary.places
+    never = exclusive_places(net, place_semiflows(net))
+    entered = sorted(net.place_index[names[q]] for q in set(training.runs.place.tolist()))
+    together = [pair for pair in combinations(entered, 2) if pair not in never]
+    named = dict.fromkeys(net.places[p] for pair in together for p in pair)
+    return [
+        f"{', '.join(named)}: these may run at the same time, and an estimates file does not tell "
+        "whether they are slow, or fail, together; give a campaign's folder"
+    ] * bool(named)
 
 
 def doubts(residual: Sequence[Mapping[str, Any]], played: Played, trials: int) -> list[str]:

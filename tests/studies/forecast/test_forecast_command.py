@@ -212,8 +212,10 @@ def test_estimates_of_another_task_are_refused(
     assert main(["forecast", str(own), "--estimates", str(path), *QUICK]) == 2
     assert "it holds estimates of locate, watch; pair has first, second" in capsys.readouterr().err
     own.write_text(ONE_WAY, encoding="utf-8")
-    assert main(["forecast", str(own), "--estimates", str(path), *QUICK]) == 0
-    assert "no trials to compare with" in capsys.readouterr().out
+    assert main(["forecast", str(own), "--estimates", str(path), *QUICK]) == 1
+    shown = capsys.readouterr().out
+    assert "no trials to compare with" in shown
+    assert "DOUBTFUL: locate, watch: these may run at the same time" in shown
 
 
 # --- places that training never entered -------------------------------------------------------
@@ -246,11 +248,15 @@ def test_a_place_that_training_never_entered_forbids_nothing(
     told = ["forecast", str(tmp_path / "pair.toml"), "--estimates", str(train), *QUICK]
     assert main([*told, "--out", str(out)]) == 0
     shown = capsys.readouterr().out
-    assert "no training run entered repair: forecast with probability 0 (below 0.015" in shown
+    assert "no training run entered repair: forecast with probability 0 (at most 0.018" in shown
     made = json.loads(out.read_text(encoding="utf-8"))["regimes"][""]
     assert made["figures"]["P_complete"]["value"] == 1.0
     assert made["gspn"]["P_complete"] == pytest.approx(1.0, abs=1e-12)
     assert made["gspn"]["mean"] > 0
+    mean, longest = made["figures"]["mean"], 0.018 * 9.0  # its deadline
+    for kind in ("confidence", "interval"):
+        low, high = mean[kind]
+        assert high - mean["value"] > longest > mean["value"] - low
     assert main([*told, "--choose", "repair=repair_b"]) == 2
     assert "repair: no training run entered repair" in capsys.readouterr().err
 
