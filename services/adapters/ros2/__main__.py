@@ -102,11 +102,7 @@ class OfferedTask:
         """Start a run, follow it to its end, and report to ROS 2."""
         try:
             async with self._connect() as page:
-                try:
-                    ended = await self._follow(goal, page, await self._start(page, args))
-                finally:
-                    with contextlib.suppress(OperatorError):
-                        await page.command("release_controls")
+                ended = await self._follow(goal, page, await self._start(page, args))
         except (OperatorError, ValueError) as fault:
             ended = ABORTED, "refused", str(fault), ""
         except Exception as fault:  # answer at once, so that the client does not wait for ever
@@ -126,10 +122,9 @@ class OfferedTask:
         start = {"task": self._options.task, "mode": self._options.mode}
         start |= {"parameters": {**parameters, **given}}
         start |= {name: args[name] for name in ("runs", "seed") if args.get(name)}
-        for verb, data in (("take_controls", {}), ("start", start)):
-            answer = await page.command(verb, data)
-            if not answer.get("ok"):
-                raise ValueError(f"{verb}: {answer.get('text')}")
+        answer = await _ordered(page, "start", start)
+        if not answer.get("ok"):
+            raise ValueError(f"start: {answer.get('text')}")
         return str(answer["run"])
 
     async def _follow(self, goal: str, page: OperatorClient, run: str) -> tuple[int, str, str, str]:
@@ -152,8 +147,7 @@ class OfferedTask:
                 told = feedback
                 self._tell("action_feedback", goal, "Feedback", feedback)
             if self._why and page.state["mission"]["state"] != "stopping":
-                await page.command("take_controls")
-                await page.command("abort")
+                await _ordered(page, "abort", {})
             await page.until(lambda state: not is_active(state), LOOK)
             if page.over:
                 raise OperatorError(page.over)
@@ -178,6 +172,15 @@ class OfferedTask:
         self._link.send(
             {"op": op, "action": self._options.action, "id": goal, "values": values, **more}
         )
+
+
+async def _ordered(page: OperatorClient, verb: str, data: Message) -> Message:
+    """Give a command, and keep the controls no longer: an operator may want to pause the run."""
+    answer = await page.command("take_controls")
+    if answer.get("ok"):
+        answer = await page.command(verb, data)
+        await page.command("release_controls")
+    return answer
 
 
 async def main(arguments: list[str]) -> int:

@@ -149,10 +149,10 @@ def test_a_goal_is_a_run(state: str, status: int) -> None:
             },
         ),
     ]
+    assert page.commands[2:] == [("release_controls", {})], "an operator may take the controls"
     told = [m["values"] for m in link.sent if m["op"] == "action_feedback"]
     assert told[-1] == {"places": ["b"], "tokens": [2], "active": ["rest"]}
     assert link.results() == [("g1", status, state)]
-    assert page.commands[-1] == ("release_controls", {})
 
 
 def test_a_cancel_aborts_the_run() -> None:
