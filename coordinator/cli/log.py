@@ -14,6 +14,7 @@ from petrobot.coordinator.cli.loading import add_services_argument, load_directo
 from petrobot.coordinator.cli.options import refuse_idle
 from petrobot.coordinator.cli.recorded_runs import recorded
 from petrobot.coordinator.run.folder import NODE_LOGS
+from petrobot.services.host.json_text import without_controls
 from petrobot.services.host.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -161,7 +162,7 @@ def _text(found: Recorded) -> Iterator[str]:
             yield f"{when}resumed   {'':20} {step.told}"
         else:
             for word, of, text in _lines(step, found.engine):
-                yield f"{when}{word:9} {of:20} {text}".rstrip()
+                yield without_controls(f"{when}{word:9} {of:20} {text}".rstrip())
 
 
 def _lines(step: RecordedStep, engine: Engine) -> Iterator[tuple[str, str, str]]:

@@ -18,6 +18,7 @@ from rich.text import Text
 
 from petrobot.coordinator.cli.loading import pictures_of, write_json
 from petrobot.services.host.command_line import reopen_outputs
+from petrobot.services.host.json_text import without_controls
 from petrobot.services.host.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -125,7 +126,7 @@ def print_result(result: Mapping[str, Any]) -> None:
 def _error(row: Mapping[str, Any]) -> str:
     """Describe one action that ended in ERROR or FAILURE in one line."""
     place = f" on {row['node']}" if row["node"] else ""
-    why = ": ".join(filter(None, (row["cause"], row["text"])))
+    why = without_controls(": ".join(filter(None, (row["cause"], row["text"]))))
     return (
         f"{row['run']}, {row['action'] or 'no action'}{place} for "
         f"{row['primitive_task']}: {why or 'no reason given'}"
@@ -155,7 +156,9 @@ def _cell(key: str, value: Any) -> Text:
         return Text("yes" if value else "no")
     if isinstance(value, float):
         return Text(f"{value:.4g}")
-    return Text(str(value), style=COLOURS.get(str(value), "") if key == "status" else "")
+    return Text(
+        without_controls(str(value)), style=COLOURS.get(str(value), "") if key == "status" else ""
+    )
 
 
 def _remarks(session: RunSession, result: Mapping[str, Any]) -> Iterator[str]:

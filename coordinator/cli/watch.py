@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.operate import add_run_arguments, connected
-from petrobot.services.host.json_text import json_text
+from petrobot.services.host.json_text import json_text, without_controls
 from petrobot.services.host.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def _line(change: Mapping[str, Any]) -> str:
     """Describe a change in words; empty for changes that people need not read."""
     words = _WORDS.get(change["kind"])
     said = words(change) if words is not None else ""
-    return f"{change.get('time', 0.0):10.3f} s  {said}" if said else ""
+    return f"{change.get('time', 0.0):10.3f} s  {without_controls(said)}" if said else ""
 
 
 def _ended(change: Mapping[str, Any]) -> str:

@@ -23,7 +23,7 @@ from petrobot.coordinator.engine import (
 from petrobot.coordinator.run.journal import Journal
 from petrobot.coordinator.run.recording import RecordedStep, Remark, TakeOver, with_asides
 from petrobot.coordinator.task.net import Net
-from petrobot.services.host.json_text import json_text
+from petrobot.services.host.json_text import json_text, without_controls
 from petrobot.services.host.whole_file import write_whole
 
 
@@ -130,7 +130,9 @@ def _xes_event(instruction: object) -> str | None:
 
 def _strings(values: dict[str, str]) -> str:
     return "".join(
-        f"<string key={quoteattr(k)} value={quoteattr(v)}/>" for k, v in values.items() if v
+        f"<string key={quoteattr(k)} value={quoteattr(without_controls(v))}/>"
+        for k, v in values.items()
+        if v
     )
 
 

@@ -8,6 +8,7 @@ nothing of the whole text. So a number that is not finite is written as null: "n
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from math import isfinite
 from numbers import Real
@@ -68,3 +69,15 @@ def _foreign(value: Any) -> Any:
         return str(value)
     except Exception:  # an object whose `__str__` fails must not end the data feed
         return f"<{type(value).__name__}>"
+
+
+_CONTROLS = re.compile(
+    "[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u202a-\u202e\ud800-\udfff\ufffe\uffff]"
+)
+
+
+def without_controls(text: str) -> str:
+    """Return a text with a replacement character for each control character but tabs and line ends:
+    XML cannot carry them, a terminal obeys them, and some turn the direction of what follows. They
+    come with texts of actions, such as the coloured output of a program."""
+    return _CONTROLS.sub("\ufffd", text)

@@ -9,13 +9,15 @@ from fractions import Fraction
 from math import inf, nan
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
+from xml.sax.saxutils import escape
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.services.host.json_text import finite, json_text
+from petrobot.services.host.json_text import finite, json_text, without_controls
 
 ROOT = Path(__file__).parents[2]
 BETWEEN_OWN_PROCESSES = {
@@ -133,3 +135,11 @@ def test_no_other_code_writes_json() -> None:
             assert not calls or name in own, (
                 f"{name}:{calls[0]}: write JSON with services.comm.json_text.json_text"
             )
+
+
+@given(st.text())
+def test_a_text_without_controls_is_one_that_xml_can_carry(text: str) -> None:
+    """Each is replaced by one character."""
+    shown = without_controls(text + "\x1b[31m\x00")
+    assert ElementTree.fromstring(f"<a>{escape(shown)}</a>").tag == "a"
+    assert "\x1b" not in shown and len(shown) == len(text) + 6

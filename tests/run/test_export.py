@@ -31,8 +31,9 @@ def counts() -> Counter[str]:
 def test_the_log_shows_the_text_of_any_result(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Control characters in it neither reach the terminal nor break a file."""
     (tmp_path / "services.toml").write_text(SERVICES)
-    said = 'text = "3 of 5 parts found"\n'
+    said = 'text = "3 of 5 parts \\u001b[31mfound"\n'
     (tmp_path / "mock.toml").write_text(SCRIPT.replace("seconds = 0.1\n", "seconds = 0.1\n" + said))
     given = ["run", str(SHUTTLE), "--mode", "lockstep", "--quiet", "--journal", str(tmp_path / "r")]
     given += ["--services", str(tmp_path / "services.toml"), "--mock", str(tmp_path / "mock.toml")]
@@ -40,7 +41,12 @@ def test_the_log_shows_the_text_of_any_result(
     [folder] = (tmp_path / "r").iterdir()
     capsys.readouterr()
     assert main(["log", str(folder)]) == 0
-    assert "SUCCESS  3 of 5 parts found\n" in capsys.readouterr().out
+    assert "SUCCESS  3 of 5 parts \ufffd[31mfound\n" in capsys.readouterr().out
+    assert main(["log", str(folder), "--format", "xes", "--out", str(tmp_path / "run.xes")]) == 0
+    assert main(["report", str(folder), "--out", str(tmp_path / "page")]) == 0
+    files = [tmp_path / "run.xes", *(tmp_path / "page_pictures").glob("*.svg")]
+    assert len(files) > 1 and all(ElementTree.parse(file) for file in files)
+    assert "script-src 'none'" in (tmp_path / "page").read_text()
 
 
 def test_json_lines_contain_everything(tmp_path: Path) -> None:

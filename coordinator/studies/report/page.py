@@ -9,6 +9,7 @@ from html import escape
 from typing import Any
 
 from petrobot.coordinator.task import Status
+from petrobot.services.host.json_text import without_controls
 
 # --- colours ---
 
@@ -47,6 +48,7 @@ def variables(colours: Mapping[str, str]) -> str:
 def standalone(svg: str) -> str:
     """Turn a picture of a page into a file of its own, with the page's light colours and a name
     space."""
+    svg = without_controls(svg)
     svg = re.sub(r"var\(--([a-z0-9-]+)\)", lambda found: LIGHT.get(found[1], found[0]), svg)
     return (
         svg
@@ -85,10 +87,13 @@ details summary{cursor:pointer;color:var(--soft)}
 def html_page(title: str, parts: Iterable[str]) -> str:
     """Return a whole page that needs no other file."""
     return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        # A page has no scripts of its own; the pictures of a task come from code of users.
+        """<meta http-equiv="Content-Security-Policy" content="script-src 'none'">"""
+        f"<title>{escape(without_controls(title))}</title>"
         '<meta name="viewport" '
         f'content="width=device-width,initial-scale=1"><style>{STYLE}</style></head>'
-        f"<body>{''.join(parts)}</body></html>\n"
+        f"<body>{without_controls(''.join(parts))}</body></html>\n"
     )
 
 
