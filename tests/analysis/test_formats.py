@@ -402,6 +402,9 @@ def test_expressions_are_exact(text: str, value: int) -> None:
         ('name="N" consttype', 'name="mu" consttype', "defined twice"),
         ('name="busy" x', 'name="busy" domain="C" x', "coloured"),
         ("<text-box", "<fluid", "unknown element"),
+        ("hello", '<place name="in" x="1" y="1"/>', "<text-box> contains nodes of the net"),
+        ('head="one" kind="INPUT"', 'head="one" kind="OUTPUT"', "from 'busy' to 'one'; INPUT"),
+        ('tail="one" head="idle" kind="OUTPUT"', 'tail="one" head="idle" kind="INPUT"', "'idle'"),
     ],
 )
 def test_unsupported_greatspn_features_are_refused(old: str, new: str, said: str) -> None:

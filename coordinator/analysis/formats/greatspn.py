@@ -153,6 +153,10 @@ class _ProjectReading:
         for node in nodes:
             if node.tag in ELEMENTS:
                 self._check(node, ELEMENTS[node.tag], f"{node.tag} {node.get('name')}")
+            elif any(inner.tag in ELEMENTS for inner in node.iter()):
+                self.draft.line = line_of(node)
+                problem = f"<{node.tag}> contains nodes of the net"
+                raise self.draft.fault("nodes", problem, "save the net without it")
             if node.tag in ("constant", "template"):
                 self._constant(node)
         for node in nodes:
@@ -246,6 +250,12 @@ class _ProjectReading:
             )
         weight = self.draft.whole(element, node.get("mult") or "1")
         ends = node.get("tail", ""), node.get("head", "")
+        if kind != "INHIBITOR" and (ends[0] in self.draft.places) != (kind == "INPUT"):
+            raise self.draft.fault(
+                element,
+                f"an arc of kind {kind} from {ends[0]!r} to {ends[1]!r}",
+                "INPUT leads from a place to a transition, OUTPUT back",
+            )
         self.draft.arc(*ends, weight, ARC_KINDS[kind], element)
 
 

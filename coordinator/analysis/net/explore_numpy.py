@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from petrobot.coordinator.analysis.net.explore import Explored, Numbers, widened_layout
 from petrobot.coordinator.analysis.net.pack import Layout, Rules, Words
 
-SUCCESSORS = 1 << 18
+SUCCESSORS = 1 << 17
 """Successors aimed at in a block: many of them are equal, but their arrays should stay in the
-cache."""
+cache. Arrays of twice this size (2 MiB each) are given back to the system after each block, and
+the page faults of the next block cost more than fewer blocks save."""
 TESTS = 1 << 22
 """The most pairs of marking and transition that a block tests."""
 EMPTY = -1
@@ -89,7 +90,8 @@ class NumpyEngine:
         able = self._enabled(stop)
         degree = able.view(np.uint8).sum(axis=0, dtype=np.int64)
         source = np.repeat(np.arange(self._expanded, stop), degree)
-        label = np.flatnonzero(able.T.ravel()) - (source - self._expanded) * transitions
+        label = np.flatnonzero(able.T.ravel())
+        label -= np.repeat(np.arange(0, (stop - self._expanded) * transitions, transitions), degree)
         self._reserve(len(label))
         new, telling = label[:0], self._layout.telling
         overflown = self._fire(range(telling), source, label)
@@ -167,7 +169,7 @@ class NumpyEngine:
             differ |= key.take(first) != key
         single = np.flatnonzero(differ | (first == every))
         number, new, taken = self._probe(single, slot.take(single))
-        order = np.argsort(new)
+        order = np.argsort(new, kind="stable")  # a few sorted runs, one of each round: merged fast
         new = new.take(order)
         rank = np.empty(m, dtype=np.int32)
         rank[new] = np.arange(n, n + len(new), dtype=np.int32)
