@@ -162,7 +162,7 @@ class Surroundings:
                 signal.signal(number, handler)
         if warnings.filters != self._filters:
             warnings.resetwarnings()
-            warnings.filters[:] = self._filters
+            warnings.filters = self._filters[:]
         if socket.getdefaulttimeout() != self._timeout:
             socket.setdefaulttimeout(self._timeout)
         if self._numpy and self._numpy.geterr() != self._numbers:

@@ -469,7 +469,7 @@ class DrawsByItself(Axis):
 def test_each_broken_rule_is_named(kind: type[Axis], fault: str) -> None:
     check = checked(kind)
     # On a very busy computer a wait is only noted: it may not be the driver's.
-    waiting = kind in (WaitsOnce, WaitsInStop, WaitsForItsThread)
+    waiting = kind in (WaitsOnce, WaitsInStop, WaitsForItsThread, ItsThreadKeepsTheLock)
     found = [*check.faults, *(check.notes if waiting else ())]
     assert any(fault in one for one in found), found
     assert kind is not BreaksOnTheWay or BreaksOnTheWay.after[-2:] == ["stop", "close"]
