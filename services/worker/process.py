@@ -121,7 +121,7 @@ class Surroundings:
         self._files = self._standard_files()
         self._environment, self._path = dict(vars(os.environ)["_data"]), sys.path[:]
         self._handlers = [signal.getsignal(number) for number in self.SIGNALS]
-        self._filters, self._timeout = warnings.filters[:], socket.getdefaulttimeout()
+        self._filters, self._timeout = list(warnings.filters), socket.getdefaulttimeout()
         # Not imported here: a node in real time starts in half the time without it.
         self._numpy = sys.modules.get("numpy")
         self._numbers = self._numpy.geterr() if self._numpy else {}
@@ -162,7 +162,7 @@ class Surroundings:
                 signal.signal(number, handler)
         if warnings.filters != self._filters:
             warnings.resetwarnings()
-            warnings.filters = self._filters[:]
+            warnings.filters = list(self._filters)
         if socket.getdefaulttimeout() != self._timeout:
             socket.setdefaulttimeout(self._timeout)
         if self._numpy and self._numpy.geterr() != self._numbers:
