@@ -422,11 +422,12 @@ def parallel_doubts(training: Training) -> list[str]:
     never = exclusive_places(net, place_semiflows(net))
     entered = sorted(net.place_index[names[q]] for q in set(training.runs.place.tolist()))
     together = [pair for pair in combinations(entered, 2) if pair not in never]
-    named = dict.fromkeys(net.places[p] for pair in together for p in pair)
+    more = f" (as {len(together) - 1} more pairs of places)" * (len(together) > 1)
     return [
-        f"{', '.join(named)}: these may run at the same time, and an estimates file does not tell "
-        "whether they are slow, or fail, together; give a campaign's folder"
-    ] * bool(named)
+        f"{net.places[p]} and {net.places[q]} may run at the same time{more}, and an estimates "
+        "file does not tell whether they are slow, or fail, together; give a campaign's folder"
+        for p, q in together[:1]
+    ]
 
 
 def doubts(residual: Sequence[Mapping[str, Any]], played: Played, trials: int) -> list[str]:
