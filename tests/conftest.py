@@ -4,8 +4,10 @@ starts processes says so."""
 from __future__ import annotations
 
 import gc
+import os
 import signal
 import sys
+import tempfile
 from collections.abc import Iterator
 from typing import Any
 
@@ -27,6 +29,9 @@ PROOF_LIMIT_S = 6 * 3600.0
 
 _started: list[str] = []
 """What this test has started as processes."""
+
+
+os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="petrobot-cache-")  # not the user's
 
 
 def _note_start(event: str, arguments: tuple[Any, ...]) -> None:

@@ -19,6 +19,7 @@ from petrobot.coordinator.cli.loading import (
     cell_path,
     find_cell,
     load_directory,
+    objections,
     task_path,
     write_json,
 )
@@ -173,6 +174,8 @@ def _checked(
         judged = may_run(task, None, budget)
         return judged, judged.report
     judged = may_run(task, cell_of(cell.value), budget)
+    if search and not cell.faults:
+        objections(task, cell_of(cell.value), judged)  # so that `run` need not search again
     return judged, _with_code(task, cell.value, code, judged)
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +18,7 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Mapping
 
-    from petrobot.coordinator.analysis.may_run import Cell
+    from petrobot.coordinator.analysis.may_run import Cell, MayRun
     from petrobot.coordinator.analysis.time.measured import Measured
     from petrobot.coordinator.task import Task
     from petrobot.services.comm.location_file import Directory
@@ -225,6 +228,37 @@ def cell_of(directory: Directory) -> Cell:
         {action.name: action.device for action in actions if action.device},
         {action.name: action.task for action in actions if action.task},
     )
+
+
+def objections(task: Task, cell: Cell, judged: MayRun | None = None) -> list[str]:
+    """Return what the state space shows against running the task, a line for each.
+
+    The search takes seconds, so its answer is kept in the cache of the user, under a hash of all
+    that it depends on. `judged`: it was just searched.
+    """
+    from petrobot.coordinator.analysis import may_run
+    from petrobot.coordinator.task.file import dumps
+
+    package = Path(__file__).parents[1]
+    searching = [
+        f for part in ("analysis", "engine", "task") for f in (package / part).rglob("*.py")
+    ]
+    changed = max(file.stat().st_mtime_ns for file in searching)
+    devices = sorted((cell.devices or {}).items())
+    asked = repr((dumps(task.flat), task.name, devices, may_run.BUDGET, changed))
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "petrobot"
+    kept = home / f"{hashlib.sha256(asked.encode()).hexdigest()[:32]}.json"
+    if judged is None:
+        try:
+            return list(json.loads(kept.read_text(encoding="utf-8")))
+        except (OSError, ValueError):
+            judged = may_run.may_run(task, cell, may_run.BUDGET)
+    found = judged.objections()
+    if judged.analysis is not None and not judged.analysis.interrupted:
+        with suppress(OSError):
+            make_folder(home)
+            write_whole(kept, json_text(found))
+    return found
 
 
 def file_line(path: Path, key: str) -> str:

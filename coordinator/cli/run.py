@@ -20,6 +20,7 @@ from petrobot.coordinator.cli.loading import (
     cell_path,
     load_directory,
     load_task,
+    objections,
     refuse_arguments,
     refuse_misplaced,
     task_path,
@@ -423,11 +424,9 @@ def _refuse_unfit(task: Task, directory: Directory) -> None:
 
 def _warn(task: Task, directory: Directory, options: argparse.Namespace) -> None:
     """Print what a short search of the state space finds against the task. The run still starts."""
-    from petrobot.coordinator.analysis.may_run import BUDGET, may_run
-
     if options.quiet:
         return
-    for objection in may_run(task, cell_of(directory), BUDGET).objections():
+    for objection in objections(task, cell_of(directory)):
         print(f"warning: {objection} (details: petrobot check {options.task})", file=sys.stderr)
 
 

@@ -8,12 +8,15 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from petrobot.coordinator.analysis import may_run
 from petrobot.coordinator.cli import main
+from petrobot.coordinator.cli.loading import cell_of, load_directory, load_task, objections
+from petrobot.coordinator.task.conditions import parse
 from petrobot.services.comm.location_file import load
 from petrobot.services.comm.location_file.code import read_code
 from tests.ports import free_ports
@@ -204,3 +207,22 @@ async def test_an_import_that_never_ends_ends_with_its_check(
         check.wait()
         for process in filter(alive, found):
             os.kill(process, signal.SIGKILL)
+
+
+@pytest.mark.processes
+def test_run_does_not_repeat_the_search_of_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What it found is kept until the task, its devices or the search change."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "robot", "arm_bot"]) == 0
+    monkeypatch.chdir(tmp_path / "arm_bot")
+    task, cell = load_task("arm_bot.toml"), cell_of(load_directory(None))
+    assert objections(replace(task, final=parse("parts == 9")), cell)
+    assert main(["check", "arm_bot.toml"]) == 0
+    monkeypatch.setattr(may_run, "_search", lambda *_: pytest.fail("it searched again"))
+    assert objections(task, cell) == []
+    assert objections(replace(task, final=parse("parts == 9")), cell)
+    with pytest.raises(pytest.fail.Exception):
+        objections(replace(task, final=parse("parts == 8")), cell)
