@@ -3,8 +3,10 @@ starts processes says so."""
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
+import shutil
 import signal
 import sys
 import tempfile
@@ -32,6 +34,7 @@ _started: list[str] = []
 
 
 os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="petrobot-cache-")  # not the user's
+atexit.register(shutil.rmtree, os.environ["XDG_CACHE_HOME"], ignore_errors=True)
 
 
 def _note_start(event: str, arguments: tuple[Any, ...]) -> None:

@@ -172,6 +172,8 @@ def cell_path(given: Path | None, name: str, task: Task) -> Path:
     return path
 
 
+KEPT_ANSWERS = 200
+"""The most answers of searches that the cache of the user keeps."""
 MISSING_CELL = "there is no services.toml beside the task, one folder above it, or here"
 
 
@@ -246,18 +248,20 @@ def objections(task: Task, cell: Cell, judged: MayRun | None = None) -> list[str
     changed = max(file.stat().st_mtime_ns for file in searching)
     devices = sorted((cell.devices or {}).items())
     asked = repr((dumps(task.flat), task.name, devices, may_run.BUDGET, changed))
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "petrobot"
-    kept = home / f"{hashlib.sha256(asked.encode()).hexdigest()[:32]}.json"
+    folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    kept = Path(folder, "petrobot", f"{hashlib.sha256(asked.encode()).hexdigest()[:32]}.json")
     if judged is None:
         try:
             return list(json.loads(kept.read_text(encoding="utf-8")))
         except (OSError, ValueError):
             judged = may_run.may_run(task, cell, may_run.BUDGET)
     found = judged.objections()
-    if judged.analysis is not None and not judged.analysis.interrupted:
+    if judged.analysis is not None and not judged.analysis.interrupted and kept.is_absolute():
         with suppress(OSError):
-            make_folder(home)
+            make_folder(kept.parent)
             write_whole(kept, json_text(found))
+            for old in sorted(kept.parent.glob("*.json"), key=os.path.getmtime)[:-KEPT_ANSWERS]:
+                old.unlink()
     return found
 
 
