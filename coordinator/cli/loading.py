@@ -248,8 +248,10 @@ def objections(task: Task, cell: Cell, judged: MayRun | None = None) -> list[str
     changed = max(file.stat().st_mtime_ns for file in searching)
     devices = sorted((cell.devices or {}).items())
     asked = repr((dumps(task.flat), task.name, devices, may_run.BUDGET, changed))
-    folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    kept = Path(folder, "petrobot", f"{hashlib.sha256(asked.encode()).hexdigest()[:32]}.json")
+    kept = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache")
+    kept = kept / "petrobot" / f"{hashlib.sha256(asked.encode()).hexdigest()[:32]}.json"
+    with suppress(RuntimeError):  # this user has no home
+        kept = kept.expanduser()
     if judged is None:
         try:
             return list(json.loads(kept.read_text(encoding="utf-8")))
