@@ -169,6 +169,8 @@ def _with_graph(report: CheckReport, analysis: Analysis) -> CheckReport:
     found = [_contest(contest) for contest in analysis.progress.contests]
     found += map(_retries, analysis.progress.x.retries)
     found += [_left_behind(p, verdict) for p, verdict in analysis.progress.left_behind.items()]
+    if (late := analysis.progress.ends_by_error) is not None:
+        found.append(_ends_by_error(late))
     found += _lost_pulses(analysis.progress.x)
     found += _uncovered(analysis.progress.x) if open_ones else ()
     errors = [f for f in found if f.severity is Severity.ERROR]
@@ -265,6 +267,18 @@ def _left_behind(places: tuple[str, ...], verdict: PropertyVerdict) -> Finding:
     key, by = f"places.{places[0]}", path_lines(verdict.witness, "")
     details = (*verdict.details, *by)
     return Finding(Severity.WARNING, "left-behind", key, text, remedy, details=details)
+
+
+def _ends_by_error(verdict: PropertyVerdict) -> Finding:
+    from petrobot.coordinator.analysis.report import path_lines
+
+    remedy = (
+        "a place outside `final` is never empty before: let a transition take its token, or write "
+        "`listen = true` in a place that waits for events all the time"
+    )
+    details = tuple(path_lines(verdict.witness, ""))
+    key, text = "task.final", verdict.reason
+    return Finding(Severity.WARNING, "end-by-error", key, text, remedy, details=details)
 
 
 def _late(task: Task) -> list[Finding]:

@@ -789,6 +789,27 @@ def test_exits_that_read_another_run_are_judged_with_the_graph(
     assert answer.report.ok is (severity != "error")
 
 
+@pytest.mark.parametrize("also", ["", " and waiting == 0"])
+def test_an_end_that_only_an_error_leads_to_is_a_warning(also: str) -> None:
+    """The token that waits for the button is never gone before `nod` ends in ERROR."""
+    task = make_task(
+        "go=1 act! waiting=1 nod!",
+        {
+            "begin": {"in": "go", "out": "act"},
+            "good": {"in": "act:normal"},
+            "bad": {"in": "act:error"},
+            "pressed": {"in": "waiting", "out": "nod", "event": "button"},
+            "nodded": {"in": "nod:normal", "out": "waiting"},
+            "broken": {"in": "nod:error"},
+        },
+        events="button+",
+        final=f"go == 0 and act == 0{also}",
+    )
+    found = [f for f in may_run(task, None, Budget()).report.findings if f.code == "end-by-error"]
+    assert [f.severity.value for f in found] == ["warning"] * bool(also)
+    assert not also or any("nod ends in error" in line for line in found[0].details), found
+
+
 def test_a_branch_that_can_never_fire_is_reported_with_its_reason() -> None:
     task = make_task(
         "go=1 act! done bin",

@@ -216,11 +216,11 @@ def test_run_does_not_repeat_the_search_of_check(
     """What it found is kept until the task, its devices or the search change."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
-    assert main(["new", "robot", "arm_bot"]) == 0
-    monkeypatch.chdir(tmp_path / "arm_bot")
-    task, cell = load_task("arm_bot.toml"), cell_of(load_directory(None))
+    assert main(["new", "robot", "kept_bot"]) == 0
+    monkeypatch.chdir(tmp_path / "kept_bot")
+    task, cell = load_task("kept_bot.toml"), cell_of(load_directory(None))
     assert objections(replace(task, final=parse("parts == 9")), cell)
-    assert main(["check", "arm_bot.toml"]) == 0
+    assert main(["check", "kept_bot.toml"]) == 0
     monkeypatch.setattr(may_run, "_search", lambda *_: pytest.fail("it searched again"))
     assert objections(task, cell) == []
     assert objections(replace(task, final=parse("parts == 9")), cell)

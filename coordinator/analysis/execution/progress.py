@@ -906,6 +906,17 @@ class Progress:
                 found[tuple(places)] = self._no(first, i, tuple(others))
         return found
 
+    @cached_property
+    def ends_by_error(self) -> PropertyVerdict | None:
+        """How `final` is reached, if only after a run has ended in ERROR; else None."""
+        x = self.x
+        regular = x.of_edges(~x.fails & ~x.by_hand)
+        if not self._whole or not x.final.any() or regular.backward(x.final)[0]:
+            return None
+        return self._no(
+            "`final` is only reached after a run has ended in ERROR", int(np.argmax(x.final))
+        )
+
     @property
     def _fair(self) -> str:
         return " and ".join((FAIR, *self.x.names.assumptions))
