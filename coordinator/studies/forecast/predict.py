@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import betabinom, norm
 
 from petrobot.coordinator.studies.forecast.choices import choice_counts, choices_of
 from petrobot.coordinator.studies.forecast.direct import (
@@ -128,7 +127,7 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         "choice_runs": {name: sum(actions.values()) for name, actions in counts.items()},
         "asked": asked,
         "not_back": sum(t.completed and t.time is None for t in training.trials),
-        "notes": _notes(training),
+        "notes": _never_entered(training),
     }
 
 
@@ -180,45 +179,20 @@ def _refuse_unmeasured(training: Training, choices: Choices, asked: list[str]) -
                     )
 
 
-def _never_entered(training: Training) -> dict[str, float]:
-    """Return the action places that no training run entered, and how long a run there takes as far
-    as the task file says: as declared, else its deadline."""
-    entered, out = set(training.runs.place.tolist()), {}
+def _never_entered(training: Training) -> list[str]:
+    """Note the action places that no training run entered, with what that is worth."""
+    entered, task = set(training.runs.place.tolist()), training.task
+    most = 1.0 - 0.05 ** (1.0 / len(training.trials))  # rule of three, exactly: (1 - p)^n = 5 %
+    out = []
     for q, place in enumerate(training.vocabulary.places):
         if q not in entered:
-            primitive = training.task.primitive_task_of(place)
-            declared = primitive.estimates.values()
-            out[place] = sum(e.share * e.mean for e in declared) if declared else primitive.deadline
+            longest = task.primitive_task_of(place).deadline
+            out.append(
+                f"no training run entered {place}: forecast with probability 0"
+                + f" (below {most:.2g} per trial, 95 %; runs of its deadline, {longest:g} s, would "
+                f"add up to {most * longest:.2g} s to the mean time)" * training.whole
+            )
     return out
-
-
-def _notes(training: Training) -> list[str]:
-    """Say which action places no training run entered, and what that is worth."""
-    most = confidence_interval(0.0, len(training.trials))[1]
-    return [
-        f"no training run entered {place}: forecast with probability 0"
-        + f" (at most {most:.2g} per trial, 95 %; runs of {seconds:g} s would add up to "
-        f"{most * seconds:.2g} s to the mean time, which its intervals contain)" * training.whole
-        for place, seconds in _never_entered(training).items()
-    ]
-
-
-def _with_rare(
-    figure: dict[str, Any], training: Training, trials: float, runs: int
-) -> dict[str, Any]:
-    """Return the mean with upper ends that contain the places that no training run entered.
-
-    No more than the upper limit of 0 in `trials` trials comes to any of them, and each adds a run
-    in all of them. Quantiles and shares need no such addition: their intervals are of counts.
-    """
-    seconds = sum(_never_entered(training).values()) if training.whole else 0.0
-    if not seconds or figure["value"] is None:
-        return figure
-    often = betabinom.ppf(norm.cdf(SCORES), runs, 1, trials) / runs
-    low, high = figure["confidence"]
-    most = confidence_interval(0.0, trials)[1]
-    widened = np.array([low, high + seconds * most])
-    return time_figure(figure["value"], np.array(figure["curve"]) + seconds * often, widened)
 
 
 # --- figures straight from the trials ---
@@ -244,8 +218,7 @@ def _from_trials(
     if len(times) > 1:
         likeness = design_effect(times, own, mission[kept])
         late = design_effect((times > point["q90"]).astype(np.float64), own, mission[kept])
-        mean = mean_figure(times, own, runs, random, likeness)
-        found["mean"] = _with_rare(mean, training, worth / likeness, runs)
+        found["mean"] = mean_figure(times, own, runs, random, likeness)
         found["q90"] = quantile_figure(times, own, runs, 0.9, late)
         likeness = max(likeness, late)
     told = {name: found.get(name, NO_FIGURE) for name in (*SHARES, *TIMES)}
@@ -331,7 +304,6 @@ def _from_net(training: Training, request: Request, random: np.random.Generator)
         **{name: _net_share(point[name], samples[name], request.runs, n) for name in SHARES},
         **{name: _net_time(point[name], samples[name], request.runs, n) for name in TIMES},
     }
-    told["mean"] = _with_rare(told["mean"], training, n, request.runs)
     return {
         "from": NET,
         "figures": told,
