@@ -27,6 +27,7 @@ from petrobot.services.comm.location_file import DirectoryError
 from petrobot.services.comm.lockstep.mesh import PartyLostError
 from petrobot.services.comm.protocol.codec import ProtocolError
 from petrobot.services.comm.protocol.messages import Cancel
+from petrobot.services.host.toml_text import TomlError
 from petrobot.services.picking.handling import ArmError
 from petrobot.services.worker.runner import Returned
 from tests.test_layout import parsed
@@ -50,6 +51,7 @@ RAISED = [
     Returned({"x": 1}),
     ProtocolError("malformed", "not a message", [Cancel("r", "stop")]),
     SdoAbortError(0x06020000, 0x6040, 1),
+    TomlError("cell.toml", 3, "cup.mouth", "already written in line 2", "drop one of the two"),
 ]
 
 
