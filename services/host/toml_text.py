@@ -12,7 +12,7 @@ _HEADER = re.compile(r"\s*\[{1,2}([^\[\]]+)\]{1,2}\s*(?:#.*)?$")
 _KEY = re.compile(r"""\s*([\w./\-"']+)\s*=""")
 
 NOT_TOML = "not valid TOML"
-"""Stands for the key when the fault is no certain key's."""
+"""Stands for the key of a fault that concerns the text as a whole."""
 
 
 class TomlError(ValueError):

@@ -152,10 +152,14 @@ class Surroundings:
 
     def _restore_modules(self) -> None:
         # Its dictionary: to decode each variable takes as long as a short run.
-        if not self._environment.items() <= vars(os.environ)["_data"].items():
+        now = vars(os.environ)["_data"]
+        if now != self._environment and not self._environment.items() <= now.items():
             os.environb.update(self._environment)
             time.tzset()
-        if not isinstance(sys.path, list) or not set(self._path) <= set(sys.path):
+        kept = sys.path == self._path or (  # the sets are only made if code has changed it
+            isinstance(sys.path, list) and set(self._path) <= set(sys.path)
+        )
+        if not kept:
             sys.path = self._path[:]
         for number, handler in zip(self.SIGNALS, self._handlers, strict=True):
             if signal.getsignal(number) is not handler:
