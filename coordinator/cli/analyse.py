@@ -210,7 +210,7 @@ def bounded(file: str) -> Iterator[None]:
     has no answer by then; one with a partial answer stops by itself (`overtime`)."""
     full = CommandError(2, f"{file}: the memory was used up; use a smaller net")
     try:
-        with bounded_memory(), until(time.monotonic() + SECONDS, time.monotonic):
+        with bounded_memory(), until(time.monotonic() + SECONDS, time.monotonic, MEMORY):
             yield
     except OUT_OF_MEMORY as fault:
         raise full from fault

@@ -140,11 +140,9 @@ def _heat(task: Task, options: argparse.Namespace) -> Overlay:
     CommandError."""
     from petrobot.coordinator.analysis.limits import OutOfTime
     from petrobot.coordinator.analysis.may_run import assumed, devices_of
-    from petrobot.coordinator.analysis.net.space import SearchLimits
     from petrobot.coordinator.analysis.report import heat
     from petrobot.coordinator.analysis.time.stochastic import stochastic_view
     from petrobot.coordinator.analysis.time.task_forecast import forecast
-    from petrobot.coordinator.cli.analyse import MEMORY
     from petrobot.coordinator.drawing import Overlay
 
     cell = cell_finder(options.services, options.task)(task)
@@ -152,7 +150,7 @@ def _heat(task: Task, options: argparse.Namespace) -> Overlay:
     known = measure(task, cell) if measure else None
     try:
         view = stochastic_view(task, known, devices=devices_of(cell))
-        shares = heat(forecast(view, limits=SearchLimits(memory=MEMORY)))
+        shares = heat(forecast(view))
     except OutOfTime:
         raise
     except (ValueError, ArithmeticError) as why:

@@ -25,7 +25,7 @@ from petrobot.coordinator.analysis.formats.netfile import NetFile
 from petrobot.coordinator.analysis.formats.pnml import write_pnml
 from petrobot.coordinator.analysis.limits import until
 from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
-from petrobot.coordinator.analysis.net.space import SearchLimits, Space
+from petrobot.coordinator.analysis.net.space import SearchLimits, Space, explore
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.cli import loading
 from petrobot.coordinator.task.file import load
@@ -214,6 +214,13 @@ def test_the_execution_graph_ends_with_the_time_of_the_analysis() -> None:
         late = execute(task)
     assert not late.complete and late.reason.startswith("time limit, after 10")
     assert len(late) < len(execute(task))
+
+
+def test_a_search_without_limits_of_its_own_keeps_the_memory_of_the_analysis() -> None:
+    assert explore(kanban(3), engine="numpy").complete
+    with until(1.0, lambda: 0.0, memory=1_000_000):
+        space = explore(kanban(3), engine="numpy")
+    assert not space.complete and space.reason == "memory limit of 1000000 bytes"
 
 
 def test_all_parts_of_an_analysis_share_its_time(tmp_path: Path) -> None:

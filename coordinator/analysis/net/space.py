@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.coordinator.analysis.limits import OUT_OF_MEMORY, overtime
+from petrobot.coordinator.analysis.limits import OUT_OF_MEMORY, memory_limit, overtime
 from petrobot.coordinator.analysis.net.explore import (
     ExplorationEngine,
     Explored,
@@ -201,7 +201,7 @@ def explore(
     tokens than 63 bits can count ends the search; the space found so far is returned, marked as
     incomplete. Raises TooManyTokens if the initial marking has such a place.
     """
-    limits = limits or SearchLimits()
+    limits = limits or SearchLimits(memory=memory_limit())
     started = limits.clock() if limits.clock else 0.0
     if engine in ("auto", "integers"):
         layout = Layout.for_net(net, least=NARROW)
