@@ -93,6 +93,12 @@ IN_THE_TASK: list[Mistake] = [
     (
         TASK,
         "deadline = 8.0",
+        "deadline = 8.0, estimates = { move = { mean = 2.0 } }",
+        r":LINE: .*estimates.move: unknown key; known here: error, failure, success",
+    ),
+    (
+        TASK,
+        "deadline = 8.0",
         "dedline = 8.0",
         r":LINE: .*dedline: unknown key; did you mean 'deadli",
     ),

@@ -315,6 +315,7 @@ def _estimates(t: Table) -> dict[Status, Estimate]:
     table = t.table("estimates")
     estimates: dict[Status, Estimate] = {}
     for status in Status:
+        table.asked.add(status.value)
         if status.value in table.data:
             e = table.table(status.value)
             estimates[status] = Estimate(e.number("share"), e.number("mean"), e.number("cv", 1.0))
