@@ -113,7 +113,6 @@ PURE = (
     "services.motion.interception",
     "services.vision.location",
     "services.vision.prediction",
-    "services.mobile.floor",
     "services.mobile.detection",
     "services.mobile.sight",
     "services.mobile.watching",

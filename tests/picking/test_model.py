@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from petrobot import JointChain
-from petrobot.services.adapters.so101.kinematics import CHAIN
-from petrobot.services.adapters.ur.kinematics import chain
+from petrobot.services.adapters.so101.arm import CHAIN
+from petrobot.services.adapters.ur.arm import chain
 from petrobot.services.joint_chain import rotation_matrix
 from petrobot.services.picking.model import (
     NumbersError,
