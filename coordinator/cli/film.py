@@ -7,8 +7,7 @@ import argparse
 from pathlib import Path
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.options import refuse_idle
-from petrobot.coordinator.cli.recorded_runs import recorded
+from petrobot.coordinator.cli.options import recorded, refuse_idle
 from petrobot.services.host.command_line import number, whole
 
 EXAMPLE = (

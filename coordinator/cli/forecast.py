@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from petrobot.coordinator.analysis.may_run import Cell
     from petrobot.coordinator.learning.learning import Estimates
     from petrobot.coordinator.studies.campaign.plan import CampaignPlan
-    from petrobot.coordinator.studies.campaign.rows import TrialRow
+    from petrobot.coordinator.studies.campaign.table import TrialRow
     from petrobot.coordinator.studies.forecast.history import Training
     from petrobot.coordinator.studies.forecast.predict import Request
     from petrobot.coordinator.task import Task

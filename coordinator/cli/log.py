@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import add_services_argument, load_directory
-from petrobot.coordinator.cli.options import refuse_idle
-from petrobot.coordinator.cli.recorded_runs import recorded
+from petrobot.coordinator.cli.options import recorded, refuse_idle
 from petrobot.coordinator.run.folder import NODE_LOGS
 from petrobot.services.host.json_text import without_controls
 from petrobot.services.host.whole_file import write_whole

@@ -26,18 +26,16 @@ from petrobot.coordinator.cli.loading import (
     task_path,
 )
 from petrobot.coordinator.cli.options import (
+    add_journal_arguments,
     add_log_level_argument,
     add_page_port_argument,
+    journal_folder,
     named_port,
     pairs,
     parameter_of,
     parameter_texts,
-    refuse_idle,
-)
-from petrobot.coordinator.cli.recorded_runs import (
-    add_journal_arguments,
-    journal_folder,
     recorded,
+    refuse_idle,
     tidy,
 )
 from petrobot.services.host.command_line import (

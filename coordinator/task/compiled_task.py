@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from petrobot.coordinator.task.compiled import Arcs, Changes, Thresholds
 from petrobot.coordinator.task.conditions import Expression
 from petrobot.coordinator.task.elements import (
     Counts,
@@ -20,7 +19,7 @@ from petrobot.coordinator.task.elements import (
     Transition,
 )
 from petrobot.coordinator.task.model import Task
-from petrobot.coordinator.task.net import Net
+from petrobot.coordinator.task.net import Arcs, Changes, Net, Thresholds
 from petrobot.coordinator.task.validation import is_pulse
 
 

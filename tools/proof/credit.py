@@ -35,8 +35,7 @@ from petrobot.coordinator.learning.combinations import CombinationSelector
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.selectors import TASK
 from petrobot.coordinator.studies.campaign.policies import AllCombinations, offered
-from petrobot.coordinator.studies.campaign.rows import TrialRow
-from petrobot.coordinator.studies.campaign.table import TABLE
+from petrobot.coordinator.studies.campaign.table import TABLE, TrialRow
 from petrobot.coordinator.studies.report.comparing import paired, share_difference
 
 REGIMES = (

@@ -18,7 +18,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.coordinator.task.net import Marking, Net
+from petrobot.coordinator.analysis.net.graph import Mask
+from petrobot.coordinator.task.net import CompiledNet, Marking, Net
 
 WORD = 64
 WIDEST = WORD - 1
@@ -273,3 +274,21 @@ def _test(layout: Layout, need: Mapping[int, int], below: Mapping[int, int]) -> 
 
     sub = sum(k << layout.offsets[p] for p, k in (*need.items(), *below.items()))
     return Test(sub, guards(need) | guards(below), guards(need))
+
+
+# --- many markings side by side ---
+# The firing rule for many markings side by side: places are rows of an array, markings its
+# columns.
+#
+# Used where trials are played in parallel (`time/simulate.py`, `studies/forecast/play.py`).
+
+
+def concession(rule: CompiledNet, tokens: Tokens, t: int) -> Mask:
+    """Return in which markings transition t has concession; `tokens` has shape (places, markings),
+    the result (markings,)."""
+    able = np.ones(tokens.shape[1], dtype=np.bool_)
+    for p, w in rule.needs[t]:
+        able &= tokens[p] >= w
+    for p, k in rule.bars[t]:
+        able &= tokens[p] < k
+    return able

@@ -10,8 +10,7 @@ from typing import Any
 
 from petrobot.coordinator.task import Kind, Place, Reference, Subnet, Task, Transition
 from petrobot.coordinator.task.conditions import Expression
-from petrobot.coordinator.task.file.arcs import write_arc
-from petrobot.coordinator.task.file.reading import SCHEMA
+from petrobot.coordinator.task.file.reading import SCHEMA, write_arc
 
 _SHORT = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r"}
 

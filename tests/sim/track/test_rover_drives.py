@@ -27,9 +27,8 @@ from petrobot.services.comm.canopen.cia402 import (
     from_units,
     state_of,
 )
-from petrobot.sim.track.drives import RoverBus
+from petrobot.sim.track.drives import Echo, ReflectorSensor, RoverBus
 from petrobot.sim.track.rover import RoverBody
-from petrobot.sim.track.sensor import Echo, ReflectorSensor
 from petrobot.sim.track.truth import TrackSite
 
 canopen: Any = importlib.import_module("canopen")  # it has no annotations worth the name
