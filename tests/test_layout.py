@@ -45,6 +45,7 @@ ALLOWED: tuple[tuple[str, tuple[str, ...]], ...] = (
                 "services.action",
                 "services.device",
                 "services.camera",
+                "services.perform",
                 "services.comm",
                 "services.host",
             ),

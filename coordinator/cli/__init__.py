@@ -247,7 +247,7 @@ def _dispatch(command: Subcommand, arguments: Sequence[str], ordered: float) -> 
         options = parser.parse_args(arguments)
     except SystemExit as leaving:
         return int(leaving.code or 0)
-    options.ordered = ordered
+    options.ordered, options.parser = ordered, parser
     if level := getattr(options, "log_level", None):
         from petrobot.coordinator.cli.options import log_to_stderr
 

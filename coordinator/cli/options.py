@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -58,7 +58,6 @@ def parameter_texts(options: argparse.Namespace) -> dict[str, str]:
 
 def refuse_idle(
     options: argparse.Namespace,
-    add_arguments: Callable[[argparse.ArgumentParser], None],
     why: str,
     *,
     idle: Collection[str] = (),
@@ -67,9 +66,7 @@ def refuse_idle(
     """Raise CommandError for an option that was given and would have no effect: one of `idle`, or
     one that is not in `heeded`. (Given means other than its default.) `why` says why it has none,
     and what to do."""
-    parser = argparse.ArgumentParser()
-    add_arguments(parser)
-    for action in parser._actions:  # parse_args([]) would ask for the arguments without --
+    for action in options.parser._actions:  # parse_args([]) would ask for the arguments without --
         name, default = action.dest, action.default
         given = getattr(options, name, default) != default
         if given and (name in idle or (heeded and name not in heeded)):

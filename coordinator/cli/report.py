@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> int:
     folder = Path(options.subject)
     if options.against is None:
         why = "it is of a comparison; add --against CAMPAIGN, or leave it out"
-        refuse_idle(options, add_arguments, why, idle={"rho_of", "json"})
+        refuse_idle(options, why, idle={"rho_of", "json"})
     try:
         if (folder / MANIFEST).exists():
             page, pictures, target = _campaign(folder, options)

@@ -70,10 +70,10 @@ def run(options: argparse.Namespace) -> int:
     if options.print_unit:
         why = "not written into the unit; leave it out, and edit the unit's ExecStart"
         heeded = {"print_unit", "services", "logs", "dry_run"}
-        refuse_idle(options, add_arguments, why, heeded=heeded)
+        refuse_idle(options, why, heeded=heeded)
     if not options.lockstep:
         why = "needs --lockstep: in real time, nodes wait for a coordinator without a limit"
-        refuse_idle(options, add_arguments, why, idle={"await_coordinator"})
+        refuse_idle(options, why, idle={"await_coordinator"})
     directory = load_directory(options.services, options.dry_run)
     refuse_misplaced(directory, scripted=options.mock is not None)
     refuse_script(options.mock, directory)

@@ -155,7 +155,6 @@ def supersampled(
 # They are computed again only when arm or cup has moved. Plain floats decide what is in view,
 # since most parts never are.
 
-Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Box = tuple[slice, slice]
 Disc = tuple[float, float, float]

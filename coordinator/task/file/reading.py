@@ -39,7 +39,7 @@ from petrobot.coordinator.task.conditions import ConditionError, Expression, par
 from petrobot.coordinator.task.expansion import written
 from petrobot.coordinator.task.validation import faults as task_faults
 from petrobot.coordinator.task.wording import Fault, nearest
-from petrobot.services.host.toml_text import TomlError, key_lines, line_of, read_toml
+from petrobot.services.host.toml_text import TomlError, key_lines, line_of, not_utf8, read_toml
 
 
 class TaskFileError(ValueError):
@@ -293,10 +293,12 @@ def read_text(path: Path) -> str:
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
-        line = data[: error.start].count(b"\n") + 1
-        raise TaskFileError(
-            str(path), [Fault("file", "is not UTF-8", "save it as UTF-8")], [line]
-        ) from error
+        raise _faulty(not_utf8(error, str(path))) from error
+
+
+def _faulty(error: TomlError) -> TaskFileError:
+    fault = Fault(error.key, error.found, error.remedy)
+    return TaskFileError(error.source, [fault], [error.line or 0])
 
 
 def loads(
@@ -316,8 +318,7 @@ def loads(
     try:
         data = read_toml(text, source) if data is None else data
     except TomlError as error:
-        fault = Fault(error.key, error.found, error.remedy)
-        raise TaskFileError(source, [fault], [error.line or 0]) from error
+        raise _faulty(error) from error
     if "nodes" in data and "task" not in data:
         remedy = "name the task: petrobot check TASK.toml finds the services.toml beside it"
         raise TaskFileError(
