@@ -77,7 +77,7 @@ MUTATIONS = (
     ),
     _m(
         "the forecast ignores inhibitor arcs and capacities",
-        ANALYSIS + "net/columns.py",
+        ANALYSIS + "net/pack.py",
         "        able &= tokens[p] < k\n",
         "        pass\n",
         "tests/studies/forecast",

@@ -4,7 +4,7 @@ a few mask tests.
 A field of `width` value bits holds the tokens of a place; the guard bit just above it is 0 in every
 stored marking. With all guards G set, `(M | G) - s` leaves the guard of place p set exactly when
 M(p) >= s(p), and no field borrows from the next one. So one subtraction tests all consumed weights
-(guards must stay) and all bars (guards must go) of a transition; `task/compiled.py` has turned
+(guards must stay) and all bars (guards must go) of a transition; `task/net.py` has turned
 capacities into bars. A guard that is set after a firing is a token count that outgrew its field:
 the caller widens the field and continues.
 """
