@@ -69,6 +69,8 @@ primitive_task, node, device, args ({name: default}), up}."""
 
 
 # --- feed of changes ---
+# It numbers changes, keeps the resulting snapshot, and passes them to subscribers: the same for
+# every mission.
 
 Receive = Callable[[dict[str, Any]], None]
 READ_FOR = 5.0
@@ -143,6 +145,7 @@ class Feed:
 
 
 # --- controls ---
+# One operator holds them, the others watch and may ask for them. They outlive mission runs.
 
 Answer = dict[str, Any]
 

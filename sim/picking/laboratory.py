@@ -20,8 +20,8 @@ from petrobot.sim.bus.ur_controller import PORTS, ControllerSession, UrControlle
 from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.faults import CAMERA_FAULTS, FaultKinds, FaultPlan
 from petrobot.sim.laboratory_party import LaboratoryParty, whole_number
-from petrobot.sim.picking.arm import ToolPose
 from petrobot.sim.picking.camera import Picture, SceneCamera
+from petrobot.sim.picking.gripper import ToolPose
 from petrobot.sim.picking.parts import Part
 from petrobot.sim.picking.truth import PickingSite, picking_site_of
 from petrobot.sim.picking.world import PickingWorld

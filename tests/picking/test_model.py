@@ -22,7 +22,7 @@ from petrobot.services.picking.model import (
     read_arm,
     read_cell,
 )
-from petrobot.sim.picking.arm import true_arm
+from petrobot.sim.picking.gripper import true_arm
 from tests.sim.picking.bench import FILES, site
 
 ARMS = ["so101", "ur5e"]

@@ -23,6 +23,7 @@ from petrobot.services.host.json_text import json_text
 from petrobot.services.host.whole_file import sync_folder, write_whole
 
 # --- rows ---
+# A trial as a row and back. The columns depend on the task and its score.
 
 GENERAL = (
     "n",

@@ -15,7 +15,7 @@ from petrobot.coordinator.task.check.completeness import (
 )
 from petrobot.coordinator.task.check.conflicts import conflicts
 from petrobot.coordinator.task.check.findings import NEVER_MARKED, CheckReport, Finding, in_file
-from petrobot.coordinator.task.instant_firings import endless
+from petrobot.coordinator.task.compiled_task import endless
 from petrobot.coordinator.task.validation import faults
 from petrobot.coordinator.task.wording import Severity, few, listed
 

@@ -58,6 +58,8 @@ class TaskFileError(ValueError):
 
 
 # --- arcs ---
+# Their short notation: `ball`, `runs*2`, `locate_ball:normal`, `catch_ball:preempt=success`,
+# `!blocked*3`.
 
 W = TypeVar("W", bound=StrEnum)
 _ARC = re.compile(
