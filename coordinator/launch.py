@@ -40,9 +40,8 @@ from petrobot.coordinator.task.wording import nearest
 from petrobot.services.comm.calls.caller import Caller
 from petrobot.services.comm.location_file import Directory, NodeEntry, module_name
 from petrobot.services.comm.lockstep.cell import Delays, LockStepCell
-from petrobot.services.comm.lockstep.mesh import Member
+from petrobot.services.comm.lockstep.mesh import Member, cell_key
 from petrobot.services.comm.lockstep.party import Party
-from petrobot.services.comm.lockstep.process import cell_key
 from petrobot.services.comm.protocol.messages import Hello
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 from petrobot.services.host.toml_text import key_lines, line_of

@@ -110,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run_in_lockstep(directory: Directory, options: argparse.Namespace) -> int:
     # Imported here: a node in real time starts in half the time without numpy.
     from petrobot.services.comm.lockstep.cell import CellError
-    from petrobot.services.comm.lockstep.process import run_member
+    from petrobot.services.comm.lockstep.mesh import run_member
     from petrobot.services.node.lockstep import LockstepNode
 
     if wanted_with_parent():

@@ -371,27 +371,11 @@ class _Check:
         begin, before = self.numbers(), self.leaves
         positions, took = self.way(there, back, seconds)
         if not positions:
-            self.numbers()
-            still = {name for name, change in self.idle.items() if not change}
-            counts = {n for n, value in before.items() if _tells(value)} - still
-            if all(before[n] == self.leaves.get(n) for n in before.keys() - counts):
-                text = "no number of state changes: give a command that moves it"
-                self.fault(f"{dict(there)}: {text}")
-            else:
-                self.stands(f"after {dict(there)}")
-                self.note(f"stop and hold during {dict(there)}: it changes the state at once")
+            self.unmoved(there, before)
             return
         far = {n: begin[n] - v for n, v in self.numbers().items() if n in positions.keys() & begin}
         fastest = self.fastest
-        self.run(self.within, self.stopped)
-        if self.stopped():
-            self.stands(f"after {dict(there)}", positions)
-        else:  # it may be one that runs until it is stopped, as a pump
-            before = self.numbers()
-            self.stop(f"stop after {dict(there)}", positions)
-            if not _differ(before, self.numbers(), positions, PART):
-                text = f"stopped() is still False after {self.within:g} s"
-                self.fault(f"after {dict(there)}: {text}")
+        self.arrived(there, positions)
 
         def begun() -> None:
             self.move(there, seconds, judged=False)
@@ -402,36 +386,14 @@ class _Check:
             return
         self.stop("stop during a movement", positions)
         begun()
-        answer = self.ask(self.driver.hold, self.now())
-        if answer not in ("held", "cannot hold", "stopped"):
-            self.fault(f'hold: expected "held", "cannot hold" or "stopped", got {answer!r}')
-        if answer in ("held", "stopped"):
-            self.run(self.within)
-            if drift := self.run(max(self.within, REST * self.period), positions=positions):
-                self.fault(f"hold: answered {answer!r}, and {_names(drift)} still changes")
+        held = self.holds(positions)
         before = self.numbers()
         self.ask(self.driver.release, self.now())
-        if answer == "held":
+        if held:
             self.follow(back, seconds, before, judged=False)
-            after = self.numbers()
-            arrived = not {n for n in positions if abs(after[n] - begin[n]) > PART * positions[n]}
-            if not arrived and not _differ(before, after, positions, PLAY):
-                self.fault("release: the movement that was held does not continue")
-            jumps = {
-                n
-                for n, way in positions.items()
-                if self.fastest.get(n, 0.0) > max(PART * way, JUMP * fastest.get(n, 0.0))
-            }
-            if jumps:
-                self.fault(f"release: {_names(jumps)} jumps instead of moving on")
+            self.released(positions, begin, before, fastest)
             begun()
-            self.ask(self.driver.hold, self.now())
-            self.stop("stop while it is held", positions)
-            before = self.numbers()
-            self.ask(self.driver.release, self.now())
-            self.run(self.within)
-            if _differ(before, self.numbers(), positions, PART):
-                self.fault("release: the movement that was held and then stopped continues")
+            self.stopped_while_held(positions)
         self.stop("stop", positions)
         self.turned(there, back, seconds, took, far)
         if isinstance(self.driver, QuickStopping):
@@ -439,6 +401,75 @@ class _Check:
             self.stop("quick_stop during a movement", positions, self.driver.quick_stop)
             self.again("made again after a quick stop")  # it may need its drives switched on
         begun()
+        self.remade(positions, seconds)
+
+    def unmoved(self, there: Command, before: Mapping[str, Any]) -> None:
+        """Judge a command that moved nothing: it may change the state at once."""
+        self.numbers()
+        still = {name for name, change in self.idle.items() if not change}
+        counts = {n for n, value in before.items() if _tells(value)} - still
+        if all(before[n] == self.leaves.get(n) for n in before.keys() - counts):
+            text = "no number of state changes: give a command that moves it"
+            self.fault(f"{dict(there)}: {text}")
+        else:
+            self.stands(f"after {dict(there)}")
+            self.note(f"stop and hold during {dict(there)}: it changes the state at once")
+
+    def arrived(self, there: Command, positions: Mapping[str, float]) -> None:
+        """Judge whether the device stands at the end of a movement."""
+        self.run(self.within, self.stopped)
+        if self.stopped():
+            self.stands(f"after {dict(there)}", positions)
+        else:  # it may be one that runs until it is stopped, as a pump
+            before = self.numbers()
+            self.stop(f"stop after {dict(there)}", positions)
+            if not _differ(before, self.numbers(), positions, PART):
+                text = f"stopped() is still False after {self.within:g} s"
+                self.fault(f"after {dict(there)}: {text}")
+
+    def holds(self, positions: Mapping[str, float]) -> bool:
+        """Hold during a movement. Return whether the driver answered that it is held."""
+        answer = self.ask(self.driver.hold, self.now())
+        if answer not in ("held", "cannot hold", "stopped"):
+            self.fault(f'hold: expected "held", "cannot hold" or "stopped", got {answer!r}')
+        if answer in ("held", "stopped"):
+            self.run(self.within)
+            if drift := self.run(max(self.within, REST * self.period), positions=positions):
+                self.fault(f"hold: answered {answer!r}, and {_names(drift)} still changes")
+        return bool(answer == "held")
+
+    def released(
+        self,
+        positions: Mapping[str, float],
+        begin: Mapping[str, float],
+        before: Mapping[str, float],
+        fastest: Mapping[str, float],
+    ) -> None:
+        """Judge a movement that was held and released: it continues to `begin`, and no faster."""
+        after = self.numbers()
+        arrived = not {n for n in positions if abs(after[n] - begin[n]) > PART * positions[n]}
+        if not arrived and not _differ(before, after, positions, PLAY):
+            self.fault("release: the movement that was held does not continue")
+        jumps = {
+            n
+            for n, way in positions.items()
+            if self.fastest.get(n, 0.0) > max(PART * way, JUMP * fastest.get(n, 0.0))
+        }
+        if jumps:
+            self.fault(f"release: {_names(jumps)} jumps instead of moving on")
+
+    def stopped_while_held(self, positions: Mapping[str, float]) -> None:
+        """Hold, stop and release: a movement that was stopped does not continue."""
+        self.ask(self.driver.hold, self.now())
+        self.stop("stop while it is held", positions)
+        before = self.numbers()
+        self.ask(self.driver.release, self.now())
+        self.run(self.within)
+        if _differ(before, self.numbers(), positions, PART):
+            self.fault("release: the movement that was held and then stopped continues")
+
+    def remade(self, positions: Mapping[str, float], seconds: float) -> None:
+        """Make the driver again during a movement: nothing moves before it has got a command."""
         self.again(what := "made again during a movement")
         self.stop("stop")  # as its node does
         self.run(self.within)

@@ -1,4 +1,5 @@
-"""The action of most devices: send a command, and wait until the device has obeyed it."""
+"""Actions that send a command to a cyclic driver: the action of most devices, which waits until the
+device has obeyed it, and how the shipped robots report a fault of one of their drives."""
 
 from __future__ import annotations
 
@@ -37,3 +38,23 @@ async def perform(
     reason = device.state.get("reason", "")
     await ctx.command({"do": "rest"})
     return error("late", f"not done after {timeout:g} s {reason}".rstrip())
+
+
+def drive_fault(state: Mapping[str, Any], part: str) -> Result | None:
+    """Return the first fault of a driver with drives as the result of an action. Its `faults` are
+    rows of cause, name of the drive, code and text; `part` is what the drive moves."""
+    if state["faults"]:
+        cause, name, code, text = state["faults"][0]
+        return error(cause, text, **{part: name}, code=code)
+    return None
+
+
+async def command_drives(ctx: Context, body: Mapping[str, Any], part: str) -> Result | None:
+    """Send a command; return the driver's fault if that is why it is refused."""
+    try:
+        await ctx.command(body)
+    except CommandRefused:
+        if fault := drive_fault(ctx.device.state, part):
+            return fault
+        raise
+    return None

@@ -21,8 +21,7 @@ from petrobot.services.device import Driver
 from petrobot.services.node.inline_host import InlineHost
 from petrobot.services.node.memory import GlobalMemory
 from petrobot.services.worker.context import Draws, Report, outcome_of, result_of
-from petrobot.services.worker.outlets import Sent
-from petrobot.services.worker.setpoints import SetpointReceiver
+from petrobot.services.worker.setpoints import Sent, SetpointReceiver
 
 NAME, RUN = "action", "rehearsal/action#1"
 

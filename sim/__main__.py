@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from petrobot.services.comm.location_file import Directory, DirectoryError, load, resolve
-from petrobot.services.comm.lockstep.mesh import CellError
-from petrobot.services.comm.lockstep.process import run_member
+from petrobot.services.comm.lockstep.mesh import CellError, run_member
 from petrobot.services.comm.protocol.security import KeyFileError, KeyNeededError
 from petrobot.services.host.command_line import LOG_LEVELS, add_log_level, log_to_stderr, number
 from petrobot.sim.catching.truth import LaboratoryError

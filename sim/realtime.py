@@ -31,7 +31,7 @@ from typing import Final
 
 from petrobot.services.comm.calls.callee import Callee, Offer, Order
 from petrobot.services.comm.calls.server import Server
-from petrobot.services.comm.canopen.hub import CanHub
+from petrobot.services.comm.canopen.byte_stream import CanHub
 from petrobot.services.comm.location_file import Directory, resolve
 from petrobot.services.comm.location_file.host_checks import listening, refuse_unusable
 from petrobot.services.comm.lockstep.party import TICK

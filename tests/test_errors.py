@@ -19,7 +19,7 @@ from petrobot.coordinator.run.realtime import UnreachableError
 from petrobot.coordinator.task.conditions.language import ConditionError
 from petrobot.coordinator.task.elements import Kind, Place
 from petrobot.coordinator.task.expansion import CircleError
-from petrobot.coordinator.task.file.errors import TaskFileError
+from petrobot.coordinator.task.file.reading import TaskFileError
 from petrobot.coordinator.task.wording import Fault
 from petrobot.services.action import CallFailed, error
 from petrobot.services.comm.canopen.cia301 import SdoAbortError

@@ -124,8 +124,8 @@ COMMANDS = (
     Subcommand("show", "draw a task as SVG"),
     Subcommand("up", "start the nodes that services.toml places on this host"),
     Subcommand("nodes", "show which nodes are up, and what they offer"),
-    Subcommand("node", "start one node"),
-    Subcommand("sim", "start the simulated laboratory"),
+    Subcommand("node", "start one node", "up:StartNode"),
+    Subcommand("sim", "start the simulated laboratory", "up:StartLaboratory"),
     Subcommand("calibrate", "calibrate a camera from images of a board"),
     Subcommand("keys", "make the shared key or the certificates that several hosts need"),
     Subcommand("test", "check that a driver keeps the rules of drivers, with its device"),
@@ -247,7 +247,7 @@ def _dispatch(command: Subcommand, arguments: Sequence[str], ordered: float) -> 
         options = parser.parse_args(arguments)
     except SystemExit as leaving:
         return int(leaving.code or 0)
-    options.ordered = ordered
+    options.ordered, options.parser = ordered, parser
     if level := getattr(options, "log_level", None):
         from petrobot.coordinator.cli.options import log_to_stderr
 

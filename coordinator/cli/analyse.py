@@ -115,7 +115,7 @@ def run(options: argparse.Namespace) -> int:
 
     if options.view == "ordinary":
         why = "the ordinary view has no times; leave it out, or --view"
-        refuse_idle(options, add_arguments, why, idle={"rates", "measure"})
+        refuse_idle(options, why, idle={"rates", "measure"})
     longest = options.seconds or None
     limits = SearchLimits(
         states=options.states, seconds=longest, memory=options.memory << 20, clock=time.monotonic

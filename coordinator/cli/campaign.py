@@ -183,14 +183,14 @@ def run(options: argparse.Namespace) -> int:
     try:
         if options.resume is not None:
             why = "a campaign is continued as it began; leave this out beside --resume, or begin"
-            refuse_idle(options, add_arguments, f"{why} another one with --out", heeded=HEEDED)
+            refuse_idle(options, f"{why} another one with --out", heeded=HEEDED)
             folder, plan = options.resume, read_manifest(options.resume)
         elif options.task is None:
             raise CommandError(2, "give a TASK, or --resume FOLDER")
         else:
             if options.cluster:
                 why = "the workers are those of --cluster; leave this out"
-                refuse_idle(options, add_arguments, why, idle={"workers"})
+                refuse_idle(options, why, idle={"workers"})
             task = load_task(options.task)
             options.services = cell_path(options.services, options.task, task)
             _refuse_unfit(task, options)

@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> int:
     source = task_path(options.source)
     if source.suffix == ".toml" and view != "gspn":
         why = f"its devices are of the stochastic view, and the {view} net is written; add --view"
-        refuse_idle(options, add_arguments, f"{why} gspn, or leave it out", idle={"services"})
+        refuse_idle(options, f"{why} gspn, or leave it out", idle={"services"})
     with bounded(options.source):  # a chain (`.drn`) may be far larger than its net
         found = convert_command(
             source,

@@ -7,8 +7,7 @@ import argparse
 from pathlib import Path
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.options import refuse_idle
-from petrobot.coordinator.cli.recorded_runs import recorded
+from petrobot.coordinator.cli.options import recorded, refuse_idle
 from petrobot.services.host.command_line import number, whole
 
 EXAMPLE = (
@@ -69,7 +68,7 @@ def run(options: argparse.Namespace) -> int:
 
     if options.out.suffix.lower() != ".webp":
         why = "only a .webp film has a quality; leave it out, or name the film .webp"
-        refuse_idle(options, add_arguments, why, idle={"quality"})
+        refuse_idle(options, why, idle={"quality"})
     span = {"begin": options.begin, "seconds": options.seconds}
     try:
         refuse_file(options.out)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from petrobot.coordinator.analysis.may_run import Cell
     from petrobot.coordinator.learning.learning import Estimates
     from petrobot.coordinator.studies.campaign.plan import CampaignPlan
-    from petrobot.coordinator.studies.campaign.rows import TrialRow
+    from petrobot.coordinator.studies.campaign.table import TrialRow
     from petrobot.coordinator.studies.forecast.history import Training
     from petrobot.coordinator.studies.forecast.predict import Request
     from petrobot.coordinator.task import Task
@@ -121,7 +121,7 @@ def run(options: argparse.Namespace) -> int:
     try:
         if options.compare is not None:
             why = "a registered forecast is compared as it is; leave this out beside --compare"
-            refuse_idle(options, add_arguments, why, heeded={"compare", "markdown", "json"})
+            refuse_idle(options, why, heeded={"compare", "markdown", "json"})
             registered, folder = options.compare
             return _compare(registered, folder, options)
         if options.task is None or options.estimates is None:
@@ -129,10 +129,10 @@ def run(options: argparse.Namespace) -> int:
                 2, "give TASK and --estimates CAMPAIGN to forecast, or --compare FORECAST CAMPAIGN"
             )
         why = "a forecast has no table; give it beside --compare"
-        refuse_idle(options, add_arguments, why, idle={"markdown"})
+        refuse_idle(options, why, idle={"markdown"})
         if options.out is None:
             why = "nothing is registered without --out FILE; add that, or leave this out"
-            refuse_idle(options, add_arguments, why, idle={"doubtful"})
+            refuse_idle(options, why, idle={"doubtful"})
         return _forecast(options)
     except (ForecastError, CampaignError) as fault:
         raise CommandError(2, str(fault)) from fault

@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
     within 30 days."""
     if options.tls is not None:
         why = "it is for the shared key, and --tls makes certificates; leave one out"
-        refuse_idle(options, add_arguments, why, idle={"file"})
+        refuse_idle(options, why, idle={"file"})
     directory = load_directory(options.services)
     print(
         _certificates(directory, options.tls)

@@ -255,7 +255,7 @@ def run(options: argparse.Namespace) -> int:
     from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, said
 
     why = f"learned {options.verb} makes no use of it; leave it out"
-    refuse_idle(options, add_arguments, why, heeded=HEEDED[options.verb])
+    refuse_idle(options, why, heeded=HEEDED[options.verb])
     file = EstimatesFile(options.file)
     try:
         if options.verb == "merge":

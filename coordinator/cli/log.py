@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import add_services_argument, load_directory
-from petrobot.coordinator.cli.options import refuse_idle
-from petrobot.coordinator.cli.recorded_runs import recorded
+from petrobot.coordinator.cli.options import recorded, refuse_idle
 from petrobot.coordinator.run.folder import NODE_LOGS
 from petrobot.services.host.json_text import without_controls
 from petrobot.services.host.whole_file import write_whole
@@ -59,16 +58,16 @@ def run(options: argparse.Namespace) -> int:
 
     if (log := _node_log(options)) is not None:
         why = "the log of a node is text; leave it out"
-        refuse_idle(options, add_arguments, why, idle={"format", "mcap"})
+        refuse_idle(options, why, idle={"format", "mcap"})
         with log.open(encoding="utf-8", errors="replace") as lines:
             _write(options.out, (line.rstrip("\n") for line in lines))
         return 0
     found = recorded(options.run)
     why = "it is for the log of a node, and this is a run; leave it out"
-    refuse_idle(options, add_arguments, why, idle={"services", "logs"})
+    refuse_idle(options, why, idle={"services", "logs"})
     if options.mcap is not None:
         why = "--mcap names the file and the format; leave this out"
-        refuse_idle(options, add_arguments, why, idle={"format", "out"})
+        refuse_idle(options, why, idle={"format", "out"})
     try:
         if options.mcap is not None:
             _write_mcap(options.mcap, found)

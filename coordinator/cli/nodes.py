@@ -14,7 +14,7 @@ from petrobot.coordinator.cli.loading import (
     tell_of_demo,
     write_json,
 )
-from petrobot.services.comm.tls.expiry import SOON
+from petrobot.services.comm.tls.credentials import SOON
 from petrobot.services.host.command_line import number
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import argparse
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import write_json
-from petrobot.coordinator.cli.recorded_runs import recorded
+from petrobot.coordinator.cli.options import recorded
 
 EXAMPLE = "petrobot replay last"
 

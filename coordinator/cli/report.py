@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from petrobot.coordinator.operator.start_from import Recorded
     from petrobot.coordinator.run.recording import RecordedStep
     from petrobot.coordinator.studies.campaign.plan import CampaignPlan
-    from petrobot.coordinator.studies.campaign.rows import TrialRow
+    from petrobot.coordinator.studies.campaign.table import TrialRow
     from petrobot.coordinator.studies.report.run_page import ObservedRun
     from petrobot.coordinator.task import Task
 
@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> int:
     folder = Path(options.subject)
     if options.against is None:
         why = "it is of a comparison; add --against CAMPAIGN, or leave it out"
-        refuse_idle(options, add_arguments, why, idle={"rho_of", "json"})
+        refuse_idle(options, why, idle={"rho_of", "json"})
     try:
         if (folder / MANIFEST).exists():
             page, pictures, target = _campaign(folder, options)
@@ -191,7 +191,7 @@ def _plots(folder: Path) -> dict[str, Any]:
 
 
 def _run(name: str) -> tuple[str, dict[str, str], Path]:
-    from petrobot.coordinator.cli.recorded_runs import recorded
+    from petrobot.coordinator.cli.options import recorded
     from petrobot.coordinator.drawing import draw
     from petrobot.coordinator.run.folder import RESULT
     from petrobot.coordinator.run.timeline import Timeline

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli.loading import write_json
-from petrobot.coordinator.cli.options import add_log_level_argument
-from petrobot.coordinator.cli.recorded_runs import recorded
+from petrobot.coordinator.cli.options import add_log_level_argument, recorded
 from petrobot.coordinator.cli.run import add_page_arguments, conduct, refuse_stopped
 
 if TYPE_CHECKING:

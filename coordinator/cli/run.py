@@ -26,18 +26,16 @@ from petrobot.coordinator.cli.loading import (
     task_path,
 )
 from petrobot.coordinator.cli.options import (
+    add_journal_arguments,
     add_log_level_argument,
     add_page_port_argument,
+    journal_folder,
     named_port,
     pairs,
     parameter_of,
     parameter_texts,
-    refuse_idle,
-)
-from petrobot.coordinator.cli.recorded_runs import (
-    add_journal_arguments,
-    journal_folder,
     recorded,
+    refuse_idle,
     tidy,
 )
 from petrobot.services.host.command_line import (
@@ -246,7 +244,7 @@ def run(options: argparse.Namespace) -> int:
     """Check the task, run it, print and write its result."""
     if options.journal is None and (options.mode == "lockstep" or options.starts_from is not None):
         why = "needs --journal FOLDER: without it, a run in lock step is not kept"
-        _refuse_idle(options, why, "keep", "durable")
+        refuse_idle(options, why, idle={"keep", "durable"})
     if options.starts_from is not None:
         return conduct(_from_record(options), options, "lockstep")
     if options.task is None:
@@ -257,11 +255,11 @@ def run(options: argparse.Namespace) -> int:
     options.seed = SEED if options.seed is None else options.seed
     lockstep = options.mode == "lockstep"
     if lockstep:
-        _refuse_idle(options, "a run in lock step starts its own nodes; leave it out", "up")
-        _refuse_idle(options, "a run in lock step serves no page; leave it out", "page_port")
+        refuse_idle(options, "a run in lock step starts its own nodes; leave it out", idle={"up"})
+        refuse_idle(options, "a run in lock step serves no page; leave it out", idle={"page_port"})
     elif not options.join:
-        _refuse_idle(
-            options, "only for --mode lockstep; in real time, nodes are joined", "processes"
+        refuse_idle(
+            options, "only for --mode lockstep; in real time, nodes are joined", idle={"processes"}
         )
     task = load_task(options.task)
     directory = load_directory(cell_path(options.services, options.task, task), options.dry_run)
@@ -291,10 +289,6 @@ def run(options: argparse.Namespace) -> int:
         return prepare(request, task, text, directory, observers)
 
     return conduct(make, options, options.mode)
-
-
-def _refuse_idle(options: argparse.Namespace, why: str, *idle: str) -> None:
-    refuse_idle(options, add_arguments, why, idle=idle)
 
 
 def conduct(

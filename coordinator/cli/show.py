@@ -105,7 +105,7 @@ def _refuse_idle(options: argparse.Namespace) -> None:
     """Raise CommandError for an option that this drawing would ignore."""
     if options.graph:
         why = "the reachability graph has no such choice; leave it out, or --graph"
-        refuse_idle(options, add_arguments, why, heeded={"task", "graph", "out"})
+        refuse_idle(options, why, heeded={"task", "graph", "out"})
     timed = options.heat or options.view == "gspn"
     for name in ("estimates", "services"):
         if getattr(options, name) is not None and not timed:

@@ -6,11 +6,12 @@ from __future__ import annotations
 import argparse
 import asyncio
 import getpass
+import os
 import signal
 import sys
 from collections.abc import Awaitable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
@@ -19,6 +20,7 @@ from petrobot.coordinator.cli.loading import (
     load_directory,
     refuse_misplaced,
     refuse_script,
+    services_path,
 )
 from petrobot.coordinator.cli.options import add_log_level_argument, refuse_idle
 from petrobot.coordinator.run.folder import NODE_LOGS
@@ -70,10 +72,10 @@ def run(options: argparse.Namespace) -> int:
     if options.print_unit:
         why = "not written into the unit; leave it out, and edit the unit's ExecStart"
         heeded = {"print_unit", "services", "logs", "dry_run"}
-        refuse_idle(options, add_arguments, why, heeded=heeded)
+        refuse_idle(options, why, heeded=heeded)
     if not options.lockstep:
         why = "needs --lockstep: in real time, nodes wait for a coordinator without a limit"
-        refuse_idle(options, add_arguments, why, idle={"await_coordinator"})
+        refuse_idle(options, why, idle={"await_coordinator"})
     directory = load_directory(options.services, options.dry_run)
     refuse_misplaced(directory, scripted=options.mock is not None)
     refuse_script(options.mock, directory)
@@ -164,3 +166,47 @@ async def _until(stop: asyncio.Event, ended: Awaitable[None] | None) -> None:
     _, pending = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
     for task in pending:
         task.cancel()
+
+
+# --- one node, or the laboratory ---
+
+
+class StartNode:
+    """Start one node of services.toml on this host (as python -m petrobot.services NAME does)."""
+
+    EXAMPLE = "petrobot node vision --services services.toml"
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Add the command's options."""
+        parser.add_argument("name", help="the node's name in services.toml")
+        add_services_argument(parser)
+        add_log_level_argument(parser, "info")
+
+    def run(self, options: argparse.Namespace) -> int:
+        """Become the node."""
+        _become("petrobot.services", options, options.name)
+
+
+class StartLaboratory:
+    """Start the simulated laboratory on this host (as python -m petrobot.sim does)."""
+
+    EXAMPLE = "petrobot sim --services services.toml"
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Add the command's options."""
+        add_services_argument(parser)
+        add_log_level_argument(parser, "info")
+
+    def run(self, options: argparse.Namespace) -> int:
+        """Become the laboratory."""
+        _become("petrobot.sim", options)
+
+
+def _become(module: str, options: argparse.Namespace, *names: str) -> NoReturn:
+    """Replace this process by `python -m module names`. A child process would survive when its
+    parent is killed."""
+    services = str(services_path(options.services))
+    given = [*names, "--services", services, "--log-level", options.log_level]
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execv(sys.executable, [sys.executable, "-m", module, *given])

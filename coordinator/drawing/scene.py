@@ -7,8 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from petrobot.coordinator.drawing.layout import Edge, Point, lay_out
 from petrobot.coordinator.task import End, Kind, Place, Scope, Task, Transition
-from petrobot.coordinator.task.expansion import with_error_branches
-from petrobot.coordinator.task.macros import macros_around
+from petrobot.coordinator.task.expansion import macros_around, with_error_branches
 from petrobot.coordinator.task.net import Marking, Net
 from petrobot.coordinator.task.wording import listed
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from petrobot.coordinator.task import EarlyEvent, Kind, Place, PrimitiveTask, Task
-from petrobot.coordinator.task.compiled_task import CompiledTransition, compile_transitions
+from petrobot.coordinator.task.compiled_task import CompiledTransition, compile_transitions, endless
 from petrobot.coordinator.task.conditions import Domain
-from petrobot.coordinator.task.instant_firings import endless
 from petrobot.coordinator.task.net import Net
 from petrobot.coordinator.task.validation import condition_domains, faults
 

@@ -11,7 +11,6 @@ from dataclasses import astuple, dataclass
 from math import inf
 from typing import Any, Protocol
 
-from petrobot.coordinator.learning.combinations import TOGETHER
 from petrobot.coordinator.learning.estimate import (
     Firings,
     FiringsKey,
@@ -23,6 +22,7 @@ from petrobot.coordinator.learning.estimate import (
 from petrobot.coordinator.learning.learning import Estimates, corrected
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.records import Correction
+from petrobot.coordinator.learning.selectors import TOGETHER
 
 State = Mapping[str, Any]
 

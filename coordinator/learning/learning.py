@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.coordinator.learning.combinations import CombinationSelector
 from petrobot.coordinator.learning.estimate import (
     Firings,
     FiringsKey,
@@ -34,7 +33,14 @@ from petrobot.coordinator.learning.records import (
     TrialEnd,
     WaitEnd,
 )
-from petrobot.coordinator.learning.selectors import ACTION, DEFAULT, TASK, RuleSelector, make
+from petrobot.coordinator.learning.selectors import (
+    ACTION,
+    DEFAULT,
+    TASK,
+    CombinationSelector,
+    RuleSelector,
+    make,
+)
 from petrobot.coordinator.learning.statistics import merged
 from petrobot.coordinator.task import Task
 

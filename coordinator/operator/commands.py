@@ -35,10 +35,9 @@ from petrobot.coordinator.engine import (
     Step,
     Stimulus,
 )
-from petrobot.coordinator.operator.controls import Answer, Controls, refusal
 from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
-from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.observation import Shell, TrialWatch, Watching, shown_selectors
+from petrobot.coordinator.operator.port import Answer, Controls, Feed, refusal
 from petrobot.coordinator.operator.run_state import ChangePublisher
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.journal import JournalError

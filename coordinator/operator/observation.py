@@ -15,12 +15,12 @@ from typing import Any, Protocol
 
 from petrobot.coordinator.engine import Corrected, Instruction, Mode, RunRecorded, State, Stimulus
 from petrobot.coordinator.learning.statistics import wilson
-from petrobot.coordinator.operator.feed import Feed
+from petrobot.coordinator.operator.port import Feed
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.studies.campaign.block import costs
-from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.summary import Summary
+from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import TrialLog
 from petrobot.coordinator.task import Task
 from petrobot.services.comm.location_file import Directory

@@ -35,7 +35,7 @@ from petrobot.coordinator.learning.session import (
     session_of,
 )
 from petrobot.coordinator.operator.commands import Shown
-from petrobot.coordinator.operator.feed import Feed
+from petrobot.coordinator.operator.port import Feed
 from petrobot.coordinator.operator.session import (
     LOCKSTEP,
     REALTIME,

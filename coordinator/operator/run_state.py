@@ -37,8 +37,8 @@ from petrobot.coordinator.operator.event_texts import (
     reason_of,
     reason_recorded,
 )
-from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.net_state import picture
+from petrobot.coordinator.operator.port import Feed
 from petrobot.coordinator.task import End, Executed, Scope, Task
 from petrobot.coordinator.task.net import Marking
 from petrobot.coordinator.task.wording import Severity

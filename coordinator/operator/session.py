@@ -29,9 +29,8 @@ from petrobot.coordinator.engine import Mode, Override, SetBreakpoints, Stimulus
 from petrobot.coordinator.launch import local_nodes
 from petrobot.coordinator.learning.session import LearningSession
 from petrobot.coordinator.operator.commands import Operation, Shown
-from petrobot.coordinator.operator.controls import Controls
-from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.observation import Shell
+from petrobot.coordinator.operator.port import Controls, Feed
 from petrobot.coordinator.operator.run_address import RunAddress, published
 from petrobot.coordinator.run.folder import RESULT
 from petrobot.coordinator.run.interfaces import FirstAlternative, Observer

@@ -17,11 +17,10 @@ from typing import Any
 
 from petrobot.coordinator.background import BackgroundProcess
 from petrobot.coordinator.learning.estimates_file import EstimatesError
-from petrobot.coordinator.operator.controls import Answer, Controls, refusal
 from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
-from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.operator.observation import shown_selectors
+from petrobot.coordinator.operator.port import Answer, Controls, Feed, refusal
 from petrobot.coordinator.operator.prepare import RunRequest, prepare, prepare_from
 from petrobot.coordinator.operator.run_address import RunAddress
 from petrobot.coordinator.operator.run_state import ChangePublisher

@@ -14,8 +14,7 @@ from aiohttp import web
 
 from petrobot.coordinator.background import BackgroundProcess
 from petrobot.coordinator.operator.port import MissionPort, Offers, StartForm
-from petrobot.coordinator.page.access import AccessRules
-from petrobot.coordinator.page.connection_limits import ConnectionLimit
+from petrobot.coordinator.page.access import AccessRules, ConnectionLimit
 from petrobot.coordinator.page.sessions import Session, carry_out, encode
 from petrobot.coordinator.page.task_store import TaskStore
 

@@ -14,9 +14,8 @@ from aiohttp import web
 from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.operator.port import PROTOCOL, MissionPort, Offers, StartForm
 from petrobot.coordinator.page import documents
-from petrobot.coordinator.page.access import HOST, AccessRules, Handler, middleware
+from petrobot.coordinator.page.access import HOST, AccessRules, ConnectionLimit, Handler, middleware
 from petrobot.coordinator.page.app_state import PAGE_STATE, PageState
-from petrobot.coordinator.page.connection_limits import ConnectionLimit
 from petrobot.coordinator.page.requests import LARGEST_BODY, json_answer, read_object, refused
 from petrobot.coordinator.page.sessions import LARGEST_MESSAGE, Session, carry_out, who_is
 from petrobot.coordinator.page.task_store import TaskStore

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from petrobot.coordinator.task.compiled import Arcs, Changes, Thresholds
 from petrobot.coordinator.task.conditions import Expression
 from petrobot.coordinator.task.elements import (
     Counts,
@@ -20,7 +19,7 @@ from petrobot.coordinator.task.elements import (
     Transition,
 )
 from petrobot.coordinator.task.model import Task
-from petrobot.coordinator.task.net import Net
+from petrobot.coordinator.task.net import Arcs, Changes, Net, Thresholds
 from petrobot.coordinator.task.validation import is_pulse
 
 
@@ -132,3 +131,46 @@ def _action_arc(
         and t.priority > max((u.priority for u in rivals), default=t.priority),
         raised=tuple(e.name for e in events if e.scope is Scope.INTERNAL and e.by == primitive),
     )
+
+
+# --- firings that wait for nothing ---
+# Firings that wait for nothing: whether a task can fire for ever without time passing.
+
+
+def is_timeless(t: Transition) -> bool:
+    """Whether the transition waits neither for an event nor for a time nor for the end of a run."""
+    return (
+        not t.events
+        and t.after is None
+        and not any(a.end in (End.NORMAL, End.ERROR) for a in t.inputs)
+    )
+
+
+def endless(task: Task) -> set[str]:
+    """Return the transitions of a flat task that might fire for ever without time passing; if there
+    are none, every such sequence ends.
+
+    Of the transitions that wait for nothing, those are dropped again and again that drain a place
+    which no other of them fills, or that fill a place which inhibits them and which no other of
+    them drains: they can fire only finitely often. The others may fire for ever.
+    """
+    net = task.net
+    changes = dict(zip(net.transitions, net.compiled.changes, strict=True))
+    barred = {
+        t: {p for p, _ in inhibitors}
+        for t, inhibitors in zip(net.transitions, net.inhibit, strict=True)
+    }
+    loose = {t.name for t in task.transitions.values() if is_timeless(t)}
+    while True:
+        filled = {p for t in loose for p, change in changes[t] if change > 0}
+        drained = {p for t in loose for p, change in changes[t] if change < 0}
+        finite = {
+            t
+            for t in loose
+            for p, change in changes[t]
+            if (change < 0 and p not in filled)
+            or (change > 0 and p in barred[t] and p not in drained)
+        }
+        if not finite:
+            return loose
+        loose -= finite

@@ -34,8 +34,7 @@ from petrobot.coordinator.task.elements import (
     Variable,
     VariableType,
 )
-from petrobot.coordinator.task.expansion import CircleError
-from petrobot.coordinator.task.macros import macro_faults
+from petrobot.coordinator.task.expansion import CircleError, macro_faults
 from petrobot.coordinator.task.model import Task
 from petrobot.coordinator.task.wording import Fault, few, listed, nearest
 

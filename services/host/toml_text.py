@@ -34,8 +34,7 @@ def read_toml(text: str | bytes, source: str) -> dict[str, Any]:
         try:
             text = text.decode("utf-8")
         except UnicodeDecodeError as error:
-            line = error.object.count(b"\n", 0, error.start) + 1
-            raise TomlError(source, line, "file", "is not UTF-8", "save it as UTF-8") from error
+            raise not_utf8(error, source) from error
     text = text.removeprefix("\ufeff")  # some editors begin a file with a byte-order mark
     try:
         return tomllib.loads(text)
@@ -43,6 +42,12 @@ def read_toml(text: str | bytes, source: str) -> dict[str, Any]:
         raise TomlError(source, *_syntax_fault(text, str(error))) from error
     except RecursionError as error:
         raise TomlError(source, None, NOT_TOML, "nested too deeply", "flatten it") from error
+
+
+def not_utf8(error: UnicodeDecodeError, source: str) -> TomlError:
+    """Return the fault of a text that is not UTF-8."""
+    line = error.object.count(b"\n", 0, error.start) + 1
+    return TomlError(source, line, "file", "is not UTF-8", "save it as UTF-8")
 
 
 def key_lines(text: str) -> dict[str, int]:

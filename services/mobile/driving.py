@@ -15,7 +15,6 @@ from typing import Any, Final
 
 from petrobot.services.action import (
     Cancelled,
-    CommandRefused,
     Context,
     Result,
     Status,
@@ -27,6 +26,7 @@ from petrobot.services.action import (
 from petrobot.services.mobile import paths
 from petrobot.services.mobile.odometry import Pose, turned
 from petrobot.services.mobile.sight import TrackEnd
+from petrobot.services.perform import command_drives, drive_fault
 
 RENEW: Final = 0.1
 """Seconds between repeated motion commands; the driver rests if it receives none for 0.4 s."""
@@ -71,7 +71,7 @@ async def enable_drives(ctx: Context, *, timeout: float = 8.0, forget: bool = Fa
         await ctx.command({"do": "forget"})
         await ctx.command({"do": "stretch"})
     if not await ctx.wait(lambda: bool(ctx.device.state["enabled"]), max(0.0, until - ctx.now)):
-        return _trouble(ctx.device.state) or error(
+        return drive_fault(ctx.device.state, "wheel") or error(
             "timeout", f"the drives were not enabled within {timeout} s"
         )
     return success()
@@ -435,14 +435,10 @@ class _Drive:
         while ctx.now <= until:
             if ctx.now - renewed >= RENEW:
                 renewed = ctx.now
-                try:
-                    await ctx.command(wanted)
-                except CommandRefused:
-                    if trouble := _trouble(ctx.device.state):
-                        return trouble
-                    raise
+                if trouble := await command_drives(ctx, wanted, "wheel"):
+                    return trouble
             state = ctx.device.state
-            result = _trouble(state) or judge(state)
+            result = drive_fault(state, "wheel") or judge(state)
             if result is not None:
                 return result
             seen = state["cycles"]
@@ -474,11 +470,3 @@ def _marked(
         if off < NEAR_GATE and (best is None or off < best[2]):
             best = (x, y, off)
     return None if best is None else (best[0], best[1])
-
-
-def _trouble(state: Mapping[str, Any]) -> Result | None:
-    """Return the driver's first fault as the result of an action."""
-    if state["faults"]:
-        cause, wheel, code, text = state["faults"][0]
-        return error(cause, text, wheel=wheel, code=code)
-    return None

@@ -17,8 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.services.mobile.detection import TrackDetector
-from petrobot.services.mobile.floor import FloorView, Grey, ScanGrid
+from petrobot.services.mobile.detection import FloorView, Grey, ScanGrid, TrackDetector
 from petrobot.services.mobile.model import FloorSizes, RoverModel
 from petrobot.services.mobile.sight import (
     UNSEEN,

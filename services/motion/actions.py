@@ -15,7 +15,6 @@ from typing import Any, Final
 
 from petrobot.services.action import (
     Cancelled,
-    CommandRefused,
     Context,
     Result,
     Status,
@@ -24,6 +23,7 @@ from petrobot.services.action import (
     provisional,
     success,
 )
+from petrobot.services.perform import command_drives, drive_fault
 
 RENEW: Final = 0.1
 """Seconds between repeated `follow` commands; the driver holds if it receives none for 0.5 s."""
@@ -155,7 +155,7 @@ async def reset_and_home(ctx: Context, *, speed: float = 0.3, timeout: float = 1
     until = ctx.now + timeout
     await ctx.command({"do": "reset"})
     if not await ctx.wait(lambda: bool(ctx.device.state["enabled"]), max(0.0, until - ctx.now)):
-        return _trouble(ctx.device.state) or error(
+        return drive_fault(ctx.device.state, "joint") or error(
             "arm_timeout", f"the drives were not enabled within {timeout} s"
         )
     return await empty_and_home(ctx, speed=speed, timeout=max(0.0, until - ctx.now))
@@ -221,7 +221,10 @@ class _Following:
             if state["cycles"] != seen:
                 self.travel += sum(map(abs, map(sub, state["q"], before)))
                 before = state["q"]
-                seen, result = state["cycles"], _trouble(state) or judge(state, ctx.now - begun)
+                seen, result = (
+                    state["cycles"],
+                    drive_fault(state, "joint") or judge(state, ctx.now - begun),
+                )
             return result is not None
 
         while ctx.now - begun <= timeout:
@@ -233,7 +236,7 @@ class _Following:
 
     async def _renew(self) -> Result | None:
         self._renewed = self._ctx.now
-        return await _command(self._ctx, {"do": "follow", **self._how})
+        return await command_drives(self._ctx, {"do": "follow", **self._how}, "joint")
 
 
 def _await_place(
@@ -291,28 +294,10 @@ def _point(state: Mapping[str, Any]) -> list[float]:
     return [] if plan is None else [float(value) for value in plan["point"]]
 
 
-def _trouble(state: Mapping[str, Any]) -> Result | None:
-    """Return the driver's first fault as the result of an action."""
-    if state["faults"]:
-        cause, joint, code, text = state["faults"][0]
-        return error(cause, text, joint=joint, code=code)
-    return None
-
-
-async def _command(ctx: Context, body: Mapping[str, Any]) -> Result | None:
-    """Send a command; return the driver's fault if that is why it is refused."""
-    try:
-        await ctx.command(body)
-    except CommandRefused:
-        if trouble := _trouble(ctx.device.state):
-            return trouble
-        raise
-    return None
-
-
 async def _go(ctx: Context, pose: str, speed: float, until: float) -> Result | None:
     """Move to a named pose; return None when it is reached, else the result of the action."""
-    if trouble := await _command(ctx, {"do": "move", "pose": pose, "speed": speed}):
+    move = {"do": "move", "pose": pose, "speed": speed}
+    if trouble := await command_drives(ctx, move, "joint"):
         return trouble
 
     def over() -> bool:
@@ -323,4 +308,4 @@ async def _go(ctx: Context, pose: str, speed: float, until: float) -> Result | N
     if not await ctx.wait(over, max(0.0, until - ctx.now)):
         what = ctx.device.state["guard"] or "still in progress"
         return error("arm_timeout", f"pose {pose} not reached in time: {what}")
-    return _trouble(ctx.device.state)
+    return drive_fault(ctx.device.state, "joint")

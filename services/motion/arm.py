@@ -30,8 +30,7 @@ import numpy as np
 from petrobot.services.comm.canopen.master import MasterPhase
 from petrobot.services.device import LIMITS, Driver, Ports, Setpoint, key
 from petrobot.services.motion.drive_master import DriveMaster, DriveSettings
-from petrobot.services.motion.following import Follower
-from petrobot.services.motion.interception import STRATEGIES, Interceptor, Strategy
+from petrobot.services.motion.interception import STRATEGIES, Follower, Interceptor, Strategy
 from petrobot.services.motion.kinematics import Puma, branch_of
 from petrobot.services.motion.limits import CollisionGuard
 from petrobot.services.motion.model import (

@@ -61,9 +61,9 @@ from petrobot.services.worker.callables import (
     log_fault,
 )
 from petrobot.services.worker.context import Report, RunContext, checked_result, outcome_of
-from petrobot.services.worker.outlets import Outlets, Sent
 from petrobot.services.worker.remote import CLEAR_EMERGENCY, EMERGENCY_STOP, IN_EMERGENCY
 from petrobot.services.worker.runner import Hung, stop_reason
+from petrobot.services.worker.setpoints import Outlets, Sent
 
 _log = logging.getLogger(__name__)
 

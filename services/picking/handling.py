@@ -1,7 +1,8 @@
 """Primitive actions of the arm: make ready, grasp, verify, place.
 
-They use any arm whose driver `petrobot.services.picking.commands` knows. Their argument `arm` is
-the file of the arm's numbers (`petrobot.services.picking.model.arm_named`), `cell` the cell's file.
+They use any arm whose driver is in `ARMS`; to add your own arm, add a class there. Their argument
+`arm` is the file of the arm's numbers (`petrobot.services.picking.model.arm_named`), `cell` the
+cell's file.
 
 Error causes: `unreachable`, `arm_timeout`, `arm_fault`, `bad_part`.
 """
@@ -23,9 +24,9 @@ from petrobot.services.action import (
     provisional,
     success,
 )
-from petrobot.services.picking.commands import ARMS, ArmState
 from petrobot.services.picking.model import (
     ArmNumbers,
+    Gripper,
     NumbersError,
     OutOfReachError,
     PartKind,
@@ -33,6 +34,100 @@ from petrobot.services.picking.model import (
     arm_named,
     cell_named,
 )
+
+# --- commands and states of arms ---
+
+
+class ArmState(NamedTuple):
+    """The state of an arm for the actions: whether it is switched on, joint angles (rad), whether
+    it is at its goal, the gap between its fingers (m; None if unknown), whether a part keeps them
+    apart, whether they have stopped, and its faults."""
+
+    on: bool
+    q: tuple[float, ...]
+    at_goal: bool
+    grip: float | None
+    held: bool
+    gripped: bool
+    fault: str
+
+
+class Commands:
+    """The commands of drivers of arms, and those of one kind of gripper."""
+
+    def enable(self) -> Mapping[str, Any]:
+        """Switch on, and clear faults."""
+        return {"do": "enable"}
+
+    def move(self, joints: Sequence[float]) -> Mapping[str, Any]:
+        """Move to joint angles (rad)."""
+        return {"do": "move", "joints": list(joints)}
+
+    def open(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
+        """Open the fingers to a gap (m)."""
+        raise NotImplementedError
+
+    def close(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
+        """Close the fingers on what is between them, but not below a gap (m) if the gripper accepts
+        one."""
+        raise NotImplementedError
+
+    def fingers(
+        self, gripper: Gripper, state: Mapping[str, Any]
+    ) -> tuple[float | None, bool, bool]:
+        """Read `grip`, `held` and `gripped` of `ArmState`."""
+        raise NotImplementedError
+
+    def state(self, gripper: Gripper, state: Mapping[str, Any]) -> ArmState:
+        """Read the driver's state."""
+        faults = "; ".join(state["faults"].values())
+        on, q = state["ready"] and not faults, tuple(state["q"])
+        return ArmState(on, q, state["at_goal"], *self.fingers(gripper, state), faults)
+
+
+class So101(Commands):
+    """`petrobot.services.adapters.so101`: the gripper is a joint, and closes until it squeezes."""
+
+    def open(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
+        return {"do": "open", "angle": gap / gripper.numbers["gap_per_rad"]}
+
+    def close(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
+        """See `Commands`. It closes until it squeezes and ignores the gap."""
+        return {"do": "close", "squeeze": gripper.numbers["squeeze"]}
+
+    def fingers(
+        self, gripper: Gripper, state: Mapping[str, Any]
+    ) -> tuple[float | None, bool, bool]:
+        jaw = state["gripper"]
+        grip = max(0.0, jaw["angle"] * gripper.numbers["gap_per_rad"])
+        held = jaw["holding"] and grip > CLOSED
+        return grip, held, jaw["open"] or jaw["holding"] or jaw["closed"]
+
+
+class Ur(Commands):
+    """`petrobot.services.adapters.ur`: the gripper is connected to digital output 0 (close) and
+    inputs 0 (holds something) and 1 (its fingers have stopped), and does not measure its gap."""
+
+    def open(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
+        """See `Commands`. It opens as far as it can."""
+        return {"do": "output", "bit": 0, "value": False}
+
+    def close(self, gripper: Gripper, gap: float) -> Mapping[str, Any]:
+        return {"do": "output", "bit": 0, "value": True}
+
+    def fingers(
+        self, gripper: Gripper, state: Mapping[str, Any]
+    ) -> tuple[float | None, bool, bool]:
+        inputs = state["inputs"]
+        return None, bool(inputs & 1) and bool(state["outputs"] & 1), bool(inputs & 2)
+
+
+CLOSED: Final = 0.003
+"""Gap up to which stopped fingers have met each other (m)."""
+ARMS: Final[Mapping[str, Commands]] = {"feetech": So101(), "ur": Ur()}
+
+
+# --- actions ---
 
 ABOVE: Final = 0.065
 """Height over the table at which the finger tips travel (m)."""

@@ -109,7 +109,7 @@ class ArmNumbers:
     """Where it stands (m)."""
     gripper: Gripper
     controller: str
-    """Commands of its driver: a key of `petrobot.services.picking.commands.ARMS`."""
+    """Commands of its driver: a key of `petrobot.services.picking.handling.ARMS`."""
     poses: Mapping[str, tuple[float, ...]]
 
     def over(

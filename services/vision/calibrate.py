@@ -25,12 +25,10 @@ from petrobot.services.host.whole_file import write_whole
 from petrobot.services.vision.calibration import (
     Calibration,
     CalibrationError,
-    calibrate,
-    find_corners,
-)
-from petrobot.services.vision.calibration_file import (
     CalibrationFileError,
+    calibrate,
     calibration_text,
+    find_corners,
     missing_views,
     read_views,
 )

@@ -16,10 +16,10 @@ from petrobot.services.camera import CameraDriver
 from petrobot.services.comm.streams.image import Image
 from petrobot.services.device import key
 from petrobot.services.host.toml_text import read_toml
-from petrobot.services.vision.calibration_file import DEFAULT, parse_calibration
+from petrobot.services.vision.calibration import DEFAULT, parse_calibration
 from petrobot.services.vision.location import Background, BallDetector
+from petrobot.services.vision.optics import TableView
 from petrobot.services.vision.prediction import Surface
-from petrobot.services.vision.table import TableView
 
 CELL = Path(__file__).parents[1] / "cell.toml"
 REMEMBERED = 256

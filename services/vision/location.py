@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.services.vision.table import TableView
+from petrobot.services.vision.optics import TableView
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]

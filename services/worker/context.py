@@ -30,7 +30,7 @@ from petrobot.services.comm.protocol.messages import (
 )
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.worker.callables import describe, from_outside, words_of
-from petrobot.services.worker.outlets import Outlets, Sent
+from petrobot.services.worker.setpoints import Outlets, Sent
 
 Report = Outcome | Feedback | Event | Call | Cancel | Answer | Sent
 """What a host of runs tells its node. Outcome: the result of a run. Feedback: its progress. Event:

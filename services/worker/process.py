@@ -49,7 +49,6 @@ from petrobot.services.node.ports import ProcessPorts
 from petrobot.services.scripted import load as load_script
 from petrobot.services.worker.callables import log_fault
 from petrobot.services.worker.device_process import DeviceLoop, take_priority
-from petrobot.services.worker.outlets import Sent, StreamOutlets
 from petrobot.services.worker.pipe import Item, NewestLink, Permits, Pipe, keep_from_copies
 from petrobot.services.worker.remote import (
     DeviceCommand,
@@ -57,6 +56,7 @@ from petrobot.services.worker.remote import (
     DeviceState,
     RemoteDriver,
 )
+from petrobot.services.worker.setpoints import Sent, StreamOutlets
 
 LONGEST_PAUSE = 3600.0
 """Longest wait for the next message (s): `poll` takes no infinite one."""

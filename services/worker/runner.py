@@ -32,8 +32,8 @@ from petrobot.services.worker.callables import (
     words_of,
 )
 from petrobot.services.worker.context import Report, RunContext, checked_result, never
-from petrobot.services.worker.outlets import Outlets
 from petrobot.services.worker.remote import Refusing
+from petrobot.services.worker.setpoints import Outlets
 
 _log = logging.getLogger(__name__)
 

@@ -20,8 +20,16 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from petrobot.sim.catching.occluders import Box, Occluders, fill
-from petrobot.sim.catching.scenery import Chessboard, TableArea, floor_grey, stripes, supersampled
+from petrobot.sim.catching.scenery import (
+    Box,
+    Chessboard,
+    Occluders,
+    TableArea,
+    fill,
+    floor_grey,
+    stripes,
+    supersampled,
+)
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]

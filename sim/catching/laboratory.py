@@ -28,9 +28,8 @@ from petrobot.sim.catching.site import CupMount, Site, laboratory_file, site_of
 from petrobot.sim.catching.thrower import Thrower, draw_throw
 from petrobot.sim.catching.truth import LaboratoryError, Truth, read_toml
 from petrobot.sim.catching.world import BallWorld, SecondBall
-from petrobot.sim.exposures import camera_of
 from petrobot.sim.faults import BUS_FAULTS, CAMERA_FAULTS, FaultKinds, FaultPlan
-from petrobot.sim.laboratory_party import LaboratoryParty, whole_number
+from petrobot.sim.laboratory_party import LaboratoryParty, camera_of, whole_number
 
 _NOISE, _FAULTS, _SCATTER, _SECOND = 0x6361, 0x6661, 0x7363, 0x7362
 """Keep the draws of camera noise, of faults, of scatter and of second balls separate from other

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from petrobot.sim.catching.course import ThrowCourse, ThrowOutcome
 from petrobot.sim.catching.oracle import Oracle, OracleVerdict
+from petrobot.sim.catching.thrower import ThrowCourse, ThrowOutcome
 
 PLOTS: Final = {
     "catch_map": {

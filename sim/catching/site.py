@@ -12,9 +12,8 @@ from typing import Any
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.host.numba_kernels import kernel, packed
 from petrobot.sim.catching.arm_motion import Six
-from petrobot.sim.catching.drives import ratings
+from petrobot.sim.catching.drives import DriveRating, ratings
 from petrobot.sim.catching.puma_model import Frame3, PrincipalInertia, PumaModel, read_arm
-from petrobot.sim.catching.servo import DriveRating
 from petrobot.sim.catching.truth import (
     LABORATORY_FILE,
     LaboratoryError,

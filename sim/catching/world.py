@@ -16,10 +16,9 @@ from typing import Any
 
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.sim.catching.ball import BallModel, BallState, TableMotion, UnevenMotion, fly
-from petrobot.sim.catching.course import LightBarrier, ThrowCourse, ThrowOutcome
 from petrobot.sim.catching.physics import ball_contact, choose
 from petrobot.sim.catching.puma_model import Frame3
-from petrobot.sim.catching.thrower import Throw
+from petrobot.sim.catching.thrower import LightBarrier, Throw, ThrowCourse, ThrowOutcome
 from petrobot.sim.catching.truth import Truth
 
 _HAND_SPEED = 3.0

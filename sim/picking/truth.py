@@ -17,9 +17,8 @@ import numpy as np
 
 from petrobot.services.comm.location_file import Directory
 from petrobot.sim.catching.truth import LaboratoryError, disturbed, read_toml
-from petrobot.sim.picking.arm import TrueArm, true_arm
 from petrobot.sim.picking.camera import Lighting, Mounted, mounted
-from petrobot.sim.picking.gripper import Fingers
+from petrobot.sim.picking.gripper import Fingers, TrueArm, true_arm
 from petrobot.sim.picking.parts import Part, contact
 from petrobot.sim.picking.world import TableTop
 

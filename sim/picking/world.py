@@ -14,8 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from petrobot.sim.picking.arm import ToolPose
-from petrobot.sim.picking.gripper import FULL_DEPTH, Fingers, close_on
+from petrobot.sim.picking.gripper import FULL_DEPTH, Fingers, ToolPose, close_on
 from petrobot.sim.picking.parts import Part, contact, rectangle, within
 
 GRAVITY: Final = 9.81

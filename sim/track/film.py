@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.sim.track.camera import Motion, Mount, RoverCamera
-from petrobot.sim.track.course import BOARD, Track, TrackError
-from petrobot.sim.track.elements import SQUARE
+from petrobot.sim.track.course import BOARD, SQUARE, Track, TrackError
 from petrobot.sim.track.floor import COARSE, ORIGIN, Floor
 from petrobot.sim.track.plan import floor_plan, summary
 

@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.sim.track.course import BOARD, Track, white
-from petrobot.sim.track.elements import SQUARE, Element, ElementKind, Square
+from petrobot.sim.track.course import BOARD, SQUARE, Element, ElementKind, Square, Track, white
 
 Picture = NDArray[np.uint8]
 

@@ -21,13 +21,11 @@ from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.faults import BUS_FAULTS, CAMERA_FAULTS, FaultKinds, FaultPlan
 from petrobot.sim.laboratory_party import LaboratoryParty, whole_number
 from petrobot.sim.track.camera import Motion, RoverCamera
-from petrobot.sim.track.course import Track
-from petrobot.sim.track.drives import RoverBus
-from petrobot.sim.track.elements import FloorPose
+from petrobot.sim.track.course import FloorPose, Track
+from petrobot.sim.track.drives import Echo, ReflectorSensor, RoverBus, look
 from petrobot.sim.track.floor import Floor, Picture
 from petrobot.sim.track.referee import TrackReferee
 from petrobot.sim.track.rover import RoverBody
-from petrobot.sim.track.sensor import Echo, ReflectorSensor, look
 from petrobot.sim.track.truth import LightTruth, RoverTruth, TrackSite, TrackTruth, track_site_of
 
 # Light over the floor: a slow drift, and the flashes of spectators' cameras.

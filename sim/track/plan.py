@@ -8,15 +8,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 from xml.sax.saxutils import escape
 
-from petrobot.sim.track.course import BOARD, Track, white
-from petrobot.sim.track.elements import (
+from petrobot.sim.track.course import (
     BAR_LENGTH,
     BAR_WIDTH,
+    BOARD,
     HALF_WIDTH,
     RADIUS,
     SQUARE,
     Element,
     ElementKind,
+    Track,
+    white,
 )
 
 WIDTH_PX: Final = 720

@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final
 
-from petrobot.sim.track.course import BOARD, Gap, Near, Track
-from petrobot.sim.track.elements import SQUARE, FloorPose
+from petrobot.sim.track.course import BOARD, SQUARE, FloorPose, Gap, Near, Track
 
 LEFT: Final = 0.30
 """Distance from the centre line at which the track counts as left (m)."""

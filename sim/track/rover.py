@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from petrobot.sim.track.elements import FloorPose
+from petrobot.sim.track.course import FloorPose
 from petrobot.sim.track.truth import RoverTruth
 
 SLOT: Final = 0.02

@@ -13,17 +13,18 @@ from scipy.stats import erlang
 
 from petrobot.coordinator.analysis.net.graph import Mask
 from petrobot.coordinator.analysis.net.space import SearchLimits
-from petrobot.coordinator.analysis.time.completion import completion, completion_time
+from petrobot.coordinator.analysis.time.completion import (
+    completion,
+    completion_time,
+    reliability_slopes,
+    time_slopes,
+)
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn, TimelessTrap, Values
 from petrobot.coordinator.analysis.time.linear import stationary
 from petrobot.coordinator.analysis.time.markov import (
     Generator,
     long_run,
     poisson_weights,
-)
-from petrobot.coordinator.analysis.time.sensitivity import (
-    reliability_slopes,
-    time_slopes,
 )
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.cli.loading import load_task
-from petrobot.coordinator.cli.recorded_runs import recorded
+from petrobot.coordinator.cli.options import recorded
 from petrobot.coordinator.engine import Finished, Fired, RunRecorded, StartRun
 from petrobot.coordinator.launch import local_programs, with_runs
 from petrobot.coordinator.run.folder import JOURNAL, RESULT

@@ -26,15 +26,14 @@ from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.location_file import parse
 from petrobot.services.comm.protocol import messages as m
-from petrobot.services.comm.tls import expiry
+from petrobot.services.comm.tls import credentials
 from petrobot.services.comm.tls.certificates import (
     CA_LIFE,
     LIFE,
     CertificateError,
     make_certificates,
 )
-from petrobot.services.comm.tls.credentials import Credentials
-from petrobot.services.comm.tls.expiry import SOON, ending, ends_of
+from petrobot.services.comm.tls.credentials import SOON, Credentials, ending, ends_of
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 DAY = timedelta(days=1)
@@ -44,8 +43,8 @@ HELLO = m.Hello(2, 2, "client", "asking", "a1")
 @pytest.fixture(autouse=True)
 def new_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Start with no warning given yet."""
-    monkeypatch.setattr(expiry, "_said", set())
-    monkeypatch.setattr(expiry, "_remedies", {})
+    monkeypatch.setattr(credentials, "_said", set())
+    monkeypatch.setattr(credentials, "_remedies", {})
 
 
 def made(
@@ -149,12 +148,12 @@ def test_each_expiry_is_warned_about_once_with_file_and_remedy(
     assert (
         "`petrobot keys --tls keys`" in said[0] and "copy vision.pem and vision.key here" in said[0]
     )
-    expiry.look_again(NOW + 8 * DAY)
+    credentials.look_again(NOW + 8 * DAY)
     assert capsys.readouterr().err == "", "the warning was given before"
-    expiry.look_again(NOW + 10 * DAY)
-    expiry.look_again(NOW + 11 * DAY)
+    credentials.look_again(NOW + 10 * DAY)
+    credentials.look_again(NOW + 11 * DAY)
     assert capsys.readouterr().err.count("this certificate expired on") == 1
-    expiry.look_again(NOW - LIFE + CA_LIFE)
+    credentials.look_again(NOW - LIFE + CA_LIFE)
     assert "ca.pem: this certificate expires in" in (said := [capsys.readouterr().err])[0]
     assert "make a new authority" in said[0] and "another folder" in said[0]
 
@@ -172,9 +171,9 @@ def test_a_certificate_may_be_replaced_while_its_process_runs(
 ) -> None:
     Credentials("vision", None, made(tmp_path, 40 * DAY)).server()
     make_certificates(tmp_path, ["coordinator", "vision"], NOW + 20 * DAY)
-    expiry.look_again(NOW + 30 * DAY)
+    credentials.look_again(NOW + 30 * DAY)
     (tmp_path / "vision.pem").unlink()
-    expiry.look_again(NOW + 30 * DAY)
+    credentials.look_again(NOW + 30 * DAY)
     assert capsys.readouterr().err == ""
 
 

@@ -38,7 +38,7 @@ from petrobot.coordinator.task import (
     VariableType,
 )
 from petrobot.coordinator.task.conditions import parse
-from petrobot.coordinator.task.file.arcs import read_input, read_output
+from petrobot.coordinator.task.file.reading import read_input, read_output
 
 
 def make_task(

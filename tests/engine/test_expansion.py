@@ -22,7 +22,7 @@ from petrobot.coordinator.engine import (
 from petrobot.coordinator.task import Executed, Status, Task
 from petrobot.coordinator.task.check import check
 from petrobot.coordinator.task.file import TaskFileError, dumps, loads
-from petrobot.coordinator.task.file.arcs import write_arc
+from petrobot.coordinator.task.file.reading import write_arc
 from tests.engine.conftest import Play
 
 SHORT = """schema = 1

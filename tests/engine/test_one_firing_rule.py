@@ -16,11 +16,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.analysis.net.columns import concession
 from petrobot.coordinator.analysis.net.explore import ExplorationEngine as Explorer
 from petrobot.coordinator.analysis.net.explore import Explored, IntegerEngine
 from petrobot.coordinator.analysis.net.explore_numpy import NumpyEngine
-from petrobot.coordinator.analysis.net.pack import Layout
+from petrobot.coordinator.analysis.net.pack import Layout, concession
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.simulate import _Replicas
 from petrobot.coordinator.engine import (

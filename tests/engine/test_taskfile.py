@@ -10,7 +10,7 @@ import pytest
 from petrobot.coordinator.task import Counts, End, Inhibitor, Input, Output
 from petrobot.coordinator.task.check import check
 from petrobot.coordinator.task.file import TaskFileError, dumps, load, loads
-from petrobot.coordinator.task.file.arcs import ArcError, read_input, read_output, write_arc
+from petrobot.coordinator.task.file.reading import ArcError, read_input, read_output, write_arc
 
 GOOD = """schema = 1
 

@@ -22,7 +22,7 @@ from typing import Any
 
 from petrobot.coordinator import launch
 from petrobot.coordinator.cli.loading import load_task
-from petrobot.coordinator.cli.recorded_runs import recorded
+from petrobot.coordinator.cli.options import recorded
 from petrobot.coordinator.engine import Engine, Fired, Instruction, RunRecorded, State, Stimulus
 from petrobot.coordinator.launch import (
     Setting,

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.cli.recorded_runs import recorded
+from petrobot.coordinator.cli.options import recorded
 from petrobot.coordinator.engine import RunRecorded
 from petrobot.coordinator.task import Executed, Status
 from tests.chaos.shuttle_cell import ROOT, TASK, moves, shuttle_services

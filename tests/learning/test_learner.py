@@ -38,7 +38,7 @@ from petrobot.coordinator.run.realtime import RealtimeMission
 from petrobot.coordinator.run.recording import JournalStore, replay
 from petrobot.coordinator.studies.campaign.block import costs
 from petrobot.coordinator.studies.campaign.observed import estimates_of
-from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import TrialLog
 from petrobot.coordinator.task import Executed, Status, Task
 from tests.learning.cell import directory, run, scripts, sorting

@@ -26,7 +26,7 @@ from petrobot.coordinator.learning.propagation import measured_from
 from petrobot.coordinator.learning.records import Passage, Waited, WaitEnd
 from petrobot.coordinator.learning.waits import EventWaits
 from petrobot.coordinator.studies.campaign.observed import estimates_of
-from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import Trial, TrialLog, waits_of
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.distributions import Drawer, RunDistributions

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.services.mobile.floor import FloorView
+from petrobot.services.mobile.detection import FloorView
 from petrobot.services.mobile.model import nominal_rover
 
 Vector = NDArray[np.float64]

@@ -20,13 +20,13 @@ from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.task.file import load
 from petrobot.services.comm.location_file import load as load_directory
 from petrobot.services.mobile.detection import (
+    ScanGrid,
     TemplateBank,
     TrackDetector,
     consensus,
     detect_edges,
     detect_ridge,
 )
-from petrobot.services.mobile.floor import ScanGrid
 from tests.mobile.conftest import DrawnFloor, DrawnPose, Photographer
 from tests.mobile.test_detection import off_line
 

@@ -15,9 +15,8 @@ from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.mobile.rover import Rover
 from petrobot.services.mobile.sight import LineEnd, TrackAhead, TrackEnd
 from petrobot.services.worker.setpoints import SetpointReceiver
-from petrobot.sim.track.drives import RoverBus
+from petrobot.sim.track.drives import Echo, ReflectorSensor, RoverBus, look
 from petrobot.sim.track.rover import RoverBody as Body
-from petrobot.sim.track.sensor import Echo, ReflectorSensor, look
 from petrobot.sim.track.truth import read_track_site
 from tests.bare_ports import BarePorts
 from tests.mobile.conftest import DrawnFloor, DrawnPose

@@ -20,13 +20,13 @@ from petrobot.services.comm.canopen.byte_stream import (
     EXTENDED,
     GREETING,
     REMOTE,
+    CanHub,
     Splitter,
     StreamBus,
     StreamFormatError,
     encode,
     parse_channel,
 )
-from petrobot.services.comm.canopen.hub import CanHub
 from petrobot.services.comm.canopen.ports import PythonCanBus, StreamPort, open_can
 from tests.waiting import Limit
 

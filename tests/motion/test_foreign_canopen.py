@@ -15,6 +15,7 @@ import can
 import pytest
 
 from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.byte_stream import CanHub
 from petrobot.services.comm.canopen.cia402 import (
     DriveCommand,
     DriveFault,
@@ -23,7 +24,6 @@ from petrobot.services.comm.canopen.cia402 import (
     command_of,
     from_units,
 )
-from petrobot.services.comm.canopen.hub import CanHub
 from petrobot.services.comm.canopen.master import MasterPhase
 from petrobot.services.motion.drive_master import DriveMaster, DriveSettings
 from petrobot.sim.catching.drives import ArmBus, ratings

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from petrobot import JointChain
-from petrobot.services.adapters.ur.kinematics import MODELS, chain
+from petrobot.services.adapters.ur.arm import MODELS, chain
 from petrobot.services.joint_chain import rotation_matrix, rotation_vector
 from petrobot.services.motion.kinematics import Puma
 from petrobot.services.motion.model import nominal_arm

@@ -259,9 +259,7 @@ def test_a_file_in_another_code_is_refused_with_its_line(tmp_path: Path) -> None
     path.write_bytes(b"\xef\xbb\xbf" + SHIPPED.read_bytes())
     assert load(path).hash == load(SHIPPED).hash
     path.write_bytes(b"schema = 1\n# K\xf6ln\n")
-    with pytest.raises(
-        DirectoryError, match=r"services.toml:2: not UTF-8 text .*save the file as UTF-8"
-    ):
+    with pytest.raises(DirectoryError, match=r"services.toml:2: file: is not UTF-8; save it as"):
         load(path)
 
 

@@ -24,8 +24,8 @@ from petrobot.services.comm.protocol.messages import (
     Outcome,
 )
 from petrobot.services.node.inline_host import HOLD, RELEASE
-from petrobot.services.worker.outlets import Sent
 from petrobot.services.worker.runner import GRACE, STOP_LIMIT, Runner
+from petrobot.services.worker.setpoints import Sent
 from tests.node.conftest import Bench, Clock, Device
 
 Make = Callable[..., Bench]

@@ -8,8 +8,7 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.worker.outlets import Outlets, Sent
-from petrobot.services.worker.setpoints import SetpointReceiver
+from petrobot.services.worker.setpoints import Outlets, Sent, SetpointReceiver
 from tests.node.conftest import Clock
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from petrobot.coordinator.engine import Begin, Choose, Chosen, Engine, RunEnded, StartRun
-from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.operator.history import opened
+from petrobot.coordinator.operator.port import Feed
 from petrobot.coordinator.operator.run_state import ChangePublisher
 from petrobot.coordinator.run.journal import JournalWriter
 from petrobot.coordinator.run.recording import JournalStore

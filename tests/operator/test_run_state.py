@@ -13,7 +13,7 @@ from petrobot.coordinator.engine import (
     RunHeld,
     StartRun,
 )
-from petrobot.coordinator.operator.feed import Feed
+from petrobot.coordinator.operator.port import Feed
 from petrobot.coordinator.operator.run_state import ChangePublisher
 from petrobot.coordinator.task import Counts
 from petrobot.coordinator.task.file import loads

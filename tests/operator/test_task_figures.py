@@ -6,8 +6,8 @@ from pathlib import Path
 
 from petrobot.coordinator.learning.statistics import wilson
 from petrobot.coordinator.operator.observation import task_text
-from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.summary import Summary
+from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.task.file import load
 

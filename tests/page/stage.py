@@ -42,8 +42,7 @@ from petrobot.coordinator.engine import (
     StopConfirmed,
     TimerFired,
 )
-from petrobot.coordinator.operator.feed import Feed
-from petrobot.coordinator.operator.port import FREE
+from petrobot.coordinator.operator.port import FREE, Feed
 from petrobot.coordinator.operator.run_state import ChangePublisher
 from petrobot.coordinator.run.folder import JOURNAL, header
 from petrobot.coordinator.run.journal import JournalWriter

@@ -15,8 +15,7 @@ import pytest
 
 from petrobot.coordinator.operator.port import PROTOCOL
 from petrobot.coordinator.page import requests
-from petrobot.coordinator.page.access import HEADERS
-from petrobot.coordinator.page.connection_limits import CONNECTIONS, ConnectionLimit
+from petrobot.coordinator.page.access import CONNECTIONS, HEADERS, ConnectionLimit
 from petrobot.coordinator.page.server import CLIENTS, Page, start_page
 from petrobot.coordinator.page.sessions import LARGEST_MESSAGE
 from tests.page.stage import Stage

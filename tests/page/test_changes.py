@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.coordinator.operator import feed as feeds
+from petrobot.coordinator.operator import port
 from petrobot.coordinator.operator.changes import (
     KINDS,
     PENDING_LIMIT,
@@ -18,7 +18,7 @@ from petrobot.coordinator.operator.changes import (
     copy_state,
     empty_state,
 )
-from petrobot.coordinator.operator.feed import Feed
+from petrobot.coordinator.operator.port import Feed
 
 NAMES = st.sampled_from(["a", "b", "c"])
 SMALL = st.integers(0, 5)
@@ -204,7 +204,7 @@ def test_a_change_and_a_snapshot_have_the_time_of_the_clock() -> None:
 def test_a_script_that_reads_snapshots_counts_as_watching(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nodes are asked for their devices only while somebody watches."""
     now = 100.0
-    monkeypatch.setattr(feeds, "monotonic", lambda: now)
+    monkeypatch.setattr(port, "monotonic", lambda: now)
     feed = Feed()
     watched = [feed.watched]
     feed.snapshot()

@@ -8,8 +8,8 @@ import time
 
 import numpy as np
 
-from petrobot.services.picking.finding import FINDERS
 from petrobot.services.picking.model import cell_named
+from petrobot.services.picking.seeing import FINDERS
 from tests.sim.picking.bench import scene
 
 SEEDS, NEAR = range(1000, 1040), 0.008

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from petrobot import JointChain
-from petrobot.services.adapters.so101.kinematics import CHAIN
-from petrobot.services.adapters.ur.kinematics import chain
+from petrobot.services.adapters.so101.arm import CHAIN
+from petrobot.services.adapters.ur.arm import chain
 from petrobot.services.joint_chain import rotation_matrix
 from petrobot.services.picking.model import (
     NumbersError,
@@ -22,7 +22,7 @@ from petrobot.services.picking.model import (
     read_arm,
     read_cell,
 )
-from petrobot.sim.picking.arm import true_arm
+from petrobot.sim.picking.gripper import true_arm
 from tests.sim.picking.bench import FILES, site
 
 ARMS = ["so101", "ur5e"]

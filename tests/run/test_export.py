@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.cli import main
-from petrobot.coordinator.cli.recorded_runs import recorded
+from petrobot.coordinator.cli.options import recorded
 from petrobot.coordinator.engine import Fired, RunRecorded
 from petrobot.coordinator.run.export import messages
 from tests.run.test_folder import SCRIPT, SERVICES

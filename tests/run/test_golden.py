@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.coordinator.cli.recorded_runs import recorded
+from petrobot.coordinator.cli.options import recorded
 from petrobot.coordinator.engine import Engine, Finished, Fired, State
 from petrobot.coordinator.run.journal import read_journal
 from petrobot.coordinator.run.recording import ReplayError, replay

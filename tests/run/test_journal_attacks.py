@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.recorded_runs import recorded
+from petrobot.coordinator.cli.options import recorded
 from petrobot.coordinator.engine import Begin, Engine
 from petrobot.coordinator.launch import resumed_mission
 from petrobot.coordinator.run.journal import (

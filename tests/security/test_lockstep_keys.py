@@ -11,7 +11,7 @@ from petrobot.coordinator.cli import main
 from petrobot.coordinator.launch import Setting, lockstep_member, lockstep_mission
 from petrobot.coordinator.task.file import load as load_task
 from petrobot.services.comm.location_file import Directory, parse
-from petrobot.services.comm.lockstep.process import cell_key
+from petrobot.services.comm.lockstep.mesh import cell_key
 from petrobot.services.comm.protocol.security import KeyNeededError, new_key, write_key
 from tests.chaos.shuttle_cell import SERVICES, TASK
 from tests.ports import free_ports

@@ -15,7 +15,7 @@ import pytest
 from petrobot.services.comm.calls.caller import Caller
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.canopen.bus import Frame
-from petrobot.services.comm.canopen.hub import CanHub
+from petrobot.services.comm.canopen.byte_stream import CanHub
 from petrobot.services.comm.canopen.ports import StreamPort
 from petrobot.services.comm.protocol.messages import Hello
 from petrobot.services.comm.protocol.security import new_key, write_key

@@ -27,8 +27,7 @@ from petrobot.services.comm.canopen.cia402 import (
     to_units,
 )
 from petrobot.sim.catching import drives
-from petrobot.sim.catching.drives import ArmBus, ServoDrive
-from petrobot.sim.catching.servo import DriveRating
+from petrobot.sim.catching.drives import ArmBus, DriveRating, ServoDrive
 from tests.waiting import Limit
 
 CYCLE = 0.004

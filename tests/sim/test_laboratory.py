@@ -19,12 +19,11 @@ from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.comm.protocol.codec import decode, encode
 from petrobot.services.comm.protocol.messages import Executed, Outcome
 from petrobot.services.host.numba_kernels import SWITCH
-from petrobot.sim.catching.course import ThrowOutcome
 from petrobot.sim.catching.referee import MOST_ROWS
 from petrobot.sim.catching.site import Site
-from petrobot.sim.catching.thrower import draw_throw
+from petrobot.sim.catching.thrower import ThrowOutcome, draw_throw
 from petrobot.sim.catching.truth import Scatter
-from petrobot.sim.exposures import Exposures
+from petrobot.sim.laboratory_party import Exposures
 from tests.sim.conftest import needs_bullet
 
 REPOSITORY = Path(__file__).parents[2]

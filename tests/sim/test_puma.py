@@ -22,10 +22,10 @@ from petrobot.sim.catching.arm_dynamics import (
     regrouped,
 )
 from petrobot.sim.catching.arm_motion import Six
+from petrobot.sim.catching.drives import JointServo
 from petrobot.sim.catching.physics import BULLET, ArmDynamics, arm_dynamics
 from petrobot.sim.catching.puma import ArmPlant
 from petrobot.sim.catching.puma_model import PrincipalInertia, PumaModel
-from petrobot.sim.catching.servo import JointServo
 from petrobot.sim.catching.site import Site
 from petrobot.sim.catching.truth import Vector
 from tests.sim.conftest import needs_bullet

@@ -17,7 +17,7 @@ from petrobot.sim.catching.truth import (
     read_toml,
     read_truth,
 )
-from petrobot.sim.exposures import camera_of
+from petrobot.sim.laboratory_party import camera_of
 
 SETTINGS = read_toml(LABORATORY_FILE)
 

@@ -11,10 +11,9 @@ import pytest
 
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.sim.catching.ball import BallState, TableMotion, fly
-from petrobot.sim.catching.course import ThrowCourse, ThrowOutcome
 from petrobot.sim.catching.puma_model import Frame3
 from petrobot.sim.catching.site import Site
-from petrobot.sim.catching.thrower import Throw, draw_throw
+from petrobot.sim.catching.thrower import Throw, ThrowCourse, ThrowOutcome, draw_throw
 from petrobot.sim.catching.world import BallWorld, Where
 
 AWAY = Frame3((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (-0.5, 0.0, 0.3))

@@ -17,18 +17,16 @@ from petrobot.coordinator.cli import main
 from petrobot.services.comm.streams.image import Image
 from petrobot.services.vision import calibrate as command
 from petrobot.services.vision.calibration import (
+    DEFAULT,
     Board,
     BoardView,
     Calibration,
     CalibrationError,
+    CalibrationFileError,
     adjust,
     calibrate,
-    find_corners,
-)
-from petrobot.services.vision.calibration_file import (
-    DEFAULT,
-    CalibrationFileError,
     calibration_text,
+    find_corners,
     parse_calibration,
     read_views,
 )

@@ -13,7 +13,7 @@ from petrobot.services.action import Result, Status
 from petrobot.services.camera import CameraError
 from petrobot.services.comm.streams.image import Image
 from petrobot.services.vision.actions import locate_background, predict_least_squares
-from petrobot.services.vision.calibration_file import DEFAULT, CalibrationFileError
+from petrobot.services.vision.calibration import DEFAULT, CalibrationFileError
 from petrobot.services.vision.camera import CELL, Camera
 from petrobot.services.vision.location import FixedThreshold
 from tests.vision.bench import BenchContext, BenchPorts, CameraBench, draw_ball, run_action

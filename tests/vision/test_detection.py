@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from petrobot.services.vision.calibration_file import DEFAULT, parse_calibration
+from petrobot.services.vision.calibration import DEFAULT, parse_calibration
 from petrobot.services.vision.locating import Confirmation
 from petrobot.services.vision.location import (
     Background,
@@ -22,8 +22,7 @@ from petrobot.services.vision.location import (
     MixtureOfGaussians,
     ball_blobs,
 )
-from petrobot.services.vision.optics import Array
-from petrobot.services.vision.table import TableView
+from petrobot.services.vision.optics import Array, TableView
 from petrobot.sim.catching.camera import PinholeCamera
 
 DETECTORS = ("background", "mog2", "hough", "threshold", "compensated")

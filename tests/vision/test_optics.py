@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.services.vision.optics import Optics
-from petrobot.services.vision.table import TableView
+from petrobot.services.vision.optics import Optics, TableView
 from petrobot.sim.catching.camera import PinholeCamera
 from tests.vision.bench import nominal_optics, true_view
 

@@ -38,7 +38,7 @@ import aiohttp
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
-from petrobot.coordinator.operator.feed import Feed  # noqa: E402 - the bench runs as a file
+from petrobot.coordinator.operator.port import Feed  # noqa: E402 - the bench runs as a file
 from petrobot.coordinator.page.server import Page, start_page  # noqa: E402
 from tests.operator.conftest import SCRIPT, TASK, Cell  # noqa: E402
 from tests.page.conftest import ARGUMENTS, BROWSER  # noqa: E402

@@ -21,8 +21,7 @@ from typing import Any
 
 from tools.proof.proof import ROOT
 
-from petrobot.coordinator.studies.campaign.rows import TrialRow
-from petrobot.coordinator.studies.campaign.table import TABLE, read_table
+from petrobot.coordinator.studies.campaign.table import TABLE, TrialRow, read_table
 from tests.waiting import Limit
 
 FAST = 15.0

@@ -31,12 +31,10 @@ from tools.proof.proof import LOCK_STEP, ROOT, FigureProof, digest
 
 from petrobot.coordinator.cli.loading import load_directory, load_task
 from petrobot.coordinator.learning.batch import Response
-from petrobot.coordinator.learning.combinations import CombinationSelector
 from petrobot.coordinator.learning.objective import Question
-from petrobot.coordinator.learning.selectors import TASK
+from petrobot.coordinator.learning.selectors import TASK, CombinationSelector
 from petrobot.coordinator.studies.campaign.policies import AllCombinations, offered
-from petrobot.coordinator.studies.campaign.rows import TrialRow
-from petrobot.coordinator.studies.campaign.table import TABLE
+from petrobot.coordinator.studies.campaign.table import TABLE, TrialRow
 from petrobot.coordinator.studies.report.comparing import paired, share_difference
 
 REGIMES = (

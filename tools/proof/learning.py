@@ -27,7 +27,7 @@ from tools.proof.proof import LOCK_STEP, ROOT, FigureProof, digest
 from petrobot.coordinator.cli.loading import load_directory, load_task
 from petrobot.coordinator.cli.report import compared
 from petrobot.coordinator.studies.campaign.policies import AllCombinations, offered
-from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.report.campaign_page import CombinationFigures, by_combination
 from petrobot.coordinator.studies.report.comparing import Weighting
 from petrobot.coordinator.task import Task

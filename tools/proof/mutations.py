@@ -77,7 +77,7 @@ MUTATIONS = (
     ),
     _m(
         "the forecast ignores inhibitor arcs and capacities",
-        ANALYSIS + "net/columns.py",
+        ANALYSIS + "net/pack.py",
         "        able &= tokens[p] < k\n",
         "        pass\n",
         "tests/studies/forecast",
@@ -248,7 +248,7 @@ MUTATIONS = (
     # Analysis.
     _m(
         "the compiled net forgets capacities",
-        "coordinator/task/compiled.py",
+        "coordinator/task/net.py",
         "if gain > 0 and limit is not None:",
         "if False:",
         "tests/analysis/test_space.py",
@@ -327,7 +327,7 @@ MUTATIONS = (
     ),
     _m(
         "an image leaves before it is exposed",
-        "sim/exposures.py",
+        "sim/laboratory_party.py",
         "self._waiting[count].ready <= until + _ON_TIME",
         "True",
         "tests/sim/test_laboratory.py",

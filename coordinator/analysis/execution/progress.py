@@ -62,10 +62,10 @@ from petrobot.coordinator.engine import (
 )
 from petrobot.coordinator.engine.step import at_end
 from petrobot.coordinator.task import Kind, Value
-from petrobot.coordinator.task.compiled import Arcs
 from petrobot.coordinator.task.compiled_task import CompiledTransition
 from petrobot.coordinator.task.conditions import ConditionFault
 from petrobot.coordinator.task.conditions.language import as_literal
+from petrobot.coordinator.task.net import Arcs
 from petrobot.coordinator.task.wording import few
 
 MENDED = "the operator repairs what `final_error` leaves and starts the task again"

@@ -19,8 +19,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from petrobot.coordinator.analysis.limits import OutOfTime, keep_time, overtime
-from petrobot.coordinator.task.compiled import Arcs
-from petrobot.coordinator.task.net import Marking, Net
+from petrobot.coordinator.task.net import Arcs, Marking, Net
 
 SIPHON_EFFORT = 5_000
 """Branches after which the enumeration of siphons or traps gives up."""

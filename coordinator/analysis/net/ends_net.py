@@ -55,9 +55,8 @@ from petrobot.coordinator.analysis.net.structure import place_bounds
 from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
 from petrobot.coordinator.engine import Engine, Run, RunEnded
 from petrobot.coordinator.task import End, Kind, Status, Task
-from petrobot.coordinator.task.compiled_task import ActionArc, CompiledTransition
+from petrobot.coordinator.task.compiled_task import ActionArc, CompiledTransition, endless
 from petrobot.coordinator.task.conditions import ConditionFault
-from petrobot.coordinator.task.instant_firings import endless
 from petrobot.coordinator.task.net import Marking, Net
 
 CASES = 5_000

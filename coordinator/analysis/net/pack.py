@@ -4,7 +4,7 @@ a few mask tests.
 A field of `width` value bits holds the tokens of a place; the guard bit just above it is 0 in every
 stored marking. With all guards G set, `(M | G) - s` leaves the guard of place p set exactly when
 M(p) >= s(p), and no field borrows from the next one. So one subtraction tests all consumed weights
-(guards must stay) and all bars (guards must go) of a transition; `task/compiled.py` has turned
+(guards must stay) and all bars (guards must go) of a transition; `task/net.py` has turned
 capacities into bars. A guard that is set after a firing is a token count that outgrew its field:
 the caller widens the field and continues.
 """
@@ -18,7 +18,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.coordinator.task.net import Marking, Net
+from petrobot.coordinator.analysis.net.graph import Mask
+from petrobot.coordinator.task.net import CompiledNet, Marking, Net
 
 WORD = 64
 WIDEST = WORD - 1
@@ -273,3 +274,21 @@ def _test(layout: Layout, need: Mapping[int, int], below: Mapping[int, int]) -> 
 
     sub = sum(k << layout.offsets[p] for p, k in (*need.items(), *below.items()))
     return Test(sub, guards(need) | guards(below), guards(need))
+
+
+# --- many markings side by side ---
+# The firing rule for many markings side by side: places are rows of an array, markings its
+# columns.
+#
+# Used where trials are played in parallel (`time/simulate.py`, `studies/forecast/play.py`).
+
+
+def concession(rule: CompiledNet, tokens: Tokens, t: int) -> Mask:
+    """Return in which markings transition t has concession; `tokens` has shape (places, markings),
+    the result (markings,)."""
+    able = np.ones(tokens.shape[1], dtype=np.bool_)
+    for p, w in rule.needs[t]:
+        able &= tokens[p] >= w
+    for p, k in rule.bars[t]:
+        able &= tokens[p] < k
+    return able

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.limits import overtime
-from petrobot.coordinator.analysis.net.columns import concession
 from petrobot.coordinator.analysis.net.graph import Mask
-from petrobot.coordinator.analysis.net.pack import Tokens
+from petrobot.coordinator.analysis.net.pack import Tokens, concession
 from petrobot.coordinator.analysis.time.gspn import Gspn, Values
 from petrobot.coordinator.task.net import Marking
 

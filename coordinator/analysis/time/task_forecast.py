@@ -27,18 +27,16 @@ from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.time.completion import (
     Completion,
     CompletionTime,
+    Slope,
     completion,
     completion_time,
-)
-from petrobot.coordinator.analysis.time.gspn import Chain, Values
-from petrobot.coordinator.analysis.time.linear import SolveOrder, solve
-from petrobot.coordinator.analysis.time.markov import visits_before
-from petrobot.coordinator.analysis.time.sensitivity import (
-    Slope,
     reliability_slopes,
     slopes_of,
     time_slopes,
 )
+from petrobot.coordinator.analysis.time.gspn import Chain, Values
+from petrobot.coordinator.analysis.time.linear import SolveOrder, solve
+from petrobot.coordinator.analysis.time.markov import visits_before
 from petrobot.coordinator.analysis.time.stochastic import StochasticView
 from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.net import Marking

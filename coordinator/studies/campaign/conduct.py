@@ -28,12 +28,13 @@ from petrobot.coordinator.studies.campaign.plan import (
     write_manifest,
 )
 from petrobot.coordinator.studies.campaign.policies import ChoicePolicy, policy_of
-from petrobot.coordinator.studies.campaign.rows import TrialRow, rows_of
 from petrobot.coordinator.studies.campaign.summary import Summary, result_of
 from petrobot.coordinator.studies.campaign.table import (
     CampaignTable,
+    TrialRow,
     note_block,
     note_sessions,
+    rows_of,
     sessions,
 )
 from petrobot.services.host.json_text import json_text

@@ -22,7 +22,7 @@ from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.records import Waited, WaitEnd
 from petrobot.coordinator.learning.statistics import added
 from petrobot.coordinator.studies.campaign.plan import CampaignError
-from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry
 from petrobot.coordinator.task import Executed, Status, Task
 

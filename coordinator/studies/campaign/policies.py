@@ -22,7 +22,7 @@ from petrobot.coordinator.learning.selectors import ACTION, RULES, TASK, verdict
 from petrobot.coordinator.studies.campaign.block import Weights
 from petrobot.coordinator.studies.campaign.observed import context_of, observation, regime_of
 from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, CampaignPlan
-from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.task import Task
 from petrobot.services.comm.location_file import Directory
 

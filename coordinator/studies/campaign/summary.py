@@ -17,8 +17,7 @@ from petrobot.coordinator.learning.objective import Comparison, Question, compar
 from petrobot.coordinator.learning.statistics import wilson
 from petrobot.coordinator.studies.campaign.observed import ESTIMATES, add_row, context_of, regime_of
 from petrobot.coordinator.studies.campaign.plan import TABLE, CampaignPlan
-from petrobot.coordinator.studies.campaign.rows import TrialRow
-from petrobot.coordinator.studies.campaign.table import sessions, times
+from petrobot.coordinator.studies.campaign.table import TrialRow, sessions, times
 from petrobot.coordinator.task import PrimitiveTask, Task
 
 

@@ -19,7 +19,13 @@ import numpy as np
 from scipy.stats import binom, chi2_contingency, kstwobign, norm, t
 
 from petrobot.coordinator.learning.statistics import wilson
-from petrobot.coordinator.studies.forecast.direct import SCORES
+from petrobot.coordinator.studies.forecast.direct import (
+    SCORES,
+    holm,
+    predictive_interval,
+    share_p_value,
+    share_weight,
+)
 from petrobot.coordinator.studies.forecast.history import Training, Values
 from petrobot.coordinator.studies.forecast.predict import SHARES, figures
 from petrobot.coordinator.studies.forecast.residual import (
@@ -29,12 +35,6 @@ from petrobot.coordinator.studies.forecast.residual import (
     measured,
     routing,
     ways_table,
-)
-from petrobot.coordinator.studies.forecast.shares import (
-    holm,
-    predictive_interval,
-    share_p_value,
-    share_weight,
 )
 
 FAMILY = ("R_goal", "P_complete", "R_conj", "mean", "q90")

@@ -25,7 +25,7 @@ from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.records import Waited, WaitEnd
 from petrobot.coordinator.learning.waits import memory_of
 from petrobot.coordinator.studies.campaign.observed import context_of, regime_of
-from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.task import (
     EarlyEvent,

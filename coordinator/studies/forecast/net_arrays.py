@@ -22,9 +22,9 @@ from petrobot.coordinator.task import (
     Task,
     Transition,
 )
-from petrobot.coordinator.task.compiled import CompiledNet
 from petrobot.coordinator.task.compiled_task import CompiledTransition, compile_transitions
 from petrobot.coordinator.task.conditions import ConditionFault, Literal, walk
+from petrobot.coordinator.task.net import CompiledNet
 
 
 @dataclass(frozen=True)

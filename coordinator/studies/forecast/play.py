@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.coordinator.analysis.net.columns import concession
+from petrobot.coordinator.analysis.net.pack import concession
 from petrobot.coordinator.engine.compiled import contested_places
 from petrobot.coordinator.studies.forecast.distributions import Drawer, Mask
 from petrobot.coordinator.studies.forecast.history import CENSORED, STATUSES, Codes, Seen, Values

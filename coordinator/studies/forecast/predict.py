@@ -12,11 +12,14 @@ from petrobot.coordinator.studies.forecast.choices import choice_counts, choices
 from petrobot.coordinator.studies.forecast.direct import (
     LEAST,
     SCORES,
+    confidence_interval,
     design_effect,
     effective,
     mean_figure,
     missions,
+    predictive_interval,
     quantile_figure,
+    share_weight,
     time_figure,
     trial_weights,
 )
@@ -41,11 +44,6 @@ from petrobot.coordinator.studies.forecast.residual import (
     rare_doubts,
     residuals,
     routing,
-)
-from petrobot.coordinator.studies.forecast.shares import (
-    confidence_interval,
-    predictive_interval,
-    share_weight,
 )
 
 POINT = 40_000

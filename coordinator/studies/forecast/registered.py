@@ -14,9 +14,8 @@ from typing import Any
 
 from petrobot.coordinator.analysis.may_run import Cell, assumed, devices_of
 from petrobot.coordinator.analysis.net.space import SearchLimits
-from petrobot.coordinator.analysis.time.completion import completion_time
+from petrobot.coordinator.analysis.time.completion import completion_time, reliability_slopes
 from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
-from petrobot.coordinator.analysis.time.sensitivity import reliability_slopes
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, trial_forecast
 from petrobot.coordinator.learning.learning import Estimates

@@ -14,7 +14,7 @@ from scipy.stats import chi2_contingency, rankdata, spearmanr, ttest_ind_from_st
 from petrobot.coordinator.analysis.net.structure import exclusive_places, place_semiflows
 from petrobot.coordinator.learning.records import WaitEnd
 from petrobot.coordinator.learning.waits import memory_of
-from petrobot.coordinator.studies.forecast.direct import FEWEST, missions
+from petrobot.coordinator.studies.forecast.direct import FEWEST, holm, missions
 from petrobot.coordinator.studies.forecast.history import (
     Codes,
     Training,
@@ -23,7 +23,6 @@ from petrobot.coordinator.studies.forecast.history import (
 )
 from petrobot.coordinator.studies.forecast.net_arrays import Move
 from petrobot.coordinator.studies.forecast.play import Choices, Played
-from petrobot.coordinator.studies.forecast.shares import holm
 from petrobot.coordinator.task import EarlyEvent, EventMemory
 
 LEVEL = 0.01

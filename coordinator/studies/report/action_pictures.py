@@ -18,7 +18,7 @@ from petrobot.coordinator.studies.campaign.block import LoadedPlan
 from petrobot.coordinator.studies.campaign.observed import regime_of
 from petrobot.coordinator.studies.campaign.plan import CampaignPlan
 from petrobot.coordinator.studies.campaign.policies import LearnedActions, learns, policy_of
-from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.report import charts
 from petrobot.coordinator.task import Status, Task
 

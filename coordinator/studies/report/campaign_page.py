@@ -16,8 +16,8 @@ from petrobot.coordinator.learning.statistics import wilson
 from petrobot.coordinator.run.timeline import Bar, Timeline
 from petrobot.coordinator.studies.campaign.observed import regime_of
 from petrobot.coordinator.studies.campaign.plan import CampaignPlan
-from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.summary import Summary
+from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import Trial
 from petrobot.coordinator.studies.report import charts
 from petrobot.coordinator.studies.report.action_pictures import (

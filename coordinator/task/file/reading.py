@@ -1,8 +1,9 @@
-"""TOML to task. All faults are found in one pass and raised together."""
+"""Task files: TOML to task. All faults are found in one pass and raised together."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from enum import StrEnum
 from math import isfinite
@@ -10,7 +11,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from petrobot.coordinator.task import (
+    Counts,
     EarlyEvent,
+    End,
     Estimate,
     Event,
     EventMemory,
@@ -34,11 +37,96 @@ from petrobot.coordinator.task import (
 )
 from petrobot.coordinator.task.conditions import ConditionError, Expression, parse
 from petrobot.coordinator.task.expansion import written
-from petrobot.coordinator.task.file.arcs import ArcError, read_input, read_output
-from petrobot.coordinator.task.file.errors import TaskFileError
 from petrobot.coordinator.task.validation import faults as task_faults
 from petrobot.coordinator.task.wording import Fault, nearest
-from petrobot.services.host.toml_text import TomlError, key_lines, line_of, read_toml
+from petrobot.services.host.toml_text import TomlError, key_lines, line_of, not_utf8, read_toml
+
+
+class TaskFileError(ValueError):
+    """A task file that cannot be used. `faults` are all that is wrong; `lines[i]` is the line of
+    fault i (0: unknown)."""
+
+    def __init__(self, source: str, faults: Sequence[Fault], lines: Sequence[int]) -> None:
+        super().__init__(source, faults, lines)
+        self.source = source
+        self.faults = tuple(faults)
+        self.lines = tuple(lines)
+
+    def __str__(self) -> str:
+        places = (f"{self.source}:{n}" if n else self.source for n in self.lines)
+        return "\n".join(f"{at}: {fault}" for at, fault in zip(places, self.faults, strict=True))
+
+
+# --- arcs ---
+# Their short notation: `ball`, `runs*2`, `locate_ball:normal`, `catch_ball:preempt=success`,
+# `!blocked*3`.
+
+W = TypeVar("W", bound=StrEnum)
+_ARC = re.compile(
+    r"(?P<bar>!?)\s*(?P<place>[\w.]+)(?::(?P<end>\w+)(?:=(?P<counts>\w+))?)?(?:\s*\*\s*(?P<weight>\d{1,9}))?\Z"
+)
+
+
+class ArcError(ValueError):
+    """The text is not an arc; the message says how one is written."""
+
+
+def read_input(text: str) -> Input | Inhibitor:
+    """An arc of `in`. Raises ArcError."""
+    found = _ARC.match(text.strip())
+    if not found:
+        raise ArcError(
+            f"{text!r} is not an arc: write PLACE, PLACE*2, PLACE:normal, PLACE:preempt=success "
+            "or !PLACE"
+        )
+    weight = int(found["weight"] or 1)
+    if found["bar"]:
+        if found["end"]:
+            raise ArcError(
+                f"{text!r}: an inhibitor arc looks at tokens alone: write !{found['place']}"
+            )
+        return Inhibitor(found["place"], weight)
+    end = _word(End, found["end"], text)
+    counts = _word(Counts, found["counts"], text)
+    return Input(found["place"], weight, end, counts)
+
+
+def read_output(text: str) -> Output:
+    """An arc of `out`. Raises ArcError."""
+    found = _ARC.match(text.strip())
+    if not found or found["bar"] or found["end"]:
+        raise ArcError(f"{text!r} is not an arc of `out`: write PLACE or PLACE*2")
+    return Output(found["place"], int(found["weight"] or 1))
+
+
+def write_arc(arc: Input | Inhibitor | Output) -> str:
+    """The notation of an arc."""
+    if isinstance(arc, Inhibitor):
+        return f"!{arc.place}{_times(arc.threshold)}"
+    end = ""
+    if isinstance(arc, Input) and arc.end is not None:
+        end = f":{arc.end}" + (f"={arc.counts}" if arc.counts is not None else "")
+    return f"{arc.place}{end}{_times(arc.weight)}"
+
+
+def _times(weight: int) -> str:
+    return "" if weight == 1 else f"*{weight}"
+
+
+def _word(words: type[W], text: str | None, arc: str) -> W | None:
+    if text is None:
+        return None
+    try:
+        return words(text)
+    except ValueError:
+        what = f"{arc!r}: {text!r} is none of {', '.join(words)}{nearest(text, list(words))}"
+        place, _, _ = arc.partition(":")
+        if words is End and text in (Status.SUCCESS, Status.FAILURE):
+            what += f"; write {place}:normal, and when = \"{place}.status == '{text}'\""
+        raise ArcError(what) from None
+
+
+# --- tables ---
 
 # Reading one TOML table: every key is asked for by name and type, every fault is collected,
 # leftovers are refused.
@@ -207,10 +295,12 @@ def read_text(path: Path) -> str:
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
-        line = data[: error.start].count(b"\n") + 1
-        raise TaskFileError(
-            str(path), [Fault("file", "is not UTF-8", "save it as UTF-8")], [line]
-        ) from error
+        raise _faulty(not_utf8(error, str(path))) from error
+
+
+def _faulty(error: TomlError) -> TaskFileError:
+    fault = Fault(error.key, error.found, error.remedy)
+    return TaskFileError(error.source, [fault], [error.line or 0])
 
 
 def loads(
@@ -230,8 +320,7 @@ def loads(
     try:
         data = read_toml(text, source) if data is None else data
     except TomlError as error:
-        fault = Fault(error.key, error.found, error.remedy)
-        raise TaskFileError(source, [fault], [error.line or 0]) from error
+        raise _faulty(error) from error
     if "nodes" in data and "task" not in data:
         remedy = "name the task: petrobot check TASK.toml finds the services.toml beside it"
         raise TaskFileError(

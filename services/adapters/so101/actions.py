@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from petrobot import Context, Remote, Result, error, failure, perform, success
-from petrobot.services.adapters.so101.kinematics import CHAIN, inverse
+from petrobot.services.adapters.so101.arm import CHAIN, inverse
 
 State = Mapping[str, Any]
 STARTING = 1.0

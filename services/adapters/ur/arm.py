@@ -16,13 +16,44 @@ The workspace limits the tool point in the base frame. After a fault nothing mov
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from petrobot import Driver, JointMotion, Link, Ports, key, numbers
-from petrobot.services.adapters.ur import kinematics
+from petrobot import Driver, JointChain, JointMotion, Link, Ports, key, numbers
 from petrobot.services.adapters.ur.rtde import Rtde, RtdeError
+
+# --- kinematics ---
+# The joints of UR arms.
+#
+# Denavit-Hartenberg parameters: Universal Robots, "DH Parameters for calculations of kinematics and
+# dynamics" (support article 16538). A robot's own calibration differs by a few tenths of a
+# millimetre.
+
+# d1, a2, a3, d4, d5, d6 (m)
+MODELS = {
+    "ur3e": (0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921),
+    "ur5e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996),
+    "ur10e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
+}
+TURN = (-2 * math.pi, 2 * math.pi)
+
+
+def chain(model: str, tool: Sequence[float] = (0.0, 0.0, 0.0)) -> JointChain:
+    """Return the joints of a model with a tool point `tool` (m, in the flange's frame)."""
+    d1, a2, a3, d4, d5, d6 = MODELS[model]
+    rows = [
+        {"name": "base", "d": d1, "alpha": math.pi / 2},
+        {"name": "shoulder", "a": a2},
+        {"name": "elbow", "a": a3},
+        {"name": "wrist_1", "d": d4, "alpha": math.pi / 2},
+        {"name": "wrist_2", "d": d5, "alpha": -math.pi / 2},
+        {"name": "wrist_3", "d": d6},
+    ]
+    return JointChain(({**row, "limits": TURN} for row in rows), (*tool, 0.0, 0.0, 0.0))
+
+
+# --- driver ---
 
 OUTPUTS = (
     *("actual_q", "actual_qd", "robot_mode", "safety_mode"),
@@ -92,12 +123,12 @@ class Arm(Driver):
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         super().__init__(config, ports)
-        if self.model not in kinematics.MODELS:
-            known = ", ".join(kinematics.MODELS)
+        if self.model not in MODELS:
+            known = ", ".join(MODELS)
             raise ValueError(f"model: expected one of {known}, found {self.model!r}")
         if self.top_speed > 3.14 or self.acceleration > 20.0:
             raise ValueError("expected top_speed up to 3.14 rad/s, acceleration up to 20 rad/s^2")
-        self._arm = kinematics.chain(self.model, numbers(self.tool, 3, "tool"))
+        self._arm = chain(self.model, numbers(self.tool, 3, "tool"))
         addresses = self.rtde_port, self.dashboard_port, self.program_port
         self._link, self._dashboard, self._program = (
             Link(ports.now, partial(ports.tcp, self.host, port), patience)

@@ -39,8 +39,7 @@ from petrobot.services.comm.protocol.messages import (
 )
 from petrobot.services.comm.protocol.security import Keys, is_loopback, require_key
 from petrobot.services.comm.protocol.wire import ConnectionState, ProtocolError, Side
-from petrobot.services.comm.tls.credentials import may_speak_as, name_on
-from petrobot.services.comm.tls.expiry import DAY, look_again
+from petrobot.services.comm.tls.credentials import DAY, look_again, may_speak_as, name_on
 from petrobot.services.comm.tls.listener import Admission, TlsListener
 
 _log = logging.getLogger(__name__)

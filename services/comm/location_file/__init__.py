@@ -18,6 +18,7 @@ from typing import Any
 from petrobot.services.comm.location_file import reading as directory_file
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.comm.protocol.messages import COORDINATOR
+from petrobot.services.host.toml_text import not_utf8
 
 _log = logging.getLogger(__name__)
 COORDINATOR_PORT = directory_file.COORDINATOR_PORT
@@ -250,10 +251,7 @@ def read_text(source: Path) -> str:
     try:
         return source.read_text(encoding="utf-8")
     except UnicodeDecodeError as fault:
-        line = source.read_bytes()[: fault.start].count(b"\n") + 1
-        raise DirectoryError(
-            (f"{source}:{line}: not UTF-8 text ({fault.reason}); save the file as UTF-8",)
-        ) from fault
+        raise DirectoryError((str(not_utf8(fault, str(source))),)) from fault
 
 
 def parse(text: str, source: Path, data: dict[str, Any] | None = None) -> Directory:

@@ -18,8 +18,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from petrobot.services.comm.tls.credentials import CA_FILE, RENEW_CA
-from petrobot.services.comm.tls.expiry import SOON
+from petrobot.services.comm.tls.credentials import CA_FILE, RENEW_CA, SOON
 from petrobot.services.host.whole_file import make_folder, write_whole
 
 CA_KEY = "ca.key"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -11,7 +12,7 @@ import pytest
 
 from petrobot import ByteLine, Driver, Ports, check_driver, rehearse
 from petrobot.services.adapters.ur import actions
-from petrobot.services.adapters.ur.arm import PROGRAM, Arm
+from petrobot.services.adapters.ur.arm import PROGRAM, Arm, chain
 from petrobot.services.comm.streams.line import TcpConnection
 from petrobot.sim.bus.ur_controller import (
     NORMAL,
@@ -379,3 +380,22 @@ def test_the_program_reads_the_registers_that_the_driver_writes() -> None:
     assert PROGRAM.startswith("def ") and PROGRAM.endswith("end\n")
     opens = sum(PROGRAM.count(word) for word in ("def ", "while ", "    if "))
     assert PROGRAM.count("end\n") == opens
+
+
+# --- kinematics ---
+
+
+@pytest.mark.parametrize(
+    ("model", "place"),
+    [
+        ("ur3e", (-0.45675, -0.22315, 0.0665)),
+        ("ur5e", (-0.8172, -0.2329, 0.0628)),
+        ("ur10e", (-1.18425, -0.2907, 0.06085)),
+    ],
+)
+def test_stretched_out_the_flange_is_where_the_pendant_shows_it(
+    model: str, place: tuple[float, ...]
+) -> None:
+    """All joints at zero: sums of the lengths (d1 - d5 above, d4 + d6 aside, a2 + a3 out)."""
+    pose = chain(model).tool([0.0] * 6)
+    assert pose[:3] == pytest.approx(place) and pose[3:] == pytest.approx((math.pi / 2, 0.0, 0.0))

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from petrobot.sim.catching.truth import read_toml
-from petrobot.sim.picking.arm import ToolPose
 from petrobot.sim.picking.camera import Picture, SceneCamera
-from petrobot.sim.picking.gripper import Fingers
+from petrobot.sim.picking.gripper import Fingers, ToolPose
 from petrobot.sim.picking.parts import Part
 from petrobot.sim.picking.truth import LABORATORY_FILE, PickingSite
 from petrobot.sim.picking.world import PickingWorld, TableTop

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from petrobot.sim.catching.truth import LaboratoryError
-from petrobot.sim.picking.arm import ToolPose
-from petrobot.sim.picking.laboratory import PickingLaboratory
+from petrobot.sim.picking.gripper import ToolPose
+from petrobot.sim.picking.laboratory import EXCHANGE, PickingLaboratory, Referee
 from petrobot.sim.picking.parts import contact
-from petrobot.sim.picking.referee import EXCHANGE, Referee
 from petrobot.sim.picking.world import PickingWorld
 from tests.sim.picking.bench import FINGERS, camera, cube, puck, scene, site
 

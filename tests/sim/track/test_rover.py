@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.sim.track.elements import FloorPose
+from petrobot.sim.track.course import FloorPose
 from petrobot.sim.track.rover import RoverBody
 from petrobot.sim.track.truth import RoverTruth, TrackSite, WheelTruth
 

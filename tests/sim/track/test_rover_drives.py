@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.byte_stream import CanHub
 from petrobot.services.comm.canopen.cia301 import DataType, heartbeat, sdo_write_request
 from petrobot.services.comm.canopen.cia301 import NmtState as Network
 from petrobot.services.comm.canopen.cia402 import (
@@ -26,10 +27,8 @@ from petrobot.services.comm.canopen.cia402 import (
     from_units,
     state_of,
 )
-from petrobot.services.comm.canopen.hub import CanHub
-from petrobot.sim.track.drives import RoverBus
+from petrobot.sim.track.drives import Echo, ReflectorSensor, RoverBus
 from petrobot.sim.track.rover import RoverBody
-from petrobot.sim.track.sensor import Echo, ReflectorSensor
 from petrobot.sim.track.truth import TrackSite
 
 canopen: Any = importlib.import_module("canopen")  # it has no annotations worth the name

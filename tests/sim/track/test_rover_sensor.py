@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.sim.track.elements import FloorPose
-from petrobot.sim.track.sensor import look
+from petrobot.sim.track.course import FloorPose
+from petrobot.sim.track.drives import look
 from petrobot.sim.track.truth import SensorTruth, TrackSite
 
 PERFECT = SensorTruth(

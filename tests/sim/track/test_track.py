@@ -11,14 +11,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.sim.track.course import BOARD, KINDS, Track, TrackError
-from petrobot.sim.track.elements import (
+from petrobot.sim.track.course import (
     BAR_LENGTH,
     BAR_MARGIN,
+    BOARD,
     HALF_WIDTH,
+    KINDS,
     SQUARE,
     Element,
     ElementKind,
+    Track,
+    TrackError,
 )
 from petrobot.sim.track.floor import COARSE, FINE, ORIGIN, Floor
 

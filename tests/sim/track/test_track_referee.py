@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from petrobot.sim.track.course import Track
-from petrobot.sim.track.elements import FloorPose
+from petrobot.sim.track.course import FloorPose, Track
 from petrobot.sim.track.referee import MOST_ROWS, TrackReferee
 
 TRACK = Track.of((0, 3), 0, "SSSSSSS", (3,))  # along y = 7 from x = 0; no paint from x = 6 to x = 8

@@ -33,14 +33,13 @@ from petrobot.coordinator.studies.campaign.plan import (
     write_manifest,
 )
 from petrobot.coordinator.studies.campaign.pool import LocalPool
-from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.summary import (
     Summary,
     TrialCounts,
     comparisons,
     result_of,
 )
-from petrobot.coordinator.studies.campaign.table import TABLE, read_table
+from petrobot.coordinator.studies.campaign.table import TABLE, TrialRow, read_table
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.campaign.worker import serve
 from petrobot.coordinator.task import Kind

@@ -8,8 +8,8 @@ import pytest
 
 from petrobot.coordinator.cli.campaign import text_of
 from petrobot.coordinator.learning.propagation import propagate
-from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.summary import Summary
+from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.task.file import loads
 

@@ -18,7 +18,7 @@ from petrobot.coordinator.learning.records import Waited, WaitEnd
 from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.studies.campaign.block import scores
 from petrobot.coordinator.studies.campaign.plan import CampaignPlan, identity
-from petrobot.coordinator.studies.campaign.rows import TrialRow, cells, columns, read_row
+from petrobot.coordinator.studies.campaign.table import TrialRow, cells, columns, read_row
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial, TrialLog
 from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.file import load

@@ -20,16 +20,16 @@ from petrobot.coordinator.studies.forecast.agreement import (
     time_p_value,
 )
 from petrobot.coordinator.studies.forecast.choices import choices_of
+from petrobot.coordinator.studies.forecast.direct import (
+    holm,
+    predictive_interval,
+    share_p_value,
+)
 from petrobot.coordinator.studies.forecast.distributions import RunDistributions, dependences
 from petrobot.coordinator.studies.forecast.history import ForecastError, Training
 from petrobot.coordinator.studies.forecast.predict import Request, figures, predict
 from petrobot.coordinator.studies.forecast.registered import read, register, write
 from petrobot.coordinator.studies.forecast.residual import durations, measured
-from petrobot.coordinator.studies.forecast.shares import (
-    holm,
-    predictive_interval,
-    share_p_value,
-)
 from petrobot.coordinator.task import Task
 from tests.studies.forecast.conftest import Make
 
@@ -337,7 +337,7 @@ def test_the_stochastic_view_is_reported_too(pair: Task, make_trials: Make) -> N
     """It keeps shares and means exactly, but assumes independent statuses: its R_conj is the
     product, not the true value."""
     from petrobot.coordinator.studies.campaign.observed import estimates_of
-    from petrobot.coordinator.studies.campaign.rows import TrialRow
+    from petrobot.coordinator.studies.campaign.table import TrialRow
     from petrobot.coordinator.studies.forecast.registered import exact
 
     trials = make_trials(1500, np.random.default_rng(14))

@@ -12,12 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from petrobot.coordinator.analysis.time.completion import Completion
-from petrobot.coordinator.analysis.time.sensitivity import Slope, reliability_slopes
+from petrobot.coordinator.analysis.time.completion import Completion, Slope, reliability_slopes
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest, write_manifest
-from petrobot.coordinator.studies.campaign.rows import TrialRow
-from petrobot.coordinator.studies.campaign.table import CampaignTable
+from petrobot.coordinator.studies.campaign.table import CampaignTable, TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast import registered
 from petrobot.coordinator.studies.forecast.choices import misfit

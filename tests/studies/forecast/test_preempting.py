@@ -17,7 +17,7 @@ from petrobot.coordinator.analysis.time.measured import is_cause
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.learning.propagation import incidences, propagate, unended
 from petrobot.coordinator.studies.campaign.observed import estimates_of
-from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.distributions import RunDistributions, with_weights

@@ -16,7 +16,7 @@ from scipy.stats import binomtest
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.studies.campaign.conduct import Campaign
 from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest
-from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.report.action_pictures import (
     learned_curves,

@@ -7,9 +7,15 @@ import math
 
 import pytest
 
-from petrobot.services.picking.finding import FINDERS, find_by_contours, find_by_templates
 from petrobot.services.picking.model import cell_named
-from petrobot.services.picking.seeing import confirmed, easiest, is_empty
+from petrobot.services.picking.seeing import (
+    FINDERS,
+    confirmed,
+    easiest,
+    find_by_contours,
+    find_by_templates,
+    is_empty,
+)
 from tests.sim.picking.bench import scene
 
 SEEDS = range(40, 52)
