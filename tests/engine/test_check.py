@@ -275,11 +275,22 @@ def test_conflicts_of_a_long_task_are_found_soon(task: Tasks) -> None:
     assert effort(160) < 5 * effort(80)
 
 
-@pytest.mark.parametrize("lost", [{}, {"lost": {"in": "q", "out": "c", "event": "g"}}])
+@pytest.mark.parametrize(
+    "lost",
+    [
+        {},
+        {"lost": {"in": "q", "out": "c", "event": "g"}},
+        {
+            "lost": {"in": "q", "out": "c", "event": "g"},
+            "seen": {"in": "c", "out": "c", "event": "g"},
+        },
+    ],
+)
 def test_invariant_that_excludes_two_transitions(
     task: Tasks, lost: dict[str, dict[str, Any]]
 ) -> None:
-    """Also where a token can leave for a control place: it does not come back."""
+    """Also where a token can leave for a control place: it does not come back, even if another
+    transition takes it and puts it back."""
     net = {
         **lost,
         "swap": {"in": "p", "out": "q", "event": "f"},
